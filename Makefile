@@ -1,0 +1,38 @@
+# make demo    the main job on a sample that needs no download; ARGS="--sample motorcycle"
+# make test    the tests; ARGS="--runslow" for all of them
+# make lint    what continuous integration asks of the code's form
+# make wheel   dist/*.whl
+# make clean   removes what the above made, .venv included
+#
+# Each of them first sees to .venv and to the system libraries of open3d.
+# make PYTHON=/path/to/python3 names another interpreter (>= 3.10).
+
+BIN := .venv/bin
+ARGS ?=
+
+.PHONY: demo test lint wheel clean environment
+
+demo: environment
+	$(BIN)/gvtools demo $(ARGS)
+
+test: environment
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: environment
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m mypy
+
+wheel: environment
+	rm -rf build dist
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	rm -rf build
+	ls -l dist/*.whl
+
+environment:
+	@PYTHON="$(PYTHON)" bash tools/environment.sh
+	@bash tools/system_libraries.sh $(BIN)/python
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,14 @@
+"""Completers: fill what the memory does not know of a target view."""
+
+from __future__ import annotations
+
+from gvtools.completers.base import (
+    Completer,
+    Completion,
+    ContextView,
+    available,
+    create,
+    register,
+)
+
+__all__ = ["Completer", "Completion", "ContextView", "available", "create", "register"]

@@ -1,0 +1,31 @@
+"""The completer that completes nothing: what memory does not know stays empty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from gvtools.completers.base import Completion, ContextView
+from gvtools.guidance import Guidance
+
+
+@dataclass(frozen=True)
+class NoneCompleter:
+    """Returns the guidance as it is; invalid pixels are 0 in colour, depth and confidence."""
+
+    name: ClassVar[str] = "none"
+
+    def complete(
+        self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
+    ) -> Completion:
+        """Pass the valid pixels through; see ``Completer.complete``."""
+        valid = guidance.valid
+        return Completion(
+            np.where(valid[..., None], guidance.rgb, np.float32(0)),
+            np.where(valid, guidance.depth, np.float32(0)),
+            np.where(valid, np.minimum(guidance.confidence, 1), 0).astype(np.float32),
+            spent={"seconds": 0.0, "holes": float((~valid).sum()), "filled": 0.0},
+        )

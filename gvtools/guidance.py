@@ -1,0 +1,51 @@
+"""What the memory knows of target cameras: the hint that completers receive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+
+
+@dataclass(frozen=True, eq=False)
+class Guidance:
+    """Memory projected into V cameras of one image size.
+
+    Attributes:
+        cameras: the V target cameras.
+        rgb: (V, H, W, 3) float32 in [0, 1]; 0 where not valid.
+        depth: (V, H, W) float32 z-depth, scene units; 0 where not valid.
+        valid: (V, H, W) bool, True where memory supports the pixel.
+        confidence: (V, H, W) float32 >= 0; 0 where not valid.
+        generated: (V, H, W) bool, True where the support is generated content.
+    """
+
+    cameras: Cameras
+    rgb: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    confidence: NDArray[np.float32]
+    generated: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+    def __getitem__(self, index: int) -> Guidance:
+        """One view, as a batch of one."""
+        rows = slice(index, index + 1)
+        return Guidance(
+            self.cameras[index],
+            self.rgb[rows],
+            self.depth[rows],
+            self.valid[rows],
+            self.confidence[rows],
+            self.generated[rows],
+        )
+
+    @property
+    def coverage(self) -> float:
+        """The share of pixels that memory supports."""
+        return float(self.valid.mean()) if self.valid.size else 0.0

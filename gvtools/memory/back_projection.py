@@ -1,0 +1,227 @@
+"""From a depth image to points: what is lifted, what is dropped, and how far it is trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.errors import ShapeError
+from gvtools.memory.points import PointSet
+
+# Side of a cell of the free-space grid, pixels.
+FREE_CELL = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackProjectionOptions:
+    """How a depth image becomes points.
+
+    Attributes:
+        edge: drop a pixel whose 3x3 neighbours spread over more than this share of its depth,
+            beyond what a plane's slope explains; such pixels mix foreground and background
+            ("flying pixels").
+        depth_max: drop what is farther, scene units; None keeps all.
+        grazing: the smallest cosine between ray and surface normal that is still kept.
+    """
+
+    edge: float = 0.05
+    depth_max: float | None = None
+    grazing: float = 0.05
+
+
+def back_project(
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    camera: Cameras,
+    *,
+    origin: ArrayLike = (0.0, 0.0, 0.0),
+    confidence: NDArray[np.float32] | None = None,
+    mask: NDArray[np.bool_] | None = None,
+    options: BackProjectionOptions | None = None,
+) -> PointSet:
+    """Lift the pixels of one view to points.
+
+    The confidence of a point is the source's, times the cosine between ray and surface (oblique
+    surfaces are measured badly); depth edges are dropped. The spacing is the pixel's footprint on
+    the fronto-parallel plane, z / f.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) float32 z-depth, scene units; 0, NaN and inf mean none.
+        camera: a batch of one, of the same image size.
+        origin: (3,) world point the positions are taken relative to.
+        confidence: (H, W) float32 of the source, > 0; None means 1.
+        mask: (H, W) bool, True = use.
+        options: see BackProjectionOptions.
+
+    Raises:
+        ShapeError: the images and the camera disagree in size.
+    """
+    options = options or BackProjectionOptions()
+    height, width = int(camera.height[0]), int(camera.width[0])
+    for name, array, shape in (
+        ("rgb", rgb, (height, width, 3)),
+        ("depth", depth, (height, width)),
+        ("confidence", confidence, (height, width)),
+        ("mask", mask, (height, width)),
+    ):
+        if array is not None and array.shape != shape:
+            raise ShapeError(
+                f"{camera.names[0]}: {name} has shape {array.shape}; its camera needs {shape}"
+            )
+    origin = np.asarray(origin, np.float64)
+    world_from_cam = camera.world_from_cam[0].copy()
+    world_from_cam[:3, 3] -= origin
+    z = np.ascontiguousarray(depth, np.float32)
+    use = np.ones((0, 0), np.bool_) if mask is None else np.ascontiguousarray(mask, np.bool_)
+    trust = (
+        np.ones((0, 0), np.float32)
+        if confidence is None
+        else np.ascontiguousarray(confidence, np.float32)
+    )
+    positions = np.empty((height * width, 3), np.float32)
+    colors = np.empty((height * width, 3), np.uint8)
+    weight = np.empty(height * width, np.float32)
+    spacing = np.empty(height * width, np.float32)
+    count, invalid, edges, masked = _lift(
+        np.ascontiguousarray(rgb, np.uint8), z, trust, use, camera.K[0], world_from_cam,
+        options.edge, np.inf if options.depth_max is None else options.depth_max, options.grazing,
+        positions, colors, weight, spacing,
+    )  # fmt: skip
+    far = np.inf if options.depth_max is None else options.depth_max
+    return PointSet(
+        positions[:count].copy(),
+        colors[:count].copy(),
+        weight[:count].copy(),
+        spacing[:count].copy(),
+        camera,
+        origin,
+        _free_depth(z, use, np.float32(far)),
+        {"no depth": invalid, "depth edge": edges, "masked": masked},
+    )
+
+
+@njit(cache=True, inline="always")
+def _usable(z):
+    return z > 0 and z < np.inf
+
+
+@njit(cache=True)
+def _lift(rgb, depth, trust, mask, K, world_from_cam, edge, depth_max, grazing,
+          positions, colors, weight, spacing):  # fmt: skip
+    height, width = depth.shape
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    skew = K[0, 1]
+    focal = np.sqrt(fx * fy)
+    n = 0
+    invalid = 0
+    edges = 0
+    masked = 0
+    for row in range(height):
+        ry = (row + 0.5 - cy) / fy
+        for col in range(width):
+            z = depth[row, col]
+            if not _usable(z) or z > depth_max:
+                invalid += 1
+                continue
+            if mask.size and not mask[row, col]:
+                masked += 1
+                continue
+            cosine = _surface_cosine(depth, row, col, edge, fx, fy, cx, cy)
+            if cosine < grazing:
+                edges += 1
+                continue
+            w = np.float32(cosine)
+            if trust.size:
+                w *= trust[row, col]
+                if not (w > 0 and w < np.inf):
+                    invalid += 1
+                    continue
+            rx = (col + 0.5 - cx - skew * ry) / fx
+            for k in range(3):
+                positions[n, k] = (
+                    z * (world_from_cam[k, 0] * rx + world_from_cam[k, 1] * ry + world_from_cam[k, 2])
+                    + world_from_cam[k, 3]
+                )
+                colors[n, k] = rgb[row, col, k]
+            weight[n] = w
+            spacing[n] = z / focal
+            n += 1
+    return n, invalid, edges, masked
+
+
+@njit(cache=True)
+def _surface_cosine(depth, row, col, edge, fx, fy, cx, cy):
+    """Cosine between the pixel's ray and the surface there; -1 on a depth edge.
+
+    On a plane, inverse depth is linear in the image, so a neighbour's inverse depth may differ
+    by a slope; a jump shows as a spread of the two one-sided slopes beyond ``edge``.
+    """
+    height, width = depth.shape
+    z = depth[row, col]
+    inverse = 1.0 / z
+    slope_x = 0.0
+    slope_y = 0.0
+    for axis in range(2):
+        step_row = axis
+        step_col = 1 - axis
+        before = 0.0
+        after = 0.0
+        has_before = False
+        has_after = False
+        if row >= step_row and col >= step_col:
+            zb = depth[row - step_row, col - step_col]
+            if _usable(zb):
+                before = (inverse - 1.0 / zb) * z
+                has_before = True
+        if row + step_row < height and col + step_col < width:
+            za = depth[row + step_row, col + step_col]
+            if _usable(za):
+                after = (1.0 / za - inverse) * z
+                has_after = True
+        if has_before and has_after:
+            if abs(after - before) > edge or min(abs(after), abs(before)) > edge:
+                return -1.0
+            slope = before if abs(before) < abs(after) else after
+        elif has_before or has_after:
+            slope = before + after
+            if abs(slope) > edge:
+                return -1.0
+        else:
+            return -1.0
+        if axis == 0:
+            slope_x = slope
+        else:
+            slope_y = slope
+    # The plane 1/z = a·x + b·y + c over normalised image coordinates has the normal (a, b, c).
+    a = slope_x * inverse * fx
+    b = slope_y * inverse * fy
+    x = (col + 0.5 - cx) / fx
+    y = (row + 0.5 - cy) / fy
+    c = inverse - a * x - b * y
+    return inverse / (np.sqrt(a * a + b * b + c * c) * np.sqrt(x * x + y * y + 1.0))
+
+
+@njit(cache=True)
+def _free_depth(depth, mask, depth_max):
+    """(ceil(H/4), ceil(W/4)): the nearest depth of each cell, 0 unless every pixel has one."""
+    height, width = depth.shape
+    rows = (height + FREE_CELL - 1) // FREE_CELL
+    cols = (width + FREE_CELL - 1) // FREE_CELL
+    out = np.zeros((rows, cols), np.float32)
+    for i in range(rows):
+        for j in range(cols):
+            nearest = np.float32(np.inf)
+            for row in range(i * FREE_CELL, min((i + 1) * FREE_CELL, height)):
+                for col in range(j * FREE_CELL, min((j + 1) * FREE_CELL, width)):
+                    z = depth[row, col]
+                    if not _usable(z) or (mask.size and not mask[row, col]):
+                        nearest = np.float32(0)
+                    elif z < nearest:
+                        nearest = min(z, depth_max)
+            out[i, j] = nearest
+    return out

@@ -1,0 +1,318 @@
+"""The fusion kernel: points of one view into voxels, one observation per voxel and direction.
+
+A voxel keeps a chain of observations. The view's own points in a voxel are averaged by
+confidence. The average then joins the chain: it merges with an observation seen from almost the
+same direction at no finer detail (agreement raises the confidence), or with the most similar one
+once the chain is full, and stands beside the others otherwise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from gvtools.memory.voxel_index import (
+    BLOCK_BITS,
+    EMPTY_KEY,
+    LOCAL_MASK,
+    MAX_VOXEL,
+    NO_RECORD,
+    block_key,
+    insert_voxel,
+)
+
+# Rows of the kernel's report.
+ADDED, MERGED, AGREED, REJECTED_OBSERVED, NEW_VOXELS, MERGED_POINTS = range(6)
+REPORT_SIZE = 6
+
+
+@njit(cache=True)
+def voxel_keys(positions, inverse_edge, keys, locals_):
+    """Block key and place in the block of each point; EMPTY_KEY when it is out of reach."""
+    outside = 0
+    for i in range(len(positions)):
+        x = np.floor(np.float64(positions[i, 0]) * inverse_edge)
+        y = np.floor(np.float64(positions[i, 1]) * inverse_edge)
+        z = np.floor(np.float64(positions[i, 2]) * inverse_edge)
+        if not (abs(x) < MAX_VOXEL and abs(y) < MAX_VOXEL and abs(z) < MAX_VOXEL):
+            keys[i] = EMPTY_KEY
+            outside += 1
+            continue
+        ix = np.int64(x)
+        iy = np.int64(y)
+        iz = np.int64(z)
+        keys[i] = block_key(ix >> BLOCK_BITS, iy >> BLOCK_BITS, iz >> BLOCK_BITS)
+        locals_[i] = (
+            ((ix & LOCAL_MASK) << (2 * BLOCK_BITS))
+            | ((iy & LOCAL_MASK) << BLOCK_BITS)
+            | (iz & LOCAL_MASK)
+        )
+    return outside
+
+
+@njit(cache=True)
+def group_by_block(blocks, total):
+    """Counting sort of the points by block, blocks in the order of their first point.
+
+    Returns (touched blocks, start of each in the order, order).
+    """
+    counts = np.zeros(total, np.int32)
+    for b in blocks:
+        counts[b] += 1
+    rank = np.full(total, -1, np.int32)
+    touched = np.empty(min(len(blocks), total), np.int32)
+    starts = np.empty(min(len(blocks), total) + 1, np.int64)
+    n = 0
+    at = np.int64(0)
+    for b in blocks:
+        if rank[b] < 0:
+            rank[b] = n
+            touched[n] = b
+            starts[n] = at
+            at += counts[b]
+            n += 1
+    starts[n] = at
+    cursor = starts[:n].copy()
+    order = np.empty(len(blocks), np.int64)
+    for i in range(len(blocks)):
+        r = rank[blocks[i]]
+        order[cursor[r]] = i
+        cursor[r] += 1
+    return touched[:n], starts[: n + 1], order
+
+
+@njit(cache=True, fastmath={"nsz", "arcp", "contract"})
+def _most_similar(head, p, spacing, center, view_centers, r_view, r_spacing, r_next):
+    """The chain's observation seen from the most similar direction: (record, cosine, length)."""
+    ax = center[0] - p[0]
+    ay = center[1] - p[1]
+    az = center[2] - p[2]
+    norm_a = ax * ax + ay * ay + az * az
+    best = NO_RECORD
+    best_score = -2.0
+    best_cosine = -2.0
+    length = 0
+    m = head
+    while m != NO_RECORD:
+        length += 1
+        c = view_centers[r_view[m]]
+        bx = c[0] - p[0]
+        by = c[1] - p[1]
+        bz = c[2] - p[2]
+        norm = norm_a * (bx * bx + by * by + bz * bz)
+        cosine = (ax * bx + ay * by + az * bz) / np.sqrt(norm) if norm > 0 else 1.0
+        # An observation of much finer or coarser detail is less alike than one of the same.
+        ratio = r_spacing[m] / spacing
+        if ratio < 1:
+            ratio = 1 / ratio
+        score = cosine - 0.01 * (ratio - 1)
+        if score > best_score:
+            best_score = score
+            best_cosine = cosine
+            best = m
+        m = r_next[m]
+    return best, best_cosine, length
+
+
+@njit(cache=True)
+def fuse_blocks(
+    positions, colors, confidence, spacing, locals_, touched, starts, order,
+    pool_local, pool_head, pool_state, block_offset, block_log2, block_count,
+    r_position, r_color, r_confidence, r_spacing, r_view, r_next, count,
+    view, center, view_centers, view_round, view_generated,
+    cosine_same, finer, capacity, weight_cap, inverse_edge,
+    run_start, run_count, run_box, agreed_record, agreed_weight, report,
+):  # fmt: skip
+    """Fuse one view's points, grouped by block; returns (records, runs, agreements).
+
+    New records are appended block by block, so each (block, view) is one contiguous run with a
+    tight bounding box (``run_box``: min xyz, max xyz). Records of earlier rounds are never
+    changed: what agrees with one is logged as (record, confidence).
+    """
+    largest = 0
+    for g in range(len(touched)):
+        largest = max(largest, starts[g + 1] - starts[g])
+    t_sum = np.empty((largest, 6), np.float64)
+    t_weight = np.empty(largest, np.float64)
+    t_spacing = np.empty(largest, np.float64)
+    t_best = np.empty(largest, np.float32)
+    t_points = np.empty(largest, np.int32)
+    t_slot = np.empty(largest, np.int64)
+    t_head = np.empty(largest, np.int32)
+    t_first = np.empty(largest, np.int64)
+    p = np.empty(3, np.float64)
+    runs = 0
+    agreed = 0
+    generated = view_generated[view]
+    for g in range(len(touched)):
+        block = touched[g]
+        n = 0
+        for o in range(starts[g], starts[g + 1]):
+            i = order[o]
+            before = block_count[block]
+            log2 = block_log2[block]
+            slot = insert_voxel(
+                pool_local, pool_head, pool_state, block_offset, block_log2, block_count, block,
+                locals_[i],
+            )  # fmt: skip
+            report[NEW_VOXELS] += block_count[block] - before
+            if block_log2[block] != log2:
+                # The block's table moved: find the voxels of this view again.
+                for t in range(n):
+                    t_slot[t] = -1
+                _relocate(pool_head, block_offset[block], block_log2[block], t_slot)
+            head = pool_head[slot]
+            w = np.float64(confidence[i])
+            if head <= -2:
+                t = -2 - head
+            else:
+                t = n
+                n += 1
+                pool_head[slot] = -2 - t
+                t_slot[t] = slot
+                t_head[t] = head
+                t_first[t] = i
+                t_weight[t] = 0
+                t_spacing[t] = 0
+                t_best[t] = 0
+                t_points[t] = 0
+                for k in range(6):
+                    t_sum[t, k] = 0
+            for k in range(3):
+                t_sum[t, k] += w * positions[i, k]
+                t_sum[t, 3 + k] += w * colors[i, k]
+            t_weight[t] += w
+            t_spacing[t] += w * spacing[i]
+            t_best[t] = max(t_best[t], confidence[i])
+            t_points[t] += 1
+        first = count
+        for t in range(n):
+            slot = t_slot[t]
+            head = t_head[t]
+            weight = t_weight[t]
+            for k in range(3):
+                p[k] = t_sum[t, k] / weight
+            own = np.float64(t_best[t])
+            # Several pixels in one voxel cover it together.
+            width = t_spacing[t] / weight
+            if t_points[t] > 1:
+                width = min(1.0 / inverse_edge, width * np.sqrt(np.float64(t_points[t])))
+            best = NO_RECORD
+            cosine = -2.0
+            length = 0
+            if head != NO_RECORD:
+                if generated and _any_observed(head, r_view, r_next, view_generated):
+                    pool_head[slot] = head
+                    report[REJECTED_OBSERVED] += t_points[t]
+                    continue
+                best, cosine, length = _most_similar(
+                    head, p, width, center, view_centers, r_view, r_spacing, r_next
+                )
+                if (
+                    best != NO_RECORD
+                    and not generated
+                    and view_generated[r_view[best]]
+                ):
+                    best = NO_RECORD  # generated content never stands in for observed content
+            if best != NO_RECORD and (
+                length >= capacity
+                or (cosine >= cosine_same and width >= finer * r_spacing[best])
+            ):
+                pool_head[slot] = head
+                report[MERGED_POINTS] += t_points[t]
+                if view_round[r_view[best]] == view_round[view]:
+                    report[MERGED] += 1
+                    _merge(
+                        best, p, t_sum[t], weight, own, width, view, inverse_edge,
+                        r_position, r_color, r_confidence, r_spacing, r_view, weight_cap,
+                    )  # fmt: skip
+                else:
+                    report[AGREED] += 1
+                    agreed_record[agreed] = best
+                    agreed_weight[agreed] = own
+                    agreed += 1
+                continue
+            for k in range(3):
+                r_position[count, k] = _inside(p[k], positions[t_first[t], k], inverse_edge)
+                r_color[count, k] = np.uint8(t_sum[t, 3 + k] / weight + 0.5)
+            r_confidence[count] = min(own, weight_cap)
+            r_spacing[count] = width
+            r_view[count] = view
+            r_next[count] = head
+            pool_head[slot] = count
+            report[MERGED_POINTS] += t_points[t] - 1
+            count += 1
+        if count > first:
+            run_start[runs] = first
+            run_count[runs] = count - first
+            for k in range(3):
+                low = r_position[first, k]
+                high = low
+                for i in range(first + 1, count):
+                    low = min(low, r_position[i, k])
+                    high = max(high, r_position[i, k])
+                run_box[runs, k] = low
+                run_box[runs, 3 + k] = high
+            runs += 1
+            report[ADDED] += count - first
+    return count, runs, agreed
+
+
+@njit(cache=True, inline="always")
+def _inside(value, member, inverse_edge):
+    """``value`` as float32, or ``member`` where rounding pushed it out of the member's voxel."""
+    rounded = np.float32(value)
+    if np.floor(np.float64(rounded) * inverse_edge) != np.floor(
+        np.float64(member) * inverse_edge
+    ):
+        return np.float32(member)
+    return rounded
+
+
+@njit(cache=True)
+def _relocate(pool_head, offset, log2, t_slot):
+    for slot in range(offset, offset + (np.int64(1) << np.int64(log2))):
+        if pool_head[slot] <= -2:
+            t_slot[-2 - pool_head[slot]] = slot
+
+
+@njit(cache=True)
+def _any_observed(head, r_view, r_next, view_generated):
+    m = head
+    while m != NO_RECORD:
+        if not view_generated[r_view[m]]:
+            return True
+        m = r_next[m]
+    return False
+
+
+@njit(cache=True)
+def _merge(m, p, sums, weight, own, width, view, inverse_edge, r_position, r_color, r_confidence,
+           r_spacing, r_view, weight_cap):  # fmt: skip
+    """Confidence-weighted running mean; the integer view goes to the more confident side."""
+    old = np.float64(r_confidence[m])
+    share = own / (old + own)
+    for k in range(3):
+        moved = r_position[m, k] + share * (p[k] - r_position[m, k])
+        r_position[m, k] = _inside(moved, r_position[m, k], inverse_edge)
+        value = r_color[m, k] + share * (sums[3 + k] / weight - r_color[m, k])
+        r_color[m, k] = np.uint8(value + 0.5)
+    r_spacing[m] += share * (width - r_spacing[m])
+    if own > old:
+        r_view[m] = view
+    r_confidence[m] = min(old + own, weight_cap)
+
+
+@njit(cache=True)
+def link_records(
+    locals_, pool_local, pool_head, pool_state, block_offset, block_log2, block_count,
+    blocks, r_next,
+):  # fmt: skip
+    """Rebuild the voxel chains of records in their order (after loading or forgetting)."""
+    for i in range(len(locals_)):
+        slot = insert_voxel(
+            pool_local, pool_head, pool_state, block_offset, block_log2, block_count, blocks[i],
+            locals_[i],
+        )  # fmt: skip
+        r_next[i] = pool_head[slot]
+        pool_head[slot] = i

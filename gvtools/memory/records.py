@@ -1,0 +1,93 @@
+"""The memory's arrays: observations, and the runs that culling works on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.memory.voxel_index import extended
+
+
+@dataclass(eq=False)
+class Records:
+    """Observations as parallel arrays with spare capacity; only the first ``count`` rows count.
+
+    Attributes:
+        position: (C, 3) float32, scene units, relative to the memory's origin.
+        color: (C, 3) uint8.
+        confidence: (C,) float32, from the views of the observation's own round.
+        spacing: (C,) float32, scene units.
+        view: (C,) int32, row of the view table.
+        next: (C,) int32, the next observation of the same voxel, -1 at the end.
+        agreement: (C,) float32, confidence added by later rounds.
+    """
+
+    count: int = 0
+    position: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    color: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
+    confidence: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
+    spacing: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
+    view: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    next: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    agreement: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
+
+    ARRAYS = ("position", "color", "confidence", "spacing", "view", "next", "agreement")
+
+    def reserve(self, extra: int) -> None:
+        """Make room for ``extra`` more rows, doubling the capacity."""
+        need = self.count + extra
+        capacity = len(self.confidence)
+        if need > capacity:
+            size = max(need, 2 * capacity)
+            for name in self.ARRAYS:
+                setattr(self, name, extended(getattr(self, name), size, self.count))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the rows in use."""
+        return sum(getattr(self, name)[: self.count].nbytes for name in self.ARRAYS)
+
+
+@dataclass(eq=False)
+class Runs:
+    """Contiguous observations of one block and one view: the unit of culling.
+
+    Attributes:
+        count: rows in use.
+        start: (C,) int64, first observation.
+        length: (C,) int32, observations.
+        view: (C,) int32, row of the view table.
+        box: (C, 6) float32, bounding box of the positions: min xyz, max xyz.
+    """
+
+    count: int = 0
+    start: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    length: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    view: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    box: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 6), np.float32))
+
+    ARRAYS = ("start", "length", "view", "box")
+
+    def append(
+        self,
+        start: NDArray[np.int64],
+        length: NDArray[np.int32],
+        view: NDArray[np.int32],
+        box: NDArray[np.float32],
+    ) -> None:
+        """Add rows of equal number."""
+        need = self.count + len(start)
+        if need > len(self.start):
+            size = max(need, 2 * len(self.start))
+            for name in self.ARRAYS:
+                setattr(self, name, extended(getattr(self, name), size, self.count))
+        for name, rows in zip(self.ARRAYS, (start, length, view, box), strict=True):
+            getattr(self, name)[self.count : need] = rows
+        self.count = need
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the rows in use."""
+        return sum(getattr(self, name)[: self.count].nbytes for name in self.ARRAYS)

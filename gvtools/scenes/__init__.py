@@ -1,0 +1,1 @@
+"""What a run reads: COLMAP projects, posed RGB-D folders, transforms.json, and samples."""

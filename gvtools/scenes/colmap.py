@@ -1,0 +1,212 @@
+"""COLMAP projects: a model, its pictures, and the masks and depth maps beside them."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from functools import partial
+from pathlib import Path
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.colmap_depth import depth_map_path, depth_map_size, read_depth_map
+from gvtools.scenes.colmap_files import find_model
+from gvtools.scenes.colmap_model import ColmapModel, load_model, sparse_points
+from gvtools.scenes.colmap_writer import write_colmap
+from gvtools.scenes.images import read_depth, same_aspect
+from gvtools.scenes.photographs import Photograph, header_findings, lens_findings, named
+from gvtools.scenes.scene import Finding, Scene
+
+__all__ = ["read_colmap", "write_colmap"]
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
+
+
+def read_colmap(
+    root: Path,
+    *,
+    images: Path | None = None,
+    masks: Path | None = None,
+    depths: Path | None = None,
+) -> Scene:
+    """A COLMAP project with every view in an undistorted pinhole camera.
+
+    The model is looked for in ``sparse/0``, ``sparse`` and ``root`` itself, the pictures in
+    ``images`` beside it. Masks follow COLMAP's layout (``masks/NAME.png`` for the image NAME,
+    black = ignore). Depth comes from ``stereo/depth_maps`` (geometric before photometric); it is
+    z-depth of the recorded camera, which in a dense workspace is the undistorted one already.
+
+    Args:
+        root: the workspace or the model folder.
+        images: the image folder, where it is not beside the model.
+        masks: the mask folder, where it is not beside the images.
+        depths: the depth folder: COLMAP's ``NAME.geometric.bin`` or ``NAME.photometric.bin``, or
+            ``NAME.npy`` or ``NAME.npz`` (key ``depth``) in scene units.
+
+    Returns:
+        The scene, in the model's frame and scale.
+
+    Raises:
+        ProjectError: no model, a damaged one, no registered image, no pictures, or a spherical
+            camera. Unreadable pictures and wrong sizes are error findings, and raise when loaded.
+    """
+    root = Path(root)
+    folder = find_model(root)
+    if folder is None:
+        raise ProjectError(
+            f"{root}: no COLMAP model; expected cameras.bin or cameras.txt in sparse/0, in sparse "
+            "or in the folder itself"
+        )
+    model = load_model(folder)
+    homes = _homes(root, folder)
+    image_folder = _image_folder(images, homes, folder)
+    mask_folder = _beside(masks, "masks", [image_folder.parent, *homes])
+    depth_folder = _beside(depths, "stereo/depth_maps", [*homes, image_folder.parent])
+    findings = list(model.findings)
+    photographs, ids = _photographs(model, image_folder, mask_folder, depth_folder, findings)
+    points, dropped = sparse_points(model, {key: i for i, key in enumerate(ids)})
+    lenses = [photograph.lens for photograph in photographs]
+    findings += dropped + lens_findings(lenses)
+    findings += header_findings([(item.image, item.lens.source_size) for item in photographs])
+    findings += _depth_findings(photographs)
+    findings += _registered_findings(image_folder, model)
+    views = tuple(photograph.view() for photograph in photographs)
+    return Scene(root, "colmap", views, points, tuple(findings), metric=False)
+
+
+def _homes(root: Path, folder: Path) -> list[Path]:
+    """Folders that may hold ``images``, ``masks`` and ``stereo``, nearest guess first."""
+    homes = [root, folder, folder.parent]
+    if folder.parent.name == "sparse":
+        homes.append(folder.parent.parent)
+    return list(dict.fromkeys(path.resolve() for path in homes))
+
+
+def _image_folder(given: Path | None, homes: list[Path], folder: Path) -> Path:
+    if given is not None:
+        if not Path(given).is_dir():
+            raise ProjectError(f"{given}: no such image folder")
+        return Path(given)
+    for home in homes:
+        if (home / "images").is_dir():
+            return home / "images"
+    raise ProjectError(
+        f"{folder}: a model without images: no folder 'images' in "
+        f"{', '.join(str(home) for home in homes)}; give it with --images"
+    )
+
+
+def _beside(given: Path | None, name: str, homes: list[Path]) -> Path | None:
+    if given is not None:
+        if not Path(given).is_dir():
+            raise ProjectError(f"{given}: no such folder ({name} were expected there)")
+        return Path(given)
+    return next((home / name for home in homes if (home / name).is_dir()), None)
+
+
+def _photographs(
+    model: ColmapModel,
+    image_folder: Path,
+    mask_folder: Path | None,
+    depth_folder: Path | None,
+    findings: list[Finding],
+) -> tuple[list[Photograph], list[int]]:
+    photographs, ids, absent, unmasked = [], [], [], []
+    for image in model.images:
+        path = image_folder / image.name
+        if not path.is_file():
+            absent.append(image.name)
+            continue
+        mask = None if mask_folder is None else mask_folder / f"{image.name}.png"
+        if mask is not None and not mask.is_file():
+            unmasked.append(image.name)
+            mask = None
+        depth = None if depth_folder is None else _depth_file(depth_folder, image.name)
+        reader = read_depth_map if depth is not None and depth.suffix == ".bin" else read_depth
+        photographs.append(
+            Photograph(
+                image.name,
+                path,
+                model.lenses[image.camera_id],
+                image.cam_from_world,
+                mask,
+                depth,
+                partial(reader),
+            )
+        )
+        ids.append(image.image_id)
+    if not photographs:
+        raise ProjectError(
+            f"{image_folder}: none of the model's {len(model.images)} registered images is there "
+            f"(looked for {named(absent)}); give the image folder with --images"
+        )
+    if absent:
+        findings.append(
+            Finding(
+                "warning",
+                f"{len(absent)} of {len(model.images)} registered images are absent on disk: "
+                + named(absent),
+            )
+        )
+    if mask_folder is not None and unmasked:
+        findings.append(
+            Finding("warning", f"{len(unmasked)} views have no mask in {mask_folder.name}")
+        )
+    return photographs, ids
+
+
+def _depth_file(folder: Path, name: str) -> Path | None:
+    found = depth_map_path(folder, name)
+    if found is not None:
+        return found[0]
+    for suffix in (".npy", ".npz"):
+        if (folder / f"{name}{suffix}").is_file():
+            return folder / f"{name}{suffix}"
+    return None
+
+
+def _depth_findings(photographs: list[Photograph]) -> list[Finding]:
+    findings = []
+    kinds: Counter[str] = Counter()
+    resized: Counter[str] = Counter()
+    for item in photographs:
+        if item.depth is None:
+            kinds["none"] += 1
+            continue
+        if item.depth.suffix != ".bin":
+            kinds["arrays"] += 1
+            continue
+        kinds[item.depth.name.split(".")[-2]] += 1
+        try:
+            size = depth_map_size(item.depth)
+        except ProjectError as error:
+            findings.append(Finding("error", str(error)))
+            continue
+        width, height = item.lens.source_size
+        if size == (width, height):
+            continue
+        line = f"{size[0]}x{size[1]} for pictures of {width}x{height}"
+        if same_aspect(size, (width, height)):
+            resized[f"depth maps of {line}: nearest pixel taken"] += 1
+        else:
+            message = f"{item.depth}: depth of {line}; expected the same aspect"
+            findings.append(Finding("error", message))
+    if kinds["none"] < len(photographs):
+        listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+        findings.append(Finding("info", f"depth maps: {listed}"))
+    findings += [Finding("info", f"{count} {line}") for line, count in resized.items()]
+    return findings
+
+
+def _registered_findings(image_folder: Path, model: ColmapModel) -> list[Finding]:
+    """How many of the pictures on disk the model knows, and through which cameras."""
+    known = {Path(image.name).as_posix() for image in model.images}
+    others = 0
+    for folder, _, files in os.walk(image_folder):
+        relative = Path(folder).relative_to(image_folder)
+        for name in files:
+            if name.lower().endswith(IMAGE_SUFFIXES):
+                others += (relative / name).as_posix() not in known
+    models = Counter(lens.model for lens in model.lenses.values())
+    cameras = ", ".join(f"{count} {name}" for name, count in sorted(models.items()))
+    line = f"{len(known)} of {others + len(known)} pictures registered; cameras: {cameras}"
+    return [Finding("warning" if others > len(known) else "info", line)]

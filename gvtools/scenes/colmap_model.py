@@ -1,0 +1,216 @@
+"""A COLMAP model in memory, read through pycolmap."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import rigid_transform
+from gvtools.errors import ProjectError
+from gvtools.scenes.colmap_files import ModelFiles, check_cameras_size, check_model
+from gvtools.scenes.scene import Finding, SparsePoints, natural_key
+from gvtools.scenes.undistort import Undistortion, undistortion
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# What the reader's terser complaints mean.
+_REASONS = {
+    "camera.VerifyParams()": "a camera has not as many parameters as its model needs",
+    "inserted": "an id occurs twice",
+    "unordered_map::at": "an image, camera, rig or frame is named that is not there",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredImage:
+    """One image of a model.
+
+    Attributes:
+        image_id: the model's id.
+        name: path relative to the image folder.
+        camera_id: the model's id of its camera.
+        cam_from_world: (4, 4) float64, rigid.
+    """
+
+    image_id: int
+    name: str
+    camera_id: int
+    cam_from_world: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapModel:
+    """A model whose every record was found sound.
+
+    Attributes:
+        files: where it was read.
+        images: registered images, in natural order of their names.
+        lenses: for each camera that a registered image uses, its way to a pinhole camera.
+        reconstruction: pycolmap's own object.
+        findings: what was met.
+    """
+
+    files: ModelFiles
+    images: tuple[RegisteredImage, ...]
+    lenses: dict[int, Undistortion]
+    reconstruction: pycolmap.Reconstruction
+    findings: tuple[Finding, ...]
+
+
+def load_model(folder: Path) -> ColmapModel:
+    """The model in ``folder``, binary or text, classic or with rigs and frames.
+
+    Raises:
+        ProjectError: damaged, incomplete, without registered image, or with a spherical camera.
+        ShapeError: a pose with NaN.
+    """
+    files = check_model(folder)
+    findings = []
+    if files.others:
+        listed = ", ".join(f"{name} ({count} images)" for name, count in files.others)
+        findings.append(
+            Finding("warning", f"model {folder.name} is read; further models are not: {listed}")
+        )
+    reconstruction = _read(files, findings)
+    if reconstruction.num_reg_images() == 0:
+        raise ProjectError(
+            f"{folder}: no registered image among {reconstruction.num_images()}; expected at least "
+            "one; solve the cameras again, or give another model folder"
+        )
+    images = _registered(files, reconstruction)
+    absent = reconstruction.num_images() - len(images)
+    if absent:
+        findings.append(
+            Finding("warning", f"{absent} of {reconstruction.num_images()} images have no pose")
+        )
+    used = {image.camera_id for image in images}
+    unused = sorted(set(reconstruction.cameras) - used)
+    if unused:
+        findings.append(Finding("info", f"{len(unused)} cameras of the model are used by no image"))
+    lenses = {
+        key: undistortion(
+            reconstruction.cameras[key].model_name,
+            reconstruction.cameras[key].params,
+            (reconstruction.cameras[key].width, reconstruction.cameras[key].height),
+            what=f"{folder}, camera {key}",
+        )
+        for key in sorted(used)
+    }
+    return ColmapModel(files, images, lenses, reconstruction, tuple(findings))
+
+
+def _read(files: ModelFiles, findings: list[Finding]) -> pycolmap.Reconstruction:
+    import pycolmap
+
+    reconstruction = pycolmap.Reconstruction()
+    try:
+        if files.suffix == ".bin":
+            reconstruction.read_binary(files.folder)
+        elif _has_carriage_returns(files.folder):
+            # The reader takes a carriage return for content and then finds no image at all.
+            findings.append(Finding("info", "the text model has Windows line ends: converted"))
+            with tempfile.TemporaryDirectory() as copy:
+                for path in files.folder.glob("*.txt"):
+                    text = path.read_bytes().replace(b"\r\n", b"\n")
+                    (Path(copy) / path.name).write_bytes(text)
+                reconstruction.read_text(copy)
+        else:
+            reconstruction.read_text(files.folder)
+    except (ValueError, IndexError, KeyError, RuntimeError, OSError) as error:
+        lines = str(error).split("Check failed:")[-1].strip().splitlines() or ["no reason"]
+        reason = _REASONS.get(lines[0], lines[0][:120])
+        raise ProjectError(
+            f"{files.folder}: the model's files contradict each other ({reason}); "
+            "export the model again"
+        ) from None
+    if files.suffix == ".bin":
+        counts = [len(camera.params) for camera in reconstruction.cameras.values()]
+        check_cameras_size(files.folder / "cameras.bin", counts)
+    return reconstruction
+
+
+def _has_carriage_returns(folder: Path) -> bool:
+    for path in folder.glob("*.txt"):
+        with path.open("rb") as file:
+            if b"\r\n" in file.read(65536):
+                return True
+    return False
+
+
+def _registered(
+    files: ModelFiles, reconstruction: pycolmap.Reconstruction
+) -> tuple[RegisteredImage, ...]:
+    images = []
+    for image in reconstruction.images.values():
+        if not image.has_pose:
+            continue
+        name = files.names.get(image.image_id, image.name)
+        pose, _ = rigid_transform(
+            image.cam_from_world().matrix(), what=f"{files.folder}, image {name}"
+        )
+        images.append(RegisteredImage(image.image_id, name, image.camera_id, pose))
+    return tuple(sorted(images, key=lambda image: natural_key(image.name)))
+
+
+def sparse_points(
+    model: ColmapModel, view_of_image: dict[int, int]
+) -> tuple[SparsePoints | None, list[Finding]]:
+    """The model's points with their tracks in the views' pinhole pixels.
+
+    Args:
+        model: a loaded model.
+        view_of_image: for the model's image ids, the views' indices.
+
+    Returns:
+        The points ordered by id (None when the model has none), and what was dropped.
+    """
+    points = model.reconstruction.points3D
+    if not len(points):
+        return None, [Finding("info", "the model has no sparse points")]
+    ids = sorted(points)
+    elements = np.array(
+        [
+            (row, element.image_id, element.point2D_idx)
+            for row, key in enumerate(ids)
+            for element in points[key].track.elements
+        ],
+        np.int64,
+    ).reshape(-1, 3)
+    xy = np.full((len(elements), 2), np.nan)
+    view = np.full(len(elements), -1, np.int64)
+    for image in model.images:
+        if image.image_id not in view_of_image:
+            continue
+        rows = np.flatnonzero(elements[:, 1] == image.image_id)
+        view[rows] = view_of_image[image.image_id]
+        keypoints = np.array(
+            [point.xy for point in model.reconstruction.images[image.image_id].points2D]
+        ).reshape(-1, 2)
+        xy[rows] = model.lenses[image.camera_id].points(keypoints[elements[rows, 2]])
+    findings = []
+    lost = int((view < 0).sum())
+    if lost:
+        findings.append(Finding("info", f"{lost} track elements belong to views that are not read"))
+    sound = (view >= 0) & np.isfinite(xy).all(axis=1)
+    bent = len(view) - lost - int(sound.sum())
+    if bent:
+        findings.append(
+            Finding("warning", f"{bent} detections lie where the lens has no inverse: dropped")
+        )
+    return (
+        SparsePoints(
+            np.array([points[key].xyz for key in ids], np.float64),
+            np.array([points[key].color for key in ids], np.uint8),
+            np.array([points[key].error for key in ids], np.float32),
+            elements[sound, 0].astype(np.int32),
+            view[sound].astype(np.int32),
+            xy[sound],
+        ),
+        findings,
+    )

@@ -1,0 +1,242 @@
+"""One picture, mask or depth map read from disk, and what its header says.
+
+EXIF orientation is never applied: intrinsics and poses were solved on the pixels as stored, so a
+turned picture would no longer fit its camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gvtools.errors import ProjectError
+
+DEPTH_SATURATED = 65535  # "no reading" of Kinect-like 16-bit depth, besides 0
+OPAQUE_FROM = 128  # an alpha at or above this counts as part of the picture
+
+_EXIF_ORIENTATION = 0x0112
+_UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What a picture's header says, without decoding its pixels.
+
+    Attributes:
+        width: pixels, as stored.
+        height: pixels, as stored.
+        mode: Pillow's name of the pixel layout ("RGB", "L", "RGBA", "I;16", ...).
+        orientation: EXIF orientation, 1 when absent.
+    """
+
+    width: int
+    height: int
+    mode: str
+    orientation: int = 1
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the picture carries an alpha channel, which is read as a mask."""
+        return self.mode in ("RGBA", "LA", "PA", "RGBa", "La")
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One decoded picture.
+
+    Attributes:
+        rgb: (H, W, 3) uint8.
+        mask: (H, W) bool from the alpha channel, True = use; None where all pixels are opaque.
+    """
+
+    rgb: NDArray[np.uint8]
+    mask: NDArray[np.bool_] | None = None
+
+
+def read_header(path: Path) -> ImageHeader:
+    """Size and layout of the picture at ``path``.
+
+    Raises:
+        ProjectError: absent, or no picture.
+    """
+    try:
+        with Image.open(path) as image:
+            orientation = int(image.getexif().get(_EXIF_ORIENTATION, 1) or 1)
+            return ImageHeader(image.width, image.height, image.mode, orientation)
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
+def read_image(path: Path) -> Picture:
+    """The picture at ``path`` as 8-bit RGB, with its alpha channel as a mask.
+
+    Grey is repeated over the channels, palettes are resolved, 16 bits a channel keep their upper
+    eight. EXIF orientation is not applied (see the module's text).
+
+    Raises:
+        ProjectError: absent, truncated, no picture, or neither 8 nor 16 bits a channel.
+    """
+    try:
+        with Image.open(path) as image:
+            return _decode(image, path)
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
+def _decode(image: Image.Image, path: Path) -> Picture:
+    if image.mode in ("I", "F"):
+        raise ProjectError(
+            f"{path}: the picture holds 32-bit values ({image.mode}); "
+            "expected 8 or 16 bits a channel; save it as PNG or JPEG"
+        )
+    if image.mode.startswith("I;16"):
+        grey = (np.asarray(image) >> 8).astype(np.uint8)
+        return Picture(np.repeat(grey[..., None], 3, axis=-1))
+    if image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
+        rgba = np.array(image.convert("RGBA"))
+        mask = rgba[..., 3] >= OPAQUE_FROM
+        rgb = np.ascontiguousarray(rgba[..., :3])
+        return Picture(rgb, None if mask.all() else mask)
+    return Picture(np.array(image.convert("RGB")))
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """(H, W) bool mask at ``path``: black is ignored (False), everything else used (True).
+
+    Raises:
+        ProjectError: absent, truncated or no picture.
+    """
+    try:
+        with Image.open(path) as image:
+            pixels = np.asarray(image if image.mode.startswith("I") else image.convert("L"))
+            return pixels > 0
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
+def read_depth(
+    path: Path, *, unit: float = 1.0, maximum: float | None = None
+) -> NDArray[np.float32]:
+    """The depth map at ``path``.
+
+    Args:
+        path: 16-bit PNG, PGM or TIFF, float TIFF, ``.npy``, or ``.npz`` with the key ``depth``.
+        unit: scene units per stored unit.
+        maximum: greater depths, in scene units, count as no reading.
+
+    Returns:
+        (H, W) float32 z-depth, scene units; 0 where the file says 0, a negative number, NaN or
+        infinity, or, in 16-bit files, 65535.
+
+    Raises:
+        ProjectError: absent, truncated, 8-bit, coloured, or not two-dimensional.
+    """
+    raw = _load_array(path) if path.suffix in (".npy", ".npz") else _load_depth_image(path)
+    if raw.ndim == 3 and 1 in (raw.shape[0], raw.shape[-1]):
+        raw = raw[0] if raw.shape[0] == 1 else raw[..., 0]
+    if raw.ndim != 2 or raw.dtype.kind not in "uif":
+        raise ProjectError(
+            f"{path}: depth of shape {raw.shape} and type {raw.dtype}; expected (height, width) "
+            "numbers"
+        )
+    depth = raw.astype(np.float32) * np.float32(unit)
+    valid = np.isfinite(depth) & (depth > 0)
+    if raw.dtype.kind in "ui":
+        valid &= raw != DEPTH_SATURATED
+    if maximum is not None:
+        valid &= depth <= maximum
+    return np.where(valid, depth, np.float32(0))
+
+
+def _load_depth_image(path: Path) -> NDArray[Any]:
+    try:
+        with Image.open(path) as image:
+            if not image.mode.startswith("I") and image.mode != "F":
+                raise ProjectError(
+                    f"{path}: a depth map with 8 bits a channel ({image.mode}); expected 16-bit "
+                    "grey; export raw depth instead of a preview"
+                )
+            return np.asarray(image)
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
+def _load_array(path: Path) -> NDArray[Any]:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return loaded
+        with loaded:
+            if "depth" not in loaded:
+                raise ProjectError(
+                    f"{path}: holds the keys {sorted(loaded)}; expected the key 'depth'"
+                )
+            return np.asarray(loaded["depth"])
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from None
+
+
+def resize_nearest(array: NDArray[Any], width: int, height: int) -> NDArray[Any]:
+    """(h, w, ...) resampled to (height, width, ...), each pixel taking the one it falls into."""
+    row = ((np.arange(height) + 0.5) * (array.shape[0] / height)).astype(np.int64)
+    column = ((np.arange(width) + 0.5) * (array.shape[1] / width)).astype(np.int64)
+    return array[row[:, None], column[None, :]]
+
+
+def same_aspect(size: tuple[int, int], expected: tuple[int, int]) -> bool:
+    """Whether ``size`` is ``expected`` (both width, height) scaled and rounded to whole pixels."""
+    (w, h), (width, height) = size, expected
+    return abs(h - height * w / width) <= 1 and abs(w - width * h / height) <= max(1, width / w)
+
+
+def fit_depth(
+    depth: NDArray[np.float32], width: int, height: int, *, path: Path
+) -> NDArray[np.float32]:
+    """Depth brought to its picture's size: as it is, or by nearest pixel at the same aspect.
+
+    Raises:
+        ProjectError: the aspect differs, so the two do not show the same window.
+    """
+    size = (depth.shape[1], depth.shape[0])
+    if size == (width, height):
+        return depth
+    if not same_aspect(size, (width, height)):
+        raise ProjectError(
+            f"{path}: a depth map of {size[0]}x{size[1]} for a picture of {width}x{height}; "
+            "expected the same size or the same aspect; give the depth camera's intrinsics, "
+            "or export depth at the picture's size"
+        )
+    return resize_nearest(depth, width, height)
+
+
+def check_size(
+    found: tuple[int, int], expected: tuple[int, int], *, path: Path, orientation: int = 1
+) -> None:
+    """Refuse a picture or mask whose (width, height) is not its camera's.
+
+    Raises:
+        ProjectError: the sizes differ.
+    """
+    if found == expected:
+        return
+    advice = "give the images that the cameras were solved on"
+    if found == expected[::-1] and orientation >= 5:
+        advice = "the file is turned by EXIF orientation, which is not applied; store it turned"
+    raise ProjectError(
+        f"{path}: {found[0]}x{found[1]} pixels; its camera expects {expected[0]}x{expected[1]}; "
+        f"{advice}"
+    )
+
+
+def _unreadable(path: Path, error: BaseException) -> ProjectError:
+    if isinstance(error, FileNotFoundError):
+        return ProjectError(f"{path}: no such file")
+    reason = str(error).replace(str(path), "").strip(" '\"") or type(error).__name__
+    return ProjectError(
+        f"{path}: unreadable ({reason}); expected a complete file; copy or export it again"
+    )

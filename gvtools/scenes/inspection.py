@@ -1,0 +1,205 @@
+"""What a run would read of a scene, and what is wrong with it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from gvtools.errors import GvError
+from gvtools.scenes.scene import Finding, Scene, SparsePoints, View
+
+SAMPLED_VIEWS = 16  # opened when only a sample is asked for, spread over the scene
+
+
+@dataclass(frozen=True)
+class DepthSummary:
+    """Depth of the views that were opened.
+
+    Attributes:
+        views: of the scene's views, how many have a depth map.
+        coverage: share of valid pixels over the opened views with depth.
+        minimum: scene units.
+        median: scene units; the middle of the views' own medians.
+        maximum: scene units.
+    """
+
+    views: int
+    coverage: float | None
+    minimum: float | None
+    median: float | None
+    maximum: float | None
+
+
+@dataclass(frozen=True)
+class SceneReport:
+    """What ``gvtools check`` prints.
+
+    Attributes:
+        root: the project's folder.
+        kind: "colmap", "rgbd" or "transforms".
+        ok: a run can read it: at least one view, and no error among the findings.
+        views: how many.
+        views_opened: how many had their pixels decoded.
+        sizes: "WIDTHxHEIGHT" with the number of views of that size.
+        focal_px: smallest and largest focal length of the views' pinhole cameras.
+        depth: None when no view has depth.
+        masked: share of pixels that masks take out, over the opened views.
+        sparse_points: how many.
+        observations: their track elements.
+        reprojection_px: mean distance between detection and projection in the views' cameras.
+        metric: scene units are metres.
+        path_length: from camera to camera in order, scene units.
+        extent: largest side of the box around the camera centres, scene units.
+        findings: the reader's and this report's own.
+    """
+
+    root: str
+    kind: str
+    ok: bool
+    views: int
+    views_opened: int
+    sizes: dict[str, int]
+    focal_px: tuple[float, float]
+    depth: DepthSummary | None
+    masked: float
+    sparse_points: int
+    observations: int
+    reprojection_px: float | None
+    metric: bool
+    path_length: float
+    extent: float
+    findings: tuple[Finding, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as JSON-ready values; a figure that is not known is None."""
+        return asdict(self)
+
+
+def inspect(scene: Scene, *, read_pixels: bool | Literal["sample"] = True) -> SceneReport:
+    """Open a scene's files and sum up what a run would get.
+
+    Args:
+        scene: an opened project.
+        read_pixels: decode all views, none, or, with "sample", at most sixteen spread evenly.
+
+    Returns:
+        The report. Files that cannot be read become error findings; nothing is raised for them.
+    """
+    findings = list(scene.findings)
+    opened = _open(_views_to_open(scene, read_pixels), findings)
+    cameras = scene.cameras if scene.views else None
+    focal = cameras.K[:, (0, 1), (0, 1)] if cameras is not None else np.zeros((1, 2))
+    centers = cameras.centers if cameras is not None else np.zeros((1, 3))
+    sizes = Counter(
+        f"{int(view.camera.width[0])}x{int(view.camera.height[0])}" for view in scene.views
+    )
+    if not scene.views:
+        findings.append(Finding("error", "no view; expected at least one"))
+    if len(scene.views) > 1 and not np.ptp(centers, axis=0).any():
+        findings.append(Finding("warning", "all cameras stand at the same place: no parallax"))
+    errors = reprojection_errors(scene)
+    _depth_without_pixels(opened, findings)
+    return SceneReport(
+        root=str(scene.root),
+        kind=scene.kind,
+        ok=bool(scene.views) and all(finding.level != "error" for finding in findings),
+        views=len(scene),
+        views_opened=len(opened),
+        sizes=dict(sizes),
+        focal_px=(float(focal.min()), float(focal.max())),
+        depth=_depth(scene, opened),
+        masked=float(np.mean([item["masked"] for item in opened])) if opened else 0.0,
+        sparse_points=0 if scene.points is None else len(scene.points.positions),
+        observations=0 if scene.points is None else len(scene.points.point_index),
+        reprojection_px=float(np.nanmean(errors)) if np.isfinite(errors).any() else None,
+        metric=scene.metric,
+        path_length=float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum()),
+        extent=float(np.ptp(centers, axis=0).max()),
+        findings=tuple(findings),
+    )
+
+
+def reprojection_errors(scene: Scene) -> np.ndarray:
+    """(M,) float64, pixels: for each track element, projection minus detection, in length.
+
+    NaN where the point lies behind the camera.
+    """
+    points = scene.points
+    if points is None or not len(points.point_index):
+        return np.zeros(0)
+    cameras = scene.cameras
+    errors = np.full(len(points.point_index), np.nan)
+    for rows, view in _rows_by_view(points):
+        xy, _ = cameras[view].project(points.positions[points.point_index[rows]])
+        errors[rows] = np.linalg.norm(xy[0] - points.xy[rows], axis=1)
+    return errors
+
+
+def _rows_by_view(points: SparsePoints) -> list[tuple[np.ndarray, int]]:
+    order = np.argsort(points.view_index, kind="stable")
+    views, start = np.unique(points.view_index[order], return_index=True)
+    return [(rows, int(view)) for view, rows in zip(views, np.split(order, start[1:]), strict=True)]
+
+
+def _views_to_open(scene: Scene, read_pixels: bool | str) -> list[View]:
+    if read_pixels is False:
+        return []
+    if read_pixels == "sample" and len(scene) > SAMPLED_VIEWS:
+        rows = np.linspace(0, len(scene) - 1, SAMPLED_VIEWS).round().astype(int)
+        return [scene.views[row] for row in rows]
+    return list(scene.views)
+
+
+def _open(views: list[View], findings: list[Finding]) -> list[dict[str, Any]]:
+    known = {finding.message for finding in findings}
+    opened = []
+    for view in views:
+        try:
+            frame = view.load()
+        except GvError as error:
+            if str(error) not in known:
+                findings.append(Finding("error", str(error)))
+            continue
+        masked = 0.0 if frame.mask is None else 1.0 - float(frame.mask.mean())
+        item: dict[str, Any] = {"name": view.name, "masked": masked, "depth": None}
+        if frame.depth is not None:
+            valid = frame.depth[frame.depth > 0]
+            item["pixels"] = frame.depth.size
+            item["depth"] = valid.size
+            if valid.size:
+                item["range"] = (
+                    float(valid.min()),
+                    float(np.median(valid)),
+                    float(valid.max()),
+                )
+        opened.append(item)
+    return opened
+
+
+def _depth_without_pixels(opened: list[dict[str, Any]], findings: list[Finding]) -> None:
+    empty = [item["name"] for item in opened if item["depth"] == 0]
+    if empty:
+        findings.append(
+            Finding("warning", f"{len(empty)} depth maps hold no valid pixel, first {empty[0]}")
+        )
+
+
+def _depth(scene: Scene, opened: list[dict[str, Any]]) -> DepthSummary | None:
+    views = sum(view.has_depth for view in scene.views)
+    if not views:
+        return None
+    measured = [item for item in opened if item["depth"] is not None]
+    ranges = np.array([item["range"] for item in measured if "range" in item]).reshape(-1, 3)
+    if not len(ranges):
+        return DepthSummary(views, 0.0 if measured else None, None, None, None)
+    coverage = sum(item["depth"] for item in measured) / sum(item["pixels"] for item in measured)
+    return DepthSummary(
+        views,
+        float(coverage),
+        float(ranges[:, 0].min()),
+        float(np.median(ranges[:, 1])),
+        float(ranges[:, 2].max()),
+    )

@@ -1,0 +1,104 @@
+"""What a folder is, found out rather than declared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.colmap_files import find_model
+from gvtools.scenes.photographs import named
+from gvtools.scenes.redwood import is_redwood, read_redwood
+from gvtools.scenes.rgbd import RgbdOptions
+from gvtools.scenes.scannet import is_scannet, read_scannet
+from gvtools.scenes.scene import Finding, Scene
+from gvtools.scenes.sevenscenes import is_sevenscenes, read_sevenscenes
+from gvtools.scenes.transforms_json import FILE as TRANSFORMS
+from gvtools.scenes.transforms_json import read_transforms
+from gvtools.scenes.tum import is_tum, read_tum
+
+LOOKED_FOR = (
+    "a COLMAP model (cameras.bin or .txt in sparse/0, sparse or the folder itself)",
+    "transforms.json",
+    "7-Scenes (*.color.*, *.depth.png, *.pose.txt)",
+    "TUM (rgb.txt, depth.txt, groundtruth.txt)",
+    "ScanNet (color, depth, pose, intrinsic)",
+    "Redwood (color, depth, a .log trajectory)",
+)
+
+# ScanNet before Redwood: both have colour and depth folders.
+_LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[..., Scene]], ...] = (
+    (is_sevenscenes, read_sevenscenes),
+    (is_tum, read_tum),
+    (is_scannet, read_scannet),
+    (is_redwood, read_redwood),
+)
+
+
+def open_project(
+    path: Path,
+    *,
+    images: Path | None = None,
+    masks: Path | None = None,
+    rgbd: RgbdOptions | None = None,
+) -> Scene:
+    """The scene of a COLMAP workspace or model, a posed RGB-D folder or a ``transforms.json``.
+
+    Args:
+        path: the folder, or a ``transforms.json``.
+        images: the image folder, where the project does not say it (COLMAP, transforms).
+        masks: the mask folder (COLMAP, transforms).
+        rgbd: what a posed RGB-D folder does not tell by itself.
+
+    Raises:
+        ProjectError: nothing there that can be read, or what is there is damaged.
+        OptionError: an option of another kind of project.
+        ShapeError: a pose with NaN, a scale or a mirror.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise ProjectError(f"{path}: no such folder{_nearest(path)}")
+    model = find_model(path) if path.is_dir() else None
+    if model is not None or path.is_file() or (path / TRANSFORMS).is_file():
+        if rgbd is not None:
+            raise OptionError(f"{path}: no posed RGB-D folder; expected no RGB-D options")
+        if model is None:
+            return read_transforms(path, images=images, masks=masks)
+        from gvtools.scenes.colmap import read_colmap
+
+        scene = read_colmap(path, images=images, masks=masks)
+        if not (path / TRANSFORMS).is_file():
+            return scene
+        note = f"the COLMAP model is read, {TRANSFORMS} is not: give that file to read it instead"
+        return replace(scene, findings=(*scene.findings, Finding("info", note)))
+    for is_layout, read in _LAYOUTS:
+        if is_layout(path):
+            if images is not None or masks is not None:
+                raise OptionError(
+                    f"{path}: a posed RGB-D folder holds its own pictures; expected neither images "
+                    "nor masks"
+                )
+            return read(path, options=rgbd)
+    raise ProjectError(_unknown(path))
+
+
+def _nearest(path: Path) -> str:
+    import difflib
+
+    if not path.parent.is_dir():
+        return ""
+    near = difflib.get_close_matches(path.name, [p.name for p in path.parent.iterdir()], n=1)
+    return f"; did you mean {path.parent / near[0]}?" if near else ""
+
+
+def _unknown(path: Path) -> str:
+    entries = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
+    held = f"holds {named(entries)}" if entries else "is empty"
+    inside = [
+        str(folder)
+        for folder in sorted([*path.glob("*/"), *path.glob("dense/*/")])
+        if find_model(folder) or any(is_layout(folder) for is_layout, _ in _LAYOUTS)
+    ]
+    advice = f"did you mean {named(inside)}?" if inside else "give the project's folder"
+    return f"{path}: {held}; expected one of: {'; '.join(LOOKED_FOR)}; {advice}"

@@ -1,0 +1,158 @@
+"""The Redwood and Open3D layout: ``color/``, ``depth/`` and a ``.log`` trajectory."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.photographs import named
+from gvtools.scenes.rgbd import Recording, RgbdFrame, RgbdOptions, resolve_options, rgbd_scene
+from gvtools.scenes.scene import Finding, Scene, natural_key
+from gvtools.scenes.tum import open3d_intrinsics
+
+Float64 = NDArray[np.float64]
+
+COLOR_FOLDERS = ("color", "image", "rgb")
+PICTURES = (".jpg", ".jpeg", ".png")
+PREFERRED_LOG = "trajectory.log"
+# The sensor of these recordings, as Open3D's own "PrimeSense default".
+PRIMESENSE = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
+
+
+def is_redwood(root: Path) -> bool:
+    """Whether ``root`` holds colour and depth folders and a ``.log`` file."""
+    folders = (root / "depth").is_dir() and _color_folder(root) is not None
+    return folders and any(root.glob("*.log"))
+
+
+def read_redwood(root: Path, *, options: RgbdOptions | None = None) -> Scene:
+    """A folder in the Redwood or Open3D layout.
+
+    Each pose of the ``.log`` trajectory is camera-to-world; its first integer is the number of its
+    picture in natural order. Of several ``.log`` files ``trajectory.log`` is read. Intrinsics come
+    from a JSON file in Open3D's form (column by column), which counts pixel centres as integers,
+    or are the PrimeSense default; the cameras read here lie half a pixel further.
+
+    Args:
+        root: the folder.
+        options: units, intrinsics, and the depth camera where depth is not of the colour camera.
+
+    Returns:
+        The scene, metric.
+
+    Raises:
+        ProjectError: a malformed file, or poses that do not fit the pictures.
+        ShapeError: a pose with NaN, a scale or a mirror.
+    """
+    root = Path(root)
+    resolved, findings = resolve_options(root, options)
+    folder = _color_folder(root)
+    logs = sorted(root.glob("*.log"), key=lambda path: (path.name != PREFERRED_LOG, path.name))
+    if folder is None or not logs:
+        raise ProjectError(f"{root}: expected folders color and depth and a .log trajectory")
+    if len(logs) > 1:
+        others = named([path.name for path in logs[1:]])
+        findings.append(Finding("warning", f"poses are read from {logs[0].name}, not {others}"))
+    colors, depths = _pictures(folder), _pictures(root / "depth")
+    depth_of = pair_by_name(colors, depths)
+    unpaired = len(depths) - len(depth_of)
+    if unpaired:
+        findings.append(Finding("warning", f"{unpaired} depth maps belong to no picture"))
+    numbers, poses = read_log(logs[0])
+    rows = _rows_of(numbers, len(colors), logs[0])
+    if len(rows) < len(colors):
+        message = f"{len(colors) - len(rows)} of {len(colors)} pictures have no pose: dropped"
+        findings.append(Finding("warning", message))
+    frames = [
+        RgbdFrame(
+            colors[row].name,
+            colors[row],
+            depth_of.get(colors[row]),
+            pose,
+            f"{logs[0]}, pose {number}",
+        )
+        for number, row, pose in zip(numbers, rows, poses, strict=True)
+    ]
+    K = PRIMESENSE
+    cameras = sorted(
+        path for path in root.glob("*.json") if b"intrinsic_matrix" in path.read_bytes()
+    )
+    if cameras:
+        K = open3d_intrinsics(cameras[0])
+        findings.append(Finding("info", f"intrinsics: {cameras[0].name}"))
+    elif resolved.color_K is None:
+        message = "no intrinsics file: the PrimeSense default 525, 525, 319.5, 239.5 is taken"
+        findings.append(Finding("warning", message))
+    return rgbd_scene(Recording(root, frames, K, findings=findings), resolved)
+
+
+def read_log(path: Path) -> tuple[list[int], list[Float64]]:
+    """A ``.log`` trajectory: blocks of three integers and a 4x4 camera-to-world matrix.
+
+    Returns:
+        Each block's first integer and its (4, 4) matrix, as read.
+
+    Raises:
+        ProjectError: a block that is not of that form, with its line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ProjectError(f"{path}: unreadable ({error})") from None
+    lines = [(number, line) for number, line in enumerate(text, start=1) if line.strip()]
+    numbers, poses = [], []
+    for start in range(0, len(lines), 5):
+        block = lines[start : start + 5]
+        try:
+            head = [int(token) for token in block[0][1].split()]
+            pose = np.array([[float(token) for token in line.split()] for _, line in block[1:]])
+        except ValueError:
+            head, pose = [], np.zeros(0)
+        if not head or pose.shape != (4, 4):
+            raise ProjectError(
+                f"{path}, line {block[0][0]}: expected three integers and then four lines of four "
+                f"numbers; found {block[0][1]!r} and {len(block) - 1} lines"
+            )
+        numbers.append(head[0])
+        poses.append(pose)
+    return numbers, poses
+
+
+def pair_by_name(colors: list[Path], depths: list[Path]) -> dict[Path, Path]:
+    """For each picture its depth map: of the same stem, else of the same leading number."""
+    stems = {path.stem: path for path in depths}
+    if any(path.stem in stems for path in colors):
+        return {path: stems[path.stem] for path in colors if path.stem in stems}
+    leading = {_leading_number(path): path for path in depths}
+    return {
+        path: leading[_leading_number(path)] for path in colors if _leading_number(path) in leading
+    }
+
+
+def _leading_number(path: Path) -> int | str:
+    match = re.match(r"\D*(\d+)", path.stem)
+    return int(match.group(1)) if match else path.stem
+
+
+def _rows_of(numbers: list[int], pictures: int, path: Path) -> list[int]:
+    if len(set(numbers)) == len(numbers) and all(0 <= number < pictures for number in numbers):
+        return numbers
+    if len(numbers) == pictures:
+        return list(range(pictures))
+    raise ProjectError(
+        f"{path}: {len(numbers)} poses numbered {named(numbers)} for {pictures} pictures; expected "
+        "one pose a picture, or numbers of pictures counted from 0"
+    )
+
+
+def _color_folder(root: Path) -> Path | None:
+    return next((root / name for name in COLOR_FOLDERS if (root / name).is_dir()), None)
+
+
+def _pictures(folder: Path) -> list[Path]:
+    paths = (path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    return sorted(paths, key=lambda path: natural_key(path.name))

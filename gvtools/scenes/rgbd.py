@@ -1,0 +1,351 @@
+"""Posed RGB-D folders: what their layouts have in common.
+
+A layout's reader finds frames, poses and intrinsics and describes them as a ``Recording``; here
+they become a scene. Every supported layout publishes intrinsics whose first pixel centre is
+(0, 0), as Kinect drivers and Open3D count; they are moved by half a pixel to the project's
+(0.5, 0.5) in this file, once.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gvtools.cameras import invert_rigid, rigid_transform
+from gvtools.errors import GvError, OptionError, ProjectError
+from gvtools.scenes.images import read_depth, read_header, same_aspect
+from gvtools.scenes.photographs import (
+    Photograph,
+    Registration,
+    header_findings,
+    lens_findings,
+    named,
+)
+from gvtools.scenes.scene import Finding, Scene, natural_key
+from gvtools.scenes.undistort import undistortion
+
+Float64 = NDArray[np.float64]
+
+SIDECAR = "rgbd.json"
+MILLIMETRES = 1e-3
+# A rotation nearer to orthonormal than this is as good as float text can be.
+ROUNDING = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class RgbdOptions:
+    """What a posed RGB-D folder does not tell by itself; None means the layout's own value.
+
+    The same names may stand in a file ``rgbd.json`` in the folder; values given here win.
+    Intrinsics are as published with such recordings: the first pixel's centre is (0, 0).
+
+    Attributes:
+        depth_unit: metres per stored unit (TUM 1/5000, others 1/1000).
+        color_K: (3, 3) intrinsics of the colour camera, pixels.
+        depth_K: (3, 3) intrinsics of the depth camera, pixels; None: depth is of the colour
+            camera.
+        color_from_depth: (4, 4) rigid, metres; None with ``depth_K`` given: the same place.
+        depth_max: metres; greater readings are ignored.
+        max_time_difference: seconds between colour, depth and pose of one frame (TUM).
+    """
+
+    depth_unit: float | None = None
+    color_K: ArrayLike | None = None
+    depth_K: ArrayLike | None = None
+    color_from_depth: ArrayLike | None = None
+    depth_max: float | None = None
+    max_time_difference: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name in ("depth_unit", "depth_max", "max_time_difference"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, (int, float)) and 0 < value < np.inf):
+                raise OptionError(f"{name}: {value!r}; expected a positive number")
+
+
+@dataclass(frozen=True, eq=False)
+class RgbdFrame:
+    """One frame of a recording.
+
+    Attributes:
+        name: the view's name.
+        color: the picture.
+        depth: the depth map, None when the frame has none.
+        world_from_cam: (4, 4) as read.
+        where: the pose's file, for messages.
+    """
+
+    name: str
+    color: Path
+    depth: Path | None
+    world_from_cam: Float64
+    where: str
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What a layout's reader found.
+
+    Attributes:
+        root: the folder.
+        frames: with a pose each.
+        color_K: (3, 3) as published (integer pixel centres).
+        distortion: k1, k2, p1, p2, k3 of the colour camera as OpenCV has them; empty for none.
+        depth_K: (3, 3) as published, None where depth is of the colour camera.
+        color_from_depth: (4, 4), metres; None: the same place.
+        depth_unit: metres per stored unit.
+        findings: what was met.
+    """
+
+    root: Path
+    frames: Sequence[RgbdFrame]
+    color_K: Float64
+    distortion: tuple[float, ...] = ()
+    depth_K: Float64 | None = None
+    color_from_depth: Float64 | None = None
+    depth_unit: float = MILLIMETRES
+    findings: Sequence[Finding] = field(default_factory=tuple)
+
+
+def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOptions, list[Finding]]:
+    """``options`` over those of the folder's ``rgbd.json``, and a finding when that was read.
+
+    Raises:
+        OptionError: the file has an unknown key or a wrong value.
+        ProjectError: the file is no JSON object.
+    """
+    options = options or RgbdOptions()
+    path = root / SIDECAR
+    if not path.is_file():
+        return options, []
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ProjectError(f"{path}: no JSON ({error}); expected an object of options") from None
+    known = {item.name: item.default for item in fields(RgbdOptions)}
+    if not isinstance(values, dict):
+        raise ProjectError(f"{path}: expected an object with keys out of {', '.join(known)}")
+    for key in values:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+            raise OptionError(f"{path}: unknown key {key!r}; {hint}")
+    given = {name: getattr(options, name) for name in known}
+    given = {name: value for name, value in given.items() if value is not known[name]}
+    try:
+        merged = RgbdOptions(**{**values, **given})
+    except OptionError as error:
+        raise OptionError(f"{path}: {error}") from None
+    return merged, [Finding("info", f"options read from {SIDECAR}: {', '.join(sorted(values))}")]
+
+
+def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:
+    """The scene of a recording, in metres, in the poses' own world frame.
+
+    Raises:
+        ProjectError: no frames, or impossible intrinsics.
+        ShapeError: a pose with NaN, a scale or a mirror.
+    """
+    root = recording.root
+    if not recording.frames:
+        reasons = "; ".join(
+            finding.message for finding in recording.findings if finding.level == "warning"
+        )
+        raise ProjectError(
+            f"{root}: no frame with picture and pose{f' ({reasons})' if reasons else ''}; "
+            "expected at least one"
+        )
+    frames = sorted(recording.frames, key=lambda frame: natural_key(frame.name))
+    color_K = recording.color_K if options.color_K is None else options.color_K
+    K = _corner_origin(color_K, what=f"{root}, colour intrinsics")
+    registration = _registration(recording, options, K)
+    unit = recording.depth_unit if options.depth_unit is None else float(options.depth_unit)
+    reader = partial(read_depth, unit=unit, maximum=options.depth_max)
+    size = _common_size(frames)
+    lens = _lens(K, recording, options, size)
+    photographs, defects = [], []
+    for frame in frames:
+        pose, defect = rigid_transform(frame.world_from_cam, what=frame.where)
+        defects.append(defect)
+        photographs.append(
+            Photograph(
+                frame.name,
+                frame.color,
+                lens,
+                invert_rigid(pose),
+                None,
+                frame.depth,
+                reader,
+                registration,
+            )
+        )
+    findings = [
+        *recording.findings,
+        *rotation_findings(defects),
+        *lens_findings([item.lens for item in photographs]),
+        *header_findings([(item.image, size) for item in photographs]),
+        *_intrinsics_findings(K, size),
+        *_depth_findings(photographs, size, registration, unit),
+    ]
+    views = tuple(item.view() for item in photographs)
+    return Scene(root, "rgbd", views, None, tuple(findings), metric=True)
+
+
+def rotation_findings(defects: Sequence[float]) -> list[Finding]:
+    """One line when rotations had to be made orthonormal."""
+    mended = sum(defect > ROUNDING for defect in defects)
+    if not mended:
+        return []
+    return [
+        Finding(
+            "info",
+            f"{mended} of {len(defects)} rotations made orthonormal; largest entry of R Rᵀ − I "
+            f"was {max(defects):.2g}",
+        )
+    ]
+
+
+def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
+    """A matrix in a text file.
+
+    Raises:
+        ProjectError: absent, no numbers, or of none of ``shapes``.
+    """
+    expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
+    try:
+        matrix = np.array(
+            [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        ).astype(np.float64)
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise ProjectError(f"{path}: unreadable ({reason}); expected {expected} numbers") from None
+    if matrix.shape not in shapes:
+        shape = "x".join(str(length) for length in matrix.shape)
+        raise ProjectError(f"{path}: {shape} numbers; expected {expected}")
+    return matrix
+
+
+def _corner_origin(K: ArrayLike, *, what: str) -> Float64:
+    """Published intrinsics, whose first pixel centre is (0, 0), moved to (0.5, 0.5)."""
+    matrix = np.array(K, np.float64)
+    if matrix.shape == (4, 4):
+        matrix = matrix[:3, :3]
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise ProjectError(f"{what}: {np.asarray(K).tolist()}; expected a finite 3x3 matrix")
+    off = [matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1]
+    if min(matrix[0, 0], matrix[1, 1]) <= 0 or np.abs(off).max() > 1e-6:
+        raise ProjectError(
+            f"{what}: {matrix.tolist()}; expected [fx 0 cx; 0 fy cy; 0 0 1] with fx, fy > 0"
+        )
+    matrix[:2, 2] += 0.5
+    return matrix
+
+
+def _registration(recording: Recording, options: RgbdOptions, K: Float64) -> Registration | None:
+    depth_K = recording.depth_K if options.depth_K is None else options.depth_K
+    moved = (
+        recording.color_from_depth if options.color_from_depth is None else options.color_from_depth
+    )
+    if depth_K is None and moved is None:
+        return None
+    if depth_K is None:
+        raise OptionError(
+            f"{recording.root}: color_from_depth is given without depth_K; expected both; give the "
+            "depth camera's intrinsics"
+        )
+    transform = np.eye(4)
+    if moved is not None:
+        transform, _ = rigid_transform(moved, what=f"{recording.root}, color_from_depth")
+    return Registration(
+        _corner_origin(depth_K, what=f"{recording.root}, depth intrinsics"), transform
+    )
+
+
+def _common_size(frames: Sequence[RgbdFrame]) -> tuple[int, int]:
+    """Width and height of the first readable picture; the others are checked against it."""
+    for frame in frames:
+        try:
+            header = read_header(frame.color)
+        except ProjectError:
+            continue
+        return header.width, header.height
+    raise ProjectError(f"{frames[0].color}: unreadable, like all {len(frames)} pictures beside it")
+
+
+def _lens(K: Float64, recording: Recording, options: RgbdOptions, size: tuple[int, int]) -> Any:
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    what = f"{recording.root}, colour camera"
+    if recording.distortion and options.color_K is None:
+        params += [*recording.distortion, 0.0, 0.0, 0.0]
+        return undistortion("FULL_OPENCV", params, size, what=what)
+    return undistortion("PINHOLE", params, size, what=what)
+
+
+def _intrinsics_findings(K: Float64, size: tuple[int, int]) -> list[Finding]:
+    x, y = K[0, 2] / size[0], K[1, 2] / size[1]
+    if 0.25 < x < 0.75 and 0.25 < y < 0.75:
+        return []
+    return [
+        Finding(
+            "warning",
+            f"the principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) is far from the middle of "
+            f"{size[0]}x{size[1]} pixels: are the intrinsics of another size?",
+        )
+    ]
+
+
+def _depth_findings(
+    photographs: Sequence[Photograph],
+    size: tuple[int, int],
+    registration: Registration | None,
+    unit: float,
+) -> list[Finding]:
+    with_depth = [item.depth for item in photographs if item.depth is not None]
+    findings = []
+    if len(with_depth) < len(photographs):
+        findings.append(
+            Finding("warning", f"{len(photographs) - len(with_depth)} frames have no depth map")
+        )
+    if not with_depth:
+        return findings
+    findings.append(Finding("info", f"depth unit: {unit:.6g} m"))
+    if registration is not None:
+        findings.append(Finding("info", "depth is registered into the colour camera"))
+        return findings
+    wrong, resized, unreadable = [], 0, []
+    for path in with_depth:
+        try:
+            header = read_header(path)
+        except GvError as error:
+            unreadable.append(str(error))
+            continue
+        if header.mode in ("L", "P", "RGB", "RGBA"):
+            unreadable.append(f"{path}: 8-bit depth ({header.mode}); expected 16-bit grey")
+        found = (header.width, header.height)
+        if found != size and same_aspect(found, size):
+            resized += 1
+        elif found != size:
+            wrong.append(f"{path.name} ({found[0]}x{found[1]})")
+    findings += [Finding("error", message) for message in unreadable]
+    if wrong:
+        findings.append(
+            Finding(
+                "error",
+                f"depth maps of another aspect than the pictures' {size[0]}x{size[1]}: "
+                f"{named(wrong)}; give depth_K",
+            )
+        )
+    if resized:
+        findings.append(
+            Finding("warning", f"{resized} depth maps are of another size: nearest pixel taken")
+        )
+    findings.append(Finding("info", "depth is taken as seen by the colour camera (no depth_K)"))
+    return findings

@@ -1,0 +1,136 @@
+"""What a run reads: views with cameras and lazily loaded pictures, sparse points, findings."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras, concatenate
+from gvtools.errors import ProjectError
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The pixels of one view, already in its pinhole camera (undistorted, registered).
+
+    Attributes:
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) float32 z-depth, scene units, 0 = none; None when the view has no depth.
+        mask: (H, W) bool, True = use; None means all.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32] | None = None
+    mask: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One posed picture; ``load`` reads its pixels when they are needed.
+
+    Attributes:
+        name: unique within the scene: the image's path relative to the image folder.
+        camera: a batch of one.
+        load: reads the pixels; raises ProjectError when a file is unreadable or of another size.
+        has_depth: whether ``load`` gives depth.
+        files: what ``load`` reads, for fingerprints.
+    """
+
+    name: str
+    camera: Cameras
+    load: Callable[[], Frame]
+    has_depth: bool = False
+    files: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class SparsePoints:
+    """Triangulated points with their tracks.
+
+    Attributes:
+        positions: (N, 3) float64, world frame, scene units.
+        colors: (N, 3) uint8.
+        errors: (N,) float32, mean reprojection error, pixels of the recorded (distorted) image.
+        point_index: (M,) int32, for each track element its point.
+        view_index: (M,) int32, and its view in the scene.
+        xy: (M, 2) float64, where it was detected, pixels of the view's pinhole camera.
+    """
+
+    positions: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    errors: NDArray[np.float32]
+    point_index: NDArray[np.int32]
+    view_index: NDArray[np.int32]
+    xy: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that a reader met: ``level`` is "info", "warning" or "error"."""
+
+    level: str
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Views in natural order of their names, what is known beside them, and what was met reading.
+
+    Attributes:
+        root: the project's folder.
+        kind: "colmap", "rgbd" or "transforms".
+        views: in natural name order.
+        points: sparse points, where the project has them.
+        findings: everything dropped, converted, repaired or noteworthy.
+        metric: True when scene units are metres.
+    """
+
+    root: Path
+    kind: str
+    views: tuple[View, ...]
+    points: SparsePoints | None = None
+    findings: tuple[Finding, ...] = ()
+    metric: bool = False
+    _index: dict[str, int] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        index = {view.name: i for i, view in enumerate(self.views)}
+        if len(index) != len(self.views):
+            raise ProjectError(f"{self.root}: two views have the same name; names must be unique")
+        object.__setattr__(self, "_index", index)
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __iter__(self) -> Iterator[View]:
+        return iter(self.views)
+
+    def __getitem__(self, name: str) -> View:
+        if name not in self._index:
+            raise ProjectError(f"{self.root}: no view named {name!r} among {len(self)} views")
+        return self.views[self._index[name]]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """View names, in natural order."""
+        return tuple(self._index)
+
+    @property
+    def cameras(self) -> Cameras:
+        """All cameras, in the views' order."""
+        return concatenate([view.camera for view in self.views])
+
+    def subset(self, names: Iterable[str]) -> Scene:
+        """The same scene with the named views alone (sparse points are left out)."""
+        return replace(self, views=tuple(self[name] for name in names), points=None)
+
+
+def natural_key(name: str) -> tuple[object, ...]:
+    """Sort key under which img2 stands before img10."""
+    parts = re.split(r"(\d+)", name)
+    return tuple(int(part) if part.isdecimal() else part.lower() for part in parts), name

@@ -1,0 +1,122 @@
+"""View selections: which of a scene's views are context, and which are targets.
+
+A selection is one of ``all``, ``every:K``, ``every:K+OFFSET``, ``first:N``, ``last:N``,
+``range:A-B`` (indices from 0, both ends included), ``not:SPEC``, image names with commas between
+them, or ``@file`` with one name a line.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from gvtools.errors import OptionError
+
+GRAMMAR = "all, every:K, every:K+OFFSET, first:N, last:N, range:A-B, not:SPEC, names, or @file"
+_KEYWORDS = ("every", "first", "last", "range", "not")
+_FORMS = {
+    "every": r"(\d+)(?:\+(\d+))?",
+    "first": r"(\d+)",
+    "last": r"(\d+)",
+    "range": r"(\d+)-(\d+)",
+}
+
+
+def select(names: Sequence[str], spec: str) -> tuple[str, ...]:
+    """The names that ``spec`` selects, in the order of ``names``.
+
+    Args:
+        names: a scene's view names, in its order.
+        spec: see the module's text.
+
+    Raises:
+        OptionError: an unknown form or name, or a selection of nothing.
+    """
+    chosen = _chosen(names, spec.strip(), spec)
+    if not chosen:
+        raise OptionError(f"selection {spec!r}: none of {len(names)} views; expected at least one")
+    return tuple(names[i] for i in sorted(chosen))
+
+
+def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
+    count = len(names)
+    if spec == "all":
+        return set(range(count))
+    if spec.startswith("@"):
+        return _by_name(names, _lines(Path(spec[1:])), f"{spec[1:]}")
+    # A view's own name wins over a form that looks like it.
+    keyword, colon, rest = spec.partition(":")
+    if not colon or spec in names:
+        listed = [spec] if spec in names else [part.strip() for part in spec.split(",")]
+        return _by_name(names, listed, f"selection {whole!r}")
+    if keyword == "not":
+        return set(range(count)) - _chosen(names, rest.strip(), whole)
+    if keyword not in _FORMS:
+        near = difflib.get_close_matches(keyword, _KEYWORDS, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"expected {GRAMMAR}"
+        raise OptionError(f"selection {whole!r}: unknown form {keyword!r}; {hint}")
+    match = re.fullmatch(_FORMS[keyword], rest)
+    if match is None:
+        raise OptionError(f"selection {whole!r}: {rest!r} after {keyword!r}; expected {GRAMMAR}")
+    numbers = [int(group) for group in match.groups(default="0")]
+    return _counted(keyword, numbers, count, whole)
+
+
+def _counted(keyword: str, numbers: list[int], count: int, whole: str) -> set[int]:
+    if keyword == "every":
+        step, offset = numbers
+        if step < 1:
+            raise OptionError(f"selection {whole!r}: a step of 0; expected 1 or more")
+        return set(range(offset, count, step))
+    if keyword == "range":
+        start, end = numbers
+        if start > end or end >= count:
+            raise OptionError(
+                f"selection {whole!r}: from {start} to {end}; expected 0 <= A <= B <= {count - 1} "
+                f"for {count} views"
+            )
+        return set(range(start, end + 1))
+    number = numbers[0]
+    if number > count:
+        raise OptionError(f"selection {whole!r}: {number} views; there are {count}")
+    return set(range(number)) if keyword == "first" else set(range(count - number, count))
+
+
+def _by_name(names: Sequence[str], listed: Sequence[str], what: str) -> set[int]:
+    index = {name: i for i, name in enumerate(names)}
+    wanted = [name for name in listed if name]
+    unknown = [name for name in wanted if name not in index]
+    if unknown:
+        near = difflib.get_close_matches(unknown[0], [*names, "all", *_KEYWORDS], n=1, cutoff=0.4)
+        hint = f"did you mean {near[0]!r}?" if near else f"expected {GRAMMAR}"
+        more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
+        raise OptionError(f"{what}: no view named {unknown[0]!r}{more} among {len(names)}; {hint}")
+    return {index[name] for name in wanted}
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise OptionError(
+            f"@{path}: unreadable ({error}); expected a text file with one view name a line"
+        ) from None
+    return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
+
+
+def check_disjoint(context: Sequence[str], targets: Sequence[str]) -> None:
+    """Refuse targets that are context as well, since their figures would be of seen pictures.
+
+    Raises:
+        OptionError: the two overlap.
+    """
+    seen = set(context)
+    both = [name for name in targets if name in seen]
+    if both:
+        raise OptionError(
+            f"context and targets overlap in {len(both)} views ({len(context)} context, "
+            f"{len(targets)} targets; first {both[0]!r}); expected none; change one, or "
+            "pass --allow-overlap"
+        )

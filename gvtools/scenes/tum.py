@@ -1,0 +1,216 @@
+"""The TUM RGB-D layout: ``rgb.txt``, ``depth.txt`` and ``groundtruth.txt`` with time stamps."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.rgbd import (
+    Recording,
+    RgbdFrame,
+    RgbdOptions,
+    load_matrix,
+    resolve_options,
+    rgbd_scene,
+)
+from gvtools.scenes.scene import Finding, Scene
+
+Float64 = NDArray[np.float64]
+
+DEPTH_UNIT = 1 / 5000
+FILES = ("rgb.txt", "depth.txt", "groundtruth.txt")
+
+# fx, fy, cx, cy and k1, k2, p1, p2, k3 as published with the benchmark; freiburg3 is rectified.
+PUBLISHED = {
+    "freiburg1": (
+        (517.3, 516.5, 318.6, 255.3),
+        (0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    ),
+    "freiburg2": (
+        (520.9, 521.0, 325.1, 249.7),
+        (0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    ),
+    "freiburg3": ((535.4, 539.2, 320.1, 247.6), ()),
+}
+DRIVER_DEFAULT = (525.0, 525.0, 319.5, 239.5)
+
+
+def is_tum(root: Path) -> bool:
+    """Whether ``root`` holds the three lists of a TUM sequence."""
+    return all((root / name).is_file() for name in FILES)
+
+
+def read_tum(root: Path, *, options: RgbdOptions | None = None) -> Scene:
+    """A TUM RGB-D sequence.
+
+    Pictures, depth maps and poses are joined by the nearest time stamp, each depth map used once.
+    Poses are camera-to-world. Intrinsics come from ``camera-intrinsics.txt`` (3x3) or
+    ``camera.json`` (Open3D's form) in the folder; otherwise those published for freiburg1, 2 or 3
+    when the folder's name says so, with their distortion, and the driver's default when not. All
+    of them count pixel centres as integers; the cameras read here lie half a pixel further.
+
+    Args:
+        root: the sequence's folder.
+        options: unit, intrinsics, and the largest accepted difference of time stamps.
+
+    Returns:
+        The scene, metric.
+
+    Raises:
+        ProjectError: a malformed list, or no frame within the time difference.
+        ShapeError: a pose with NaN or a quaternion far from unit length.
+    """
+    root = Path(root)
+    resolved, findings = resolve_options(root, options)
+    colors, depths = _read_list(root / "rgb.txt"), _read_list(root / "depth.txt")
+    pose_times, poses = _read_poses(root / "groundtruth.txt")
+    limit = resolved.max_time_difference
+    color_times = np.array([time for time, _ in colors])
+    depth_of = associate(color_times, np.array([time for time, _ in depths]), limit)
+    frames, absent, unposed = [], 0, 0
+    for i, (time, name) in enumerate(colors):
+        nearest = int(np.argmin(np.abs(pose_times - time))) if len(pose_times) else -1
+        if nearest < 0 or abs(pose_times[nearest] - time) > limit:
+            unposed += 1
+            continue
+        if not (root / name).is_file():
+            absent += 1
+            continue
+        depth = None if i not in depth_of else root / depths[depth_of[i]][1]
+        if depth is not None and not depth.is_file():
+            absent += 1
+            depth = None
+        where = f"{root / 'groundtruth.txt'}, time {pose_times[nearest]:.6f}"
+        frames.append(RgbdFrame(Path(name).name, root / name, depth, poses[nearest], where))
+    if unposed:
+        message = f"{unposed} of {len(colors)} pictures have no pose within {limit:g} s: dropped"
+        findings.append(Finding("warning", message))
+    if absent:
+        findings.append(Finding("warning", f"{absent} files named in the lists are absent on disk"))
+    K, distortion, source = _intrinsics(root)
+    if resolved.color_K is None:
+        findings.append(Finding("info", f"intrinsics: {source}"))
+    recording = Recording(root, frames, K, distortion, depth_unit=DEPTH_UNIT, findings=findings)
+    return rgbd_scene(recording, resolved)
+
+
+def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:
+    """Pairs of nearest time stamps, each stamp used once, the closest pairs first.
+
+    Args:
+        first: (A,) seconds.
+        second: (B,) seconds.
+        limit: the largest accepted difference, seconds.
+
+    Returns:
+        For indices of ``first``, the index of ``second``.
+    """
+    order = np.argsort(second, kind="stable")
+    low = np.searchsorted(second[order], first - limit, side="left")
+    high = np.searchsorted(second[order], first + limit, side="right")
+    candidates = sorted(
+        (abs(first[i] - second[j]), i, int(j))
+        for i in range(len(first))
+        for j in order[low[i] : high[i]]
+    )
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, i, j in candidates:
+        if i not in pairs and j not in taken:
+            pairs[i] = j
+            taken.add(j)
+    return pairs
+
+
+def rotation_from_quaternion(quaternion: Float64) -> Float64:
+    """(3, 3) of x, y, z, w, scaled by the squared length, so that a wrong length shows."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), w * w - x * x + y * y - z * z, 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), w * w - x * x - y * y + z * z],
+        ]
+    )
+
+
+def _rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ProjectError(f"{path}: unreadable ({error})") from None
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        tokens = line.replace(",", " ").split(maxsplit=columns - 1)
+        if len(tokens) != columns:
+            raise ProjectError(f"{path}, line {number}: {line!r}; expected {columns} columns")
+        rows.append((number, tokens))
+    return rows
+
+
+def _read_list(path: Path) -> list[tuple[float, str]]:
+    entries = []
+    for number, (time, name) in _rows(path, 2):
+        try:
+            entries.append((float(time), name.strip()))
+        except ValueError:
+            raise ProjectError(
+                f"{path}, line {number}: {time!r}; expected a time stamp in seconds and a file"
+            ) from None
+    return entries
+
+
+def _read_poses(path: Path) -> tuple[Float64, list[Float64]]:
+    times, poses = [], []
+    for number, tokens in _rows(path, 8):
+        try:
+            values = np.array([float(token) for token in tokens])
+        except ValueError:
+            raise ProjectError(
+                f"{path}, line {number}: {' '.join(tokens)!r}; expected time tx ty tz qx qy qz qw"
+            ) from None
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_from_quaternion(values[4:])
+        pose[:3, 3] = values[1:4]
+        times.append(values[0])
+        poses.append(pose)
+    return np.array(times), poses
+
+
+def _intrinsics(root: Path) -> tuple[Float64, tuple[float, ...], str]:
+    if (root / "camera-intrinsics.txt").is_file():
+        path = root / "camera-intrinsics.txt"
+        return load_matrix(path, (3, 3)), (), path.name
+    if (root / "camera.json").is_file():
+        return open3d_intrinsics(root / "camera.json"), (), "camera.json"
+    for name, (values, distortion) in PUBLISHED.items():
+        if name in root.resolve().name:
+            return _matrix(values), distortion, f"published for {name}"
+    return _matrix(DRIVER_DEFAULT), (), "the driver's default 525, 525, 319.5, 239.5"
+
+
+def _matrix(values: tuple[float, ...]) -> Float64:
+    fx, fy, cx, cy = values
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def open3d_intrinsics(path: Path) -> Float64:
+    """(3, 3) intrinsics of Open3D's JSON form, which lists them column by column.
+
+    Raises:
+        ProjectError: no such JSON.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]
+        return np.array(values, np.float64).reshape(3, 3).T
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ProjectError(
+            f"{path}: {type(error).__name__} ({error}); expected Open3D's form with "
+            "'intrinsic_matrix' as nine numbers, column by column"
+        ) from None

@@ -1,0 +1,193 @@
+"""From a recorded camera, of any perspective model, to the pinhole camera that views have.
+
+The mapping is pycolmap's own. Pictures are resampled bilinearly; masks and depth take the nearest
+pixel of the same mapping. z-depth needs no change: undistortion turns no axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gvtools.errors import ProjectError
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# A detection whose ray projects back farther than this (pixels) lies where the distortion has no
+# inverse.
+ROUND_TRIP_TOLERANCE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Undistortion:
+    """The mapping of one recorded camera.
+
+    Attributes:
+        source: the recorded camera.
+        target: the pinhole camera.
+        untouched: True when both are the same, so that nothing is resampled.
+    """
+
+    source: pycolmap.Camera
+    target: pycolmap.Camera
+    untouched: bool
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """(3, 3) float64 of the pinhole camera, pixels; first pixel centre (0.5, 0.5)."""
+        return np.asarray(self.target.calibration_matrix(), np.float64)
+
+    @property
+    def source_size(self) -> tuple[int, int]:
+        """Width and height of the recorded picture, pixels."""
+        return int(self.source.width), int(self.source.height)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the pinhole picture, pixels."""
+        return int(self.target.width), int(self.target.height)
+
+    @property
+    def model(self) -> str:
+        """COLMAP's name of the recorded camera's model."""
+        return str(self.source.model_name)
+
+    def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(h, w, 3) uint8 recorded picture as (H, W, 3) uint8 of the pinhole camera, bilinear."""
+        import pycolmap
+
+        if self.untouched:
+            return rgb
+        bitmap, _ = pycolmap.undistort_image(
+            pycolmap.UndistortCameraOptions(),
+            pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)),
+            self.source,
+        )
+        return np.asarray(bitmap.to_array(), np.uint8)
+
+    def nearest(self, array: NDArray[Any], *, outside: float | bool = 0) -> NDArray[Any]:
+        """(h, w) recorded values as (H, W) of the pinhole camera, by nearest pixel.
+
+        Pixels that look past the recorded picture become ``outside``.
+        """
+        if self.untouched:
+            return array
+        values = array.reshape(-1)[np.maximum(self._source_pixel, 0)]
+        return np.where(self._source_pixel >= 0, values, np.asarray(outside, array.dtype))
+
+    @property
+    def inside(self) -> NDArray[np.bool_] | None:
+        """(H, W) bool, False where the pinhole camera looks past the picture; None if nowhere."""
+        if self.untouched or (self._source_pixel >= 0).all():
+            return None
+        return self._source_pixel >= 0
+
+    def points(self, xy: ArrayLike) -> NDArray[np.float64]:
+        """(N, 2) recorded pixel positions as (N, 2) of the pinhole camera, float64.
+
+        Positions outside the picture are kept; NaN where the distortion has no inverse.
+        """
+        xy = np.asarray(xy, np.float64).reshape(-1, 2)
+        if self.untouched or not len(xy):
+            return xy
+        ray = np.column_stack([np.asarray(self.source.cam_from_img(xy)), np.ones(len(xy))])
+        with np.errstate(invalid="ignore"):
+            back = np.asarray(self.source.img_from_cam(ray))
+            sound = np.abs(back - xy).max(axis=1) <= ROUND_TRIP_TOLERANCE
+        flat = ray @ self.K.T
+        return np.where(sound[:, None], flat[:, :2], np.nan)
+
+    @cached_property
+    def _source_pixel(self) -> NDArray[np.int32]:
+        """(H, W) int32, the flat index of the recorded pixel seen by each pixel; -1 for none."""
+        width, height = self.size
+        y, x = np.mgrid[:height, :width] + 0.5
+        ray = np.ones((width * height, 3))
+        ray[:, 0] = ((x - self.K[0, 2]) / self.K[0, 0]).ravel()
+        ray[:, 1] = ((y - self.K[1, 2]) / self.K[1, 1]).ravel()
+        source = np.asarray(self.source.img_from_cam(ray))
+        w, h = self.source_size
+        with np.errstate(invalid="ignore"):
+            inside = np.all((source >= 0) & (source < (w, h)), axis=1)
+        pixel = np.floor(np.where(inside[:, np.newaxis], source, 0)).astype(np.int32)
+        return np.where(inside, pixel[:, 1] * w + pixel[:, 0], -1).reshape(height, width)
+
+
+def undistortion(
+    model: str,
+    params: Sequence[float] | NDArray[np.float64],
+    size: tuple[int, int],
+    *,
+    what: str,
+) -> Undistortion:
+    """The mapping of a camera given by COLMAP's model name and parameters.
+
+    Pinhole models without distortion are passed untouched.
+
+    Args:
+        model: one of COLMAP's camera models.
+        params: its parameters, in COLMAP's order; pixels, first pixel centre (0.5, 0.5).
+        size: width and height of the recorded picture, pixels.
+        what: where the camera was read, for the message.
+
+    Raises:
+        ProjectError: an unknown or spherical model, or impossible parameters.
+    """
+    import pycolmap
+
+    if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
+        raise ProjectError(
+            f"{what}: unknown camera model {model!r}; expected one of COLMAP's: "
+            + ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
+        )
+    width, height = (int(value) for value in size)
+    values = [float(value) for value in params]
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=values)
+    if not camera.is_perspective():
+        raise ProjectError(
+            f"{what}: the camera model {model} is spherical and has no pinhole image; expected a "
+            "perspective model; render perspective views of the panoramas first"
+        )
+    wrong = _impossible(camera)
+    if wrong:
+        raise ProjectError(
+            f"{what}: {model} {width}x{height} with parameters {values} {wrong}; "
+            f"expected {camera.params_info}; solve or export the model again"
+        )
+    if camera.is_perspective_pinhole() and camera.is_undistorted():
+        target = pycolmap.Camera(
+            model="PINHOLE",
+            width=width,
+            height=height,
+            params=[
+                camera.focal_length_x,
+                camera.focal_length_y,
+                camera.principal_point_x,
+                camera.principal_point_y,
+            ],
+        )
+        return Undistortion(camera, target, True)
+    try:
+        target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    except (ValueError, RuntimeError) as error:
+        raise ProjectError(f"{what}: {model} {values} cannot be undistorted ({error})") from None
+    return Undistortion(camera, target, False)
+
+
+def _impossible(camera: pycolmap.Camera) -> str:
+    """What is wrong with a camera's parameters; empty when nothing is."""
+    if not camera.verify_params():
+        return f"has {len(camera.params)} parameters"
+    if not np.isfinite(camera.params).all():
+        return "holds NaN or infinity"
+    if min(camera.width, camera.height) < 1 or max(camera.width, camera.height) > 1_000_000:
+        return "has an impossible size"
+    if min(camera.focal_length_x, camera.focal_length_y) <= 0:
+        return "has a focal length that is not positive"
+    return ""

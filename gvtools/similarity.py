@@ -1,0 +1,258 @@
+"""Similarity, rigid and scale fits that say whether they hold: never a silent number."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gvtools.errors import ShapeError
+
+Float64 = NDArray[np.float64]
+
+# Points whose second principal spread is below this share of the first lie on a line: the
+# rotation about it is not determined.
+COLLINEAR = 1e-3
+# Spreads below this share of the coordinates' magnitude are rounding, not geometry.
+COINCIDENT = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class SimilarityFit:
+    """target ≈ scale · rotation · source + translation.
+
+    The translation is that of the given coordinates; where they are large, ``apply`` is more exact
+    than the formula, since it works about the centroids.
+
+    Attributes:
+        status: "aligned", or "degenerate: ..." with the reason; then every number is NaN.
+        scale: target units per source unit; 1 when it was not fitted.
+        rotation: (3, 3) float64, determinant 1.
+        translation: (3,) float64, target units.
+        residuals: (N,) float64, distances after alignment, target units.
+        rmse: weighted root mean square of the residuals, target units.
+        source_center: (3,) float64, weighted centroid of the source.
+        target_center: (3,) float64, weighted centroid of the target.
+    """
+
+    status: str
+    scale: float
+    rotation: Float64
+    translation: Float64
+    residuals: Float64
+    rmse: float
+    source_center: Float64
+    target_center: Float64
+
+    @property
+    def ok(self) -> bool:
+        """Whether the numbers hold."""
+        return self.status == "aligned"
+
+    def apply(self, points: ArrayLike) -> Float64:
+        """Points (..., 3) of the source frame in the target frame."""
+        centered = np.asarray(points, np.float64) - self.source_center
+        return self.scale * centered @ self.rotation.T + self.target_center
+
+
+def fit_similarity(
+    source: ArrayLike,
+    target: ArrayLike,
+    *,
+    with_scale: bool = True,
+    weights: ArrayLike | None = None,
+) -> SimilarityFit:
+    """The least-squares similarity between paired points, in closed form.
+
+    Follows S. Umeyama, "Least-squares estimation of transformation parameters between two point
+    patterns", PAMI 13(4), 1991; equation numbers are its own. Camera centres on a line (a straight
+    dolly) leave the rotation about that line open and are reported as degenerate.
+
+    Args:
+        source: (N, 3).
+        target: (N, 3), row by row the same points.
+        with_scale: False fits a rigid motion.
+        weights: (N,) >= 0; rows of weight 0 count for nothing.
+
+    Raises:
+        ShapeError: the shapes do not match, or a value is not finite.
+    """
+    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
+        raise ShapeError(
+            f"similarity: source {source.shape} and target {target.shape}; expected both (N, 3)"
+        )
+    weight = np.ones(len(source)) if weights is None else np.asarray(weights, np.float64)
+    if weight.shape != (len(source),) or not (np.isfinite(weight) & (weight >= 0)).all():
+        raise ShapeError(f"similarity: weights {weight.shape}; expected ({len(source)},), >= 0")
+    if not (np.isfinite(source).all() and np.isfinite(target).all()):
+        raise ShapeError("similarity: points hold NaN or infinity; leave those rows out")
+    used = int((weight > 0).sum())
+    if used < 3:
+        return _degenerate(len(source), f"{used} point pair(s), at least 3 are needed")
+    weight = weight / weight.sum()
+
+    source_center = _centroid(source, weight)  # (34), about a point of the set: exact far out
+    target_center = _centroid(target, weight)  # (35)
+    x, y = source - source_center, target - target_center
+    for name, points, raw in (("source", x, source), ("target", y, target)):
+        reason = _spread_defect(points, weight, np.abs(raw).max())
+        if reason:
+            return _degenerate(len(source), f"{reason} {name} points")
+    variance = float(weight @ (x**2).sum(axis=1))  # (36)
+    covariance = (y * weight[:, None]).T @ x  # (38)
+    u, d, vt = np.linalg.svd(covariance)
+    if d[1] < COLLINEAR**2 * d[0]:
+        return _degenerate(len(source), "source and target do not correspond in two directions")
+    sign = np.ones(3)
+    sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0  # (39), (43)
+    rotation = (u * sign) @ vt  # (40)
+    scale = float((d * sign).sum() / variance) if with_scale else 1.0  # (42)
+    translation = target_center - scale * rotation @ source_center  # (41)
+    residuals = np.linalg.norm(y - scale * x @ rotation.T, axis=1)
+    rmse = float(np.sqrt(weight @ residuals**2))
+    return SimilarityFit(
+        "aligned", scale, rotation, translation, residuals, rmse, source_center, target_center
+    )
+
+
+def _centroid(points: Float64, weight: Float64) -> Float64:
+    """Weighted mean, summed about the first point so that large offsets keep their digits."""
+    return points[0] + weight @ (points - points[0])
+
+
+def _spread_defect(centered: Float64, weight: Float64, magnitude: float) -> str:
+    """Why points do not determine a rotation: "coincident", "collinear", or ""."""
+    spread = np.linalg.svd(centered * np.sqrt(weight)[:, None], compute_uv=False)
+    if spread[0] <= COINCIDENT * max(magnitude, np.finfo(np.float64).tiny):
+        return "coincident"
+    return "collinear" if spread[1] < COLLINEAR * spread[0] else ""
+
+
+def _degenerate(count: int, reason: str) -> SimilarityFit:
+    nan3 = np.full(3, np.nan)
+    return SimilarityFit(
+        f"degenerate: {reason}",
+        np.nan,
+        np.full((3, 3), np.nan),
+        nan3,
+        np.full(count, np.nan),
+        np.nan,
+        nan3,
+        nan3,
+    )
+
+
+@dataclass(frozen=True)
+class ScaleFit:
+    """reference_depth ≈ scale · depth on the pixels that both know.
+
+    Attributes:
+        status: "aligned", or "unsupported: ..." with the reason; then ``scale`` is NaN.
+        scale: multiply the depth by it.
+        inliers: pixels whose ratio agrees with the scale.
+        inlier_share: inliers per support pixel, by weight.
+        residual: median relative deviation from the scale over the support (0.01 = 1 %).
+        support: pixels on which both depths are known.
+    """
+
+    status: str
+    scale: float
+    inliers: int
+    inlier_share: float
+    residual: float
+    support: int
+
+    @property
+    def ok(self) -> bool:
+        """Whether the scale may be used."""
+        return self.status == "aligned"
+
+
+def align_depth_scale(
+    depth: ArrayLike,
+    reference_depth: ArrayLike,
+    *,
+    valid: ArrayLike,
+    confidence: ArrayLike | None = None,
+    min_support: int = 200,
+    min_inlier_share: float = 0.3,
+    max_residual: float = 0.1,
+    inlier_band: float = 0.05,
+) -> ScaleFit:
+    """One robust scale between a depth map and the projected memory's depth.
+
+    Starts at the weighted median of the log ratios and re-weights with a redescending (Tukey)
+    kernel whose width follows the spread of the ratios, so that occlusions and wrong pixels do not
+    pull. Refused rather than guessed when too little supports it.
+
+    Args:
+        depth: (...) z-depth, any unit; not above 0 or not finite = none.
+        reference_depth: the same shape, scene units.
+        valid: the same shape, bool, the pixels to compare.
+        confidence: the same shape, >= 0, weights; None means equal.
+        min_support: fewer common pixels are refused.
+        min_inlier_share: so is a smaller share of inliers,
+        max_residual: and a larger median relative deviation.
+        inlier_band: largest relative deviation of an inlier.
+
+    Raises:
+        ShapeError: shapes differ.
+    """
+    depth, reference = np.asarray(depth, np.float64), np.asarray(reference_depth, np.float64)
+    mask = np.asarray(valid, bool)
+    weight = np.ones(depth.shape) if confidence is None else np.asarray(confidence, np.float64)
+    if not depth.shape == reference.shape == mask.shape == weight.shape:
+        raise ShapeError(
+            f"depth scale: depth {depth.shape}, reference {reference.shape}, valid {mask.shape}, "
+            f"confidence {weight.shape}; expected one shape"
+        )
+    with np.errstate(invalid="ignore"):
+        mask = mask & np.isfinite(depth) & np.isfinite(reference) & (depth > 0) & (reference > 0)
+        mask &= np.isfinite(weight) & (weight > 0)
+    support = int(mask.sum())
+    if support < min_support:
+        return ScaleFit(
+            f"unsupported: {support} common pixels, at least {min_support} are needed",
+            np.nan, 0, 0.0, np.nan, support,
+        )  # fmt: skip
+    ratio = np.log(reference[mask]) - np.log(depth[mask])
+    weight = weight[mask] / weight[mask].sum()
+    center = _weighted_median(ratio, weight)
+    for _ in range(20):
+        gap = np.abs(ratio - center)
+        # 1.4826 · median is the standard deviation of a normal core; Tukey's 4.685 keeps 95 %
+        # of its efficiency. The floor keeps exact data from dividing by zero.
+        width = 4.685 * max(1.4826 * _weighted_median(gap, weight), 1e-6)
+        kernel = weight * np.clip(1 - (gap / width) ** 2, 0, None) ** 2
+        update = float((kernel @ ratio) / kernel.sum())
+        moved, center = abs(update - center), update
+        if moved < 1e-9:
+            break
+    deviation = np.abs(np.expm1(ratio - center))
+    inlier = deviation <= inlier_band
+    share = float(weight[inlier].sum())
+    residual = _weighted_median(deviation, weight)
+    reason = ""
+    if share < min_inlier_share:
+        reason = f"{share:.0%} of the pixels agree within {inlier_band:.0%}, " + (
+            f"at least {min_inlier_share:.0%} are needed"
+        )
+    elif residual > max_residual:
+        reason = f"median deviation {residual:.1%}, at most {max_residual:.1%} is accepted"
+    return ScaleFit(
+        f"unsupported: {reason}" if reason else "aligned",
+        float(np.nan if reason else np.exp(center)),
+        int(inlier.sum()),
+        share,
+        residual,
+        support,
+    )
+
+
+def _weighted_median(values: Float64, weight: Float64) -> float:
+    order = np.argsort(values, kind="stable")
+    cumulative = np.cumsum(weight[order])
+    middle = np.searchsorted(cumulative, 0.5 * cumulative[-1])
+    return float(values[order[min(int(middle), len(values) - 1)]])

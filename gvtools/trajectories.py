@@ -1,0 +1,269 @@
+"""Target paths as cameras: interpolation between key cameras, orbit and spiral.
+
+World frames are arbitrary, so "up" is never taken from an axis: it is the mean of the given
+cameras' own up vectors (−y of each), which keeps a path free of roll jitter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gvtools.cameras import Cameras, invert_rigid
+from gvtools.errors import DegenerateError, OptionError
+
+Float64 = NDArray[np.float64]
+
+
+def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Cameras:
+    """A smooth path through key cameras, evenly spaced by a measure of motion.
+
+    Centres follow a monotone cubic (PCHIP) of the path length, so the path is C1 and does not
+    overshoot; rotations are interpolated on the sphere between consecutive keys; intrinsics
+    linearly; the image size is the nearest key's. Each step measures the motion of the centre
+    plus the rotation times the median distance between keys, so a camera that turns on the spot
+    still moves along. Every key lies on the path; the first and the last are among the result.
+
+    Args:
+        cameras: at least two key cameras, in order.
+        count: number of cameras on the path, >= 2.
+        closed: return to the first camera at the end (it is not repeated).
+
+    Raises:
+        OptionError: fewer than two keys or cameras asked for.
+        DegenerateError: all keys are the same camera.
+    """
+    from scipy.interpolate import PchipInterpolator
+    from scipy.spatial.transform import Rotation, Slerp
+
+    if len(cameras) < 2 or count < 2:
+        raise OptionError(
+            f"interpolate: {len(cameras)} key camera(s), {count} asked for; expected 2 or more each"
+        )
+    rows = list(range(len(cameras)))
+    if closed:
+        # One key more at either end makes the spline's slopes there those of a loop.
+        rows = [rows[-1], *rows, 0, 1]
+    world = cameras.world_from_cam[rows]
+    rotation = Rotation.from_matrix(world[:, :3, :3])
+    moved = np.linalg.norm(np.diff(world[:, :3, 3], axis=0), axis=1)
+    turned = (rotation[:-1].inv() * rotation[1:]).magnitude()
+    unit = float(np.median(moved[moved > 0])) if (moved > 0).any() else 1.0
+    steps = moved + unit * turned
+    # Keys that repeat their predecessor would give the spline two values at one place.
+    keep = np.concatenate([[True], steps > 1e-9 * steps.sum()])
+    if keep.sum() < 2:
+        raise DegenerateError("interpolate: all key cameras are the same; give cameras that differ")
+    index = np.array(rows)[keep]
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    first, last = (length[1], length[-2]) if closed else (0.0, length[-1])
+    length = length[keep]
+    at = np.linspace(first, last, count + int(closed))[:count]
+    # PCHIP has no cross-talk between coordinates: centred first for large offsets.
+    origin = world[0, :3, 3]
+    pose = np.tile(np.eye(4), (count, 1, 1))
+    pose[:, :3, 3] = PchipInterpolator(length, world[keep, :3, 3] - origin)(at) + origin
+    pose[:, :3, :3] = Slerp(length, rotation[keep])(at).as_matrix()
+    segment = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(length) - 2)
+    share = (at - length[segment]) / (length[segment + 1] - length[segment])
+    K = cameras.K[index]
+    blend = share[:, None, None]
+    nearest = index[segment + (share > 0.5)]
+    return Cameras(
+        (1 - blend) * K[segment] + blend * K[segment + 1],
+        invert_rigid(pose),
+        cameras.width[nearest],
+        cameras.height[nearest],
+        _names("path", count),
+    )
+
+
+def focus_point(cameras: Cameras) -> Float64:
+    """(3,) the world point nearest to all optical axes, by least squares.
+
+    Raises:
+        DegenerateError: the axes are parallel or there is one only.
+    """
+    world = cameras.world_from_cam
+    origin = cameras.centers.mean(axis=0)
+    axes, centers = world[:, :3, 2], world[:, :3, 3] - origin
+    # Σ (I − a aᵀ)(x − c) = 0.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(axis=0)
+    spread = np.linalg.eigvalsh(normal / len(axes))
+    if spread[0] < 1e-8:
+        raise DegenerateError(
+            "focus point: the optical axes are parallel, no point is nearest to them; "
+            "give the point with center="
+        )
+    return np.asarray(np.linalg.solve(normal, np.einsum("vij,vj->i", across, centers)) + origin)
+
+
+def mean_up(cameras: Cameras) -> Float64:
+    """(3,) unit, the mean of the cameras' up vectors (−y) in the world frame.
+
+    Raises:
+        DegenerateError: the up vectors cancel out.
+    """
+    up = -cameras.world_from_cam[:, :3, 1].mean(axis=0)
+    norm = float(np.linalg.norm(up))
+    if norm < 1e-3:
+        raise DegenerateError("the cameras' up vectors cancel out; give up=")
+    return np.asarray(up / norm)
+
+
+def look_at(centers: ArrayLike, target: ArrayLike, *, up: ArrayLike) -> Float64:
+    """World-from-camera poses that look at a point, with their x axis across ``up``.
+
+    Args:
+        centers: (V, 3), world frame.
+        target: (3,) or (V, 3), world frame; it appears on the optical axis.
+        up: (3,), world frame.
+
+    Returns:
+        (V, 4, 4) float64.
+
+    Raises:
+        DegenerateError: a centre lies on the target, or the view is along ``up``.
+    """
+    centers = np.asarray(centers, np.float64)
+    forward = np.asarray(target, np.float64) - centers
+    distance = np.linalg.norm(forward, axis=1, keepdims=True)
+    if (distance <= 1e-12 * np.maximum(1, np.abs(centers).max())).any():
+        raise DegenerateError("look at: a camera centre lies on the point that it looks at")
+    forward = forward / distance
+    right = np.cross(forward, np.asarray(up, np.float64))
+    norm = np.linalg.norm(right, axis=1, keepdims=True)
+    if (norm < 1e-6 * np.linalg.norm(up)).any():
+        raise DegenerateError("look at: a camera looks along the up vector; choose another up")
+    right /= norm
+    pose = np.tile(np.eye(4), (len(centers), 1, 1))
+    pose[:, :3, 0], pose[:, :3, 2] = right, forward
+    pose[:, :3, 1] = np.cross(forward, right)
+    pose[:, :3, 3] = centers
+    return pose
+
+
+def orbit(
+    cameras: Cameras,
+    count: int,
+    *,
+    center: ArrayLike | None = None,
+    radius: float | None = None,
+    height: float | None = None,
+    up: ArrayLike | None = None,
+    degrees: float = 360.0,
+) -> Cameras:
+    """Cameras on a circle (or an arc of it) that look at its middle.
+
+    The arc starts at the direction of the first camera. A full turn does not repeat its start.
+
+    Args:
+        cameras: where the scene was seen from; intrinsics and size are those of the first.
+        count: number of cameras, >= 1.
+        center: (3,) what to look at; None means ``focus_point``.
+        radius: distance from the axis, scene units; None means the cameras' median.
+        height: above ``center`` along ``up``, scene units; None means the cameras' median.
+        up: (3,) the axis; None means ``mean_up``.
+        degrees: how far to turn, counter-clockwise as seen from above.
+
+    Raises:
+        OptionError: no camera given or asked for, or a radius that is not positive.
+        DegenerateError: no focus point or no up vector can be found, or the first camera stands
+            on the axis.
+    """
+    if len(cameras) < 1 or count < 1 or (radius is not None and radius <= 0):
+        raise OptionError(
+            f"orbit: {len(cameras)} camera(s) given, {count} asked for, radius {radius}; "
+            "expected 1 or more, and a positive radius"
+        )
+    middle = focus_point(cameras) if center is None else np.asarray(center, np.float64)
+    axis = mean_up(cameras) if up is None else np.asarray(up, np.float64)
+    axis = axis / np.linalg.norm(axis)
+    offset = cameras.centers - middle
+    above = offset @ axis
+    flat = offset - above[:, None] * axis
+    distance = np.linalg.norm(flat, axis=1)
+    if distance[0] <= 1e-9 * max(1.0, float(np.abs(offset).max())):
+        raise DegenerateError("orbit: the first camera stands on the axis; give another center=")
+    radius = float(np.median(distance)) if radius is None else radius
+    height = float(np.median(above)) if height is None else height
+    first = flat[0] / distance[0]
+    side = np.cross(axis, first)
+    full = abs(abs(degrees) - 360.0) < 1e-9
+    angle = np.radians(np.linspace(0, degrees, count + int(full))[:count])[:, None]
+    around = np.cos(angle) * first + np.sin(angle) * side
+    centers = middle + radius * around + height * axis
+    return _like_first(cameras, look_at(centers, middle, up=axis), "orbit")
+
+
+def spiral(
+    cameras: Cameras,
+    count: int,
+    *,
+    turns: float = 2.0,
+    spread: float = 0.8,
+    focus_distance: float | None = None,
+) -> Cameras:
+    """A spiral about the mean camera of a forward-facing capture (as LLFF shows its scenes).
+
+    The offset along each axis of the mean camera stays within ``spread`` of the cameras' own
+    extent there (their 90th percentile), and every camera looks at one point in front.
+
+    Args:
+        cameras: a forward-facing capture, at least two; intrinsics and size are the first's.
+        count: number of cameras, >= 1; the end meets the start.
+        turns: revolutions.
+        spread: share of the captured extent.
+        focus_distance: distance of the point looked at, scene units; None means that of
+            ``focus_point``, or ten times the extent where the axes are parallel or diverge.
+
+    Raises:
+        OptionError: fewer than two cameras, none asked for, or a focus that is not in front.
+        DegenerateError: the cameras' viewing directions or up vectors cancel out.
+    """
+    if len(cameras) < 2 or count < 1:
+        raise OptionError(
+            f"spiral: {len(cameras)} camera(s) given, {count} asked for; expected 2 and 1 or more"
+        )
+    middle = cameras.centers.mean(axis=0)
+    forward = cameras.world_from_cam[:, :3, 2].mean(axis=0)
+    if np.linalg.norm(forward) < 1e-3:
+        raise DegenerateError("spiral: the viewing directions cancel out; use orbit instead")
+    forward /= np.linalg.norm(forward)
+    up = mean_up(cameras)
+    frame = look_at(middle[None], middle + forward, up=up)[0, :3, :3]
+    extent = np.percentile(np.abs((cameras.centers - middle) @ frame), 90, axis=0) * spread
+    if focus_distance is None:
+        try:
+            focus_distance = float((focus_point(cameras) - middle) @ forward)
+        except DegenerateError:
+            focus_distance = 0.0
+        if focus_distance <= extent[2]:
+            focus_distance = 10.0 * float(np.linalg.norm(extent))
+    if focus_distance <= extent[2]:
+        raise OptionError(
+            f"spiral: focus_distance {focus_distance:g}; expected more than {extent[2]:g}, "
+            "the path's own depth"
+        )
+    angle = 2 * np.pi * turns * np.arange(count) / count
+    # The depth swings at half the rate, so that successive turns differ.
+    offset = np.stack([np.cos(angle), -np.sin(angle), -np.sin(0.5 * angle)], axis=1) * extent
+    pose = look_at(middle + offset @ frame.T, middle + focus_distance * forward, up=up)
+    return _like_first(cameras, pose, "spiral")
+
+
+def _like_first(cameras: Cameras, world_from_cam: Float64, prefix: str) -> Cameras:
+    """Cameras at the given poses, with the intrinsics and the size of the first of ``cameras``."""
+    count = len(world_from_cam)
+    return Cameras(
+        np.repeat(cameras.K[:1], count, axis=0),
+        invert_rigid(world_from_cam),
+        np.repeat(cameras.width[:1], count),
+        np.repeat(cameras.height[:1], count),
+        _names(prefix, count),
+    )
+
+
+def _names(prefix: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{prefix}_{i:05d}" for i in range(count))

@@ -1,0 +1,172 @@
+"""Trajectory files: TUM (timestamped quaternions) and KITTI (rows of 3x4 matrices).
+
+Both hold camera-to-world poses, OpenCV axes, in scene units, and nothing of the camera itself: the
+intrinsics and the image size come from given cameras.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras, invert_rigid, rigid_transform
+from gvtools.errors import ProjectError, ShapeError
+
+Float64 = NDArray[np.float64]
+
+# A quaternion written with few digits may be this far from unit length; farther, it is none.
+QUATERNION_TOLERANCE = 1e-2
+
+
+def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") -> Cameras:
+    """Cameras on the poses of a trajectory file.
+
+    Args:
+        path: a text file; blank lines and lines that start with # are passed over.
+        like: intrinsics and size: those of the first camera for all, or row by row when there are
+            as many cameras as poses.
+        layout: "tum" (timestamp tx ty tz qx qy qz qw), "kitti" (12 numbers, a 3x4 matrix by rows)
+            or "auto" (by the count of numbers in the first line: 8 or 12).
+
+    Returns:
+        V cameras; the names are the timestamps as written (TUM) or running numbers (KITTI).
+
+    Raises:
+        ProjectError: unreadable or empty; a line with another count of numbers, something that is
+            no number, a rotation that is none, or a timestamp that was there before. The message
+            names the line.
+    """
+    path = Path(path)
+    rows = _rows(path)
+    count = {"tum": 8, "kitti": 12, "auto": len(rows[0][1])}.get(layout)
+    if count not in (8, 12):
+        raise ProjectError(
+            f"{path}:{rows[0][0]}: {len(rows[0][1])} numbers with layout {layout!r}; expected 8 "
+            "(tum: timestamp tx ty tz qx qy qz qw) or 12 (kitti: a 3x4 matrix)"
+        )
+    poses: list[Float64] = []
+    names: list[str] = []
+    known: dict[str, int] = {}
+    for number, words in rows:
+        values = _numbers(words, count, where=f"{path}:{number}")
+        if count == 8:
+            matrix = np.eye(4)
+            matrix[:3, :3] = _rotation(values[4:], where=f"{path}:{number}")
+            matrix[:3, 3] = values[1:4]
+        else:
+            matrix = values.reshape(3, 4)
+        try:
+            poses.append(rigid_transform(matrix, what=f"{path}:{number}")[0])
+        except ShapeError as error:
+            raise ProjectError(str(error)) from None
+        name = words[0] if count == 8 else f"{len(names):06d}"
+        if name in known:
+            raise ProjectError(
+                f"{path}:{number}: timestamp {name} stands in line {known[name]} too; "
+                "expected each once"
+            )
+        known[name] = number
+        names.append(name)
+    return _with_intrinsics(np.array(poses), like, names, path)
+
+
+def write_trajectory(path: str | Path, cameras: Cameras, *, layout: str = "tum") -> None:
+    """Write the poses of ``cameras``; the file appears complete or not at all.
+
+    Args:
+        path: the file.
+        cameras: whose poses to write. A name that is a number becomes the TUM timestamp when all
+            names are; otherwise the row number does.
+        layout: "tum" or "kitti"; 17 digits keep float64 poses.
+
+    Raises:
+        ProjectError: an unknown layout, or a file that cannot be written.
+    """
+    path = Path(path)
+    world = cameras.world_from_cam
+    if layout == "tum":
+        stamps = cameras.names if _all_numbers(cameras.names) else range(len(cameras))
+        quaternions = _quaternions(world[:, :3, :3])
+        lines = [
+            " ".join([str(stamp), *(f"{x:.17g}" for x in (*pose[:3, 3], *quaternion))])
+            for stamp, pose, quaternion in zip(stamps, world, quaternions, strict=True)
+        ]
+    elif layout == "kitti":
+        lines = [" ".join(f"{x:.17g}" for x in pose[:3].ravel()) for pose in world]
+    else:
+        raise ProjectError(f"{path}: trajectory layout {layout!r}; expected 'tum' or 'kitti'")
+    partial = path.with_name(path.name + ".partial")
+    try:
+        partial.write_text("".join(line + "\n" for line in lines), encoding="ascii")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise ProjectError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def _rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Line numbers and words of the lines that hold data."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a text file"
+        raise ProjectError(f"{path}: cannot be read as a trajectory ({reason})") from error
+    rows = [
+        (number, line.replace(",", " ").split())
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not rows:
+        raise ProjectError(f"{path}: no poses; expected one line for each camera")
+    return rows
+
+
+def _numbers(words: list[str], count: int, *, where: str) -> Float64:
+    """The numbers of a line, all finite."""
+    if len(words) != count:
+        raise ProjectError(f"{where}: {len(words)} numbers; expected {count} as in the layout")
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise ProjectError(f"{where}: {error}; expected {count} numbers") from None
+    if not np.isfinite(values).all():
+        raise ProjectError(f"{where}: NaN or infinity; remove the line or mend it")
+    return values
+
+
+def _rotation(quaternion: Float64, *, where: str) -> Float64:
+    """The rotation of a quaternion (x, y, z, w) of about unit length."""
+    from scipy.spatial.transform import Rotation
+
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > QUATERNION_TOLERANCE:
+        raise ProjectError(
+            f"{where}: a quaternion of length {norm:.6g}; expected 1 (order qx qy qz qw)"
+        )
+    return np.asarray(Rotation.from_quat(quaternion).as_matrix())
+
+
+def _quaternions(rotations: Float64) -> Float64:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotations).as_quat(canonical=True))
+
+
+def _all_numbers(names: tuple[str, ...]) -> bool:
+    try:
+        return len({float(name) for name in names}) == len(names)
+    except ValueError:
+        return False
+
+
+def _with_intrinsics(poses: Float64, like: Cameras, names: list[str], path: Path) -> Cameras:
+    """The poses with the intrinsics of ``like``: one for all, or one each."""
+    if len(like) < 1:
+        raise ProjectError(f"{path}: no camera to take the intrinsics from; give at least one")
+    rows = np.arange(len(poses)) if len(like) == len(poses) else np.zeros(len(poses), np.int64)
+    return Cameras(
+        like.K[rows], invert_rigid(poses), like.width[rows], like.height[rows], tuple(names)
+    )

@@ -1,0 +1,48 @@
+"""What all tests share: options, what is skipped and why, and the real scenes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--runslow", action="store_true", help="run the tests marked slow as well")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--runslow"):
+        slow = pytest.mark.skip(reason="slow; run with --runslow")
+        for item in items:
+            if "slow" in item.keywords:
+                item.add_marker(slow)
+    gpu_items = [item for item in items if "gpu" in item.keywords]
+    if gpu_items and not _cuda():
+        gpu = pytest.mark.skip(reason="needs a CUDA device; torch sees none")
+        for item in gpu_items:
+            item.add_marker(gpu)
+
+
+def _cuda() -> bool:
+    import torch
+
+    return torch.cuda.is_available()
+
+
+def shared_folder() -> Path:
+    """Where the real scenes and oracles lie: $GVTOOLS_SHARED, or shared/ beside the repository."""
+    named = os.environ.get("GVTOOLS_SHARED")
+    return Path(named) if named else REPOSITORY.parent / "shared"
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of real scenes and oracles; the test is skipped where it is absent."""
+    folder = shared_folder()
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}; set GVTOOLS_SHARED to the folder of shared scenes")
+    return folder

@@ -1,0 +1,232 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes_workspace import HEIGHT, LENSES, WIDTH, ramp, save, workspace
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.colmap_depth import write_depth_map
+from gvtools.scenes.inspection import reprojection_errors
+
+UNTOUCHED = ("SIMPLE_PINHOLE", "PINHOLE")
+
+
+@pytest.mark.parametrize("model", sorted(LENSES))
+def test_every_perspective_model_reprojects_its_own_points(tmp_path, model):
+    reconstruction = workspace(tmp_path, model)
+    scene = read_colmap(tmp_path)
+    # pycolmap made the detections with the distorted camera; our pinhole must hit them exactly.
+    errors = reprojection_errors(scene)
+    assert len(errors) == reconstruction.compute_num_observations() > 100
+    assert errors.max() < 1e-3
+    camera, frame = scene.cameras, scene.views[0].load()
+    assert frame.rgb.shape == (camera.height[0], camera.width[0], 3)
+    untouched = model in UNTOUCHED
+    assert any("undistorted" in finding.message for finding in scene.findings) != untouched
+    if untouched:
+        np.testing.assert_array_equal(frame.rgb, ramp())
+        np.testing.assert_array_equal(
+            camera.K[0], next(iter(reconstruction.cameras.values())).calibration_matrix()
+        )
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("classic", [False, True])
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "model"])
+def test_places_and_forms_give_one_scene(tmp_path, text, classic, place):
+    reconstruction = workspace(tmp_path, text=text, classic=classic, place=place)
+    scene = read_colmap(tmp_path / place if place == "model" else tmp_path)
+    assert scene.kind == "colmap"
+    assert not scene.metric
+    for view in scene:
+        image = reconstruction.find_image_with_name(view.name)
+        np.testing.assert_allclose(
+            view.camera.cam_from_world[0, :3], image.cam_from_world().matrix(), atol=1e-12
+        )
+    assert reprojection_errors(scene).max() < 1e-3
+
+
+def test_rig_with_several_cameras_composes_sensor_and_rig(tmp_path):
+    reconstruction = workspace(tmp_path, num_rigs=2, num_cameras_per_rig=2)
+    scene = read_colmap(tmp_path)
+    assert len(scene) == reconstruction.num_images() == 16
+    assert reprojection_errors(scene).max() < 1e-3
+
+
+def test_model_folder_itself_finds_the_images_of_its_workspace(tmp_path):
+    workspace(tmp_path)
+    assert read_colmap(tmp_path / "sparse" / "0").names == read_colmap(tmp_path).names
+
+
+def test_images_in_subfolders_and_natural_order(tmp_path):
+    reconstruction = workspace(tmp_path)
+    names = ["b/img10.png", "b/img9.png", "a/img2.png", "a/img 11.png"]
+    for image, name in zip(reconstruction.images.values(), names, strict=True):
+        (tmp_path / "images" / image.name).rename(save(tmp_path / "images" / name, ramp()))
+        image.name = name
+    reconstruction.write_binary(tmp_path / "sparse" / "0")
+    binary = read_colmap(tmp_path)
+    assert binary.names == ("a/img2.png", "a/img 11.png", "b/img9.png", "b/img10.png")
+    # A reader of text models that stops at the first blank would take "a/img" for a name.
+    (tmp_path / "text").mkdir()
+    reconstruction.write_text(tmp_path / "text")
+    text = read_colmap(tmp_path / "text")
+    assert text.names == binary.names
+    np.testing.assert_allclose(text.cameras.centers, binary.cameras.centers, atol=1e-12)
+
+
+def test_unused_cameras_absent_and_unregistered_images_are_reported(tmp_path):
+    import pycolmap
+
+    reconstruction = workspace(tmp_path)
+    spare = pycolmap.Camera(model="PINHOLE", width=5, height=5, params=[5.0, 5, 2, 2], camera_id=77)
+    reconstruction.add_camera_with_trivial_rig(spare)
+    reconstruction.write_binary(tmp_path / "sparse" / "0")
+    (tmp_path / "images" / sorted(i.name for i in reconstruction.images.values())[1]).unlink()
+    save(tmp_path / "images" / "extra" / "other.JPG", ramp())
+    scene = read_colmap(tmp_path)
+    assert len(scene) == 3
+    messages = " | ".join(finding.message for finding in scene.findings)
+    assert "1 cameras of the model are used by no image" in messages
+    assert "1 of 4 registered images are absent on disk" in messages
+    assert "4 of 5 pictures registered" in messages
+    assert "40 track elements belong to views that are not read" in messages
+    assert reprojection_errors(scene).max() < 1e-3
+
+
+def test_several_cameras_and_sizes(tmp_path):
+    import pycolmap
+
+    reconstruction = workspace(tmp_path, "PINHOLE", num_rigs=2)
+    second = reconstruction.cameras[max(reconstruction.cameras)]
+    second.rescale(new_width=WIDTH // 2, new_height=HEIGHT // 2)
+    small = [
+        image.name
+        for image in reconstruction.images.values()
+        if image.camera_id == second.camera_id
+    ]
+    for name in small:
+        save(tmp_path / "images" / name, ramp(WIDTH // 2, HEIGHT // 2))
+    reconstruction.write_binary(tmp_path / "sparse" / "0")
+    assert isinstance(second, pycolmap.Camera)
+    scene = read_colmap(tmp_path)
+    assert sorted(set(scene.cameras.width.tolist())) == [WIDTH // 2, WIDTH]
+    assert any("2 different sizes" in finding.message for finding in scene.findings)
+    for view in scene:
+        frame = view.load()
+        assert frame.rgb.shape == (view.camera.height[0], view.camera.width[0], 3)
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV_FISHEYE", "FOV"])
+def test_mask_and_depth_go_through_the_mapping_of_the_image(tmp_path, model):
+    reconstruction = workspace(tmp_path, model)
+    image = next(iter(reconstruction.images.values()))
+    # Depth and mask repeat what the picture shows, so that after undistortion all must agree.
+    depth = ramp()[..., 0].astype(np.float32) + 1
+    write_depth_map(tmp_path / "stereo/depth_maps" / f"{image.name}.photometric.bin", depth + 50)
+    write_depth_map(tmp_path / "stereo/depth_maps" / f"{image.name}.geometric.bin", depth)
+    save(
+        tmp_path / "masks" / f"{image.name}.png",
+        np.where(ramp()[..., 1] > 127, 255, 0).astype("u1"),
+    )
+    scene = read_colmap(tmp_path)
+    view = scene[image.name]
+    frame = view.load()
+    assert view.has_depth
+    assert sum(other.has_depth for other in scene) == 1
+    assert frame.depth is not None
+    assert frame.mask is not None
+    step = 255 / WIDTH
+    assert np.abs(frame.depth - 1 - frame.rgb[..., 0]).max() <= step + 1
+    sure = np.abs(frame.rgb[..., 1].astype(int) - 127) > 255 / HEIGHT + 1
+    np.testing.assert_array_equal(frame.mask[sure], frame.rgb[..., 1][sure] > 127)
+    messages = " | ".join(finding.message for finding in scene.findings)
+    assert "depth maps: 1 geometric, 3 none" in messages
+    assert "3 views have no mask" in messages
+
+
+def test_depth_map_of_a_smaller_size_is_taken_by_nearest_pixel(tmp_path):
+    reconstruction = workspace(tmp_path, "PINHOLE")
+    name = next(iter(reconstruction.images.values())).name
+    small = np.arange(HEIGHT * WIDTH / 9, dtype=np.float32).reshape(HEIGHT // 3, WIDTH // 3) + 1
+    write_depth_map(tmp_path / "stereo/depth_maps" / f"{name}.geometric.bin", small)
+    scene = read_colmap(tmp_path)
+    np.testing.assert_array_equal(
+        scene[name].load().depth, np.repeat(np.repeat(small, 3, axis=0), 3, axis=1)
+    )
+    assert any("32x24 for pictures of 96x72" in finding.message for finding in scene.findings)
+
+
+def test_depth_map_of_another_aspect_is_an_error_finding_and_raises_when_loaded(tmp_path):
+    reconstruction = workspace(tmp_path, "PINHOLE")
+    name = next(iter(reconstruction.images.values())).name
+    write_depth_map(tmp_path / "stereo/depth_maps" / f"{name}.geometric.bin", np.ones((30, 30)))
+    scene = read_colmap(tmp_path)
+    assert [f.level for f in scene.findings if "30x30" in f.message] == ["error"]
+    with pytest.raises(ProjectError, match="30x30 for a picture of 96x72"):
+        scene[name].load()
+
+
+def test_masks_images_and_depths_may_be_given(tmp_path):
+    reconstruction = workspace(tmp_path / "project", "PINHOLE")
+    name = next(iter(reconstruction.images.values())).name
+    (tmp_path / "project" / "images").rename(tmp_path / "pictures")
+    save(tmp_path / "ignore" / f"{name}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    (tmp_path / "deep").mkdir()
+    np.save(tmp_path / "deep" / f"{name}.npy", np.full((HEIGHT, WIDTH), 2.5))
+    with pytest.raises(ProjectError, match="without images"):
+        read_colmap(tmp_path / "project")
+    scene = read_colmap(
+        tmp_path / "project",
+        images=tmp_path / "pictures",
+        masks=tmp_path / "ignore",
+        depths=tmp_path / "deep",
+    )
+    frame = scene[name].load()
+    assert not frame.mask.any()
+    assert (frame.depth == 2.5).all()
+
+
+def test_spherical_camera_is_refused_by_name(tmp_path):
+    folder = tmp_path / "sparse"
+    folder.mkdir()
+    (tmp_path / "images").mkdir()
+    (folder / "cameras.txt").write_text("1 EQUIRECTANGULAR 200 100 200 100\n")
+    (folder / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+    (folder / "points3D.txt").write_text("")
+    with pytest.raises(ProjectError, match="EQUIRECTANGULAR is spherical"):
+        read_colmap(tmp_path)
+
+
+def test_fisheye_without_coefficients_is_still_undistorted(tmp_path):
+    # pycolmap calls such a camera undistorted, but its projection is no pinhole's.
+    workspace(tmp_path, "OPENCV_FISHEYE", camera_params=[60.0, 60, 48, 36, 0, 0, 0, 0])
+    scene = read_colmap(tmp_path)
+    assert any("OPENCV_FISHEYE 96x72 undistorted" in f.message for f in scene.findings)
+    assert reprojection_errors(scene).max() < 1e-3
+
+
+def test_pinhole_model_with_zero_coefficients_passes_untouched(tmp_path):
+    workspace(tmp_path, "OPENCV", camera_params=[90.0, 91, 48, 36, 0, 0, 0, 0])
+    scene = read_colmap(tmp_path)
+    np.testing.assert_array_equal(scene.views[0].load().rgb, ramp())
+
+
+def test_further_models_are_named(tmp_path):
+    reconstruction = workspace(tmp_path)
+    (tmp_path / "sparse" / "1").mkdir()
+    reconstruction.write_binary(tmp_path / "sparse" / "1")
+    messages = [finding.message for finding in read_colmap(tmp_path).findings]
+    assert "model 0 is read; further models are not: 1 (4 images)" in messages
+
+
+def test_picture_of_another_size_is_an_error_finding_and_raises_when_loaded(tmp_path):
+    workspace(tmp_path)
+    scene = read_colmap(tmp_path)
+    path = scene.views[1].files[0]
+    save(path, ramp(50, 40))
+    scene = read_colmap(tmp_path)
+    assert [f.level for f in scene.findings if "50x40" in f.message] == ["error"]
+    with pytest.raises(ProjectError, match="50x40 pixels; its camera expects 96x72"):
+        scene.views[1].load()

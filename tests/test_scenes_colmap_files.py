@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import re
+import struct
+
+import numpy as np
+import pytest
+from scenes_workspace import workspace
+
+from gvtools.errors import GvError, ProjectError
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.colmap_depth import depth_map_size, read_depth_map, write_depth_map
+
+
+def one_line(error: pytest.ExceptionInfo[BaseException]) -> str:
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+@pytest.mark.parametrize("change", ["cut", "grown", "empty"])
+def test_truncated_or_oversized_binary_file_is_refused(tmp_path, name, change):
+    workspace(tmp_path)
+    path = tmp_path / "sparse/0" / f"{name}.bin"
+    data = path.read_bytes()
+    path.write_bytes({"cut": data[:-5], "grown": data + b"\0" * 7, "empty": b""}[change])
+    with pytest.raises(ProjectError) as error:
+        read_colmap(tmp_path)
+    assert name in one_line(error)
+
+
+@pytest.mark.parametrize("name", ["images", "points3D", "rigs", "frames", "cameras"])
+def test_absurd_count_is_refused_before_memory_is_reserved(tmp_path, name):
+    workspace(tmp_path)
+    path = tmp_path / "sparse/0" / f"{name}.bin"
+    path.write_bytes(struct.pack("<Q", 2**40) + path.read_bytes()[8:])
+    with pytest.raises(ProjectError, match="records that its head"):
+        read_colmap(tmp_path)
+
+
+def test_absurd_inner_count_is_refused(tmp_path):
+    workspace(tmp_path, classic=True)
+    path = tmp_path / "sparse/0/points3D.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<Q", data, 8 + 43, 2**59)  # track length of the first point
+    path.write_bytes(data)
+    with pytest.raises(ProjectError, match=r"points3D\.bin"):
+        read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern", "replacement", "told"),
+    [
+        ("images", r"^1 \S+ ", "1 ", r"images\.txt, line \d+: malformed"),
+        ("images", r"^1 \S+ ", "1 word ", r"images\.txt, line \d+: malformed"),
+        ("images", r"^1 \S+ ", "1 nan ", r"images\.txt, line \d+: malformed"),
+        ("images", r"(\S+ \S+) -1 ", r"\1 ", r"images\.txt, line \d+: malformed"),
+        ("cameras", r"^1 SIMPLE_RADIAL 96 72", "1 SIMPLE_RADIAL 96", "as many parameters"),
+        ("cameras", r"SIMPLE_RADIAL", "SIMPEL_RADIAL", "Camera model does not exist"),
+        ("cameras", r" -0\.1\S+", "", "as many parameters"),
+        ("points3D", r"^1 \S+ \S+ \S+ .*$", "1 2 3", r"points3D\.txt, line \d+: malformed"),
+        ("points3D", r"^(1 .*) \d+$", r"\1", r"points3D\.txt, line \d+: malformed"),
+    ],
+)
+def test_malformed_text_model_names_file_and_line(tmp_path, name, pattern, replacement, told):
+    workspace(tmp_path, text=True, classic=True)
+    path = tmp_path / "sparse/0" / f"{name}.txt"
+    text, count = re.subn(pattern, replacement, path.read_text(), count=1, flags=re.MULTILINE)
+    assert count == 1
+    path.write_text(text)
+    with pytest.raises(ProjectError, match=told) as error:
+        read_colmap(tmp_path)
+    one_line(error)
+
+
+def test_text_model_without_point_lines_does_not_lose_every_second_image(tmp_path):
+    workspace(tmp_path, text=True, classic=True)
+    path = tmp_path / "sparse/0/images.txt"
+    lines = [line for line in path.read_text().splitlines() if line.endswith(".png")]
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(ProjectError, match="two lines"):
+        read_colmap(tmp_path)
+
+
+def test_windows_line_ends_are_read_and_reported(tmp_path):
+    workspace(tmp_path, text=True)
+    expected = read_colmap(tmp_path)
+    for path in (tmp_path / "sparse/0").iterdir():
+        path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    scene = read_colmap(tmp_path)
+    assert scene.names == expected.names
+    np.testing.assert_array_equal(scene.cameras.cam_from_world, expected.cameras.cam_from_world)
+    assert any("Windows line ends" in finding.message for finding in scene.findings)
+
+
+def test_pose_with_nan_is_refused(tmp_path):
+    workspace(tmp_path, classic=True)
+    path = tmp_path / "sparse/0/images.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, 8 + 4 + 4 * 8, float("nan"))  # tx of the first image
+    path.write_bytes(data)
+    with pytest.raises(GvError, match="NaN"):
+        read_colmap(tmp_path)
+
+
+def test_camera_with_nan_is_refused(tmp_path):
+    workspace(tmp_path)
+    path = tmp_path / "sparse/0/cameras.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, 8 + 24, float("nan"))
+    path.write_bytes(data)
+    with pytest.raises(ProjectError, match=r"camera 1: SIMPLE_RADIAL 96x72 .* NaN"):
+        read_colmap(tmp_path)
+
+
+def test_no_model_no_image_and_half_a_model(tmp_path):
+    with pytest.raises(ProjectError, match="no COLMAP model"):
+        read_colmap(tmp_path)
+    workspace(tmp_path)
+    (tmp_path / "sparse/0/frames.bin").unlink()
+    with pytest.raises(ProjectError, match=r"rigs\.bin without frames\.bin"):
+        read_colmap(tmp_path)
+    (tmp_path / "sparse/0/points3D.bin").unlink()
+    with pytest.raises(ProjectError, match="incomplete model"):
+        read_colmap(tmp_path)
+
+
+def test_model_without_registered_image(tmp_path):
+    import pycolmap
+
+    folder = tmp_path / "sparse"
+    folder.mkdir()
+    pycolmap.Reconstruction().write_binary(folder)
+    with pytest.raises(ProjectError, match="no registered image among 0"):
+        read_colmap(tmp_path)
+
+
+def test_no_picture_on_disk(tmp_path):
+    workspace(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        path.unlink()
+    with pytest.raises(ProjectError, match="none of the model's 4 registered images"):
+        read_colmap(tmp_path)
+
+
+def test_depth_map_round_trip_is_what_pycolmap_reads(tmp_path):
+    import pycolmap
+
+    depth = np.random.default_rng(0).uniform(0.5, 9, (7, 11)).astype(np.float32)
+    write_depth_map(tmp_path / "deep" / "a.bin", depth)
+    peer = pycolmap.DepthMap()
+    peer.read(tmp_path / "deep" / "a.bin")
+    np.testing.assert_array_equal(peer.to_array(), depth)
+    np.testing.assert_array_equal(read_depth_map(tmp_path / "deep" / "a.bin"), depth)
+    assert depth_map_size(tmp_path / "deep" / "a.bin") == (11, 7)
+    pycolmap.DepthMap.from_array(depth, 0, 10).write(tmp_path / "b.bin")
+    np.testing.assert_array_equal(read_depth_map(tmp_path / "b.bin"), depth)
+
+
+def test_depth_map_without_readings_and_damaged_ones(tmp_path):
+    path = tmp_path / "a.bin"
+    write_depth_map(path, [[1, -1, np.nan, np.inf, 0]])
+    np.testing.assert_array_equal(read_depth_map(path), [[1, 0, 0, 0, 0]])
+    data = path.read_bytes()
+    for damaged in (data[:-1], data + b"\0", b"9999999&9999999&1&", b"nothing", b""):
+        path.write_bytes(damaged)
+        with pytest.raises(ProjectError) as error:
+            read_depth_map(path)
+        assert "a.bin" in one_line(error)

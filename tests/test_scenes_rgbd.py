@@ -1,0 +1,400 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scenes_workspace import HEIGHT, WIDTH, depth_picture, pose_matrix, ramp, save, sevenscenes
+
+from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
+from gvtools.scenes.redwood import read_redwood
+from gvtools.scenes.rgbd import RgbdOptions
+from gvtools.scenes.scannet import read_scannet
+from gvtools.scenes.sevenscenes import read_sevenscenes
+from gvtools.scenes.tum import PUBLISHED, associate, read_tum, rotation_from_quaternion
+
+
+def messages(scene):
+    return " | ".join(finding.message for finding in scene.findings)
+
+
+# --- 7-Scenes ---------------------------------------------------------------------------------
+
+
+def test_sevenscenes_poses_units_and_pixel_centres(tmp_path):
+    scene = read_sevenscenes(sevenscenes(tmp_path))
+    assert scene.metric
+    assert scene.names == tuple(f"frame-{i:06d}.color.png" for i in range(3))
+    # The file counts pixel centres as integers, we as integer + 0.5.
+    np.testing.assert_allclose(scene.cameras.K[0], [[90, 0, 48], [0, 90, 36], [0, 0, 1]])
+    for i in range(3):
+        np.testing.assert_allclose(
+            scene.cameras.world_from_cam[i], pose_matrix(0.1 * i), atol=1e-12
+        )
+    frame = scene.views[0].load()
+    assert frame.depth[0, 0] == frame.depth[0, 1] == 0
+    np.testing.assert_allclose(frame.depth[1:], 2.0, rtol=1e-6)
+    np.testing.assert_array_equal(frame.rgb, ramp())
+
+
+def test_sevenscenes_incomplete_frames_are_dropped_and_counted(tmp_path):
+    root = sevenscenes(tmp_path, frames=5)
+    (root / "frame-000001.pose.txt").unlink()
+    (root / "frame-000002.color.png").unlink()
+    (root / "frame-000003.depth.png").unlink()
+    scene = read_sevenscenes(root)
+    assert len(scene) == 3
+    assert [view.has_depth for view in scene] == [True, False, True]
+    assert "1 pictures have no pose: dropped (frame-000001.color.png)" in messages(scene)
+    assert "1 poses have no picture: dropped" in messages(scene)
+    assert "1 frames have no depth map" in messages(scene)
+
+
+def test_sevenscenes_intrinsics_in_the_parent_or_nowhere(tmp_path):
+    root = sevenscenes(tmp_path / "seq-01")
+    (root / "camera-intrinsics.txt").rename(tmp_path / "camera-intrinsics.txt")
+    assert read_sevenscenes(root).cameras.K[0, 0, 0] == 90
+    (tmp_path / "camera-intrinsics.txt").unlink()
+    with pytest.raises(ProjectError, match=r"no camera-intrinsics\.txt"):
+        read_sevenscenes(root)
+    K = [[80, 0, 47.5], [0, 80, 35.5], [0, 0, 1]]
+    assert read_sevenscenes(root, options=RgbdOptions(color_K=K)).cameras.K[0, 0, 0] == 80
+
+
+def test_slightly_skewed_rotation_is_mended_and_reported(tmp_path):
+    root = sevenscenes(tmp_path)
+    pose = pose_matrix()
+    pose[0, :3] *= 1 + 2e-4
+    np.savetxt(root / "frame-000000.pose.txt", pose)
+    scene = read_sevenscenes(root)
+    rotation = scene.cameras.cam_from_world[0, :3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert "1 of 3 rotations made orthonormal; largest entry of R Rᵀ − I was 0.0004" in messages(
+        scene
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda pose: pose * np.array([[2.0], [2], [2], [1]]), r"scale 2"),
+        (lambda pose: pose * np.array([1, 1, -1.0, 1]), "determinant -1"),
+        (lambda pose: pose + np.where(np.eye(4) > 0, np.nan, 0), "NaN"),
+        (lambda pose: pose[:2], "2x4 numbers; expected 4x4 or 3x4"),
+    ],
+)
+def test_impossible_poses_name_their_file(tmp_path, change, told):
+    root = sevenscenes(tmp_path)
+    np.savetxt(root / "frame-000001.pose.txt", change(pose_matrix()))
+    with pytest.raises(GvError, match=told) as error:
+        read_sevenscenes(root)
+    assert "frame-000001.pose.txt" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_pose_of_words(tmp_path):
+    root = sevenscenes(tmp_path)
+    (root / "frame-000001.pose.txt").write_text("lost\n")
+    with pytest.raises(ProjectError, match=r"frame-000001\.pose\.txt: unreadable"):
+        read_sevenscenes(root)
+
+
+@pytest.mark.parametrize("codes", [[[90, 5, 0], [0, 90, 0], [0, 0, 1]], [[0, 0, 0]] * 3])
+def test_impossible_intrinsics(tmp_path, codes):
+    root = sevenscenes(tmp_path)
+    np.savetxt(root / "camera-intrinsics.txt", codes)
+    with pytest.raises(ProjectError, match="fx, fy > 0"):
+        read_sevenscenes(root)
+
+
+def test_depth_of_another_size(tmp_path):
+    root = sevenscenes(tmp_path)
+    half = np.arange(HEIGHT * WIDTH // 4, dtype=np.uint16).reshape(HEIGHT // 2, -1) + 1000
+    save(root / "frame-000000.depth.png", half)
+    save(root / "frame-000001.depth.png", np.full((50, 50), 1000, np.uint16))
+    scene = read_sevenscenes(root)
+    np.testing.assert_allclose(
+        scene.views[0].load().depth, np.repeat(np.repeat(half, 2, 0), 2, 1) / 1000, rtol=1e-6
+    )
+    with pytest.raises(ProjectError, match="50x50 for a picture of 96x72"):
+        scene.views[1].load()
+    assert [f.level for f in scene.findings if "50x50" in f.message] == ["error"]
+
+
+def test_depth_maximum_unit_and_eight_bit_depth(tmp_path):
+    root = sevenscenes(tmp_path)
+    save(root / "frame-000001.depth.png", np.full((HEIGHT, WIDTH), 99, np.uint8))
+    scene = read_sevenscenes(root, options=RgbdOptions(depth_unit=1e-2, depth_max=15.0))
+    assert not scene.views[0].load().depth.any()  # 20 m everywhere
+    with pytest.raises(ProjectError, match="8 bits"):
+        scene.views[1].load()
+    assert "8-bit depth" in messages(scene)
+
+
+def test_registration_through_options_and_sidecar(tmp_path):
+    root = sevenscenes(tmp_path)
+    K = [[90, 0, 47.5], [0, 90, 35.5], [0, 0, 1]]
+    shift = np.eye(4)
+    shift[0, 3] = 0.2  # 90 * 0.2 / 2 m = 9 pixels to the right
+    given = read_sevenscenes(root, options=RgbdOptions(depth_K=K, color_from_depth=shift))
+    depth = given.views[0].load().depth
+    assert not depth[:, :9].any()
+    np.testing.assert_allclose(depth[1:, 10:], 2, rtol=1e-5)
+    (root / "rgbd.json").write_text(
+        json.dumps({"depth_K": K, "color_from_depth": shift.tolist(), "depth_unit": 5e-4})
+    )
+    read = read_sevenscenes(root, options=RgbdOptions(depth_unit=1e-3))
+    np.testing.assert_array_equal(read.views[0].load().depth, depth)
+    assert "options read from rgbd.json" in messages(read)
+    assert "registered into the colour camera" in messages(read)
+
+
+def test_wrong_options(tmp_path):
+    root = sevenscenes(tmp_path)
+    with pytest.raises(OptionError, match="depth_unit: -1"):
+        RgbdOptions(depth_unit=-1)
+    with pytest.raises(OptionError, match="without depth_K"):
+        read_sevenscenes(root, options=RgbdOptions(color_from_depth=np.eye(4)))
+    with pytest.raises(ShapeError, match="no rotation"):
+        read_sevenscenes(
+            root, options=RgbdOptions(depth_K=np.eye(3), color_from_depth=np.diag([2, 2, 2, 1]))
+        )
+    (root / "rgbd.json").write_text('{"depth_units": 0.001}')
+    with pytest.raises(OptionError, match="did you mean 'depth_unit'"):
+        read_sevenscenes(root)
+    (root / "rgbd.json").write_text("{")
+    with pytest.raises(ProjectError, match="no JSON"):
+        read_sevenscenes(root)
+
+
+def test_intrinsics_of_another_size_are_pointed_out(tmp_path):
+    root = sevenscenes(tmp_path)
+    np.savetxt(root / "camera-intrinsics.txt", [[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
+    assert "far from the middle" in messages(read_sevenscenes(root))
+
+
+# --- TUM --------------------------------------------------------------------------------------
+
+
+def tum(root, *, offset=0.004):
+    root.mkdir(parents=True)
+    pose = pose_matrix(0.3)
+    quaternion = (0.0, np.sin(0.05), 0.0, np.cos(0.05))
+    lists = {"rgb.txt": "# color\n", "depth.txt": "# depth\n", "groundtruth.txt": "# truth\n"}
+    for i in range(4):
+        time = 100 + i / 30
+        save(root / f"rgb/{time:.6f}.png", ramp(640, 480))
+        save(root / f"depth/{time + offset:.6f}.png", np.full((480, 640), 10000, np.uint16))
+        lists["rgb.txt"] += f"{time:.6f} rgb/{time:.6f}.png\n"
+        lists["depth.txt"] += f"{time + offset:.6f} depth/{time + offset:.6f}.png\n"
+        if i < 3:
+            values = (*pose[:3, 3], *quaternion)
+            line = " ".join(f"{value:.9f}" for value in values)
+            lists["groundtruth.txt"] += f"{time - 0.01:.4f} {line}\n"
+    for name, text in lists.items():
+        (root / name).write_text(text)
+    return root
+
+
+def test_tum_association_scale_and_poses(tmp_path):
+    scene = read_tum(tum(tmp_path / "rgbd_dataset_freiburg3_x"))
+    assert len(scene) == 3
+    assert "1 of 4 pictures have no pose within 0.02 s" in messages(scene)
+    assert all(view.has_depth for view in scene)
+    np.testing.assert_allclose(scene.views[0].load().depth, 2.0, rtol=1e-6)  # 10000 / 5000
+    np.testing.assert_allclose(scene.cameras.world_from_cam[0], pose_matrix(0.3), atol=1e-8)
+    np.testing.assert_allclose(
+        scene.cameras.K[0], [[535.4, 0, 320.6], [0, 539.2, 248.1], [0, 0, 1]]
+    )
+
+
+def test_tum_time_difference_is_an_option(tmp_path):
+    root = tum(tmp_path / "sequence", offset=0.015)
+    assert all(view.has_depth for view in read_tum(root))
+    scene = read_tum(root, options=RgbdOptions(max_time_difference=0.012))
+    assert not any(view.has_depth for view in scene)
+    with pytest.raises(ProjectError, match=r"4 of 4 pictures have no pose within 0\.005 s"):
+        read_tum(root, options=RgbdOptions(max_time_difference=0.005))
+
+
+def test_tum_intrinsics_by_file_by_name_or_by_default(tmp_path):
+    named = read_tum(tum(tmp_path / "rgbd_dataset_freiburg1_desk"))
+    assert "published for freiburg1" in messages(named)
+    assert "FULL_OPENCV 640x480 undistorted" in messages(named)
+    plain = read_tum(tum(tmp_path / "office"))
+    np.testing.assert_allclose(plain.cameras.K[0, :2, 2], [320, 240])
+    assert "driver's default" in messages(plain)
+    written = {"intrinsic_matrix": [500, 0, 0, 0, 501, 0, 310, 230, 1]}
+    (tmp_path / "office" / "camera.json").write_text(json.dumps(written))
+    np.testing.assert_allclose(
+        read_tum(tmp_path / "office").cameras.K[0], [[500, 0, 310.5], [0, 501, 230.5], [0, 0, 1]]
+    )
+
+
+def test_tum_freiburg1_distortion_is_opencvs(tmp_path):
+    scene = read_tum(tum(tmp_path / "rgbd_dataset_freiburg1_desk"))
+    (fx, fy, cx, cy), (k1, k2, p1, p2, k3) = PUBLISHED["freiburg1"]
+    frame, K = scene.views[0].load(), scene.cameras.K[0]
+    height, width = frame.rgb.shape[:2]
+    y, x = np.mgrid[20 : height - 20 : 40, 20 : width - 20 : 40]
+    u, v = (x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1]
+    r2 = u * u + v * v
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+    dv = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+    # The picture is a ramp, so its colours tell which recorded pixel each one came from.
+    recorded_x, recorded_y = fx * du + cx + 0.5, fy * dv + cy + 0.5
+    np.testing.assert_allclose(frame.rgb[y, x, 0] / 255 * 640, recorded_x, atol=2.6)
+    np.testing.assert_allclose(frame.rgb[y, x, 1] / 255 * 480, recorded_y, atol=2.1)
+
+
+def test_tum_malformed_lists_name_the_line(tmp_path):
+    root = tum(tmp_path / "sequence")
+    text = (root / "groundtruth.txt").read_text()
+    (root / "groundtruth.txt").write_text(text + "100.2 1 2 3 0 0 0\n")
+    with pytest.raises(ProjectError, match=r"groundtruth\.txt, line 5: .* expected 8 columns"):
+        read_tum(root)
+    (root / "groundtruth.txt").write_text(text.replace("0.300000000", "x", 1))
+    with pytest.raises(ProjectError, match=r"groundtruth\.txt, line 2"):
+        read_tum(root)
+    (root / "groundtruth.txt").write_text(text.replace(" 0.998750260", " 2", 1))
+    with pytest.raises(ShapeError, match=r"groundtruth\.txt, time .*scale 4"):
+        read_tum(root)
+
+
+def test_association_is_the_greedy_one_over_all_pairs():
+    rng = np.random.default_rng(4)
+    first, second = np.sort(rng.uniform(0, 3, 60)), np.sort(rng.uniform(0, 3, 70))
+    pairs = sorted(
+        (abs(a - b), i, j)
+        for i, a in enumerate(first)
+        for j, b in enumerate(second)
+        if abs(a - b) <= 0.02
+    )
+    expected, used = {}, set()
+    for _, i, j in pairs:
+        if i not in expected and j not in used:
+            expected[i] = j
+            used.add(j)
+    assert associate(first, second, 0.02) == expected
+    assert len(expected) > 20
+
+
+def test_quaternion_matches_scipy():
+    from scipy.spatial.transform import Rotation
+
+    rotation = Rotation.random(20, rng=np.random.default_rng(2))
+    for quaternion, matrix in zip(rotation.as_quat(), rotation.as_matrix(), strict=True):
+        np.testing.assert_allclose(rotation_from_quaternion(quaternion), matrix, atol=1e-12)
+    np.testing.assert_allclose(rotation_from_quaternion(2 * quaternion), 4 * matrix, atol=1e-12)
+
+
+# --- Redwood ----------------------------------------------------------------------------------
+
+
+def redwood(root, numbers=(0, 1, 2)):
+    for i in range(3):
+        save(root / f"color/{i + 1:05d}-000{i}77.jpg", ramp())
+        save(root / f"depth/{i + 1:05d}-000{i}70.png", depth_picture())
+    text = ""
+    for number in numbers:
+        rows = "\n".join(" ".join(f"{v:.9f}" for v in row) for row in pose_matrix(number / 10))
+        text += f"{number} {number} {number + 1}\n{rows}\n"
+    (root / "trajectory.log").write_text(text)
+    (root / "odometry.log").write_text(text.replace("0.1", "0.9"))
+    camera = {
+        "width": 96,
+        "height": 72,
+        "intrinsic_matrix": [91, 0, 0, 0, 92, 0, 47.5, 35.5, 1],
+    }
+    (root / "camera.json").write_text(json.dumps(camera))
+    return root
+
+
+def test_redwood_pairs_poses_and_column_major_intrinsics(tmp_path):
+    scene = read_redwood(redwood(tmp_path))
+    assert len(scene) == 3
+    assert all(view.has_depth for view in scene)
+    np.testing.assert_allclose(scene.cameras.K[0], [[91, 0, 48], [0, 92, 36], [0, 0, 1]])
+    np.testing.assert_allclose(scene.cameras.world_from_cam[2], pose_matrix(0.2), atol=1e-8)
+    assert "poses are read from trajectory.log, not odometry.log" in messages(scene)
+
+
+def test_redwood_pose_numbers_choose_the_picture(tmp_path):
+    scene = read_redwood(redwood(tmp_path, numbers=(2, 0)))
+    assert scene.names == ("00001-000077.jpg", "00003-000277.jpg")
+    np.testing.assert_allclose(scene.cameras.world_from_cam[1], pose_matrix(0.2), atol=1e-8)
+    assert "1 of 3 pictures have no pose" in messages(scene)
+
+
+def test_redwood_trajectory_that_does_not_fit(tmp_path):
+    root = redwood(tmp_path)
+    text = (root / "trajectory.log").read_text()
+    (root / "trajectory.log").write_text(text.replace("2 2 3", "9 9 9").replace("1 1 2", "0 0 0"))
+    assert len(read_redwood(root)) == 3  # one pose a picture, whatever the numbers
+    (root / "trajectory.log").write_text("\n".join(text.splitlines()[:13]))
+    with pytest.raises(ProjectError, match=r"trajectory\.log, line 11"):
+        read_redwood(root)
+    (root / "trajectory.log").write_text(text.split("1 1 2")[0].replace("0 0 1", "7 7 8"))
+    with pytest.raises(ProjectError, match="1 poses numbered 7 for 3 pictures"):
+        read_redwood(root)
+
+
+def test_redwood_without_intrinsics_takes_the_sensors(tmp_path):
+    root = redwood(tmp_path)
+    (root / "camera.json").unlink()
+    scene = read_redwood(root)
+    np.testing.assert_allclose(scene.cameras.K[0], [[525, 0, 320], [0, 525, 240], [0, 0, 1]])
+    assert "PrimeSense default" in messages(scene)
+
+
+# --- ScanNet ----------------------------------------------------------------------------------
+
+
+def scannet(root):
+    for i in (0, 1, 2, 10):
+        save(root / f"color/{i}.jpg", ramp(192, 144))
+        save(root / f"depth/{i}.png", depth_picture())
+        (root / "pose").mkdir(exist_ok=True)
+        np.savetxt(root / f"pose/{i}.txt", pose_matrix(i) if i != 1 else np.full((4, 4), -np.inf))
+    (root / "intrinsic").mkdir()
+    K = np.eye(4)
+    K[:2, :3] = [[180, 0, 95.5], [0, 180, 71.5]]
+    np.savetxt(root / "intrinsic/intrinsic_color.txt", K)
+    K[:2, :3] = [[90, 0, 47.5], [0, 90, 35.5]]
+    np.savetxt(root / "intrinsic/intrinsic_depth.txt", K)
+    for camera in ("color", "depth"):
+        np.savetxt(root / f"intrinsic/extrinsic_{camera}.txt", np.eye(4))
+    return root
+
+
+def test_scannet_registers_depth_into_the_larger_picture_and_drops_lost_frames(tmp_path):
+    scene = read_scannet(scannet(tmp_path))
+    assert scene.names == ("0.jpg", "2.jpg", "10.jpg")
+    assert "1 of 4 frames were lost by the tracker: dropped (1.jpg)" in messages(scene)
+    depth = scene.views[0].load().depth
+    assert depth.shape == (144, 192)
+    np.testing.assert_allclose(depth[4:], 2, rtol=1e-5)  # no pinholes at twice the resolution
+    assert (depth[:2, :4] == 0).all()
+
+
+def test_scannet_moved_depth_camera_is_pointed_out(tmp_path):
+    root = scannet(tmp_path)
+    moved = np.eye(4)
+    moved[0, 3] = 0.1
+    np.savetxt(root / "intrinsic/extrinsic_color.txt", moved)
+    scene = read_scannet(root)
+    assert "camera-from-rig" in messages(scene)
+    depth = scene.views[0].load().depth  # 180 * 0.1 / 2 m = 9 pixels
+    assert not depth[:, :9].any()
+    assert depth[10:, 10:].all()
+
+
+def test_scannet_with_every_frame_lost(tmp_path):
+    root = scannet(tmp_path)
+    for path in (root / "pose").iterdir():
+        np.savetxt(path, np.full((4, 4), -np.inf))
+    with pytest.raises(
+        ProjectError, match=r"no frame with picture and pose .* lost by the tracker"
+    ):
+        read_scannet(root)
