@@ -32,12 +32,12 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
             or "auto" (by the count of numbers in the first line: 8 or 12).
 
     Returns:
-        V cameras; the names are the timestamps as written (TUM) or running numbers (KITTI).
+        V cameras; the names are the timestamps as written (TUM; a repeated one gets _1, _2, ...)
+        or running numbers (KITTI).
 
     Raises:
         ProjectError: unreadable or empty; a line with another count of numbers, something that is
-            no number, a rotation that is none, or a timestamp that was there before. The message
-            names the line.
+            no number, or a rotation that is none. The message names the line.
     """
     path = Path(path)
     rows = _rows(path)
@@ -49,7 +49,7 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
         )
     poses: list[Float64] = []
     names: list[str] = []
-    known: dict[str, int] = {}
+    repeats: dict[str, int] = {}
     for number, words in rows:
         values = _numbers(words, count, where=f"{path}:{number}")
         if count == 8:
@@ -63,12 +63,10 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
         except ShapeError as error:
             raise ProjectError(str(error)) from None
         name = words[0] if count == 8 else f"{len(names):06d}"
-        if name in known:
-            raise ProjectError(
-                f"{path}:{number}: timestamp {name} stands in line {known[name]} too; "
-                "expected each once"
-            )
-        known[name] = number
+        # Published ground truth holds repeated timestamps; names have to differ.
+        repeats[name] = repeats.get(name, -1) + 1
+        if repeats[name]:
+            name = f"{name}_{repeats[name]}"
         names.append(name)
     return _with_intrinsics(np.array(poses), like, names, path)
 

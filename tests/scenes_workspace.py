@@ -12,13 +12,13 @@ from PIL import Image
 WIDTH, HEIGHT = 96, 72
 
 # Parameters for 96x72 pictures of every perspective model that COLMAP has.
-LENSES = {
+LENSES: dict[str, list[float]] = {
     "SIMPLE_PINHOLE": [90, 48, 36],
     "PINHOLE": [90, 92, 47, 37],
     "SIMPLE_RADIAL": [90, 48, 36, -0.15],
     "RADIAL": [90, 48, 36, 0.1, -0.02],
     "OPENCV": [90, 91, 48, 36, 0.05, -0.07, 0.002, -0.002],
-    "FULL_OPENCV": [90, 91, 48, 36, 0.1, 0.01, 0.001, 0.001, 0.01, 0.1, 0.01, 0.01],
+    "FULL_OPENCV": [90, 91, 48, 36, 0.1, 0.01, 0.001, 0.001, 0.01, 0.02, 0.01, 0.01],
     "FOV": [90, 91, 48, 36, 0.4],
     "SIMPLE_DIVISION": [90, 48, 36, -0.05],
     "DIVISION": [90, 91, 48, 36, -0.05],
@@ -117,7 +117,8 @@ def depth_picture(metres: float = 2.0, unit: float = 1e-3) -> np.ndarray:
 def sevenscenes(root: Path, frames: int = 3) -> Path:
     """Write a folder in the 7-Scenes layout."""
     root.mkdir(parents=True, exist_ok=True)
-    np.savetxt(root / "camera-intrinsics.txt", [[90, 0, 47.5], [0, 90, 35.5], [0, 0, 1]])
+    K = np.array([[90, 0, 47.5], [0, 90, 35.5], [0, 0, 1]])
+    np.savetxt(root / "camera-intrinsics.txt", K)
     for i in range(frames):
         save(root / f"frame-{i:06d}.color.png", ramp())
         save(root / f"frame-{i:06d}.depth.png", depth_picture())

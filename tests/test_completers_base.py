@@ -35,7 +35,7 @@ def painter():
 
 def _camera(width: int = 8, height: int = 6) -> Cameras:
     K = np.array([[[10.0, 0, width / 2], [0, 10, height / 2], [0, 0, 1]]])
-    return Cameras(K, np.eye(4)[None], width, height, ("a",))
+    return Cameras(K, np.eye(4)[None], np.array([width]), np.array([height]), ("a",))
 
 
 @pytest.mark.parametrize("name", available())
@@ -58,9 +58,9 @@ def test_listing_the_completers_imports_none_of_them():
 def test_texts_become_the_types_of_the_fields(painter):
     made = create("painter", strength="0.25", rounds="3", soft="true", limit="none")
     assert made == _Painter(0.25, 3, True, None)
-    assert create("painter", strength=1, limit="2").strength == 1.0
-    assert isinstance(create("painter", strength=1).strength, float)
-    assert create("painter", strength=1, limit="2").limit == 2.0
+    whole = create("painter", strength=1, limit="2")
+    assert whole == _Painter(1.0, limit=2.0)
+    assert isinstance(vars(whole)["strength"], float)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from gvtools.completers.hole_depth import fill_depth
 HEIGHT, WIDTH, FOCAL = 120, 160, 150.0
 
 
-def _grid() -> tuple[np.ndarray, np.ndarray]:
+def _grid() -> np.ndarray:
     return np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
 
 
@@ -71,15 +71,15 @@ def test_a_hole_inside_the_square_is_the_square():
 
 def test_a_room_corner_hidden_by_a_hole_is_found_again():
     # Seen from inside a room, the nearest plane is the surface: the largest inverse depth.
-    y, x = _grid()
+    x = _grid()[1]
     room = np.maximum(0.30 + 0.0015 * (x - 80), 0.30 - 0.0015 * (x - 80))
-    valid = _holes(np.s_[45:75, 65:95])
+    valid = _holes(np.s_[30:90, 50:110])
     result = _fill(room, valid)
     error = np.abs(result.inverse / room - 1)[~valid]
     assert np.quantile(error, 0.9) < 0.01
-    # A membrane from all the rim would round the corner off.
+    # Smooth interpolation from all the rim rounds the corner off.
     naive = inpaint_biharmonic(np.where(valid, room, 0), ~valid)
-    assert error.mean() < 0.5 * np.abs(naive / room - 1)[~valid].mean()
+    assert error.mean() < 0.4 * np.abs(naive / room - 1)[~valid].mean()
 
 
 def test_noise_does_not_tilt_planes():
@@ -95,8 +95,7 @@ def test_noise_does_not_tilt_planes():
 
 
 def test_nothing_known_stays_unknown_and_everything_known_stays_as_it_is():
-    y, x = _grid()
-    plane = 0.4 + 0.0005 * x
+    plane = 0.4 + 0.0005 * _grid()[1]
     empty = _fill(plane, np.zeros((HEIGHT, WIDTH), bool))
     assert not empty.inverse.any() and (empty.hits == -1).all()
     full = _fill(plane, np.ones((HEIGHT, WIDTH), bool))
@@ -124,7 +123,6 @@ def test_hits_are_the_first_known_pixels_of_a_plain_march():
 
 def test_a_thin_rim_stops_every_direction():
     # One pixel thin, yet no knight's move may leap over it to the surface behind.
-    y, x = _grid()
     inverse = np.full((HEIGHT, WIDTH), 0.5)
     valid = np.zeros((HEIGHT, WIDTH), bool)
     valid[:, 60] = valid[:, 100:] = True
@@ -134,7 +132,7 @@ def test_a_thin_rim_stops_every_direction():
 
 
 def test_the_fill_stays_within_limits_and_says_so():
-    y, x = _grid()
+    y = _grid()[0]
     floor = 0.002 * (y - 20.0) + 1e-4
     valid = y >= 60
     result = _fill(np.where(valid, floor, 1.0), valid)

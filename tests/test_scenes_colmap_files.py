@@ -1,3 +1,4 @@
+# mypy: no-check-untyped-defs
 from __future__ import annotations
 
 import re
@@ -80,6 +81,24 @@ def test_text_model_without_point_lines_does_not_lose_every_second_image(tmp_pat
     lines = [line for line in path.read_text().splitlines() if line.endswith(".png")]
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(ProjectError, match="two lines"):
+        read_colmap(tmp_path)
+
+
+def test_points_cut_off_at_a_line_end_are_noticed(tmp_path):
+    workspace(tmp_path, text=True)
+    path = tmp_path / "sparse/0/points3D.txt"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-3]))
+    with pytest.raises(ProjectError, match="points that points3D does not hold"):
+        read_colmap(tmp_path)
+
+
+def test_point_that_is_not_finite_is_refused(tmp_path):
+    workspace(tmp_path)
+    path = tmp_path / "sparse/0/points3D.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, 8 + 8, float("inf"))
+    path.write_bytes(data)
+    with pytest.raises(ProjectError, match="1 sparse points hold NaN or infinity"):
         read_colmap(tmp_path)
 
 

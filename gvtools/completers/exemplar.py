@@ -26,6 +26,9 @@ from gvtools.guidance import Guidance
 SOURCE_SPAN = 0.1
 # Photographs that weigh at least this much fix a pixel's colour before the synthesis.
 FIXED_EVIDENCE = 0.5 * EVIDENCE_WEIGHT
+# Synthesised pixels count less by this factor for each pixel from the rim, down to the floor, so
+# that texture grows inward from what is known.
+FADE, FADE_FLOOR = 0.8, 0.02
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class ExemplarCompleter(InpaintCompleter):
 
     source_views: int = 1
     levels: int = 4
-    iterations: int = 3
+    iterations: int = 5
 
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
@@ -127,7 +130,13 @@ class _Level:
         known: NDArray[np.bool_],
         sources: Sequence[Source],
     ) -> None:
-        from scipy.ndimage import binary_dilation, binary_erosion, maximum_filter, minimum_filter
+        from scipy.ndimage import (
+            binary_dilation,
+            binary_erosion,
+            distance_transform_edt,
+            maximum_filter,
+            minimum_filter,
+        )
 
         self.rgb, self.inverse, self.known, self.parts = rgb, inverse, known, list(sources)
         size = 2 * RADIUS + 1
@@ -142,6 +151,8 @@ class _Level:
             flat = maximum_filter(far, size) - minimum_filter(far, size) <= SOURCE_SPAN * far
             whole = binary_erosion(usable, np.ones((size, size)))
             self.eligible[window] = flat & whole
+        distance = distance_transform_edt(~known) if known.any() else np.zeros(known.shape)
+        self.certainty = np.maximum(FADE**distance, FADE_FLOOR)
         self.choices = np.flatnonzero(self.eligible)
         unknown = ~known & (inverse > 0)
         reach = binary_dilation(unknown, np.ones((size, size))) & (inverse > 0)
@@ -179,7 +190,7 @@ class _Level:
         """Improve the field in place; the cost of each domain pixel."""
         return np.asarray(
             search(
-                self.rgb, self.inverse, self.known, self.sources, self.depths, self.eligible,
+                self.rgb, self.inverse, self.certainty, self.sources, self.depths, self.eligible,
                 self.choices, self.domain, self.row_of, field, state, passes,
             )
         )  # fmt: skip
@@ -189,7 +200,7 @@ class _Level:
     ) -> NDArray[np.float32]:
         """The unknown pixels rebuilt from the field."""
         return np.asarray(
-            vote(self.rgb, self.inverse, self.known, self.sources, self.domain, self.row_of,
+            vote(self.rgb, self.inverse, self.certainty, self.sources, self.domain, self.row_of,
                  field, cost, sharpness)
         )  # fmt: skip
 

@@ -25,6 +25,8 @@ from gvtools.guidance import Guidance
 
 # Weight of a reliable photograph against one neighbour, in the diffusion.
 EVIDENCE_WEIGHT = 8.0
+# Relative disagreement of the planes about a depth that halves its confidence.
+DISAGREEMENT = 0.05
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ def complete_views(
         colored = color(rgb[index], valid, hole)
         rgb[index][holes] = colored[holes]
         depth[index][holes] = fill[holes]
-        confidence[index][holes] = _confidence(valid, surface.distance, options)[holes]
+        confidence[index][holes] = _confidence(valid, surface, options)[holes]
         spent["filled"] += float(holes.sum())
         spent["from_context"] += float((weight > 0.5).sum())
         spent["depth_clipped"] += float(surface.clipped)
@@ -135,18 +137,20 @@ def complete_views(
 
 
 def _confidence(
-    valid: NDArray[np.bool_], distance: Float64, options: InpaintCompleter
+    valid: NDArray[np.bool_], surface: HoleDepth, options: InpaintCompleter
 ) -> NDArray[np.float32]:
-    """(H, W): falls with the distance to the rim and with the extent of the hole."""
+    """(H, W): falls with the distance to the rim, the hole's extent, and disagreeing planes."""
     from scipy.ndimage import label, maximum
 
     length = options.confidence_reach * float(np.hypot(*valid.shape))
     labels, count = label(~valid, structure=np.ones((3, 3)))
     # A hole's extent is its inner radius: the largest distance to the rim that it holds.
-    depth, hole = distance[~valid], labels[~valid]
-    extent = np.concatenate([[0.0], maximum(depth, hole, np.arange(1, count + 1))])[hole]
+    distance, hole = surface.distance[~valid], labels[~valid]
+    extent = np.concatenate([[0.0], maximum(distance, hole, np.arange(1, count + 1))])[hole]
+    agreement = 1 / (1 + surface.spread[~valid] / DISAGREEMENT)
     value = np.zeros(valid.shape, np.float32)
-    value[~valid] = options.confidence * np.exp(-depth / length) / np.sqrt(1 + extent / length)
+    value[~valid] = options.confidence * agreement * np.exp(-distance / length)
+    value[~valid] /= np.sqrt(1 + extent / length)
     return value
 
 

@@ -19,8 +19,6 @@ RADIUS = 3
 SURFACE = 0.05
 # Sources nearer or farther than this factor show texture at another scale.
 DEPTH_FACTOR = 1.5
-# Pixels still being synthesised count this much against known ones in a comparison.
-UNKNOWN_WEIGHT = 0.4
 
 
 @numba.njit(cache=True)
@@ -35,7 +33,7 @@ def _draw(state):
 
 
 @numba.njit(cache=True)
-def _cost(rgb, inverse, known, sources, depths, y, x, s, sy, sx, limit):
+def _cost(rgb, inverse, certainty, sources, depths, y, x, s, sy, sx, limit):
     """Mean squared colour difference of two patches, given up above ``limit``."""
     height, width = inverse.shape
     here = inverse[y, x]
@@ -59,7 +57,7 @@ def _cost(rgb, inverse, known, sources, depths, y, x, s, sy, sx, limit):
                 continue
             if abs(inverse[ty, tx] - here) > SURFACE * here:
                 continue
-            weight = 1.0 if known[ty, tx] else UNKNOWN_WEIGHT
+            weight = certainty[ty, tx]
             a = rgb[ty, tx, 0] - sources[s, sy + dy, sx + dx, 0]
             b = rgb[ty, tx, 1] - sources[s, sy + dy, sx + dx, 1]
             c = rgb[ty, tx, 2] - sources[s, sy + dy, sx + dx, 2]
@@ -71,13 +69,13 @@ def _cost(rgb, inverse, known, sources, depths, y, x, s, sy, sx, limit):
 
 
 @numba.njit(cache=True)
-def _consider(rgb, inverse, known, sources, depths, eligible, field, cost, m, y, x, s, sy, sx):
+def _consider(rgb, inverse, certainty, sources, depths, eligible, field, cost, m, y, x, s, sy, sx):
     """Take the source (s, sy, sx) for domain pixel m when it is allowed and better."""
     if sy < 0 or sy >= eligible.shape[1] or sx < 0 or sx >= eligible.shape[2]:
         return
     if not eligible[s, sy, sx]:
         return
-    value = _cost(rgb, inverse, known, sources, depths, y, x, s, sy, sx, cost[m])
+    value = _cost(rgb, inverse, certainty, sources, depths, y, x, s, sy, sx, cost[m])
     if value < cost[m]:
         cost[m] = value
         field[m, 0], field[m, 1], field[m, 2] = s, sy, sx
@@ -85,14 +83,25 @@ def _consider(rgb, inverse, known, sources, depths, eligible, field, cost, m, y,
 
 @numba.njit(cache=True)
 def search(
-    rgb, inverse, known, sources, depths, eligible, choices, domain, row_of, field, state, passes
+    rgb,
+    inverse,
+    certainty,
+    sources,
+    depths,
+    eligible,
+    choices,
+    domain,
+    row_of,
+    field,
+    state,
+    passes,
 ):
     """Improve the field in place; returns the cost of each domain pixel.
 
     Args:
         rgb: (H, W, 3) the current estimate.
         inverse: (H, W) inverse depth.
-        known: (H, W) bool.
+        certainty: (H, W), 1 where the colour is known, less where it is being synthesised.
         sources: (S, Hs, Ws, 3) images to copy from.
         depths: (S, Hs, Ws) their inverse depth, 0 = unknown.
         eligible: (S, Hs, Ws) bool, centres of patches that may be copied.
@@ -110,7 +119,7 @@ def search(
         y, x = domain[m] // width, domain[m] % width
         s, sy, sx = field[m]
         if eligible[s, sy, sx]:
-            cost[m] = _cost(rgb, inverse, known, sources, depths, y, x, s, sy, sx, np.inf)
+            cost[m] = _cost(rgb, inverse, certainty, sources, depths, y, x, s, sy, sx, np.inf)
     for turn in range(passes):
         way = 1 if turn % 2 == 0 else -1
         for step in range(len(domain)):
@@ -120,29 +129,31 @@ def search(
                 y1, x1 = (y, x - way) if axis == 0 else (y - way, x)
                 if 0 <= y1 < height and 0 <= x1 < width and row_of[y1, x1] >= 0:
                     n = row_of[y1, x1]
-                    _consider(rgb, inverse, known, sources, depths, eligible, field, cost, m, y, x,
-                              field[n, 0], field[n, 1] + y - y1, field[n, 2] + x - x1)  # fmt: skip
+                    _consider(
+                        rgb, inverse, certainty, sources, depths, eligible, field, cost, m, y, x,
+                        field[n, 0], field[n, 1] + y - y1, field[n, 2] + x - x1,
+                    )  # fmt: skip
             pick = choices[int(_draw(state) * len(choices))]
-            _consider(rgb, inverse, known, sources, depths, eligible, field, cost, m, y, x,
+            _consider(rgb, inverse, certainty, sources, depths, eligible, field, cost, m, y, x,
                       pick // (tall * wide), pick // wide % tall, pick % wide)  # fmt: skip
             reach = max(tall, wide) // 4
             while reach >= 1:
                 sy = field[m, 1] + int((2 * _draw(state) - 1) * reach)
                 sx = field[m, 2] + int((2 * _draw(state) - 1) * reach)
-                _consider(rgb, inverse, known, sources, depths, eligible, field, cost, m, y, x,
+                _consider(rgb, inverse, certainty, sources, depths, eligible, field, cost, m, y, x,
                           field[m, 0], sy, sx)  # fmt: skip
                 reach //= 3
     return cost
 
 
 @numba.njit(cache=True)
-def vote(rgb, inverse, known, sources, domain, row_of, field, cost, sharpness):
+def vote(rgb, inverse, certainty, sources, domain, row_of, field, cost, sharpness):
     """(H, W, 3): each unknown pixel from the patches of its surface that cover it."""
     height, width = inverse.shape
     result = rgb.copy()
     for m in range(len(domain)):
         y, x = domain[m] // width, domain[m] % width
-        if known[y, x]:
+        if certainty[y, x] >= 1:
             continue
         here = inverse[y, x]
         # Weights are relative to the best covering patch, so that exp cannot underflow everywhere.
@@ -163,6 +174,7 @@ def vote(rgb, inverse, known, sources, domain, row_of, field, cost, sharpness):
                         best = min(best, cost[n])
                         continue
                     weight = math.exp(-(cost[n] - best) / sharpness - 0.2 * (dy * dy + dx * dx))
+                    weight *= certainty[y1, x1]
                     s, sy, sx = field[n, 0], field[n, 1] - dy, field[n, 2] - dx
                     total += weight
                     red += weight * sources[s, sy, sx, 0]

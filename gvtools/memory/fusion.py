@@ -126,7 +126,7 @@ def fuse_blocks(
     """Fuse one view's points, grouped by block; returns (records, runs, agreements).
 
     New records are appended block by block, so each (block, view) is one contiguous run with a
-    tight bounding box (``run_box``: min xyz, max xyz). Records of earlier rounds are never
+    tight bounding box (``run_box``: min xyz, max xyz, largest spacing). Records of earlier rounds are never
     changed: what agrees with one is logged as (record, confidence).
     """
     largest = 0
@@ -253,6 +253,7 @@ def fuse_blocks(
                     high = max(high, r_position[i, k])
                 run_box[runs, k] = low
                 run_box[runs, 3 + k] = high
+            run_box[runs, 6] = r_spacing[first:count].max()
             runs += 1
             report[ADDED] += count - first
     return count, runs, agreed

@@ -59,14 +59,15 @@ class Runs:
         start: (C,) int64, first observation.
         length: (C,) int32, observations.
         view: (C,) int32, row of the view table.
-        box: (C, 6) float32, bounding box of the positions: min xyz, max xyz.
+        box: (C, 7) float32, scene units: bounding box of the positions (min xyz, max xyz) and the
+            largest spacing.
     """
 
     count: int = 0
     start: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     length: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     view: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
-    box: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 6), np.float32))
+    box: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 7), np.float32))
 
     ARRAYS = ("start", "length", "view", "box")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     import open3d as o3d
 
     from gvtools.guidance import Guidance
+    from gvtools.memory.splat import SplatOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +42,7 @@ class MemoryOptions:
             observed surface.
     """
 
-    same_direction: float = 4.0
+    same_direction: float = 2.0
     finer: float = 0.7
     observations_per_voxel: int = 12
     weight_cap: float = 100.0
@@ -194,7 +196,7 @@ class SpatialMemory:
         if generated and arrived:
             hit = in_free_space(
                 points.positions,
-                self._observed_grids(),
+                self.observed_grids(range(len(self.views))),
                 tolerance=self.options.free_space_tolerance,
             )
             free = int((hit & keep).sum())
@@ -212,11 +214,14 @@ class SpatialMemory:
             out_of_reach=report.out_of_reach + unusable,
         )
 
-    def _observed_grids(self):
+    def observed_grids(
+        self, rows: Iterable[int]
+    ) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]]:
+        """K, cam_from_local and free-space grid of the observed views among ``rows``."""
         views = self.views
         return [
-            (views.cameras.K[i], views.cam_from_local[i], views[i].free_depth)
-            for i in range(len(views))
+            (views[i].camera.K[0], views.cam_from_local[i], views[i].free_depth)
+            for i in rows
             if not views.generated[i]
         ]
 
@@ -241,7 +246,7 @@ class SpatialMemory:
         first = records.count
         run_start = np.empty(len(touched), np.int64)
         run_length = np.empty(len(touched), np.int32)
-        run_box = np.empty((len(touched), 6), np.float32)
+        run_box = np.empty((len(touched), 7), np.float32)
         agreed_record = np.empty(count, np.int32)
         agreed_weight = np.empty(count, np.float32)
         tally = np.zeros(fusion.REPORT_SIZE, np.int64)
@@ -332,11 +337,11 @@ class SpatialMemory:
             index.block_offset, index.block_log2, index.block_count, blocks, records.next,
         )  # fmt: skip
 
-    def project(self, cameras: Cameras, **options: object) -> Guidance:
-        """Project the memory into cameras; see gvtools.memory.splat.project."""
+    def project(self, cameras: Cameras, *, options: SplatOptions | None = None) -> Guidance:
+        """Project the memory into cameras of one size; see gvtools.memory.splat.project."""
         from gvtools.memory.splat import project
 
-        return project(self, cameras, **options)
+        return project(self, cameras, options=options)
 
     def point_cloud(self) -> o3d.t.geometry.PointCloud:
         """The observations as an Open3D tensor point cloud.

@@ -169,48 +169,69 @@ def sparse_points(
 
     Returns:
         The points ordered by id (None when the model has none), and what was dropped.
+
+    Raises:
+        ProjectError: detections of points that are not there, or points that are not finite.
     """
     points = model.reconstruction.points3D
     if not len(points):
         return None, [Finding("info", "the model has no sparse points")]
-    ids = sorted(points)
-    elements = np.array(
-        [
-            (row, element.image_id, element.point2D_idx)
-            for row, key in enumerate(ids)
-            for element in points[key].track.elements
-        ],
-        np.int64,
-    ).reshape(-1, 3)
-    xy = np.full((len(elements), 2), np.nan)
-    view = np.full(len(elements), -1, np.int64)
-    for image in model.images:
-        if image.image_id not in view_of_image:
-            continue
-        rows = np.flatnonzero(elements[:, 1] == image.image_id)
-        view[rows] = view_of_image[image.image_id]
-        keypoints = np.array(
-            [point.xy for point in model.reconstruction.images[image.image_id].points2D]
-        ).reshape(-1, 2)
-        xy[rows] = model.lenses[image.camera_id].points(keypoints[elements[rows, 2]])
+    ids = np.array(sorted(points), np.uint64)
+    tracks = [_observations(model, image, view_of_image, ids) for image in model.images]
+    point = np.concatenate([track[0] for track in tracks])
+    view = np.concatenate([track[1] for track in tracks])
+    xy = np.concatenate([track[2] for track in tracks])
     findings = []
-    lost = int((view < 0).sum())
+    lost = model.reconstruction.compute_num_observations() - len(view)
     if lost:
         findings.append(Finding("info", f"{lost} track elements belong to views that are not read"))
-    sound = (view >= 0) & np.isfinite(xy).all(axis=1)
-    bent = len(view) - lost - int(sound.sum())
-    if bent:
+    sound = np.isfinite(xy).all(axis=1)
+    if not sound.all():
+        bent = int((~sound).sum())
         findings.append(
             Finding("warning", f"{bent} detections lie where the lens has no inverse: dropped")
         )
+    # By point, then by view: the model's own order depends on its tables.
+    rows = np.lexsort((view, point))
+    rows = rows[sound[rows]]
+    ordered = [points[int(key)] for key in ids]
+    positions = np.array([item.xyz for item in ordered], np.float64)
+    if not np.isfinite(positions).all():
+        raise ProjectError(
+            f"{model.files.folder}: {int((~np.isfinite(positions)).any(axis=1).sum())} sparse "
+            "points hold NaN or infinity; expected finite positions; export the model again"
+        )
     return (
         SparsePoints(
-            np.array([points[key].xyz for key in ids], np.float64),
-            np.array([points[key].color for key in ids], np.uint8),
-            np.array([points[key].error for key in ids], np.float32),
-            elements[sound, 0].astype(np.int32),
-            view[sound].astype(np.int32),
-            xy[sound],
+            positions,
+            np.array([item.color for item in ordered], np.uint8),
+            np.array([item.error for item in ordered], np.float32),
+            point[rows],
+            view[rows],
+            xy[rows],
         ),
         findings,
     )
+
+
+def _observations(
+    model: ColmapModel,
+    image: RegisteredImage,
+    view_of_image: dict[int, int],
+    ids: NDArray[np.uint64],
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
+    """Point index, view index and pinhole pixels of all that one image saw."""
+    if image.image_id not in view_of_image:
+        return np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2))
+    seen = model.reconstruction.images[image.image_id].get_observation_points2D()
+    keys = np.fromiter((point.point3D_id for point in seen), np.uint64, len(seen))
+    xy = np.array([point.xy for point in seen], np.float64).reshape(-1, 2)
+    view = np.full(len(seen), view_of_image[image.image_id], np.int32)
+    point_index = np.minimum(np.searchsorted(ids, keys), len(ids) - 1).astype(np.int32)
+    strange = int((ids[point_index] != keys).sum())
+    if strange:
+        raise ProjectError(
+            f"{model.files.folder}: {strange} detections of image {image.name} name points that "
+            "points3D does not hold; expected files of one model; export the model again"
+        )
+    return point_index, view, model.lenses[image.camera_id].points(xy)

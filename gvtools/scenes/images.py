@@ -31,7 +31,7 @@ class ImageHeader:
         width: pixels, as stored.
         height: pixels, as stored.
         mode: Pillow's name of the pixel layout ("RGB", "L", "RGBA", "I;16", ...).
-        orientation: EXIF orientation, 1 when absent.
+        orientation: EXIF orientation of a JPEG, 1 when absent.
     """
 
     width: int
@@ -66,7 +66,9 @@ def read_header(path: Path) -> ImageHeader:
     """
     try:
         with Image.open(path) as image:
-            orientation = int(image.getexif().get(_EXIF_ORIENTATION, 1) or 1)
+            # Other formats are decoded whole when asked for EXIF.
+            exif = image.getexif() if image.format in ("JPEG", "MPO") else {}
+            orientation = int(exif.get(_EXIF_ORIENTATION, 1) or 1)
             return ImageHeader(image.width, image.height, image.mode, orientation)
     except _UNREADABLE as error:
         raise _unreadable(path, error) from None
@@ -137,8 +139,10 @@ def read_depth(
         ProjectError: absent, truncated, 8-bit, coloured, or not two-dimensional.
     """
     raw = _load_array(path) if path.suffix in (".npy", ".npz") else _load_depth_image(path)
-    if raw.ndim == 3 and 1 in (raw.shape[0], raw.shape[-1]):
-        raw = raw[0] if raw.shape[0] == 1 else raw[..., 0]
+    if raw.ndim == 3 and raw.shape[-1] == 1:
+        raw = raw[..., 0]
+    elif raw.ndim == 3 and raw.shape[0] == 1:
+        raw = raw[0]
     if raw.ndim != 2 or raw.dtype.kind not in "uif":
         raise ProjectError(
             f"{path}: depth of shape {raw.shape} and type {raw.dtype}; expected (height, width) "

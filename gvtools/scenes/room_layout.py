@@ -41,7 +41,7 @@ class Room:
     Attributes:
         size: (3,) metres.
         patches: all surfaces.
-        solids: what hides things from one another; the walls are not among them.
+        solids: what casts shadows; the walls and small things are not among them.
         lamps: area lights.
     """
 
@@ -93,7 +93,9 @@ class _Builder:
         tiles = (1.0, 1.0) if once else (length / TILE, breadth / TILE)
         self.patches.append(Flat(texture, tiles, emission, origin, u, v, round))
 
-    def box(self, at: _Frame, low: Color, high: Color, *, texture: Texture) -> None:
+    def box(
+        self, at: _Frame, low: Color, high: Color, *, texture: Texture, shadow: bool = True
+    ) -> None:
         """A box between two corners in a place's axes."""
         low_, high_ = np.array(low), np.array(high)
         x, y, z = np.diag(high_ - low_) @ at.axes()
@@ -110,7 +112,8 @@ class _Builder:
             if flipped:
                 origin, u = origin + u, -u
             self.flat(origin, u, v, texture=texture)
-        self.solids.append(Block((a + b) / 2, (high_ - low_) / 2, at.yaw))
+        if shadow:
+            self.solids.append(Block((a + b) / 2, (high_ - low_) / 2, at.yaw))
 
     def post(self, foot: Float64, radius: float, height: float, *, texture: Texture) -> None:
         """A cylinder with its lid."""
@@ -163,7 +166,7 @@ def _shell(build: _Builder, size: Float64) -> None:
     corner = np.array([*(size[:2] - lamp[:2]) / 2, size[2] - 0.012])
     u, v = np.diag(lamp)[:2]
     build.flat(corner, u, v, texture=paint((1, 1, 0.97), grain=0.004), emission=1.6)
-    build.lamps.append(Lamp(corner, u, v, np.array([1.0, 0.95, 0.86]) * 2.2))
+    build.lamps.append(Lamp(corner, u, v, np.array([1.0, 0.95, 0.86]) * 3.0))
 
 
 def _walls(build: _Builder, size: Float64) -> None:
@@ -276,6 +279,7 @@ def _shelf(build: _Builder, at: _Frame, start: float, width: float) -> float:
                 (x, 0.03, z + board),
                 (x + thick, deep - back, z + board + tall),
                 texture=coats[rng.integers(len(coats))],
+                shadow=False,
             )
             x += thick + (rng.uniform(0.1, 0.3) if rng.random() < 0.2 else 0.004)
     return height

@@ -13,7 +13,7 @@ from gvtools.scenes.ray_casting import Patch
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
-CELL = 0.08  # edge of a light-map cell, scene units
+CELL = 0.09  # edge of a light-map cell, scene units
 AMBIENT_REACH = 1.3  # what is farther than this does not darken a corner, scene units
 LIFT = 4e-3  # rays start this far above their surface, scene units
 
@@ -31,6 +31,10 @@ class Block:
     center: Float64
     half: Float64
     yaw: float = 0.0
+
+    def ball(self) -> tuple[Float64, float]:
+        """Centre and radius of a ball round it."""
+        return self.center, float(np.linalg.norm(self.half))
 
     def interval(self, origin: Float64, ray: Float64) -> tuple[Float64, Float64]:
         """Where (N, 3) rays enter and leave, in multiples of ``ray``; entry > exit: missed."""
@@ -54,6 +58,10 @@ class Sphere:
     center: Float64
     radius: float
 
+    def ball(self) -> tuple[Float64, float]:
+        """Centre and radius of a ball round it."""
+        return self.center, self.radius
+
     def interval(self, origin: Float64, ray: Float64) -> tuple[Float64, Float64]:
         """Where (N, 3) rays enter and leave, in multiples of ``ray``; entry > exit: missed."""
         offset = origin - self.center
@@ -75,6 +83,11 @@ class Cylinder:
     foot: Float64
     radius: float
     height: float
+
+    def ball(self) -> tuple[Float64, float]:
+        """Centre and radius of a ball round it."""
+        half = self.height / 2
+        return self.foot + np.array([0, 0, half]), float(np.hypot(self.radius, half))
 
     def interval(self, origin: Float64, ray: Float64) -> tuple[Float64, Float64]:
         """Where (N, 3) rays enter and leave, in multiples of ``ray``; entry > exit: missed."""
@@ -98,16 +111,6 @@ def _roots(a: Float64, b: Float64, c: Float64) -> tuple[Float64, Float64]:
     root = np.sqrt(np.maximum(discriminant, 0))
     missed = discriminant < 0
     return np.where(missed, np.inf, (-b - root) / a), np.where(missed, -np.inf, (-b + root) / a)
-
-
-def first_hit(solids: Sequence[Solid], origin: Float64, ray: Float64) -> Float64:
-    """(N,) where (N, 3) rays meet the first solid, in multiples of ``ray``; infinity: nowhere."""
-    nearest = np.full(len(origin), np.inf)
-    for solid in solids:
-        enter, leave = solid.interval(origin, ray)
-        met = (enter < leave) & (leave > 0)
-        np.minimum(nearest, np.maximum(enter, 0), out=nearest, where=met)
-    return nearest
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +159,7 @@ def bake(
     shapes, places, normals = [], [], []
     for patch in patches:
         length, breadth = patch.size
-        shape = tuple(int(np.clip(round(x / CELL), 4, 96)) for x in (breadth, length))
+        shape = tuple(int(np.clip(round(x / CELL), 3, 96)) for x in (breadth, length))
         t, s = ((np.arange(n) + 0.5) / n for n in shape)
         position, normal = patch.at(*(grid.ravel() for grid in np.meshgrid(s, t)))
         shapes.append(shape)
@@ -166,21 +169,49 @@ def bake(
     light = ambient * _openness(place, normal, solids, room)[:, None]
     for lamp in lamps:
         light += _direct(place, normal, solids, lamp)
+    light[_buried(place, solids)] = np.nan
     split = np.cumsum([rows * columns for rows, columns in shapes])[:-1]
     return [
-        part.reshape(*shape, 3).astype(np.float32)
+        _filled(part.reshape(*shape, 3)).astype(np.float32)
         for part, shape in zip(np.split(light, split), shapes, strict=True)
     ]
 
 
+def _buried(place: Float64, solids: Sequence[Solid]) -> NDArray[np.bool_]:
+    """(N,) places inside a solid."""
+    inside = np.zeros(len(place), bool)
+    up = np.array([0.0, 0.0, 1.0])
+    for solid in solids:
+        center, radius = solid.ball()
+        rows = np.flatnonzero(((place - center) ** 2).sum(-1) < radius**2)
+        enter, leave = solid.interval(place[rows], np.broadcast_to(up, (len(rows), 3)))
+        inside[rows] |= (enter < 0) & (leave > 0)
+    return inside
+
+
+def _filled(light: Float64) -> Float64:
+    """Buried cells take their nearest neighbour's light, or they would darken the cells around."""
+    from scipy.ndimage import distance_transform_edt
+
+    buried = np.isnan(light[..., 0])
+    if not buried.any():
+        return light
+    if buried.all():
+        return np.zeros_like(light)
+    rows, columns = distance_transform_edt(buried, return_distances=False, return_indices=True)
+    return light[rows, columns]
+
+
 def _openness(
-    place: Float64, normal: Float64, solids: Sequence[Solid], room: Float64, *, rays: int = 28
+    place: Float64, normal: Float64, solids: Sequence[Solid], room: Float64, *, rays: int = 24
 ) -> Float64:
     """(N,) in [0, 1]: how far cosine-distributed rays get before they meet something."""
     side = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     tangent = np.cross(side, normal)
     tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
     bitangent = np.cross(normal, tangent)
+    near = [(solid, _near(place, solid, AMBIENT_REACH)) for solid in solids]
+    walls = Block(room / 2, room / 2)
     total = np.zeros(len(place))
     for i in range(rays):
         # Fibonacci points on the disk, lifted to the hemisphere: cosine-distributed, the same for
@@ -188,22 +219,44 @@ def _openness(
         r, angle = np.sqrt((i + 0.5) / rays), i * np.pi * (3 - np.sqrt(5))
         up = np.sqrt(1 - r * r)
         ray = r * np.cos(angle) * tangent + r * np.sin(angle) * bitangent + up * normal
-        _, wall = Block(room / 2, room / 2).interval(place, ray)
-        reach = np.minimum(first_hit(solids, place, ray), np.maximum(wall, 0))
-        total += np.sqrt(np.minimum(reach / AMBIENT_REACH, 1))
+        reach = np.clip(walls.interval(place, ray)[1], 0, AMBIENT_REACH)
+        for solid, rows in near:
+            enter, leave = solid.interval(place[rows], ray[rows])
+            met = np.where((enter < leave) & (leave > 0), np.maximum(enter, 0), np.inf)
+            reach[rows] = np.minimum(reach[rows], met)
+        total += np.sqrt(reach / AMBIENT_REACH)
     return total / rays
+
+
+def _near(place: Float64, solid: Solid, reach: float) -> NDArray[np.intp]:
+    center, radius = solid.ball()
+    return np.flatnonzero(((place - center) ** 2).sum(-1) < (radius + reach) ** 2)
 
 
 def _direct(place: Float64, normal: Float64, solids: Sequence[Solid], lamp: Lamp) -> Float64:
     axis = np.cross(lamp.v, lamp.u)
     axis = axis / np.linalg.norm(axis)
-    parts = list(lamp.samples(6, 4))
-    light = np.zeros(len(place))
-    for part in parts:
-        ray = part - place
-        distance = np.linalg.norm(ray, axis=-1)
-        strength = np.maximum((ray * normal).sum(-1), 0) * np.maximum(-(ray @ axis), 0)
-        rows = np.flatnonzero(strength > 0)
-        blocked = first_hit(solids, place[rows], ray[rows]) < 0.995
-        light[rows] += np.where(blocked, 0, strength[rows] / distance[rows] ** 4)
-    return light[:, None] / len(parts) * lamp.power
+    parts = np.array(list(lamp.samples(5, 4)))
+    ray = parts - place[:, None]
+    squared = (ray**2).sum(-1)
+    strength = np.maximum(np.einsum("npi,ni->np", ray, normal), 0) * np.maximum(-(ray @ axis), 0)
+    strength /= squared**2
+    middle = lamp.origin + (lamp.u + lamp.v) / 2
+    extent = float(np.linalg.norm(lamp.u) + np.linalg.norm(lamp.v)) / 2
+    lit = strength.any(axis=1)
+    for solid in solids:
+        rows = np.flatnonzero(lit & _between(place, middle, solid, extent))
+        for j in range(len(parts)):
+            enter, leave = solid.interval(place[rows], ray[rows, j])
+            strength[rows[(enter < leave) & (leave > 0) & (enter < 0.995)], j] = 0
+    return strength.mean(1)[:, None] * lamp.power
+
+
+def _between(place: Float64, end: Float64, solid: Solid, extent: float) -> NDArray[np.bool_]:
+    """(N,) whether a solid may stand between places and a lamp of that extent round ``end``."""
+    center, radius = solid.ball()
+    ray = end - place
+    along = ((center - place) * ray).sum(-1) / (ray**2).sum(-1)
+    along = np.clip(along, 0, 1)
+    gap = np.linalg.norm(place + along[:, None] * ray - center, axis=-1)
+    return gap < radius + extent * np.minimum(along + radius / np.linalg.norm(ray, axis=-1), 1)

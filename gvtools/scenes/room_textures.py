@@ -6,6 +6,7 @@ Only files inside the wheel are used, so nothing is downloaded. Colours are line
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +96,7 @@ def encode_srgb(linear: Float32) -> NDArray[np.uint8]:
     return np.rint(value * 255).astype(np.uint8)
 
 
+@cache
 def photograph(name: str) -> NDArray[np.uint8]:
     """(H, W, 3) uint8, a photograph of ``skimage.data`` by its function's name."""
     import skimage.data
@@ -114,13 +116,16 @@ def picture(name: str) -> Texture:
 
 def globe(name: str) -> Texture:
     """A photograph wrapped round a ball without a seam; the ball shows the tile's upper half."""
-    half = _resized(photograph(name), SIDE // 2, SIDE // 2)
+    image = photograph(name)
+    height, width = image.shape[:2]
+    image = image[height // 5 : -(height // 5), width // 5 : -(width // 5)]
+    half = _resized(image, SIDE // 2, SIDE // 2)
     return _pyramid(_mirrored(half), repeats=True, aspect=2)
 
 
 def paint(color: tuple[float, float, float], *, grain: float = 0.05, of: str = "gravel") -> Texture:
     """Weak texture: one sRGB colour with the faint relief of a photograph."""
-    relief = _contrast(_resized(photograph(of), SIDE // 2, SIDE // 2), grain)
+    relief = _contrast(_relief(of), grain)
     return _pyramid(_mirrored(_tinted(relief, color)), repeats=True, aspect=1)
 
 
@@ -128,8 +133,8 @@ def tiled(
     name: str, color: tuple[float, float, float], *, contrast: float = 1.0, turned: bool = False
 ) -> Texture:
     """A photograph of a material, mirrored so that it tiles without seams, in an sRGB tint."""
-    image = _resized(photograph(name), SIDE // 2, SIDE // 2)
-    relief = _contrast(np.rot90(image) if turned else image, 0.22 * contrast)
+    relief = _relief(name)
+    relief = _contrast(np.rot90(relief) if turned else relief, 0.22 * contrast)
     return _pyramid(_mirrored(_tinted(relief, color)), repeats=True, aspect=1)
 
 
@@ -168,13 +173,19 @@ def _resized(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.ui
     return np.asarray(picture.resize((width, height), Image.Resampling.LANCZOS))
 
 
-def _contrast(image: NDArray[np.uint8], amount: float) -> Float64:
-    """(h, w, 1) relief of mean 1 and standard deviation ``amount``, slow gradients removed."""
+@cache
+def _relief(name: str) -> Float64:
+    """(h, w) grey photograph of mean 0 and standard deviation 1, slow gradients removed."""
     from scipy.ndimage import gaussian_filter
 
-    grey = image.astype(np.float64).mean(-1)
+    grey = _resized(photograph(name), SIDE // 2, SIDE // 2).astype(np.float64).mean(-1)
     grey = grey - gaussian_filter(grey, SIDE / 8, mode="mirror")
-    return np.clip(1 + amount * grey / grey.std(), 0.1, 2)[..., None]
+    return grey / grey.std()
+
+
+def _contrast(relief: Float64, amount: float) -> Float64:
+    """(h, w, 1) factors of mean 1 and standard deviation ``amount``."""
+    return np.clip(1 + amount * relief, 0.1, 2)[..., None]
 
 
 def _tinted(relief: Float64, color: tuple[float, float, float]) -> NDArray[np.uint8]:

@@ -1,0 +1,277 @@
+"""The splatting kernels: culling of runs, depth pass, blending pass, resolving.
+
+The image is cut into bands of rows; each band walks the same runs in the same order, so the result
+does not depend on how many threads share the work.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+# Channels of the accumulator: weighted rgb, weight, weighted z, kernel, kernel x confidence,
+# generated weight.
+CHANNELS = 8
+NEAR = 1e-6
+TILE = 16
+FAST = {"nsz", "arcp", "contract", "reassoc"}
+
+
+@njit(cache=True, parallel=True)
+def cull_runs(boxes, cam_from_local, K, width, height, reach, rect, z_range):
+    """Image rectangle and depth range of each run's box.
+
+    Args:
+        boxes: (R, 7) float32, see Runs.
+        cam_from_local: (4, 4) float64.
+        K: (3, 3) float64.
+        width: pixels.
+        height: pixels.
+        reach: footprints extend this many spacings from their centre.
+        rect: out (R, 4) int32: first and last column, first and last row; empty (0, -1, 0, -1)
+            when the run is out of view.
+        z_range: out (R, 2) float32, nearest and farthest depth.
+    """
+    focal = max(K[0, 0], K[1, 1])
+    for i in prange(len(boxes)):
+        low_u = np.inf
+        high_u = -np.inf
+        low_v = np.inf
+        high_v = -np.inf
+        low_z = np.inf
+        high_z = -np.inf
+        for corner in range(8):
+            x = boxes[i, 3 * (corner & 1)]
+            y = boxes[i, 1 + 3 * ((corner >> 1) & 1)]
+            w = boxes[i, 2 + 3 * ((corner >> 2) & 1)]
+            cx = cam_from_local[0, 0] * x + cam_from_local[0, 1] * y + cam_from_local[0, 2] * w
+            cy = cam_from_local[1, 0] * x + cam_from_local[1, 1] * y + cam_from_local[1, 2] * w
+            cz = cam_from_local[2, 0] * x + cam_from_local[2, 1] * y + cam_from_local[2, 2] * w
+            cx += cam_from_local[0, 3]
+            cy += cam_from_local[1, 3]
+            cz += cam_from_local[2, 3]
+            low_z = min(low_z, cz)
+            high_z = max(high_z, cz)
+            if cz > NEAR:
+                u = (K[0, 0] * cx + K[0, 1] * cy) / cz + K[0, 2]
+                v = K[1, 1] * cy / cz + K[1, 2]
+                low_u = min(low_u, u)
+                high_u = max(high_u, u)
+                low_v = min(low_v, v)
+                high_v = max(high_v, v)
+        rect[i, 0] = 0
+        rect[i, 1] = -1
+        rect[i, 2] = 0
+        rect[i, 3] = -1
+        z_range[i, 0] = low_z
+        z_range[i, 1] = high_z
+        if high_z <= NEAR:
+            continue
+        if low_z <= NEAR:
+            # The box crosses the camera plane: its outline is not the corners' outline.
+            rect[i, 1] = width - 1
+            rect[i, 3] = height - 1
+            continue
+        pad = max(1.0, reach * boxes[i, 6] * focal / low_z) + 1.0
+        if high_u + pad < 0 or low_u - pad >= width or high_v + pad < 0 or low_v - pad >= height:
+            continue
+        rect[i, 0] = max(0, np.int64(np.floor(low_u - pad)))
+        rect[i, 1] = min(width - 1, np.int64(np.floor(high_u + pad)))
+        rect[i, 2] = max(0, np.int64(np.floor(low_v - pad)))
+        rect[i, 3] = min(height - 1, np.int64(np.floor(high_v + pad)))
+
+
+@njit(cache=True)
+def touching(rect, writable, runs):
+    """Those of ``runs`` (n,) whose rectangle holds a pixel to be written.
+
+    ``writable``: (H + 1, W + 1) int32, summed-area table of the pixels to be written.
+    """
+    out = np.empty(len(runs), np.int64)
+    n = 0
+    for r in runs:
+        c0, c1, r0, r1 = rect[r, 0], rect[r, 1] + 1, rect[r, 2], rect[r, 3] + 1
+        if writable[r1, c1] - writable[r0, c1] - writable[r1, c0] + writable[r0, c0] > 0:
+            out[n] = r
+            n += 1
+    return out[:n]
+
+
+@njit(cache=True)
+def in_front(rect, z_range, farthest, runs, band):
+    """Those of ``runs`` (n,) that lie wholly in front of something in their rectangle.
+
+    ``farthest``: the farthest depth of each tile of TILE pixels.
+    """
+    out = np.empty(len(runs), np.int64)
+    n = 0
+    for r in runs:
+        bound = np.float32(0)
+        for i in range(rect[r, 2] // TILE, rect[r, 3] // TILE + 1):
+            for j in range(rect[r, 0] // TILE, rect[r, 1] // TILE + 1):
+                bound = max(bound, farthest[i, j])
+        if z_range[r, 1] < bound * (1 - 2 * band):
+            out[n] = r
+            n += 1
+    return out[:n]
+
+
+@njit(cache=True)
+def summed_area(mask):
+    """(H + 1, W + 1) int32 summed-area table of a boolean image."""
+    height, width = mask.shape
+    table = np.zeros((height + 1, width + 1), np.int32)
+    for row in range(height):
+        line = np.int32(0)
+        for col in range(width):
+            line += mask[row, col]
+            table[row + 1, col + 1] = table[row, col + 1] + line
+    return table
+
+
+@njit(cache=True, fastmath=FAST)
+def _project_run(first, length, position, spacing, M, fx, fy, skew, cx, cy, focal, near, u, v, z,
+                 size):  # fmt: skip
+    """Centre-of-pixel coordinates, depth and footprint width (pixels) of one run's points."""
+    for k in range(length):
+        i = first + k
+        x = position[i, 0]
+        y = position[i, 1]
+        w = position[i, 2]
+        px = M[0, 0] * x + M[0, 1] * y + M[0, 2] * w + M[0, 3]
+        py = M[1, 0] * x + M[1, 1] * y + M[1, 2] * w + M[1, 3]
+        pz = M[2, 0] * x + M[2, 1] * y + M[2, 2] * w + M[2, 3]
+        z[k] = pz
+        inverse = np.float32(1) / max(pz, near)
+        u[k] = (fx * px + skew * py) * inverse + cx
+        v[k] = fy * py * inverse + cy
+        size[k] = max(spacing[i] * focal * inverse, np.float32(1))
+
+
+@njit(cache=True, parallel=True, fastmath=FAST)
+def splat_runs(
+    runs, run_start, run_length, run_view, rect, position, color, confidence, agreement, spacing,
+    view_weight, view_generated, M, K, near, limit, band, depth_reach, blend_reach, size_cap,
+    weight_cap, bands, blend, depth, total,
+):  # fmt: skip
+    """Depth pass, then blending inside the depth band.
+
+    Args:
+        runs: (n,) which runs, in the order they are to be added.
+        limit: (H, W) float32, only what is nearer than this is written; 0 shuts a pixel.
+        band: relative depth band that is blended.
+        depth_reach: half width of the depth footprint, spacings.
+        blend_reach: radius of the blending kernel, spacings.
+        size_cap: footprints wider than this many pixels are cut to it.
+        blend: False stops after the depth pass.
+        depth: out (H, W) float32, nearest depth, inf where none.
+        total: out (H, W, CHANNELS) float32, zeroed here.
+    """
+    height, width = depth.shape
+    fx = np.float32(K[0, 0])
+    fy = np.float32(K[1, 1])
+    skew = np.float32(K[0, 1])
+    cx = np.float32(K[0, 2] - 0.5)
+    cy = np.float32(K[1, 2] - 0.5)
+    focal = np.float32(np.sqrt(K[0, 0] * K[1, 1]))
+    longest = 0
+    for r in runs:
+        longest = max(longest, run_length[r])
+    one = np.float32(1)
+    for b in prange(bands):
+        top = b * height // bands
+        bottom = (b + 1) * height // bands - 1
+        u = np.empty(longest, np.float32)
+        v = np.empty(longest, np.float32)
+        z = np.empty(longest, np.float32)
+        size = np.empty(longest, np.float32)
+        depth[top : bottom + 1] = np.inf
+        if blend:
+            total[top : bottom + 1] = 0
+        for r in runs:
+            if rect[r, 3] < top or rect[r, 2] > bottom:
+                continue
+            length = run_length[r]
+            _project_run(run_start[r], length, position, spacing, M, fx, fy, skew, cx, cy, focal,
+                         near, u, v, z, size)  # fmt: skip
+            for k in range(length):
+                zk = z[k]
+                if zk <= near:
+                    continue
+                h = depth_reach * min(size[k], size_cap)
+                r0 = max(np.int64(np.ceil(v[k] - h)), top)
+                r1 = min(np.int64(np.floor(v[k] + h)), bottom)
+                c0 = max(np.int64(np.ceil(u[k] - h)), 0)
+                c1 = min(np.int64(np.floor(u[k] + h)), width - 1)
+                for row in range(r0, r1 + 1):
+                    for col in range(c0, c1 + 1):
+                        if zk < depth[row, col] and zk < limit[row, col]:
+                            depth[row, col] = zk
+        if not blend:
+            continue
+        for r in runs:
+            if rect[r, 3] < top or rect[r, 2] > bottom:
+                continue
+            length = run_length[r]
+            first = run_start[r]
+            proximity = view_weight[run_view[r]]
+            made = np.float32(view_generated[run_view[r]])
+            _project_run(first, length, position, spacing, M, fx, fy, skew, cx, cy, focal,
+                         near, u, v, z, size)  # fmt: skip
+            for k in range(length):
+                zk = z[k]
+                if zk <= near:
+                    continue
+                reach = blend_reach * min(size[k], size_cap)
+                r0 = max(np.int64(np.ceil(v[k] - reach)), top)
+                r1 = min(np.int64(np.floor(v[k] + reach)), bottom)
+                c0 = max(np.int64(np.ceil(u[k] - reach)), 0)
+                c1 = min(np.int64(np.floor(u[k] + reach)), width - 1)
+                if r0 > r1 or c0 > c1:
+                    continue
+                q = one / (reach * reach)
+                near_side = zk / (one + band)
+                trust = min(confidence[first + k] + agreement[first + k], weight_cap)
+                scale = trust * proximity
+                red = np.float32(color[first + k, 0])
+                green = np.float32(color[first + k, 1])
+                blue = np.float32(color[first + k, 2])
+                for row in range(r0, r1 + 1):
+                    dy = np.float32(row) - v[k]
+                    for col in range(c0, c1 + 1):
+                        if near_side > depth[row, col] or zk >= limit[row, col]:
+                            continue
+                        dx = np.float32(col) - u[k]
+                        kernel = one - q * (dx * dx + dy * dy)
+                        if kernel <= 0:
+                            continue
+                        kernel *= kernel
+                        w = scale * kernel
+                        total[row, col, 0] += w * red
+                        total[row, col, 1] += w * green
+                        total[row, col, 2] += w * blue
+                        total[row, col, 3] += w
+                        total[row, col, 4] += w * zk
+                        total[row, col, 5] += kernel
+                        total[row, col, 6] += kernel * trust
+                        total[row, col, 7] += w * made
+
+
+@njit(cache=True, parallel=True, fastmath=FAST)
+def resolve(total, open_, support, rgb, depth, valid, confidence, generated):
+    """Turn accumulators into pixels where ``open_`` and the support suffices."""
+    for row in prange(total.shape[0]):
+        for col in range(total.shape[1]):
+            if not open_[row, col]:
+                continue
+            kernel = total[row, col, 5]
+            weight = total[row, col, 3]
+            if kernel < support or not weight > 0:
+                continue
+            scale = np.float32(1) / weight
+            for c in range(3):
+                rgb[row, col, c] = total[row, col, c] * scale * np.float32(1 / 255)
+            depth[row, col] = total[row, col, 4] * scale
+            confidence[row, col] = total[row, col, 6] / kernel
+            generated[row, col] = total[row, col, 7] * 2 > weight
+            valid[row, col] = True

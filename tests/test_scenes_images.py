@@ -1,0 +1,131 @@
+# mypy: no-check-untyped-defs
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+from scenes_workspace import ramp, save
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.images import (
+    check_size,
+    fit_depth,
+    read_depth,
+    read_header,
+    read_image,
+    read_mask,
+    resize_nearest,
+    same_aspect,
+)
+
+
+def test_grey_palette_sixteen_bit_and_binary_become_rgb(tmp_path):
+    grey = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
+    expected = np.repeat(grey[..., None], 3, axis=-1)
+    np.testing.assert_array_equal(read_image(save(tmp_path / "g.png", grey)).rgb, expected)
+    deep = grey.astype(np.uint16) * 256 + 255
+    np.testing.assert_array_equal(read_image(save(tmp_path / "d.png", deep)).rgb, expected)
+    Image.fromarray(ramp()).convert("P").save(tmp_path / "p.png")
+    assert read_image(tmp_path / "p.png").rgb.shape == ramp().shape
+    Image.fromarray(grey > 100).save(tmp_path / "b.png")
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "b.png").rgb[..., 0], (grey > 100) * np.uint8(255)
+    )
+
+
+def test_alpha_becomes_a_mask_and_leaves_colours_alone(tmp_path):
+    rgba = np.dstack([ramp(8, 6), np.full((6, 8), 255, np.uint8)])
+    assert read_image(save(tmp_path / "opaque.png", rgba)).mask is None
+    rgba[2, 3, 3], rgba[1, 1, 3], rgba[0, 0, 3] = 0, 127, 128
+    picture = read_image(save(tmp_path / "holes.png", rgba))
+    assert np.argwhere(~picture.mask).tolist() == [[1, 1], [2, 3]]
+    np.testing.assert_array_equal(picture.rgb, rgba[..., :3])
+    assert read_header(tmp_path / "holes.png").has_alpha
+
+
+def test_exif_orientation_is_not_applied(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(ramp(8, 6)).save(tmp_path / "turned.jpg", exif=exif, quality=95)
+    header = read_header(tmp_path / "turned.jpg")
+    assert (header.width, header.height, header.orientation) == (8, 6, 6)
+    assert read_image(tmp_path / "turned.jpg").rgb.shape == (6, 8, 3)
+    with pytest.raises(ProjectError, match="EXIF"):
+        check_size((8, 6), (6, 8), path=tmp_path / "turned.jpg", orientation=6)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_truncated_absent_and_foreign_files_are_named(tmp_path, suffix):
+    path = save(
+        tmp_path / f"picture.{suffix}",
+        np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8),
+    )
+    path.write_bytes(path.read_bytes()[:-2000])
+    for reader in (read_image, read_mask):
+        with pytest.raises(ProjectError, match=r"picture.*unreadable") as error:
+            reader(path)
+        assert "\n" not in str(error.value)
+    path.write_text("no picture")
+    for reader in (read_image, read_mask, read_depth, read_header):
+        with pytest.raises(ProjectError, match=r"picture.*unreadable"):
+            reader(path)
+    path.unlink()
+    with pytest.raises(ProjectError, match="no such file"):
+        read_image(path)
+
+
+def test_mask_is_black_or_not(tmp_path):
+    mask = np.array([[0, 1], [128, 255]], np.uint8)
+    np.testing.assert_array_equal(read_mask(save(tmp_path / "m.png", mask)), mask > 0)
+    wide = mask.astype(np.uint16)
+    np.testing.assert_array_equal(read_mask(save(tmp_path / "w.png", wide)), mask > 0)
+
+
+def test_depth_units_and_invalid_codes(tmp_path):
+    stored = np.array([[0, 1500, 65535, 65534]], np.uint16)
+    np.testing.assert_allclose(
+        read_depth(save(tmp_path / "d.png", stored), unit=1e-3), [[0, 1.5, 0, 65.534]], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        read_depth(tmp_path / "d.png", unit=1e-3, maximum=10), [[0, 1.5, 0, 0]], rtol=1e-6
+    )
+    real = np.array([[np.nan, np.inf, -1, 0, 2.5, 65535]])
+    expected = [[0, 0, 0, 0, 2.5, 65535]]
+    np.save(tmp_path / "d.npy", real)
+    np.savez(tmp_path / "d.npz", depth=real[..., None])
+    for name in ("d.npy", "d.npz"):
+        np.testing.assert_array_equal(read_depth(tmp_path / name), expected)
+    assert read_depth(tmp_path / "d.npy").dtype == np.float32
+
+
+def test_depth_that_is_none(tmp_path):
+    save(tmp_path / "rgb.png", ramp())
+    with pytest.raises(ProjectError, match="8 bits a channel"):
+        read_depth(tmp_path / "rgb.png")
+    np.save(tmp_path / "c.npy", np.zeros((4, 5, 3)))
+    with pytest.raises(ProjectError, match=r"shape \(4, 5, 3\)"):
+        read_depth(tmp_path / "c.npy")
+    np.save(tmp_path / "o.npy", np.array([{}]), allow_pickle=True)
+    with pytest.raises(ProjectError, match="unreadable"):
+        read_depth(tmp_path / "o.npy")
+    np.savez(tmp_path / "k.npz", z=np.zeros(3))
+    with pytest.raises(ProjectError, match="expected the key 'depth'"):
+        read_depth(tmp_path / "k.npz")
+
+
+def test_nearest_resize_is_pillows():
+    rng = np.random.default_rng(1)
+    array = rng.uniform(size=(9, 12)).astype(np.float32)
+    for size in ((24, 18), (4, 3), (32, 24)):
+        peer = Image.fromarray(array).resize(size, Image.Resampling.NEAREST)
+        np.testing.assert_array_equal(resize_nearest(array, *size), np.asarray(peer))
+
+
+def test_aspects():
+    assert same_aspect((1999, 1333), (6000, 4000))
+    assert same_aspect((256, 192), (1920, 1440))
+    assert same_aspect((1920, 1440), (256, 192))
+    assert not same_aspect((640, 480), (640, 400))
+    assert not same_aspect((480, 640), (640, 480))
+    with pytest.raises(ProjectError, match="10x20 for a picture of 30x30"):
+        fit_depth(np.zeros((20, 10), np.float32), 30, 30, path="d.png")

@@ -1,0 +1,90 @@
+# mypy: no-check-untyped-defs
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes_workspace import HEIGHT, WIDTH, depth_picture, save, sevenscenes, workspace
+
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.inspection import inspect, reprojection_errors
+from gvtools.scenes.scene import Scene
+from gvtools.scenes.sevenscenes import read_sevenscenes
+
+
+def test_report_of_a_model(tmp_path):
+    reconstruction = workspace(tmp_path)
+    for image in reconstruction.images.values():
+        for index, point in enumerate(image.points2D):
+            if point.has_point3D():
+                image.points2D[index].xy = point.xy + np.array([0.3, 0.4])
+    reconstruction.write_binary(tmp_path / "sparse/0")
+    scene = read_colmap(tmp_path)
+    report = inspect(scene)
+    assert report.ok
+    assert (report.views, report.views_opened) == (4, 4)
+    assert report.sparse_points == 40
+    assert report.observations == 160
+    # Half a pixel in the recorded picture, nearly so in the undistorted one.
+    assert report.reprojection_px == pytest.approx(0.5, abs=0.1)
+    np.testing.assert_allclose(reprojection_errors(scene).mean(), report.reprojection_px)
+    assert report.depth is None
+    json.dumps(report.to_dict())
+
+
+def test_report_of_a_scan(tmp_path):
+    root = sevenscenes(tmp_path, frames=5)
+    save(root / "frame-000004.depth.png", depth_picture(4.0))
+    report = inspect(read_sevenscenes(root))
+    assert report.metric
+    assert report.path_length == pytest.approx(0.4)
+    assert report.extent == pytest.approx(0.4)
+    assert report.sizes == {"96x72": 5}
+    assert report.depth.views == 5
+    assert report.depth.coverage == pytest.approx(1 - 2 / (HEIGHT * WIDTH))
+    assert (report.depth.minimum, report.depth.median, report.depth.maximum) == pytest.approx(
+        (2, 2, 4)
+    )
+    assert report.reprojection_px is None
+
+
+def test_truncated_picture_is_found_by_opening(tmp_path):
+    root = sevenscenes(tmp_path)
+    path = root / "frame-000001.color.png"
+    save(path, np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8))
+    path.write_bytes(path.read_bytes()[:-3000])
+    scene = read_sevenscenes(root)
+    report = inspect(scene)
+    assert not report.ok
+    assert report.views_opened == 2
+    errors = [finding.message for finding in report.findings if finding.level == "error"]
+    assert len(errors) == 1
+    assert "frame-000001.color.png: unreadable" in errors[0]
+    assert inspect(scene, read_pixels=False).ok
+
+
+def test_sample_opens_a_few_spread_views(tmp_path):
+    scene = read_sevenscenes(sevenscenes(tmp_path, frames=1))
+    opened = []
+
+    def loader(name):
+        def load():
+            opened.append(name)
+            return scene.views[0].load()
+
+        return load
+
+    views = tuple(replace(scene.views[0], name=f"v{i}", load=loader(f"v{i}")) for i in range(100))
+    report = inspect(replace(scene, views=views), read_pixels="sample")
+    assert report.views == 100
+    assert report.views_opened == len(opened) == 16
+    assert {"v0", "v99"} <= set(opened)
+    assert any("same place" in finding.message for finding in report.findings)
+
+
+def test_scene_without_views_is_not_ok(tmp_path):
+    report = inspect(Scene(tmp_path, "rgbd", ()))
+    assert not report.ok
+    assert report.views == 0

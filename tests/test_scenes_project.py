@@ -1,0 +1,74 @@
+# mypy: no-check-untyped-defs
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scenes_workspace import ramp, save, sevenscenes, transforms, workspace
+from test_scenes_rgbd import redwood, scannet, tum
+from test_scenes_transforms_json import PINHOLE, frame
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.project import open_project
+from gvtools.scenes.rgbd import RgbdOptions
+
+
+def make_transforms(root):
+    save(root / "images" / "a.png", ramp())
+    transforms(root, [frame()], **PINHOLE)
+
+
+@pytest.mark.parametrize(
+    ("make", "kind"),
+    [
+        (workspace, "colmap"),
+        (sevenscenes, "rgbd"),
+        (tum, "rgbd"),
+        (redwood, "rgbd"),
+        (scannet, "rgbd"),
+        (make_transforms, "transforms"),
+    ],
+)
+def test_kinds_are_found_out(tmp_path, make, kind):
+    make(tmp_path / "project")
+    scene = open_project(tmp_path / "project")
+    assert scene.kind == kind
+    assert scene.views[0].load().rgb.dtype == np.uint8
+
+
+def test_colmap_goes_before_transforms_and_says_so(tmp_path):
+    workspace(tmp_path)
+    make_transforms(tmp_path)
+    scene = open_project(tmp_path)
+    assert scene.kind == "colmap"
+    assert any("transforms.json is not" in finding.message for finding in scene.findings)
+    assert open_project(tmp_path / "transforms.json").kind == "transforms"
+
+
+def test_nothing_there(tmp_path):
+    sevenscenes(tmp_path / "kitchen")
+    with pytest.raises(ProjectError, match=r"kitchn: no such folder; did you mean .*kitchen"):
+        open_project(tmp_path / "kitchn")
+    with pytest.raises(ProjectError, match=r"expected one of: .*did you mean .*kitchen"):
+        open_project(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ProjectError, match="is empty; expected one of: a COLMAP model"):
+        open_project(tmp_path / "empty")
+
+
+def test_options_of_another_kind(tmp_path):
+    workspace(tmp_path / "colmap")
+    sevenscenes(tmp_path / "scan")
+    with pytest.raises(OptionError, match="no RGB-D options"):
+        open_project(tmp_path / "colmap", rgbd=RgbdOptions())
+    with pytest.raises(OptionError, match="neither images nor masks"):
+        open_project(tmp_path / "scan", images=tmp_path)
+
+
+def test_import_is_quick():
+    heavy = "{'torch', 'open3d', 'pycolmap', 'matplotlib', 'scipy', 'skimage', 'numba'}"
+    code = f"import sys, gvtools.scenes.project; print({heavy} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"

@@ -1,0 +1,194 @@
+# mypy: no-check-untyped-defs
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scenes_workspace import HEIGHT, WIDTH, depth_picture, pose_matrix, ramp, save, transforms
+
+from gvtools.cameras import Cameras
+from gvtools.errors import GvError, ProjectError, ShapeError
+from gvtools.scenes.transforms_json import read_transforms, write_transforms
+
+FLIP = np.diag([1.0, -1, -1, 1])
+PINHOLE = {"fl_x": 90, "fl_y": 91, "cx": 48, "cy": 36, "w": WIDTH, "h": HEIGHT}
+
+
+def frame(name="images/a.png", x=0.0, **more):
+    return {"file_path": name, "transform_matrix": (pose_matrix(x) @ FLIP).tolist(), **more}
+
+
+def messages(scene):
+    return " | ".join(finding.message for finding in scene.findings)
+
+
+def test_opengl_axes_names_and_order(tmp_path):
+    for name in ("img10.png", "img9.png"):
+        save(tmp_path / "images" / name, ramp())
+    frames = [frame("./images/img10.png", 1.0), frame("images/img9.png", 0.5)]
+    scene = read_transforms(transforms(tmp_path, frames, **PINHOLE))
+    assert scene.names == ("img9.png", "img10.png")
+    np.testing.assert_allclose(scene.cameras.world_from_cam[1], pose_matrix(1.0), atol=1e-12)
+    np.testing.assert_allclose(scene.cameras.K[0], [[90, 0, 48], [0, 91, 36], [0, 0, 1]])
+    np.testing.assert_array_equal(scene.views[0].load().rgb, ramp())
+    assert not scene.metric
+
+
+def test_a_camera_at_plus_z_that_looks_down_minus_z_sees_the_origin(tmp_path):
+    # OpenGL's identity looks along -z: moved to z = +2, the world's origin is straight ahead.
+    save(tmp_path / "a.png", ramp())
+    pose = np.eye(4)
+    pose[2, 3] = 2
+    path = transforms(
+        tmp_path, [{"file_path": "a.png", "transform_matrix": pose.tolist()}], **PINHOLE
+    )
+    xy, z = read_transforms(path).cameras.project([[0, 0, 0], [0, 0.1, 0]])
+    np.testing.assert_allclose(z[0], 2)
+    np.testing.assert_allclose(xy[0, 0], [48, 36])
+    assert xy[0, 1, 1] < 36  # world y is up, the picture's y is down
+
+
+def test_blender_files_name_no_suffix_and_give_an_angle(tmp_path):
+    rgba = np.dstack([ramp(), np.full((HEIGHT, WIDTH), 255, np.uint8)])
+    rgba[:10, :, 3] = 0
+    save(tmp_path / "train" / "r_0.png", rgba)
+    path = transforms(tmp_path, [frame("./train/r_0")], camera_angle_x=0.6)
+    scene = read_transforms(path)
+    assert scene.names == ("r_0.png",)
+    focal = 0.5 * WIDTH / np.tan(0.3)
+    np.testing.assert_allclose(
+        scene.cameras.K[0], [[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]]
+    )
+    assert scene.views[0].load().mask.sum() == (HEIGHT - 10) * WIDTH
+    assert "alpha channel: read as a mask" in messages(scene)
+
+
+def test_frames_have_intrinsics_of_their_own(tmp_path):
+    save(tmp_path / "a.png", ramp())
+    save(tmp_path / "b.png", ramp(48, 36))
+    frames = [frame("a.png"), frame("b.png", fl_x=45, fl_y=45, cx=24, cy=18, w=48, h=36)]
+    scene = read_transforms(transforms(tmp_path, frames, **PINHOLE))
+    assert scene.cameras.K[:, 0, 0].tolist() == [90, 45]
+    assert scene.cameras.width.tolist() == [96, 48]
+    assert scene.views[1].load().rgb.shape == (36, 48, 3)
+
+
+@pytest.mark.parametrize(
+    ("keys", "model"),
+    [
+        ({"k1": 0.05, "k2": -0.07, "p1": 0.002, "p2": -0.002}, "OPENCV"),
+        ({"k1": 0.05, "k3": 0.01, "camera_model": "OPENCV"}, "FULL_OPENCV"),
+        ({"k1": 0.02, "k4": 0.001, "camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"k1": 0.02, "is_fisheye": True}, "OPENCV_FISHEYE"),
+    ],
+)
+def test_distortion_mask_and_depth_share_the_mapping(tmp_path, keys, model):
+    save(tmp_path / "images/a.png", ramp())
+    save(tmp_path / "depth/a.png", ramp()[..., 0].astype(np.uint16) * 10 + 1000)
+    save(tmp_path / "masks/a.png", np.where(ramp()[..., 1] > 127, 255, 0).astype(np.uint8))
+    one = frame(depth_file_path="depth/a.png", mask_path="masks/a.png")
+    scene = read_transforms(
+        transforms(tmp_path, [one], depth_unit_scale_factor=0.01, **PINHOLE, **keys)
+    )
+    assert f"{model} 96x72 undistorted" in messages(scene)
+    loaded = scene.views[0].load()
+    from_depth = (loaded.depth / 0.01 - 1000) / 10
+    assert np.abs(from_depth - loaded.rgb[..., 0]).max() <= 255 / WIDTH + 1
+    sure = np.abs(loaded.rgb[..., 1].astype(int) - 127) > 255 / HEIGHT + 1
+    np.testing.assert_array_equal(loaded.mask[sure], loaded.rgb[..., 1][sure] > 127)
+
+
+def test_depth_is_millimetres_unless_said(tmp_path):
+    save(tmp_path / "images/a.png", ramp())
+    save(tmp_path / "a.depth.png", depth_picture(2.0))
+    scene = read_transforms(transforms(tmp_path, [frame(depth_file_path="a.depth.png")], **PINHOLE))
+    np.testing.assert_allclose(scene.views[0].load().depth[1:], 2, rtol=1e-6)
+
+
+def test_absent_frames_masks_and_depth_are_reported(tmp_path):
+    save(tmp_path / "images/a.png", ramp())
+    frames = [frame(mask_path="m.png", depth_file_path="d.png"), frame("images/b.png")]
+    scene = read_transforms(transforms(tmp_path, frames, **PINHOLE))
+    assert len(scene) == 1
+    assert "1 of 2 frames are absent on disk: b.png" in messages(scene)
+    assert "m.png, d.png is absent on disk" in messages(scene)
+    (tmp_path / "images/a.png").unlink()
+    with pytest.raises(ProjectError, match="none of the pictures of its 2 frames"):
+        read_transforms(tmp_path)
+
+
+def test_images_and_masks_may_be_given(tmp_path):
+    save(tmp_path / "small" / "a.png", ramp())
+    save(tmp_path / "ignore" / "a.png.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    path = transforms(tmp_path / "project", [frame()], **PINHOLE)
+    scene = read_transforms(path, images=tmp_path / "small", masks=tmp_path / "ignore")
+    assert not scene.views[0].load().mask.any()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR has no pinhole image"),
+        ({"k4": 0.1}, "k4 = 0.1 of a perspective camera"),
+        ({"k1": "0.1"}, "k1 is '0.1'"),
+        ({"fl_x": None}, "fl_x is None"),
+        ({"fl_x": -3}, "not positive"),
+        ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix is no matrix"),
+        ({"transform_matrix": (2 * np.eye(4)).tolist()}, "frame 0"),
+        ({"transform_matrix": (np.eye(4) * np.nan).tolist()}, "NaN"),
+        ({"file_path": ""}, "no file_path"),
+    ],
+)
+def test_malformed_frames_say_what_and_where(tmp_path, change, told):
+    save(tmp_path / "images/a.png", ramp())
+    path = transforms(tmp_path, [{**frame(), **change}], **PINHOLE)
+    with pytest.raises(GvError, match=told) as error:
+        read_transforms(path)
+    assert "transforms.json, frame 0" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"frames": []}', '{"frames": [1]}'])
+def test_malformed_files(tmp_path, text):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(ProjectError, match=r"transforms\.json: no"):
+        read_transforms(tmp_path)
+
+
+def test_no_focal_length(tmp_path):
+    save(tmp_path / "images/a.png", ramp())
+    with pytest.raises(ProjectError, match="neither fl_x nor camera_angle_x"):
+        read_transforms(transforms(tmp_path, [frame()], w=WIDTH, h=HEIGHT))
+
+
+def test_written_file_reads_back(tmp_path):
+    from scipy.spatial.transform import Rotation
+
+    pose = np.repeat(np.eye(4)[None], 3, axis=0)
+    pose[:, :3, :3] = Rotation.random(3, rng=np.random.default_rng(0)).as_matrix()
+    pose[:, :3, 3] = np.random.default_rng(1).normal(size=(3, 3))
+    K = np.array([[90.0, 0, 48.25], [0, 91, 36], [0, 0, 1]])
+    names = ("a.png", "b.png", "c.png")
+    cameras = Cameras(
+        np.stack([K, K * [[2], [2], [1]], K]), pose, [96, 192, 96], [72, 144, 72], names
+    )
+    for i, name in enumerate(names):
+        save(tmp_path / "images" / name, ramp(int(cameras.width[i]), int(cameras.height[i])))
+        np.save(tmp_path / f"{name}.npy", np.full((72, 96), 2.5))
+    write_transforms(
+        tmp_path / "transforms.json",
+        cameras,
+        image_paths=[(tmp_path / "images" / names[0]).resolve(), "images/b.png", "images/c.png"],
+        depth_paths=[f"{name}.npy" for name in names],
+    )
+    written = json.loads((tmp_path / "transforms.json").read_text())
+    assert written["frames"][0]["file_path"] == "images/a.png"
+    scene = read_transforms(tmp_path)
+    np.testing.assert_allclose(scene.cameras.K, cameras.K, atol=1e-12)
+    np.testing.assert_allclose(scene.cameras.cam_from_world, pose, atol=1e-12)
+    np.testing.assert_array_equal(scene.views[0].load().depth, 2.5)
+    assert scene.names == names
+    assert not list(tmp_path.glob("*.partial"))
+    with pytest.raises(ShapeError, match="1 images"):
+        write_transforms(tmp_path / "t.json", cameras, image_paths=["a"])

@@ -1,0 +1,207 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gvtools.cameras import Cameras, invert_rigid
+from gvtools.errors import DegenerateError, OptionError
+from gvtools.trajectories import focus_point, interpolate, look_at, mean_up, orbit, spiral
+
+UP = np.array([0.2, -0.5, 0.8]) / np.linalg.norm([0.2, -0.5, 0.8])
+FOCUS = np.array([3.0, -1.0, 2.0])
+
+
+def _cameras(world_from_cam: np.ndarray) -> Cameras:
+    count = len(world_from_cam)
+    K = np.tile(np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]), (count, 1, 1))
+    size = np.full(count, 640), np.full(count, 480)
+    return Cameras(K, invert_rigid(world_from_cam), *size, ())
+
+
+def _ring(count: int = 7, *, arc: float = 1.5, radius: float = 4.0) -> Cameras:
+    """Cameras on an arc about FOCUS with axis UP, a little above, all looking at FOCUS."""
+    first = np.cross(UP, (1.0, 0, 0))
+    first /= np.linalg.norm(first)
+    angle = np.linspace(0, arc, count)[:, None]
+    around = np.cos(angle) * first + np.sin(angle) * np.cross(UP, first)
+    return _cameras(look_at(FOCUS + radius * around + 1.2 * UP, FOCUS, up=UP))
+
+
+def _assert_rigid(cameras: Cameras) -> None:
+    rotation = cameras.cam_from_world[:, :3, :3]
+    np.testing.assert_allclose(
+        rotation @ rotation.swapaxes(1, 2), np.tile(np.eye(3), (len(cameras), 1, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-12)
+
+
+def test_look_at_puts_the_target_on_the_axis_and_up_upwards():
+    cameras = _ring()
+    xy, z = cameras.project(FOCUS[None])
+    np.testing.assert_allclose(xy[:, 0], [[320, 240]] * 7, atol=1e-9)
+    np.testing.assert_allclose(z[:, 0], np.hypot(4.0, 1.2), atol=1e-12)
+    _assert_rigid(cameras)
+    # A point above the focus appears above it: y is down in the image.
+    above, _ = cameras.project(FOCUS[None] + 0.1 * UP)
+    assert (above[:, 0, 1] < 240).all()
+    np.testing.assert_allclose(above[:, 0, 0], 320, atol=1e-9)
+
+
+def test_interpolation_goes_through_its_keys():
+    rng = np.random.default_rng(0)
+    pose = np.tile(np.eye(4), (5, 1, 1))
+    pose[:, :3, :3] = Rotation.random(5, rng=rng).as_matrix()
+    pose[:, :3, 3] = rng.standard_normal((5, 3)) + 1e6
+    keys = _cameras(pose)
+    path = interpolate(keys, 20_001)
+    _assert_rigid(path)
+    apart = np.linalg.norm(path.centers[:, None] - keys.centers, axis=2)
+    assert apart.min(axis=0).max() < 1e-3
+    at = apart.argmin(axis=0)
+    assert (np.diff(at) > 0).all()
+    turn = (
+        Rotation.from_matrix(path.cam_from_world[at, :3, :3])
+        * Rotation.from_matrix(keys.cam_from_world[:, :3, :3]).inv()
+    )
+    assert turn.magnitude().max() < 2e-3
+    for end in (0, -1):
+        np.testing.assert_allclose(path.centers[end], keys.centers[end], atol=1e-8)
+
+
+def test_interpolation_is_smooth_and_even():
+    path = interpolate(_ring(6), 301)
+    velocity = np.diff(path.centers, axis=0)
+    speed = np.linalg.norm(velocity, axis=1)
+    assert speed.max() / speed.min() < 1.3
+    # C1: the change of velocity from step to step vanishes with the step, at the keys too.
+    assert np.linalg.norm(np.diff(velocity, axis=0), axis=1).max() < 0.05 * speed.max()
+
+
+def test_two_keys_give_the_straight_line_and_the_half_turn():
+    pose = np.tile(np.eye(4), (2, 1, 1))
+    pose[1, :3, 3] = (2, 0, 0)
+    pose[1, :3, :3] = Rotation.from_euler("y", 60, degrees=True).as_matrix()
+    path = interpolate(_cameras(pose), 3)
+    np.testing.assert_allclose(path.centers[1], (1, 0, 0), atol=1e-12)
+    middle = Rotation.from_matrix(path.world_from_cam[1, :3, :3])
+    np.testing.assert_allclose(middle.as_euler("YXZ", degrees=True), (30, 0, 0), atol=1e-9)
+
+
+def test_a_turn_on_the_spot_and_repeated_keys_are_interpolated():
+    pose = np.tile(np.eye(4), (4, 1, 1))
+    angles = [[0], [0], [40], [80]]
+    pose[:, :3, :3] = Rotation.from_euler("y", angles, degrees=True).as_matrix()
+    path = interpolate(_cameras(pose), 9)
+    turned = Rotation.from_matrix(path.world_from_cam[:, :3, :3]).as_euler("YXZ", degrees=True)
+    np.testing.assert_allclose(turned[:, 0], np.linspace(0, 80, 9), atol=1e-9)
+
+
+def test_intrinsics_are_interpolated_and_sizes_are_the_nearest_keys():
+    keys = _ring(2)
+    K = keys.K.copy()
+    K[1, 0, 0] = 600
+    mixed = Cameras(K, keys.cam_from_world, np.array([640, 320]), np.array([480, 240]), keys.names)
+    path = interpolate(mixed, 5)
+    np.testing.assert_allclose(path.K[:, 0, 0], [500, 525, 550, 575, 600])
+    assert path.width.tolist() == [640, 640, 640, 320, 320]
+
+
+def test_a_closed_path_is_smooth_where_it_closes():
+    keys = _ring(8, arc=2 * np.pi * 7 / 8)
+    path = interpolate(keys, 400, closed=True)
+    loop = np.concatenate([path.centers, path.centers[:2]])
+    velocity = np.diff(loop, axis=0)
+    assert (
+        np.linalg.norm(np.diff(velocity, axis=0), axis=1).max()
+        < 0.1 * np.linalg.norm(velocity, axis=1).max()
+    )
+    np.testing.assert_allclose(path.centers[0], keys.centers[0], atol=1e-12)
+
+
+def test_interpolation_needs_two_different_cameras():
+    with pytest.raises(OptionError, match="2 or more"):
+        interpolate(_ring(1), 5)
+    with pytest.raises(DegenerateError, match="same"):
+        interpolate(_ring(3)[[1, 1]], 5)
+
+
+def test_the_focus_point_is_where_the_axes_meet():
+    np.testing.assert_allclose(focus_point(_ring()), FOCUS, atol=1e-9)
+    offset = np.array([6.9e5, 5.3e6, 0])
+    far = _ring().world_from_cam
+    far[:, :3, 3] += offset
+    np.testing.assert_allclose(focus_point(_cameras(far)), FOCUS + offset, atol=1e-6)
+
+
+def test_parallel_axes_have_no_focus_point():
+    pose = np.tile(np.eye(4), (3, 1, 1))
+    pose[:, 0, 3] = (0, 1, 2)
+    with pytest.raises(DegenerateError, match="parallel"):
+        focus_point(_cameras(pose))
+    orbit(_cameras(pose), 4, center=(0, 0, 5))
+
+
+def test_the_focus_point_minimises_the_distances_to_the_axes():
+    rng = np.random.default_rng(2)
+    pose = _ring().world_from_cam
+    pose[:, :3, 3] += 0.2 * rng.standard_normal((7, 3))
+    cameras = _cameras(pose)
+
+    def cost(point: np.ndarray) -> float:
+        across = np.cross(point - cameras.centers, cameras.world_from_cam[:, :3, 2])
+        return float((across**2).sum())
+
+    best = focus_point(cameras)
+    for step in 1e-3 * np.vstack([np.eye(3), -np.eye(3)]):
+        assert cost(best) < cost(best + step)
+
+
+def test_an_orbit_looks_at_its_middle_with_a_steady_up():
+    path = orbit(_ring(), 24)
+    _assert_rigid(path)
+    xy, z = path.project(FOCUS[None])
+    np.testing.assert_allclose(xy[:, 0], [[320, 240]] * 24, atol=1e-6)
+    np.testing.assert_allclose(z, z[0, 0], atol=1e-9)
+    # No roll: the image's x axis stays across the up vector, and up points up.
+    up = mean_up(_ring())
+    np.testing.assert_allclose(path.world_from_cam[:, :3, 0] @ up, 0, atol=1e-12)
+    assert (path.world_from_cam[:, :3, 1] @ up < 0).all()
+    steps = np.linalg.norm(np.diff(np.vstack([path.centers, path.centers[:1]]), axis=0), axis=1)
+    np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
+
+
+def test_an_orbit_with_the_given_axis_meets_the_cameras_it_came_from():
+    given = _ring(7, arc=1.5)
+    path = orbit(given, 7, up=UP, degrees=np.degrees(1.5))
+    np.testing.assert_allclose(path.centers, given.centers, atol=1e-8)
+    np.testing.assert_allclose(path.cam_from_world, given.cam_from_world, atol=1e-8)
+    wide = orbit(given, 3, up=UP, radius=9.0, height=0.5)
+    offset = wide.centers - FOCUS
+    np.testing.assert_allclose(offset @ UP, 0.5, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(offset - 0.5 * UP, axis=1), 9.0, atol=1e-9)
+
+
+def test_a_spiral_stays_within_the_capture_and_looks_at_one_point():
+    rng = np.random.default_rng(4)
+    centers = np.column_stack([rng.uniform(-1, 1, 40), rng.uniform(-0.5, 0.5, 40), np.zeros(40)])
+    target = np.array([0.0, 0.0, 6.0])
+    given = _cameras(look_at(centers, target, up=(0, -1, 0)))
+    path = spiral(given, 60)
+    _assert_rigid(path)
+    assert (np.abs(path.centers[:, :2]).max(axis=0) < (1, 0.5)).all()
+    assert np.ptp(path.centers[:, 0]) > 1 and np.ptp(path.centers[:, 1]) > 0.5
+    xy, _ = path.project(focus_point(path)[None])
+    np.testing.assert_allclose(xy[:, 0], [[320, 240]] * 60, atol=1e-6)
+    assert np.linalg.norm(focus_point(path) - target) < 1.0
+    with pytest.raises(OptionError, match="focus_distance"):
+        spiral(given, 10, focus_distance=-1.0)
+
+
+def test_degenerate_orbits_say_why():
+    with pytest.raises(OptionError, match="positive radius"):
+        orbit(_ring(), 5, radius=-1.0)
+    with pytest.raises(DegenerateError, match="on the axis"):
+        orbit(_ring(), 5, center=_ring().centers[0])
+    with pytest.raises(DegenerateError, match="cancel"):
+        mean_up(_cameras(np.stack([np.eye(4), np.diag([-1.0, -1, 1, 1])])))

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gvtools.cameras import Cameras, invert_rigid
+from gvtools.errors import ProjectError
+from gvtools.trajectory_files import read_trajectory, write_trajectory
+
+
+def _cameras(count: int = 6, names: tuple[str, ...] = ()) -> Cameras:
+    rng = np.random.default_rng(0)
+    pose = np.tile(np.eye(4), (count, 1, 1))
+    pose[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
+    pose[:, :3, 3] = rng.standard_normal((count, 3)) * 1e6
+    K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]) * np.ones((count, 1, 1))
+    return Cameras(K, invert_rigid(pose), np.full(count, 640), np.full(count, 480), names)
+
+
+@pytest.mark.parametrize("layout", ["tum", "kitti"])
+def test_poses_survive_a_round_trip(tmp_path, layout):
+    cameras = _cameras()
+    write_trajectory(tmp_path / "path.txt", cameras, layout=layout)
+    for asked in (layout, "auto"):
+        again = read_trajectory(tmp_path / "path.txt", cameras[0], layout=asked)
+        np.testing.assert_allclose(again.centers, cameras.centers, rtol=1e-13)
+        np.testing.assert_allclose(
+            again.cam_from_world[:, :3, :3], cameras.cam_from_world[:, :3, :3], atol=1e-14
+        )
+        assert np.array_equal(again.K, cameras.K)
+        assert again.width.tolist() == [640] * 6
+    assert [file.name for file in tmp_path.iterdir()] == ["path.txt"]
+
+
+def test_evo_reads_the_same_poses(tmp_path):
+    interface = pytest.importorskip("evo.tools.file_interface")
+    cameras = _cameras(names=tuple(f"{100 + 0.5 * i}" for i in range(6)))
+    write_trajectory(tmp_path / "tum.txt", cameras)
+    write_trajectory(tmp_path / "kitti.txt", cameras, layout="kitti")
+    tum = interface.read_tum_trajectory_file(tmp_path / "tum.txt")
+    kitti = interface.read_kitti_poses_file(tmp_path / "kitti.txt")
+    for trajectory in (tum, kitti):
+        np.testing.assert_allclose(
+            np.array(trajectory.poses_se3), cameras.world_from_cam, rtol=1e-12, atol=1e-12
+        )
+    assert tum.timestamps.tolist() == [100 + 0.5 * i for i in range(6)]
+
+
+def test_we_read_what_evo_writes(tmp_path):
+    interface = pytest.importorskip("evo.tools.file_interface")
+    from evo.core.trajectory import PoseTrajectory3D
+
+    cameras = _cameras()
+    theirs = PoseTrajectory3D(
+        poses_se3=list(cameras.world_from_cam), timestamps=np.arange(6) + 0.25
+    )
+    interface.write_tum_trajectory_file(tmp_path / "tum.txt", theirs)
+    interface.write_kitti_poses_file(tmp_path / "kitti.txt", theirs)
+    for name in ("tum.txt", "kitti.txt"):
+        ours = read_trajectory(tmp_path / name, cameras)
+        np.testing.assert_allclose(
+            ours.world_from_cam, cameras.world_from_cam, rtol=1e-9, atol=1e-9
+        )
+    assert float(read_trajectory(tmp_path / "tum.txt", cameras).names[0]) == 0.25
+
+
+def test_intrinsics_are_matched_row_by_row_or_taken_from_the_first(tmp_path):
+    cameras = _cameras(3)
+    K = cameras.K.copy()
+    K[:, 0, 0] = (400, 500, 600)
+    mixed = Cameras(K, cameras.cam_from_world, cameras.width, cameras.height, cameras.names)
+    write_trajectory(tmp_path / "path.txt", mixed)
+    path = tmp_path / "path.txt"
+    assert read_trajectory(path, mixed).K[:, 0, 0].tolist() == [400, 500, 600]
+    assert read_trajectory(path, mixed[:2]).K[:, 0, 0].tolist() == [400, 400, 400]
+
+
+def test_comments_and_blank_lines_are_passed_over(tmp_path):
+    path = tmp_path / "path.txt"
+    path.write_text("# timestamp tx ty tz qx qy qz qw\n\n1.0 1 2 3 0 0 0 1\n", encoding="ascii")
+    read = read_trajectory(path, _cameras(1))
+    np.testing.assert_allclose(read.centers, [[1, 2, 3]])
+    assert read.names == ("1.0",)
+
+
+def test_repeated_timestamps_get_names_of_their_own(tmp_path):
+    path = tmp_path / "path.txt"
+    path.write_text("".join(f"7.5 {x} 0 0 0 0 0 1\n" for x in range(3)), encoding="ascii")
+    read = read_trajectory(path, _cameras(1))
+    assert read.names == ("7.5", "7.5_1", "7.5_2")
+    np.testing.assert_allclose(read.centers[:, 0], [0, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "no poses"),
+        ("1 2 3\n", r":1: 3 numbers"),
+        ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 1\n", r":2: 7 numbers; expected 8"),
+        ("1 0 0 0 0 0 0 1\n\n2 0 0 x 0 0 0 1\n", r":3: could not convert.*'x'"),
+        ("1 0 0 0 0 0 0 2\n", r":1: a quaternion of length 2"),
+        ("1 0 0 nan 0 0 0 1\n", r":1: NaN"),
+        ("2 0 0 0 0 2 0 0 0 0 2 0\n", r":1: the pose's 3x3 part is no rotation \(scale 2"),
+    ],
+)
+def test_wrong_files_are_refused_with_the_line(tmp_path, text, words):
+    path = tmp_path / "path.txt"
+    path.write_text(text, encoding="ascii")
+    with pytest.raises(ProjectError, match=words):
+        read_trajectory(path, _cameras(1))
+
+
+def test_absent_files_unknown_layouts_and_lost_folders_are_refused(tmp_path):
+    with pytest.raises(ProjectError, match="cannot be read"):
+        read_trajectory(tmp_path / "absent.txt", _cameras(1))
+    with pytest.raises(ProjectError, match="'tum' or 'kitti'"):
+        write_trajectory(tmp_path / "path.txt", _cameras(1), layout="euroc")
+    with pytest.raises(ProjectError, match="cannot be written"):
+        write_trajectory(tmp_path / "no" / "path.txt", _cameras(1))
+
+
+@pytest.mark.data
+def test_published_trajectories_are_read_as_evo_reads_them(shared):
+    interface = pytest.importorskip("evo.tools.file_interface")
+    folder = shared / "oracle" / "trajectories"
+    for name, read in (
+        ("fr2_desk_groundtruth.txt", interface.read_tum_trajectory_file),
+        ("KITTI_00_gt.txt", interface.read_kitti_poses_file),
+    ):
+        ours = read_trajectory(folder / name, _cameras(1))
+        np.testing.assert_allclose(ours.centers, read(folder / name).positions_xyz, atol=1e-9)
