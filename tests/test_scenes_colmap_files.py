@@ -102,6 +102,37 @@ def test_point_that_is_not_finite_is_refused(tmp_path):
         read_colmap(tmp_path)
 
 
+@pytest.mark.parametrize("classic", [False, True])
+@pytest.mark.parametrize(("stretch", "told"), [(2.0, "no rotation"), (1.0005, None)])
+def test_quaternion_of_another_length(tmp_path, classic, stretch, told):
+    reconstruction = workspace(tmp_path, classic=classic)
+    pose = reconstruction.images[1].cam_from_world()
+    stored = pose.rotation.quat[[3, 0, 1, 2]]  # pycolmap has x, y, z, w
+    path = tmp_path / "sparse/0" / ("images.bin" if classic else "frames.bin")
+    data = path.read_bytes()
+    assert struct.pack("<4d", *stored) in data
+    path.write_bytes(
+        data.replace(struct.pack("<4d", *stored), struct.pack("<4d", *stretch * stored))
+    )
+    if told:
+        with pytest.raises(GvError, match=told):
+            read_colmap(tmp_path)
+        return
+    scene = read_colmap(tmp_path)
+    assert any("1 of 4 rotations made orthonormal" in item.message for item in scene.findings)
+    camera = scene[reconstruction.images[1].name].camera
+    np.testing.assert_allclose(camera.cam_from_world[0, :3], pose.matrix(), atol=1e-9)
+
+
+def test_name_that_is_no_text_is_refused(tmp_path):
+    reconstruction = workspace(tmp_path)
+    path = tmp_path / "sparse/0/images.bin"
+    name = reconstruction.images[2].name.encode()
+    path.write_bytes(path.read_bytes().replace(name, b"\xff" + name[1:]))
+    with pytest.raises(ProjectError, match="name of image 2 is no UTF-8"):
+        read_colmap(tmp_path)
+
+
 def test_windows_line_ends_are_read_and_reported(tmp_path):
     workspace(tmp_path, text=True)
     expected = read_colmap(tmp_path)

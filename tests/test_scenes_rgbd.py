@@ -8,11 +8,12 @@ import pytest
 from scenes_workspace import HEIGHT, WIDTH, depth_picture, pose_matrix, ramp, save, sevenscenes
 
 from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
+from gvtools.scenes.quaternions import rotation_from_quaternion
 from gvtools.scenes.redwood import read_redwood
 from gvtools.scenes.rgbd import RgbdOptions
 from gvtools.scenes.scannet import read_scannet
 from gvtools.scenes.sevenscenes import read_sevenscenes
-from gvtools.scenes.tum import PUBLISHED, associate, read_tum, rotation_from_quaternion
+from gvtools.scenes.tum import PUBLISHED, associate, read_tum
 
 
 def messages(scene):

@@ -118,7 +118,7 @@ def _most_similar(head, p, spacing, center, view_centers, r_view, r_spacing, r_n
 def fuse_blocks(
     positions, colors, confidence, spacing, locals_, touched, starts, order,
     pool_local, pool_head, pool_state, block_offset, block_log2, block_count,
-    r_position, r_color, r_confidence, r_spacing, r_view, r_next, count,
+    r_x, r_y, r_z, r_color, r_confidence, r_spacing, r_view, r_next, count,
     view, center, view_centers, view_round, view_generated,
     cosine_same, finer, capacity, weight_cap, inverse_edge,
     run_start, run_count, run_box, agreed_record, agreed_weight, report,
@@ -224,7 +224,7 @@ def fuse_blocks(
                     report[MERGED] += 1
                     _merge(
                         best, p, t_sum[t], weight, own, width, view, inverse_edge,
-                        r_position, r_color, r_confidence, r_spacing, r_view, weight_cap,
+                        r_x, r_y, r_z, r_color, r_confidence, r_spacing, r_view, weight_cap,
                     )  # fmt: skip
                 else:
                     report[AGREED] += 1
@@ -232,8 +232,11 @@ def fuse_blocks(
                     agreed_weight[agreed] = own
                     agreed += 1
                 continue
+            member = positions[t_first[t]]
+            r_x[count] = _inside(p[0], member[0], inverse_edge)
+            r_y[count] = _inside(p[1], member[1], inverse_edge)
+            r_z[count] = _inside(p[2], member[2], inverse_edge)
             for k in range(3):
-                r_position[count, k] = _inside(p[k], positions[t_first[t], k], inverse_edge)
                 r_color[count, k] = np.uint8(t_sum[t, 3 + k] / weight + 0.5)
             r_confidence[count] = min(own, weight_cap)
             r_spacing[count] = width
@@ -245,14 +248,12 @@ def fuse_blocks(
         if count > first:
             run_start[runs] = first
             run_count[runs] = count - first
-            for k in range(3):
-                low = r_position[first, k]
-                high = low
-                for i in range(first + 1, count):
-                    low = min(low, r_position[i, k])
-                    high = max(high, r_position[i, k])
-                run_box[runs, k] = low
-                run_box[runs, 3 + k] = high
+            run_box[runs, 0] = r_x[first:count].min()
+            run_box[runs, 1] = r_y[first:count].min()
+            run_box[runs, 2] = r_z[first:count].min()
+            run_box[runs, 3] = r_x[first:count].max()
+            run_box[runs, 4] = r_y[first:count].max()
+            run_box[runs, 5] = r_z[first:count].max()
             run_box[runs, 6] = r_spacing[first:count].max()
             runs += 1
             report[ADDED] += count - first
@@ -288,14 +289,15 @@ def _any_observed(head, r_view, r_next, view_generated):
 
 
 @njit(cache=True)
-def _merge(m, p, sums, weight, own, width, view, inverse_edge, r_position, r_color, r_confidence,
-           r_spacing, r_view, weight_cap):  # fmt: skip
+def _merge(m, p, sums, weight, own, width, view, inverse_edge, r_x, r_y, r_z, r_color,
+           r_confidence, r_spacing, r_view, weight_cap):  # fmt: skip
     """Confidence-weighted running mean; the integer view goes to the more confident side."""
     old = np.float64(r_confidence[m])
     share = own / (old + own)
+    r_x[m] = _inside(r_x[m] + share * (p[0] - r_x[m]), r_x[m], inverse_edge)
+    r_y[m] = _inside(r_y[m] + share * (p[1] - r_y[m]), r_y[m], inverse_edge)
+    r_z[m] = _inside(r_z[m] + share * (p[2] - r_z[m]), r_z[m], inverse_edge)
     for k in range(3):
-        moved = r_position[m, k] + share * (p[k] - r_position[m, k])
-        r_position[m, k] = _inside(moved, r_position[m, k], inverse_edge)
         value = r_color[m, k] + share * (sums[3 + k] / weight - r_color[m, k])
         r_color[m, k] = np.uint8(value + 0.5)
     r_spacing[m] += share * (width - r_spacing[m])

@@ -15,7 +15,8 @@ class Records:
     """Observations as parallel arrays with spare capacity; only the first ``count`` rows count.
 
     Attributes:
-        position: (C, 3) float32, scene units, relative to the memory's origin.
+        x, y, z: (C,) float32 each, scene units, relative to the memory's origin; apart, because
+            vector units want them so.
         color: (C, 3) uint8.
         confidence: (C,) float32, from the views of the observation's own round.
         spacing: (C,) float32, scene units.
@@ -25,7 +26,9 @@ class Records:
     """
 
     count: int = 0
-    position: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    x: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
+    y: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
+    z: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
     color: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
     confidence: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
     spacing: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
@@ -33,7 +36,7 @@ class Records:
     next: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     agreement: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
 
-    ARRAYS = ("position", "color", "confidence", "spacing", "view", "next", "agreement")
+    ARRAYS = ("x", "y", "z", "color", "confidence", "spacing", "view", "next", "agreement")
 
     def reserve(self, extra: int) -> None:
         """Make room for ``extra`` more rows, doubling the capacity."""
@@ -43,6 +46,12 @@ class Records:
             size = max(need, 2 * capacity)
             for name in self.ARRAYS:
                 setattr(self, name, extended(getattr(self, name), size, self.count))
+
+    @property
+    def position(self) -> NDArray[np.float32]:
+        """(N, 3) float32, a copy of x, y, z."""
+        n = self.count
+        return np.stack([self.x[:n], self.y[:n], self.z[:n]], axis=1)
 
     @property
     def nbytes(self) -> int:

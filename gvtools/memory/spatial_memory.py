@@ -151,7 +151,7 @@ class SpatialMemory:
     @property
     def positions(self) -> NDArray[np.float64]:
         """(N, 3) float64, world frame, scene units."""
-        return self.records.position[: len(self)].astype(np.float64) + self.origin
+        return self.records.position.astype(np.float64) + self.origin
 
     @property
     def confidence(self) -> NDArray[np.float32]:
@@ -254,8 +254,8 @@ class SpatialMemory:
             positions, colors, confidence, spacing, locals_, touched, starts, order,
             index.pool_local, index.pool_head, index.pool_state,
             index.block_offset, index.block_log2, index.block_count,
-            records.position, records.color, records.confidence, records.spacing, records.view,
-            records.next, first,
+            records.x, records.y, records.z, records.color, records.confidence, records.spacing,
+            records.view, records.next, first,
             view, views.centers[view], views.centers, views.round, views.generated,
             np.cos(np.radians(options.same_direction)), options.finer,
             options.observations_per_voxel, options.weight_cap, 1.0 / self.voxel,
@@ -328,7 +328,7 @@ class SpatialMemory:
         records, count = self.records, self.records.count
         keys = np.empty(count, np.int64)
         locals_ = np.empty(count, np.uint16)
-        fusion.voxel_keys(records.position[:count], 1.0 / self.voxel, keys, locals_)
+        fusion.voxel_keys(records.position, 1.0 / self.voxel, keys, locals_)
         blocks = self._index.block_numbers(keys)
         self._index.reserve_voxels(count, np.unique(blocks))
         index = self._index
@@ -357,7 +357,7 @@ class SpatialMemory:
         cloud = o3d.t.geometry.PointCloud()
         tensor = o3d.core.Tensor.from_numpy
         view = records.view[:n]
-        cloud.point.positions = tensor(records.position[:n].copy())
+        cloud.point.positions = tensor(records.position)
         cloud.point.colors = tensor(records.color[:n].copy())
         cloud.point.confidence = tensor(self.confidence[:, None])
         cloud.point.spacing = tensor(records.spacing[:n, None].copy())

@@ -217,8 +217,8 @@ class _Projection:
         records, runs = memory.records, memory.runs
         splat_kernels.splat_runs(
             chosen, runs.start, runs.length, runs.view, self.rect,
-            records.position, records.color, records.confidence, records.agreement,
-            records.spacing, self.weight, memory.views.generated,
+            records.x, records.y, records.z, records.color, records.confidence,
+            records.agreement, records.spacing, self.weight, memory.views.generated,
             self.cam_from_local.astype(np.float32), self.camera.K[0], self.near, limit,
             np.float32(options.band), np.float32(options.depth_reach),
             np.float32(options.blend_reach), np.float32(options.size_cap),

@@ -130,27 +130,26 @@ def summed_area(mask):
 
 
 @njit(cache=True, fastmath=FAST)
-def _project_run(first, length, position, spacing, M, fx, fy, skew, cx, cy, focal, near, u, v, z,
-                 size):  # fmt: skip
+def _project_run(x, y, z, spacing, M, fx, fy, skew, cx, cy, focal, near, u, v, depth, size):
     """Centre-of-pixel coordinates, depth and footprint width (pixels) of one run's points."""
-    for k in range(length):
-        i = first + k
-        x = position[i, 0]
-        y = position[i, 1]
-        w = position[i, 2]
-        px = M[0, 0] * x + M[0, 1] * y + M[0, 2] * w + M[0, 3]
-        py = M[1, 0] * x + M[1, 1] * y + M[1, 2] * w + M[1, 3]
-        pz = M[2, 0] * x + M[2, 1] * y + M[2, 2] * w + M[2, 3]
-        z[k] = pz
-        inverse = np.float32(1) / max(pz, near)
+    m00, m01, m02, m03 = M[0, 0], M[0, 1], M[0, 2], M[0, 3]
+    m10, m11, m12, m13 = M[1, 0], M[1, 1], M[1, 2], M[1, 3]
+    m20, m21, m22, m23 = M[2, 0], M[2, 1], M[2, 2], M[2, 3]
+    one = np.float32(1)
+    for k in range(len(x)):
+        px = m00 * x[k] + m01 * y[k] + m02 * z[k] + m03
+        py = m10 * x[k] + m11 * y[k] + m12 * z[k] + m13
+        pz = m20 * x[k] + m21 * y[k] + m22 * z[k] + m23
+        depth[k] = pz
+        inverse = one / max(pz, near)
         u[k] = (fx * px + skew * py) * inverse + cx
         v[k] = fy * py * inverse + cy
-        size[k] = max(spacing[i] * focal * inverse, np.float32(1))
+        size[k] = max(spacing[k] * focal * inverse, one)
 
 
 @njit(cache=True, parallel=True, fastmath=FAST)
 def splat_runs(
-    runs, run_start, run_length, run_view, rect, position, color, confidence, agreement, spacing,
+    runs, run_start, run_length, run_view, rect, x, y, z, color, confidence, agreement, spacing,
     view_weight, view_generated, M, K, near, limit, band, depth_reach, blend_reach, size_cap,
     weight_cap, bands, blend, depth, total,
 ):  # fmt: skip
@@ -183,7 +182,7 @@ def splat_runs(
         bottom = (b + 1) * height // bands - 1
         u = np.empty(longest, np.float32)
         v = np.empty(longest, np.float32)
-        z = np.empty(longest, np.float32)
+        depths = np.empty(longest, np.float32)
         size = np.empty(longest, np.float32)
         depth[top : bottom + 1] = np.inf
         if blend:
@@ -192,10 +191,12 @@ def splat_runs(
             if rect[r, 3] < top or rect[r, 2] > bottom:
                 continue
             length = run_length[r]
-            _project_run(run_start[r], length, position, spacing, M, fx, fy, skew, cx, cy, focal,
-                         near, u, v, z, size)  # fmt: skip
+            first = run_start[r]
+            last = first + length
+            _project_run(x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx,
+                         fy, skew, cx, cy, focal, near, u, v, depths, size)  # fmt: skip
             for k in range(length):
-                zk = z[k]
+                zk = depths[k]
                 if zk <= near:
                     continue
                 h = depth_reach * min(size[k], size_cap)
@@ -216,10 +217,11 @@ def splat_runs(
             first = run_start[r]
             proximity = view_weight[run_view[r]]
             made = np.float32(view_generated[run_view[r]])
-            _project_run(first, length, position, spacing, M, fx, fy, skew, cx, cy, focal,
-                         near, u, v, z, size)  # fmt: skip
+            last = first + length
+            _project_run(x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx,
+                         fy, skew, cx, cy, focal, near, u, v, depths, size)  # fmt: skip
             for k in range(length):
-                zk = z[k]
+                zk = depths[k]
                 if zk <= near:
                     continue
                 reach = blend_reach * min(size[k], size_cap)

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from gvtools.cameras import rigid_transform
 from gvtools.errors import ProjectError
 from gvtools.scenes.colmap_files import ModelFiles, check_cameras_size, check_model
+from gvtools.scenes.photographs import rotation_findings
+from gvtools.scenes.quaternions import rotation_from_quaternion
 from gvtools.scenes.scene import Finding, SparsePoints, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
 
@@ -83,7 +85,8 @@ def load_model(folder: Path) -> ColmapModel:
             f"{folder}: no registered image among {reconstruction.num_images()}; expected at least "
             "one; solve the cameras again, or give another model folder"
         )
-    images = _registered(files, reconstruction)
+    images, defects = _registered(files, reconstruction)
+    findings += rotation_findings(defects)
     absent = reconstruction.num_images() - len(images)
     if absent:
         findings.append(
@@ -145,17 +148,25 @@ def _has_carriage_returns(folder: Path) -> bool:
 
 def _registered(
     files: ModelFiles, reconstruction: pycolmap.Reconstruction
-) -> tuple[RegisteredImage, ...]:
-    images = []
+) -> tuple[tuple[RegisteredImage, ...], list[float]]:
+    """The images with a pose, and how far each rotation was from orthonormal."""
+    images, defects = [], []
     for image in reconstruction.images.values():
         if not image.has_pose:
             continue
-        name = files.names.get(image.image_id, image.name)
-        pose, _ = rigid_transform(
-            image.cam_from_world().matrix(), what=f"{files.folder}, image {name}"
-        )
+        try:
+            name = files.names.get(image.image_id) or image.name
+        except UnicodeDecodeError:
+            raise ProjectError(
+                f"{files.folder}: the name of image {image.image_id} is no UTF-8; the file is "
+                "damaged or of another encoding; export the model again"
+            ) from None
+        matrix = np.array(image.cam_from_world().matrix())
+        matrix[:, :3] = rotation_from_quaternion(image.cam_from_world().rotation.quat)
+        pose, defect = rigid_transform(matrix, what=f"{files.folder}, image {name}")
+        defects.append(defect)
         images.append(RegisteredImage(image.image_id, name, image.camera_id, pose))
-    return tuple(sorted(images, key=lambda image: natural_key(image.name)))
+    return tuple(sorted(images, key=lambda image: natural_key(image.name))), defects
 
 
 def sparse_points(

@@ -17,6 +17,8 @@ from gvtools.scenes.scene import Finding, Frame, View
 from gvtools.scenes.undistort import Undistortion
 
 Depth = NDArray[np.float32]
+# A rotation nearer to orthonormal than this is as good as text with few digits can be.
+ROUNDING = 1e-5
 NAMED_AT_MOST = 3  # a finding names this many files and counts the rest
 
 
@@ -155,6 +157,20 @@ def lens_findings(lenses: Sequence[Undistortion]) -> list[Finding]:
         listed = named([f"{width}x{height}" for width, height in sizes])
         findings.append(Finding("info", f"views have {len(sizes)} different sizes: {listed}"))
     return findings
+
+
+def rotation_findings(defects: Sequence[float]) -> list[Finding]:
+    """One line when rotations had to be made orthonormal."""
+    mended = sum(defect > ROUNDING for defect in defects)
+    if not mended:
+        return []
+    return [
+        Finding(
+            "info",
+            f"{mended} of {len(defects)} rotations made orthonormal; largest entry of R Rᵀ − I "
+            f"was {max(defects):.2g}",
+        )
+    ]
 
 
 def named(items: Sequence[object]) -> str:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.scenes.room_textures import Texture, encode_srgb
+from gvtools.scenes.room_textures import Texture, average_blocks, encode_srgb
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -41,11 +42,11 @@ class Grid:
     y: Float64
     supersample: int
 
-    def window(self, points: Float64) -> tuple[slice, slice]:
-        """Rows and columns that the hull of (N, 3) world points can cover."""
-        local = (points - self.center) @ self.rotation.T
+    def window(self, patch: Patch) -> tuple[slice, slice]:
+        """Rows and columns that a patch can cover."""
+        local = (patch.hull() - self.center) @ self.rotation.T
         everything = slice(0, len(self.y)), slice(0, len(self.x))
-        if (local[:, 2] < NEAREST).all():
+        if patch.averted(self.center) or (local[:, 2] < NEAREST).all():
             return slice(0, 0), slice(0, 0)
         if (local[:, 2] < NEAREST).any():
             return everything
@@ -88,6 +89,10 @@ class Patch:
         """(N, 3) points whose convex hull holds the patch."""
         raise NotImplementedError
 
+    def averted(self, center: Float64) -> bool:
+        """Whether nothing of it can be seen from a (3,) place, being behind it."""
+        return False
+
     def hit(self, grid: Grid, rows: slice, columns: slice) -> tuple[Float64, Float64, Float64]:
         """z-depth (infinity where missed), s and t, each (h, w), for a window of the grid."""
         raise NotImplementedError
@@ -109,6 +114,12 @@ class Flat(Patch):
     v: Float64
     round: bool = False
 
+    @cached_property
+    def normal(self) -> Float64:
+        """(3,) of unit length, towards where it is seen from."""
+        normal = np.cross(self.v, self.u)
+        return normal / np.linalg.norm(normal)
+
     @property
     def size(self) -> tuple[float, float]:  # noqa: D102
         return float(np.linalg.norm(self.u)), float(np.linalg.norm(self.v))
@@ -116,11 +127,11 @@ class Flat(Patch):
     def hull(self) -> Float64:  # noqa: D102
         return self.origin + np.array([0 * self.u, self.u, self.v, self.u + self.v])
 
+    def averted(self, center: Float64) -> bool:  # noqa: D102
+        return bool(self.normal @ (center - self.origin) <= 0)
+
     def hit(self, grid: Grid, rows: slice, columns: slice) -> tuple[Float64, Float64, Float64]:  # noqa: D102
         x, y = grid.x[columns][None, :], grid.y[rows][:, None]
-        if np.cross(self.v, self.u) @ (grid.center - self.origin) <= 0:
-            nothing = np.full((y.shape[0], x.shape[1]), np.inf)
-            return nothing, nothing, nothing
         plane = grid.rotation @ np.stack([self.u, self.v, self.origin - grid.center], axis=1)
         H = np.linalg.inv(grid.K @ plane)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -134,10 +145,8 @@ class Flat(Patch):
         return np.where(inside, z, np.inf), s, t
 
     def at(self, s: Float64, t: Float64) -> tuple[Float64, Float64]:  # noqa: D102
-        normal = np.cross(self.v, self.u)
-        normal = normal / np.linalg.norm(normal)
         position = self.origin + s[..., None] * self.u + t[..., None] * self.v
-        return position, np.broadcast_to(normal, position.shape)
+        return position, np.broadcast_to(self.normal, position.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +167,8 @@ class Ball(Patch):
     def hit(self, grid: Grid, rows: slice, columns: slice) -> tuple[Float64, Float64, Float64]:  # noqa: D102
         ray = grid.directions(rows, columns)
         offset = grid.center - self.center
-        z = _first_root((ray**2).sum(-1), ray @ offset, offset @ offset - self.radius**2)
+        squared = np.einsum("hwi,hwi->hw", ray, ray)
+        z = _first_root(squared, ray @ offset, offset @ offset - self.radius**2)
         with np.errstate(invalid="ignore"):
             normal = (offset + z[..., None] * ray) / self.radius
         s = np.arctan2(normal[..., 1], normal[..., 0]) / (2 * np.pi) + 0.5
@@ -193,7 +203,7 @@ class Tube(Patch):
         offset = grid.center - self.foot
         across = ray[..., :2]
         z = _first_root(
-            (across**2).sum(-1),
+            np.einsum("hwi,hwi->hw", across, across),
             across @ offset[:2],
             offset[:2] @ offset[:2] - self.radius**2,
         )
@@ -248,7 +258,7 @@ def cast(patches: Sequence[Patch], camera: Cameras, *, supersample: int = 1) -> 
     shape = len(grid.y), len(grid.x)
     hits = Hits(np.full(shape, -1, np.int16), np.full(shape, np.inf), np.zeros(shape), np.zeros(shape))
     for index, patch in enumerate(patches):
-        rows, columns = grid.window(patch.hull())
+        rows, columns = grid.window(patch)
         if rows.stop <= rows.start or columns.stop <= columns.start:
             continue
         z, s, t = patch.hit(grid, rows, columns)
@@ -275,14 +285,12 @@ def shade(
         y, x = np.divmod(rows, len(grid.x))
         ray = grid.directions(y, x)
         _, normal = patch.at(s, t)
-        facing = np.maximum(np.abs((normal * ray).sum(-1)), 1e-3)
+        facing = np.maximum(np.abs(np.einsum("ni,ni->n", normal, ray)), 1e-3)
         # The surface that one sample covers: z² dx dy / |n · ray|, ray of unit z-depth.
         side = z / (grid.supersample * np.sqrt(grid.K[0, 0] * grid.K[1, 1] * facing))
         color = patch.texture.sample(s * patch.tiles[0], t * patch.tiles[1], _texels(patch) * side)
         linear[rows] = color * (bilinear(light, s, t) + np.float32(patch.emission))
-    n = grid.supersample
-    height, width = hits.patch.shape
-    return encode_srgb(linear.reshape(height // n, n, width // n, n, 3).mean((1, 3)))
+    return encode_srgb(average_blocks(linear.reshape(*hits.patch.shape, 3), grid.supersample))
 
 
 def _texels(patch: Patch) -> float:

@@ -28,6 +28,7 @@ from gvtools.scenes.photographs import (
     header_findings,
     lens_findings,
     named,
+    rotation_findings,
 )
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.undistort import undistortion
@@ -36,8 +37,6 @@ Float64 = NDArray[np.float64]
 
 SIDECAR = "rgbd.json"
 MILLIMETRES = 1e-3
-# A rotation nearer to orthonormal than this is as good as float text can be.
-ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,20 +196,6 @@ def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:
     ]
     views = tuple(item.view() for item in photographs)
     return Scene(root, "rgbd", views, None, tuple(findings), metric=True)
-
-
-def rotation_findings(defects: Sequence[float]) -> list[Finding]:
-    """One line when rotations had to be made orthonormal."""
-    mended = sum(defect > ROUNDING for defect in defects)
-    if not mended:
-        return []
-    return [
-        Finding(
-            "info",
-            f"{mended} of {len(defects)} rotations made orthonormal; largest entry of R Rᵀ − I "
-            f"was {max(defects):.2g}",
-        )
-    ]
 
 
 def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:

@@ -15,6 +15,7 @@ Float32 = NDArray[np.float32]
 
 CELL = 0.09  # edge of a light-map cell, scene units
 AMBIENT_REACH = 1.3  # what is farther than this does not darken a corner, scene units
+BURIED = 0.25  # light on a patch that is buried but for less than a cell
 LIFT = 4e-3  # rays start this far above their surface, scene units
 
 
@@ -40,10 +41,14 @@ class Block:
         """Where (N, 3) rays enter and leave, in multiples of ``ray``; entry > exit: missed."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-        start, step = (origin - self.center) @ turn.T, ray @ turn.T
-        step = np.where(np.abs(step) < 1e-12, 1e-12, step)
-        one, other = (-self.half - start) / step, (self.half - start) / step
-        return np.minimum(one, other).max(-1), np.maximum(one, other).min(-1)
+        starts, steps = ((origin - self.center) @ turn.T).T, (ray @ turn.T).T
+        enter, leave = np.full(len(origin), -np.inf), np.full(len(origin), np.inf)
+        for start, step, half in zip(starts, steps, self.half, strict=True):
+            across = np.where(np.abs(step) < 1e-12, 1e-12, step)
+            one, other = (-half - start) / across, (half - start) / across
+            np.maximum(enter, np.minimum(one, other), out=enter)
+            np.minimum(leave, np.maximum(one, other), out=leave)
+        return enter, leave
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +71,7 @@ class Sphere:
         """Where (N, 3) rays enter and leave, in multiples of ``ray``; entry > exit: missed."""
         offset = origin - self.center
         return _roots(
-            (ray**2).sum(-1), (ray * offset).sum(-1), (offset**2).sum(-1) - self.radius**2
+            _dot(ray, ray), _dot(ray, offset), _dot(offset, offset) - self.radius**2
         )
 
 
@@ -93,9 +98,9 @@ class Cylinder:
         """Where (N, 3) rays enter and leave, in multiples of ``ray``; entry > exit: missed."""
         offset, across = (origin - self.foot)[:, :2], ray[:, :2]
         enter, leave = _roots(
-            (across**2).sum(-1) + 1e-24,
-            (across * offset).sum(-1),
-            (offset**2).sum(-1) - self.radius**2,
+            _dot(across, across) + 1e-24,
+            _dot(across, offset),
+            _dot(offset, offset) - self.radius**2,
         )
         up = np.where(np.abs(ray[:, 2]) < 1e-12, 1e-12, ray[:, 2])
         one = (self.foot[2] - origin[:, 2]) / up
@@ -104,6 +109,11 @@ class Cylinder:
 
 
 Solid = Block | Sphere | Cylinder
+
+
+def _dot(a: Float64, b: Float64) -> Float64:
+    """(N,) scalar products of (N, d) or (d,) vectors."""
+    return np.einsum("...i,...i->...", a, b)
 
 
 def _roots(a: Float64, b: Float64, c: Float64) -> tuple[Float64, Float64]:
@@ -159,7 +169,8 @@ def bake(
     shapes, places, normals = [], [], []
     for patch in patches:
         length, breadth = patch.size
-        shape = tuple(int(np.clip(round(x / CELL), 3, 96)) for x in (breadth, length))
+        fewest = 6 if min(length, breadth) > 0.1 else 3
+        shape = tuple(int(np.clip(round(x / CELL), fewest, 96)) for x in (breadth, length))
         t, s = ((np.arange(n) + 0.5) / n for n in shape)
         position, normal = patch.at(*(grid.ravel() for grid in np.meshgrid(s, t)))
         shapes.append(shape)
@@ -183,7 +194,7 @@ def _buried(place: Float64, solids: Sequence[Solid]) -> NDArray[np.bool_]:
     up = np.array([0.0, 0.0, 1.0])
     for solid in solids:
         center, radius = solid.ball()
-        rows = np.flatnonzero(((place - center) ** 2).sum(-1) < radius**2)
+        rows = np.flatnonzero(_dot(place - center, place - center) < radius**2)
         enter, leave = solid.interval(place[rows], np.broadcast_to(up, (len(rows), 3)))
         inside[rows] |= (enter < 0) & (leave > 0)
     return inside
@@ -197,7 +208,7 @@ def _filled(light: Float64) -> Float64:
     if not buried.any():
         return light
     if buried.all():
-        return np.zeros_like(light)
+        return np.full_like(light, BURIED)
     rows, columns = distance_transform_edt(buried, return_distances=False, return_indices=True)
     return light[rows, columns]
 
@@ -230,7 +241,7 @@ def _openness(
 
 def _near(place: Float64, solid: Solid, reach: float) -> NDArray[np.intp]:
     center, radius = solid.ball()
-    return np.flatnonzero(((place - center) ** 2).sum(-1) < (radius + reach) ** 2)
+    return np.flatnonzero(_dot(place - center, place - center) < (radius + reach) ** 2)
 
 
 def _direct(place: Float64, normal: Float64, solids: Sequence[Solid], lamp: Lamp) -> Float64:
@@ -238,8 +249,9 @@ def _direct(place: Float64, normal: Float64, solids: Sequence[Solid], lamp: Lamp
     axis = axis / np.linalg.norm(axis)
     parts = np.array(list(lamp.samples(5, 4)))
     ray = parts - place[:, None]
-    squared = (ray**2).sum(-1)
-    strength = np.maximum(np.einsum("npi,ni->np", ray, normal), 0) * np.maximum(-(ray @ axis), 0)
+    squared = np.einsum("npi,npi->np", ray, ray)
+    facing = np.einsum("npi,ni->np", ray, normal)
+    strength = np.maximum(facing, 0) * np.maximum(-(ray @ axis), 0)
     strength /= squared**2
     middle = lamp.origin + (lamp.u + lamp.v) / 2
     extent = float(np.linalg.norm(lamp.u) + np.linalg.norm(lamp.v)) / 2
@@ -256,7 +268,7 @@ def _between(place: Float64, end: Float64, solid: Solid, extent: float) -> NDArr
     """(N,) whether a solid may stand between places and a lamp of that extent round ``end``."""
     center, radius = solid.ball()
     ray = end - place
-    along = ((center - place) * ray).sum(-1) / (ray**2).sum(-1)
-    along = np.clip(along, 0, 1)
-    gap = np.linalg.norm(place + along[:, None] * ray - center, axis=-1)
-    return gap < radius + extent * np.minimum(along + radius / np.linalg.norm(ray, axis=-1), 1)
+    length = np.sqrt(_dot(ray, ray))
+    along = np.clip(_dot(center - place, ray) / length**2, 0, 1)
+    offset = place + along[:, None] * ray - center
+    return _dot(offset, offset) < (radius + extent * np.minimum(along + radius / length, 1)) ** 2

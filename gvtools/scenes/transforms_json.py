@@ -20,8 +20,13 @@ from gvtools.cameras import Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.scenes.images import read_depth, read_header
 from gvtools.scenes.lens_parameters import lens_parameters
-from gvtools.scenes.photographs import Photograph, header_findings, lens_findings, named
-from gvtools.scenes.rgbd import rotation_findings
+from gvtools.scenes.photographs import (
+    Photograph,
+    header_findings,
+    lens_findings,
+    named,
+    rotation_findings,
+)
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
 

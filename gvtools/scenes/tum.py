@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
+from gvtools.scenes.quaternions import rotation_from_quaternion
 from gvtools.scenes.rgbd import (
     Recording,
     RgbdFrame,
@@ -124,18 +125,6 @@ def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:
             pairs[i] = j
             taken.add(j)
     return pairs
-
-
-def rotation_from_quaternion(quaternion: Float64) -> Float64:
-    """(3, 3) of x, y, z, w, scaled by the squared length, so that a wrong length shows."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [w * w + x * x - y * y - z * z, 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), w * w - x * x + y * y - z * z, 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), w * w - x * x - y * y + z * z],
-        ]
-    )
 
 
 def _rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:

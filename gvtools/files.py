@@ -1,0 +1,41 @@
+"""Writing files so that a crash or a full disk leaves the earlier version whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from gvtools.errors import ProjectError
+
+
+@contextmanager
+def replaced_when_written(path: Path) -> Iterator[Path]:
+    """Gives a temporary name beside ``path``; on success it is flushed and takes that name.
+
+    Raises:
+        ProjectError: writing failed; the temporary file is removed and ``path`` is untouched.
+    """
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise ProjectError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space or choose "
+            "another folder; what was there before is intact"
+        ) from error
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a whole text file (UTF-8) under its final name only when it is complete."""
+    with replaced_when_written(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

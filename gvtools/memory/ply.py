@@ -1,0 +1,150 @@
+"""Point clouds as binary PLY: written for every viewer, read back strictly.
+
+Open3D's own PLY reader returns the header's number of points for a truncated file, the missing
+ones being whatever the heap held. Here the header's count times its stride must equal the file's
+size.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import MemoryFileError
+from gvtools.files import replaced_when_written
+
+if TYPE_CHECKING:
+    from gvtools.memory.spatial_memory import SpatialMemory
+
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4",
+    "float": "<f4", "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2",
+    "uint16": "<u2", "int32": "<i4", "uint32": "<u4", "float32": "<f4", "float64": "<f8",
+}  # fmt: skip
+_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
+_MAX_HEADER = 1 << 16
+
+
+def write_ply(path: Path, vertices: NDArray[np.void], *, comments: tuple[str, ...] = ()) -> None:
+    """Write a structured array as the vertices of a little-endian binary PLY."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
+    lines.append(f"element vertex {len(vertices)}")
+    names = vertices.dtype.names or ()
+    lines += [f"property {_NAMES[vertices.dtype[name].str[1:]]} {name}" for name in names]
+    lines.append("end_header\n")
+    with replaced_when_written(path) as temporary, temporary.open("wb") as file:
+        file.write("\n".join(lines).encode("ascii"))
+        vertices.tofile(file)
+
+
+def read_ply(path: Path) -> NDArray[np.void]:
+    """The vertices of a little-endian binary PLY as a structured array.
+
+    Raises:
+        MemoryFileError: no such file, another kind of PLY, or a size other than the header's.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_MAX_HEADER)
+    except OSError as error:
+        raise MemoryFileError(f"{path}: cannot be read ({error.strerror})") from None
+    end = head.find(b"end_header\n")
+    if not head.startswith(b"ply\n") or end < 0:
+        raise MemoryFileError(f"{path}: no PLY header; expected a binary PLY point cloud")
+    offset = end + len(b"end_header\n")
+    count, dtype = _parse_header(path, head[:end].decode("ascii", "replace"))
+    expected = offset + count * dtype.itemsize
+    found = path.stat().st_size
+    if expected != found:
+        raise MemoryFileError(
+            f"{path}: {found} bytes, but its header says {count} vertices of {dtype.itemsize} "
+            f"bytes, that is {expected}; the file is truncated or damaged"
+        )
+    return np.fromfile(path, dtype, count, offset=offset)
+
+
+def _parse_header(path: Path, text: str) -> tuple[int, np.dtype[np.void]]:
+    count = -1
+    columns: list[tuple[str, str]] = []
+    for line in text.splitlines()[1:]:
+        words = line.split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words[0] == "format" and words[1:] == ["binary_little_endian", "1.0"]:
+            continue
+        if words[0] == "element" and len(words) == 3 and words[2].isdecimal():
+            if words[1] == "vertex" and count < 0:
+                count = int(words[2])
+                continue
+            if words[2] == "0":
+                continue
+        elif words[0] == "property" and len(words) == 3 and words[1] in _TYPES and count >= 0:
+            columns.append((words[2], _TYPES[words[1]]))
+            continue
+        raise MemoryFileError(
+            f"{path}: PLY header line {line!r}; expected one vertex element of scalar properties "
+            "in binary_little_endian 1.0"
+        )
+    names = [name for name, _ in columns]
+    if count < 0 or not {"x", "y", "z"} <= set(names) or len(set(names)) != len(names):
+        raise MemoryFileError(f"{path}: PLY header without distinct vertex properties x, y, z")
+    return count, np.dtype(columns)
+
+
+def export_memory_ply(
+    memory: SpatialMemory, path: Path, *, max_points: int | None = None
+) -> tuple[int, float]:
+    """Write the observations with colour, confidence, spacing, round, view and generated.
+
+    x, y, z are in the input's world frame: float, or double where the origin is so far away that
+    float would lose a tenth of a voxel.
+
+    Args:
+        memory: what to write.
+        path: the PLY.
+        max_points: thin to at most so many points: one per voxel (the most confident), of voxels
+            as much larger than the memory's as it takes; None keeps every observation.
+
+    Returns:
+        Points written, and the voxel edge they were thinned to (0 when all were kept).
+    """
+    rows, edge = _thinned(memory, max_points)
+    positions = memory.positions[rows]
+    reach = float(np.abs(positions).max(initial=0))
+    coordinate = "<f8" if reach * 2.0**-24 > 0.1 * memory.voxel else "<f4"
+    records, views = memory.records, memory.views
+    vertices = np.empty(
+        len(rows),
+        [("x", coordinate), ("y", coordinate), ("z", coordinate), ("red", "u1"), ("green", "u1"),
+         ("blue", "u1"), ("confidence", "<f4"), ("spacing", "<f4"), ("round", "<i4"),
+         ("view", "<i4"), ("generated", "u1")],
+    )  # fmt: skip
+    for k, (axis, color) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+        vertices[axis] = positions[:, k]
+        vertices[color] = records.color[rows, k]
+    view = records.view[rows]
+    vertices["confidence"] = memory.confidence[rows]
+    vertices["spacing"] = records.spacing[rows]
+    vertices["round"] = views.round[view]
+    vertices["view"] = view
+    vertices["generated"] = views.generated[view]
+    write_ply(path, vertices, comments=("gvtools memory, input world frame, scene units",))
+    return len(rows), edge
+
+
+def _thinned(memory: SpatialMemory, max_points: int | None) -> tuple[NDArray[np.int64], float]:
+    count = len(memory)
+    if max_points is None or count <= max_points:
+        return np.arange(count), 0.0
+    edge = memory.voxel
+    positions = memory.records.position.astype(np.float64)
+    order = np.argsort(-memory.confidence, kind="stable")
+    while True:
+        keys = np.floor(positions[order] / edge).astype(np.int64)
+        _, first = np.unique(keys, axis=0, return_index=True)
+        if len(first) <= max_points:
+            return np.sort(order[first]), edge
+        edge *= max(1.1, float(np.sqrt(len(first) / max_points)))

@@ -1,0 +1,104 @@
+"""A sample written as a COLMAP dense workspace, whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.errors import ProjectError
+from gvtools.scenes.colmap_depth import write_depth_map
+from gvtools.scenes.colmap_writer import write_colmap
+
+RECORD = "sample.json"
+
+
+@dataclass(frozen=True, eq=False)
+class SampleContent:
+    """What a sample consists of.
+
+    Attributes:
+        cameras: V cameras, named like the images.
+        images: V arrays (H, W, 3) uint8.
+        depths: V arrays (H, W) float32 z-depth, scene units, 0 = none; None: no depth map.
+        points: (N, 3) float64 sparse points, world frame, scene units.
+        colors: (N, 3) uint8.
+        tracks: point index (M,), view index (M,) and position (M, 2) in pixels.
+    """
+
+    cameras: Cameras
+    images: Sequence[NDArray[np.uint8]]
+    depths: Sequence[NDArray[np.float32] | None]
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    tracks: tuple[NDArray[Any], NDArray[Any], NDArray[Any]] = field(repr=False)
+
+
+def is_written(folder: Path, record: dict[str, Any]) -> bool:
+    """Whether the folder holds exactly the sample that the record describes.
+
+    Raises:
+        ProjectError: it holds something else.
+    """
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return False
+    try:
+        found = json.loads((folder / RECORD).read_text())
+    except (OSError, ValueError):
+        found = None
+    if found != json.loads(json.dumps(record)):
+        what = "another sample" if found is not None else "something other than a sample"
+        raise ProjectError(
+            f"{folder}: holds {what}; expected a new or an empty folder; name another one or "
+            "remove this one"
+        )
+    return True
+
+
+def write_sample(folder: Path, content: SampleContent, *, record: dict[str, Any]) -> None:
+    """Write images, model, depth maps and the record to a folder that is absent or empty.
+
+    Raises:
+        ProjectError: the folder cannot be written.
+    """
+    from PIL import Image
+
+    partial: Path | None = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        (partial / "images").mkdir()
+        for name, image, depth in zip(
+            content.cameras.names, content.images, content.depths, strict=True
+        ):
+            Image.fromarray(image).save(partial / "images" / name, compress_level=3)
+            if depth is not None:
+                write_depth_map(partial / "stereo/depth_maps" / f"{name}.geometric.bin", depth)
+        point_index, view_index, xy = content.tracks
+        write_colmap(
+            partial / "sparse" / "0",
+            content.cameras,
+            points=content.points,
+            colors=content.colors,
+            point_index=point_index,
+            view_index=view_index,
+            xy=xy,
+        )
+        (partial / RECORD).write_text(json.dumps(record, indent=1) + "\n")
+        # mkdtemp makes folders private; a sample is as readable as any other folder.
+        partial.chmod(0o755)
+        os.replace(partial, folder)
+    except OSError as error:
+        raise ProjectError(f"{folder}: the sample could not be written ({error})") from None
+    finally:
+        if partial is not None:
+            shutil.rmtree(partial, ignore_errors=True)
