@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ShapeError
+from gvtools.memory.compiled import compiled
 from gvtools.memory.points import PointSet
 
 # Side of a cell of the free-space grid, pixels.
@@ -105,12 +105,12 @@ def back_project(
     )
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def _usable(z):
     return z > 0 and z < np.inf
 
 
-@njit(cache=True)
+@compiled()
 def _lift(rgb, depth, trust, mask, K, world_from_cam, edge, depth_max, grazing,
           positions, colors, weight, spacing):  # fmt: skip
     height, width = depth.shape
@@ -144,7 +144,8 @@ def _lift(rgb, depth, trust, mask, K, world_from_cam, edge, depth_max, grazing,
             rx = (col + 0.5 - cx - skew * ry) / fx
             for k in range(3):
                 positions[n, k] = (
-                    z * (world_from_cam[k, 0] * rx + world_from_cam[k, 1] * ry + world_from_cam[k, 2])
+                    z
+                    * (world_from_cam[k, 0] * rx + world_from_cam[k, 1] * ry + world_from_cam[k, 2])
                     + world_from_cam[k, 3]
                 )
                 colors[n, k] = rgb[row, col, k]
@@ -154,7 +155,7 @@ def _lift(rgb, depth, trust, mask, K, world_from_cam, edge, depth_max, grazing,
     return n, invalid, edges, masked
 
 
-@njit(cache=True)
+@compiled()
 def _surface_cosine(depth, row, col, edge, fx, fy, cx, cy):
     """Cosine between the pixel's ray and the surface there; -1 on a depth edge.
 
@@ -206,7 +207,7 @@ def _surface_cosine(depth, row, col, edge, fx, fy, cx, cy):
     return inverse / (np.sqrt(a * a + b * b + c * c) * np.sqrt(x * x + y * y + 1.0))
 
 
-@njit(cache=True)
+@compiled()
 def _free_depth(depth, mask, depth_max):
     """(ceil(H/4), ceil(W/4)): the nearest depth of each cell, 0 unless every pixel has one."""
     height, width = depth.shape

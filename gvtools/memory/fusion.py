@@ -9,8 +9,8 @@ once the chain is full, and stands beside the others otherwise.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from gvtools.memory.compiled import compiled
 from gvtools.memory.voxel_index import (
     BLOCK_BITS,
     EMPTY_KEY,
@@ -26,7 +26,7 @@ ADDED, MERGED, AGREED, REJECTED_OBSERVED, NEW_VOXELS, MERGED_POINTS = range(6)
 REPORT_SIZE = 6
 
 
-@njit(cache=True)
+@compiled()
 def voxel_keys(positions, inverse_edge, keys, locals_):
     """Block key and place in the block of each point; EMPTY_KEY when it is out of reach."""
     outside = 0
@@ -50,7 +50,7 @@ def voxel_keys(positions, inverse_edge, keys, locals_):
     return outside
 
 
-@njit(cache=True)
+@compiled()
 def group_by_block(blocks, total):
     """Counting sort of the points by block, blocks in the order of their first point.
 
@@ -81,7 +81,7 @@ def group_by_block(blocks, total):
     return touched[:n], starts[: n + 1], order
 
 
-@njit(cache=True, fastmath={"nsz", "arcp", "contract"})
+@compiled(fastmath={"nsz", "arcp", "contract"})
 def _most_similar(head, p, spacing, center, view_centers, r_view, r_spacing, r_next):
     """The chain's observation seen from the most similar direction: (record, cosine, length)."""
     ax = center[0] - p[0]
@@ -114,7 +114,7 @@ def _most_similar(head, p, spacing, center, view_centers, r_view, r_spacing, r_n
     return best, best_cosine, length
 
 
-@njit(cache=True)
+@compiled()
 def fuse_blocks(
     positions, colors, confidence, spacing, locals_, touched, starts, order,
     pool_local, pool_head, pool_state, block_offset, block_log2, block_count,
@@ -208,15 +208,10 @@ def fuse_blocks(
                 best, cosine, length = _most_similar(
                     head, p, width, center, view_centers, r_view, r_spacing, r_next
                 )
-                if (
-                    best != NO_RECORD
-                    and not generated
-                    and view_generated[r_view[best]]
-                ):
+                if best != NO_RECORD and not generated and view_generated[r_view[best]]:
                     best = NO_RECORD  # generated content never stands in for observed content
             if best != NO_RECORD and (
-                length >= capacity
-                or (cosine >= cosine_same and width >= finer * r_spacing[best])
+                length >= capacity or (cosine >= cosine_same and width >= finer * r_spacing[best])
             ):
                 pool_head[slot] = head
                 report[MERGED_POINTS] += t_points[t]
@@ -260,25 +255,23 @@ def fuse_blocks(
     return count, runs, agreed
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def _inside(value, member, inverse_edge):
     """``value`` as float32, or ``member`` where rounding pushed it out of the member's voxel."""
     rounded = np.float32(value)
-    if np.floor(np.float64(rounded) * inverse_edge) != np.floor(
-        np.float64(member) * inverse_edge
-    ):
+    if np.floor(np.float64(rounded) * inverse_edge) != np.floor(np.float64(member) * inverse_edge):
         return np.float32(member)
     return rounded
 
 
-@njit(cache=True)
+@compiled()
 def _relocate(pool_head, offset, log2, t_slot):
     for slot in range(offset, offset + (np.int64(1) << np.int64(log2))):
         if pool_head[slot] <= -2:
             t_slot[-2 - pool_head[slot]] = slot
 
 
-@njit(cache=True)
+@compiled()
 def _any_observed(head, r_view, r_next, view_generated):
     m = head
     while m != NO_RECORD:
@@ -288,7 +281,7 @@ def _any_observed(head, r_view, r_next, view_generated):
     return False
 
 
-@njit(cache=True)
+@compiled()
 def _merge(m, p, sums, weight, own, width, view, inverse_edge, r_x, r_y, r_z, r_color,
            r_confidence, r_spacing, r_view, weight_cap):  # fmt: skip
     """Confidence-weighted running mean; the integer view goes to the more confident side."""
@@ -306,7 +299,7 @@ def _merge(m, p, sums, weight, own, width, view, inverse_edge, r_x, r_y, r_z, r_
     r_confidence[m] = min(old + own, weight_cap)
 
 
-@njit(cache=True)
+@compiled()
 def link_records(
     locals_, pool_local, pool_head, pool_state, block_offset, block_log2, block_count,
     blocks, r_next,

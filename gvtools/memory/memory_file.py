@@ -200,7 +200,7 @@ def _check_consistency(arrays: dict[str, NDArray[Any]], views: int) -> None:
         if arrays[name].shape != shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")
     rows = arrays["record_view"]
-    if count and not (0 <= rows.min() and rows.max() < views):
+    if count and not (rows.min() >= 0 and rows.max() < views):
         raise ValueError("an observation names a view that is not there")
     start, length = arrays["run_start"], arrays["run_length"].astype(np.int64)
     if len(start) and not (start[0] == 0 and (start[1:] == (start + length)[:-1]).all()):
@@ -208,7 +208,7 @@ def _check_consistency(arrays: dict[str, NDArray[Any]], views: int) -> None:
     if int(length.sum()) != count:
         raise ValueError("runs do not cover the observations")
     run_view = arrays["run_view"]
-    if len(run_view) and not (0 <= run_view.min() and run_view.max() < views):
+    if len(run_view) and not (run_view.min() >= 0 and run_view.max() < views):
         raise ValueError("a run names a view that is not there")
     if int(arrays["grid_shape"].prod(axis=1).sum()) != len(arrays["grid_depth"]):
         raise ValueError("the free-space grids do not fill their array")

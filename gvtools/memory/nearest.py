@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import Cameras
+from gvtools.memory.compiled import FAST, compiled
 
 CHUNK = 512
-FAST = {"nsz", "arcp", "contract", "reassoc"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,17 +32,17 @@ class NearestImage:
     index: NDArray[np.int32]
 
 
-@njit(cache=True, fastmath=FAST)
+@compiled(fastmath=FAST)
 def _fill(x, y, z, first, last, M, fx, skew, fy, cx, cy, depth_max, width, height, buffer):
     """Depth bits in the high half and the point's index in the low half: one comparison."""
-    pixel = np.empty(CHUNK, np.int32)
+    pixel = np.empty(CHUNK, np.uint32)
     depth = np.empty(CHUNK, np.float32)
     bits = depth.view(np.int32)
     columns = np.int32(width)
     wide = np.float32(width)
     tall = np.float32(height)
     half = np.float32(0.5)
-    spare = np.int32(width * height)
+    spare = np.uint32(width * height)
     m00, m01, m02, m03 = M[0, 0], M[0, 1], M[0, 2], M[0, 3]
     m10, m11, m12, m13 = M[1, 0], M[1, 1], M[1, 2], M[1, 3]
     m20, m21, m22, m23 = M[2, 0], M[2, 1], M[2, 2], M[2, 3]
@@ -59,19 +59,18 @@ def _fill(x, y, z, first, last, M, fx, skew, fy, cx, cy, depth_max, width, heigh
             inverse = np.float32(1) / pz
             u = (fx * px + skew * py) * inverse + cx + half
             v = fy * py * inverse + cy + half
-            inside = (
-                (u >= 0) & (u < wide) & (v >= 0) & (v < tall) & (pz > 0) & (pz <= depth_max)
-            )
+            inside = (u >= 0) & (u < wide) & (v >= 0) & (v < tall) & (pz > 0) & (pz <= depth_max)
             # Out of view goes to a spare cell behind the image, so the loop has no branch.
-            pixel[k] = np.int32(v) * columns + np.int32(u) if inside else spare
+            pixel[k] = np.uint32(np.int32(v) * columns + np.int32(u)) if inside else spare
             depth[k] = pz
         for k in range(n):
             key = (np.int64(bits[k]) << 32) | np.int64(start + k)
-            if key < buffer[pixel[k]]:
-                buffer[pixel[k]] = key
+            cell = np.uint64(pixel[k])
+            # Always stored: a branch here would be mispredicted at every new minimum.
+            buffer[cell] = min(buffer[cell], key)
 
 
-@njit(cache=True, parallel=True)
+@compiled(parallel=True)
 def _fill_parallel(x, y, z, parts, M, fx, skew, fy, cx, cy, depth_max, width, height, buffers):
     count = len(x)
     for t in prange(parts):
@@ -82,7 +81,7 @@ def _fill_parallel(x, y, z, parts, M, fx, skew, fy, cx, cy, depth_max, width, he
         )  # fmt: skip
 
 
-@njit(cache=True, parallel=True)
+@compiled(parallel=True)
 def _merge(buffers, depth, bits, index):
     parts = len(buffers)
     for i in prange(len(depth)):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from gvtools.memory.back_projection import FREE_CELL
+from gvtools.memory.compiled import compiled
 
 
-@njit(cache=True)
+@compiled()
 def seen_through(x, y, z, K, cam_from_world, free_depth, tolerance):
     """Whether the camera saw past (x, y, z): its cell's nearest depth lies clearly behind."""
     depth = (
@@ -39,7 +40,7 @@ def seen_through(x, y, z, K, cam_from_world, free_depth, tolerance):
     return depth < free_depth[np.int64(row), np.int64(column)] * (1 - tolerance)
 
 
-@njit(cache=True, parallel=True)
+@compiled(parallel=True)
 def _mark(positions, K, cam_from_world, free_depth, tolerance, out):
     for i in prange(len(positions)):
         if not out[i]:

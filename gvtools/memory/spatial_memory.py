@@ -82,8 +82,6 @@ class FuseReport:
         return FuseReport(**{k: v + getattr(other, k) for k, v in asdict(self).items()})
 
 
-
-
 class SpatialMemory:
     """A coloured point cloud that grows view by view.
 

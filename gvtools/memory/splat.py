@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ShapeError
@@ -56,9 +55,7 @@ class SplatOptions:
     occluders: bool = True
 
 
-def view_distance(
-    memory: SpatialMemory, camera: Cameras, scale: float
-) -> NDArray[np.float64]:
+def view_distance(memory: SpatialMemory, camera: Cameras, scale: float) -> NDArray[np.float64]:
     """How differently each of the memory's views looks from a camera, without unit.
 
     The angle between the optical axes over 15 degrees, plus the distance of the centres over
@@ -157,13 +154,14 @@ class _Projection:
             )
             open_ = ~self.valid
             chosen = self.seen[self.tier[views[self.seen]] == at]
+            table = None
             if at:
                 table = splat_kernels.summed_area(open_)
                 if not table[-1, -1]:
                     return
                 chosen = splat_kernels.touching(self.rect, table, chosen)
             limit = np.where(open_, np.float32(np.inf), np.float32(0))
-            self._splat(chosen, limit, open_)
+            self._splat(chosen, limit, open_, table)
             at += size
             size *= 2
 
@@ -176,9 +174,12 @@ class _Projection:
         views = self.memory.runs.view
         first = self.ranked[: self.options.nearest_views]
         later = self.seen[self.tier[views[self.seen]] != 0]
+        runs, records = self.memory.runs, self.memory.records
         chosen = splat_kernels.in_front(
-            self.rect, self.z_range, _tile_farthest(self.depth), later, self.options.band
-        )
+            later, runs.start, runs.length, self.rect, self.z_range,
+            records.x, records.y, records.z, self.cam_from_local, self.camera.K[0],
+            self.depth, _tile_farthest(self.depth), 2 * self.options.band,
+        )  # fmt: skip
         if not len(chosen):
             return
         limit = self.depth * np.float32(1 - 2 * self.options.band)
@@ -198,32 +199,40 @@ class _Projection:
         front = np.zeros(self.shape, np.bool_)
         front[rows[~free], cols[~free]] = True
         # Slivers along silhouettes are what an error of a pixel in a pose looks like.
-        front = ndimage.binary_opening(front, np.ones((OCCLUDER_SIDE, OCCLUDER_SIDE), np.bool_))
-        if front.any():
+        front = splat_kernels.opened(front, OCCLUDER_SIDE)
+        table = splat_kernels.summed_area(front)
+        if table[-1, -1]:
+            chosen = splat_kernels.touching(self.rect, table, chosen)
             nearest = self.distance[self.ranked].min()
             self.weight = np.exp(-self.options.proximity * (self.distance - nearest)).astype(
                 np.float32
             )
-            self._splat(chosen, np.where(front, limit, np.float32(0)), front)
+            self._splat(chosen, np.where(front, limit, np.float32(0)), front, table)
 
     def _splat(
         self,
         chosen: NDArray[np.int64],
         limit: NDArray[np.float32],
         open_: NDArray[np.bool_] | None,
+        table: NDArray[np.int32] | None = None,
     ) -> None:
-        """Splat runs; ``open_`` None stops after the depth pass."""
+        """Splat runs; ``open_`` None stops after the depth pass.
+
+        ``table`` is the summed-area table of ``open_`` where that is a small part of the image.
+        """
         memory, options = self.memory, self.options
         records, runs = memory.records, memory.runs
+        reachable = np.empty(0, np.bool_) if table is None else splat_kernels.near_to(table)
         splat_kernels.splat_runs(
             chosen, runs.start, runs.length, runs.view, self.rect,
             records.x, records.y, records.z, records.color, records.confidence,
             records.agreement, records.spacing, self.weight, memory.views.generated,
-            self.cam_from_local.astype(np.float32), self.camera.K[0], self.near, limit,
+            self.cam_from_local.astype(np.float32), self.camera.K[0], self.near, limit.reshape(-1), reachable,
             np.float32(options.band), np.float32(options.depth_reach),
             np.float32(options.blend_reach), np.float32(options.size_cap),
             np.float32(memory.options.weight_cap), numba.get_num_threads(), open_ is not None,
-            self.zbuffer, self.total,
+            self.shape[1], self.shape[0], self.zbuffer.reshape(-1),
+            self.total.reshape(-1, splat_kernels.CHANNELS),
         )  # fmt: skip
         if open_ is not None:
             splat_kernels.resolve(

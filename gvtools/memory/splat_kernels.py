@@ -7,17 +7,20 @@ does not depend on how many threads share the work.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from gvtools.memory.compiled import FAST, compiled
 
 # Channels of the accumulator: weighted rgb, weight, weighted z, kernel, kernel x confidence,
 # generated weight.
 CHANNELS = 8
 NEAR = 1e-6
 TILE = 16
-FAST = {"nsz", "arcp", "contract", "reassoc"}
+SAMPLE = 6
+REACHABLE = 3
 
 
-@njit(cache=True, parallel=True)
+@compiled(parallel=True)
 def cull_runs(boxes, cam_from_local, K, width, height, reach, rect, z_range):
     """Image rectangle and depth range of each run's box.
 
@@ -81,7 +84,7 @@ def cull_runs(boxes, cam_from_local, K, width, height, reach, rect, z_range):
         rect[i, 3] = min(height - 1, np.int64(np.floor(high_v + pad)))
 
 
-@njit(cache=True)
+@compiled()
 def touching(rect, writable, runs):
     """Those of ``runs`` (n,) whose rectangle holds a pixel to be written.
 
@@ -97,26 +100,41 @@ def touching(rect, writable, runs):
     return out[:n]
 
 
-@njit(cache=True)
-def in_front(rect, z_range, farthest, runs, band):
-    """Those of ``runs`` (n,) that lie wholly in front of something in their rectangle.
+@compiled(parallel=True, fastmath=FAST)
+def in_front(runs, run_start, run_length, rect, z_range, x, y, z, M, K, depth, farthest, margin):
+    """Those of ``runs`` (n,) of which a sampled point lies in front of ``depth`` by ``margin``.
 
-    ``farthest``: the farthest depth of each tile of TILE pixels.
+    A run wholly behind the farthest depth of its rectangle's tiles (``farthest``) is not sampled;
+    of the others, every SAMPLE-th point is looked up in the image.
     """
-    out = np.empty(len(runs), np.int64)
-    n = 0
-    for r in runs:
+    height, width = depth.shape
+    hit = np.zeros(len(runs), np.bool_)
+    share = np.float32(1 - margin)
+    for i in prange(len(runs)):
+        r = runs[i]
         bound = np.float32(0)
-        for i in range(rect[r, 2] // TILE, rect[r, 3] // TILE + 1):
-            for j in range(rect[r, 0] // TILE, rect[r, 1] // TILE + 1):
-                bound = max(bound, farthest[i, j])
-        if z_range[r, 1] < bound * (1 - 2 * band):
-            out[n] = r
-            n += 1
-    return out[:n]
+        for row in range(rect[r, 2] // TILE, rect[r, 3] // TILE + 1):
+            for col in range(rect[r, 0] // TILE, rect[r, 1] // TILE + 1):
+                bound = max(bound, farthest[row, col])
+        if z_range[r, 0] >= bound * share:
+            continue
+        first = run_start[r]
+        for p in range(first, first + run_length[r], SAMPLE):
+            pz = M[2, 0] * x[p] + M[2, 1] * y[p] + M[2, 2] * z[p] + M[2, 3]
+            if pz <= NEAR:
+                continue
+            px = M[0, 0] * x[p] + M[0, 1] * y[p] + M[0, 2] * z[p] + M[0, 3]
+            py = M[1, 0] * x[p] + M[1, 1] * y[p] + M[1, 2] * z[p] + M[1, 3]
+            u = (K[0, 0] * px + K[0, 1] * py) / pz + K[0, 2]
+            v = K[1, 1] * py / pz + K[1, 2]
+            inside = u >= 0 and u < width and v >= 0 and v < height
+            if inside and pz < depth[np.int64(v), np.int64(u)] * share:
+                hit[i] = True
+                break
+    return runs[hit]
 
 
-@njit(cache=True)
+@compiled()
 def summed_area(mask):
     """(H + 1, W + 1) int32 summed-area table of a boolean image."""
     height, width = mask.shape
@@ -129,7 +147,49 @@ def summed_area(mask):
     return table
 
 
-@njit(cache=True, fastmath=FAST)
+@compiled()
+def near_to(table):
+    """(H x W,) bool: pixels with one of the summed-area ``table`` within REACHABLE pixels."""
+    height, width = table.shape[0] - 1, table.shape[1] - 1
+    out = np.empty(height * width, np.bool_)
+    for row in range(height):
+        r0, r1 = max(row - REACHABLE, 0), min(row + REACHABLE + 1, height)
+        for col in range(width):
+            c0, c1 = max(col - REACHABLE, 0), min(col + REACHABLE + 1, width)
+            count = table[r1, c1] - table[r0, c1] - table[r1, c0] + table[r0, c0]
+            out[row * width + col] = count > 0
+    return out
+
+
+@compiled(inline="always")
+def closed_off(u, v, reach, width, height, reachable):
+    """Whether a footprint certainly holds no pixel to be written."""
+    if not reachable.size or reach > REACHABLE - 1:
+        return False
+    if not (u >= 0 and u < width and v >= 0 and v < height):
+        return False
+    return not reachable[np.uint64(np.int64(v) * width + np.int64(u))]
+
+
+@compiled()
+def opened(mask, side):
+    """``mask`` without what holds no square of ``side`` pixels (odd) around any of its pixels."""
+    half = side // 2
+    height, width = mask.shape
+    table = summed_area(mask)
+    out = np.zeros_like(mask)
+    for row in range(half, height - half):
+        for col in range(half, width - half):
+            if not mask[row, col]:
+                continue
+            r0, r1, c0, c1 = row - half, row + half + 1, col - half, col + half + 1
+            count = table[r1, c1] - table[r0, c1] - table[r1, c0] + table[r0, c0]
+            if count == side * side:
+                out[r0:r1, c0:c1] = True
+    return out
+
+
+@compiled(fastmath=FAST)
 def _project_run(x, y, z, spacing, M, fx, fy, skew, cx, cy, focal, near, u, v, depth, size):
     """Centre-of-pixel coordinates, depth and footprint width (pixels) of one run's points."""
     m00, m01, m02, m03 = M[0, 0], M[0, 1], M[0, 2], M[0, 3]
@@ -147,26 +207,29 @@ def _project_run(x, y, z, spacing, M, fx, fy, skew, cx, cy, focal, near, u, v, d
         size[k] = max(spacing[k] * focal * inverse, one)
 
 
-@njit(cache=True, parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST)
 def splat_runs(
     runs, run_start, run_length, run_view, rect, x, y, z, color, confidence, agreement, spacing,
-    view_weight, view_generated, M, K, near, limit, band, depth_reach, blend_reach, size_cap,
-    weight_cap, bands, blend, depth, total,
+    view_weight, view_generated, M, K, near, limit, reachable, band, depth_reach, blend_reach, size_cap,
+    weight_cap, threads, blend, width, height, depth, total,
 ):  # fmt: skip
     """Depth pass, then blending inside the depth band.
 
     Args:
         runs: (n,) which runs, in the order they are to be added.
-        limit: (H, W) float32, only what is nearer than this is written; 0 shuts a pixel.
+        limit: (H x W,) float32, only what is nearer than this is written; 0 shuts a pixel.
+        reachable: (H x W,) bool, pixels within REACHABLE pixels of one to be written; empty when
+            most of the image is open.
         band: relative depth band that is blended.
         depth_reach: half width of the depth footprint, spacings.
         blend_reach: radius of the blending kernel, spacings.
         size_cap: footprints wider than this many pixels are cut to it.
         blend: False stops after the depth pass.
-        depth: out (H, W) float32, nearest depth, inf where none.
-        total: out (H, W, CHANNELS) float32, zeroed here.
+        width: of the image, pixels.
+        height: of the image, pixels.
+        depth: out (H x W,) float32, nearest depth, inf where none.
+        total: out (H x W, CHANNELS) float32, zeroed here.
     """
-    height, width = depth.shape
     fx = np.float32(K[0, 0])
     fy = np.float32(K[1, 1])
     skew = np.float32(K[0, 1])
@@ -177,16 +240,20 @@ def splat_runs(
     for r in runs:
         longest = max(longest, run_length[r])
     one = np.float32(1)
-    for b in prange(bands):
-        top = b * height // bands
-        bottom = (b + 1) * height // bands - 1
+    bands = max(1, min(4, height // (16 * threads)))
+    for task in prange(bands * threads):
+        # Neighbouring bands go to different threads: what is open tends to lie together.
+        b = (task % bands) * threads + task // bands
+        top = b * height // (bands * threads)
+        bottom = (b + 1) * height // (bands * threads) - 1
         u = np.empty(longest, np.float32)
         v = np.empty(longest, np.float32)
         depths = np.empty(longest, np.float32)
         size = np.empty(longest, np.float32)
-        depth[top : bottom + 1] = np.inf
-        if blend:
-            total[top : bottom + 1] = 0
+        for i in range(top * width, (bottom + 1) * width):
+            depth[i] = np.inf
+            if blend and limit[i] > 0:
+                total[i] = 0
         for r in runs:
             if rect[r, 3] < top or rect[r, 2] > bottom:
                 continue
@@ -200,14 +267,18 @@ def splat_runs(
                 if zk <= near:
                     continue
                 h = depth_reach * min(size[k], size_cap)
+                if closed_off(u[k], v[k], h, width, height, reachable):
+                    continue
                 r0 = max(np.int64(np.ceil(v[k] - h)), top)
                 r1 = min(np.int64(np.floor(v[k] + h)), bottom)
                 c0 = max(np.int64(np.ceil(u[k] - h)), 0)
                 c1 = min(np.int64(np.floor(u[k] + h)), width - 1)
                 for row in range(r0, r1 + 1):
                     for col in range(c0, c1 + 1):
-                        if zk < depth[row, col] and zk < limit[row, col]:
-                            depth[row, col] = zk
+                        # Unsigned: the compiler need not ask for negative indices.
+                        cell = np.uint64(row * width + col)
+                        if zk < depth[cell] and zk < limit[cell]:
+                            depth[cell] = zk
         if not blend:
             continue
         for r in runs:
@@ -225,6 +296,8 @@ def splat_runs(
                 if zk <= near:
                     continue
                 reach = blend_reach * min(size[k], size_cap)
+                if closed_off(u[k], v[k], reach, width, height, reachable):
+                    continue
                 r0 = max(np.int64(np.ceil(v[k] - reach)), top)
                 r1 = min(np.int64(np.floor(v[k] + reach)), bottom)
                 c0 = max(np.int64(np.ceil(u[k] - reach)), 0)
@@ -241,7 +314,8 @@ def splat_runs(
                 for row in range(r0, r1 + 1):
                     dy = np.float32(row) - v[k]
                     for col in range(c0, c1 + 1):
-                        if near_side > depth[row, col] or zk >= limit[row, col]:
+                        cell = np.uint64(row * width + col)
+                        if near_side > depth[cell] or zk >= limit[cell]:
                             continue
                         dx = np.float32(col) - u[k]
                         kernel = one - q * (dx * dx + dy * dy)
@@ -249,17 +323,17 @@ def splat_runs(
                             continue
                         kernel *= kernel
                         w = scale * kernel
-                        total[row, col, 0] += w * red
-                        total[row, col, 1] += w * green
-                        total[row, col, 2] += w * blue
-                        total[row, col, 3] += w
-                        total[row, col, 4] += w * zk
-                        total[row, col, 5] += kernel
-                        total[row, col, 6] += kernel * trust
-                        total[row, col, 7] += w * made
+                        total[cell, 0] += w * red
+                        total[cell, 1] += w * green
+                        total[cell, 2] += w * blue
+                        total[cell, 3] += w
+                        total[cell, 4] += w * zk
+                        total[cell, 5] += kernel
+                        total[cell, 6] += kernel * trust
+                        total[cell, 7] += w * made
 
 
-@njit(cache=True, parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST)
 def resolve(total, open_, support, rgb, depth, valid, confidence, generated):
     """Turn accumulators into pixels where ``open_`` and the support suffices."""
     for row in prange(total.shape[0]):

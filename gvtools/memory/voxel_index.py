@@ -9,8 +9,9 @@ that arrive, not the memory that is there, and the tables of one block lie toget
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from gvtools.memory.compiled import compiled
 
 BLOCK_BITS = 4
 LOCAL_MASK = (1 << BLOCK_BITS) - 1
@@ -25,13 +26,13 @@ SIZE_CLASSES = 16
 SMALLEST_CLASS = 2
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def _hash(key, mask):
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64((mixed ^ (mixed >> np.uint64(29))) & np.uint64(mask))
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def block_key(bx, by, bz):
     """int64 key of the block with integer coordinates (bx, by, bz)."""
     return (
@@ -41,7 +42,7 @@ def block_key(bx, by, bz):
     )
 
 
-@njit(cache=True)
+@compiled()
 def find_block(keys, ids, key):
     """The block number of ``key``, or -1."""
     mask = len(keys) - 1
@@ -53,7 +54,7 @@ def find_block(keys, ids, key):
     return np.int32(-1)
 
 
-@njit(cache=True)
+@compiled()
 def insert_blocks(keys, ids, count, wanted, out):
     """Give each key of ``wanted`` (n,) its block number, new ones counting up from ``count``.
 
@@ -83,7 +84,7 @@ def insert_blocks(keys, ids, count, wanted, out):
     return len(wanted), count
 
 
-@njit(cache=True)
+@compiled()
 def _rehash(old_keys, old_ids, keys, ids):
     mask = len(keys) - 1
     for i in range(len(old_keys)):
@@ -95,12 +96,12 @@ def _rehash(old_keys, old_ids, keys, ids):
             ids[slot] = old_ids[i]
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def _local_slot(local, log2):
     return (np.int64(local) * np.int64(40503) >> 4) & ((np.int64(1) << log2) - 1)
 
 
-@njit(cache=True)
+@compiled()
 def find_voxel(pool_local, offset, log2, local):
     """Pool position of the voxel ``local`` of a block, or -1."""
     if log2 == 0:
@@ -114,7 +115,7 @@ def find_voxel(pool_local, offset, log2, local):
     return np.int64(-1)
 
 
-@njit(cache=True)
+@compiled()
 def insert_voxel(pool_local, pool_head, pool_state, block_offset, block_log2, block_count, block,
                  local):  # fmt: skip
     """Pool position of the voxel ``local`` of ``block``, made (with NO_RECORD) when it is new.

@@ -57,7 +57,9 @@ class Grid:
         (left, top), (right, bottom) = np.clip([low, high], 0, limit).astype(int)
         return slice(top, bottom), slice(left, right)
 
-    def directions(self, rows: NDArray[np.intp] | slice, columns: NDArray[np.intp] | slice) -> Float64:
+    def directions(
+        self, rows: NDArray[np.intp] | slice, columns: NDArray[np.intp] | slice
+    ) -> Float64:
         """(..., 3) world directions whose length is 1 in z-depth, over rows x columns."""
         x = (self.x[columns] - self.K[0, 2]) / self.K[0, 0]
         y = (self.y[rows] - self.K[1, 2]) / self.K[1, 1]
@@ -168,7 +170,7 @@ class Ball(Patch):
         ray = grid.directions(rows, columns)
         offset = grid.center - self.center
         squared = np.einsum("hwi,hwi->hw", ray, ray)
-        z = _first_root(squared, ray @ offset, offset @ offset - self.radius**2)
+        z = _first_root(squared, ray @ offset, float(offset @ offset) - self.radius**2)
         with np.errstate(invalid="ignore"):
             normal = (offset + z[..., None] * ray) / self.radius
         s = np.arctan2(normal[..., 1], normal[..., 0]) / (2 * np.pi) + 0.5
@@ -205,7 +207,7 @@ class Tube(Patch):
         z = _first_root(
             np.einsum("hwi,hwi->hw", across, across),
             across @ offset[:2],
-            offset[:2] @ offset[:2] - self.radius**2,
+            float(offset[:2] @ offset[:2]) - self.radius**2,
         )
         with np.errstate(invalid="ignore"):
             x, y, up = np.moveaxis(offset + z[..., None] * ray, -1, 0)
@@ -256,7 +258,9 @@ def cast(patches: Sequence[Patch], camera: Cameras, *, supersample: int = 1) -> 
         supersample=supersample,
     )
     shape = len(grid.y), len(grid.x)
-    hits = Hits(np.full(shape, -1, np.int16), np.full(shape, np.inf), np.zeros(shape), np.zeros(shape))
+    hits = Hits(
+        np.full(shape, -1, np.int16), np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
+    )
     for index, patch in enumerate(patches):
         rows, columns = grid.window(patch)
         if rows.stop <= rows.start or columns.stop <= columns.start:

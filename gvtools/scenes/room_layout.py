@@ -6,25 +6,23 @@ unit is the metre.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.scenes.ray_casting import Ball, Flat, Patch, Tube
-from gvtools.scenes.room_light import Block, Cylinder, Lamp, Solid, Sphere
+from gvtools.scenes.ray_casting import Patch
+from gvtools.scenes.room_builder import Builder, Place, Triple
+from gvtools.scenes.room_light import Lamp, Solid
 from gvtools.scenes.room_textures import PICTURES, Texture, globe, paint, picture, planks, tiled
 
 Float64 = NDArray[np.float64]
-Color = tuple[float, float, float]
 
-TILE = 1.1  # edge of a repeated texture, metres
-
-WALLS: tuple[Color, ...] = ((0.86, 0.82, 0.74), (0.74, 0.81, 0.84), (0.80, 0.84, 0.74))
-ACCENTS: tuple[Color, ...] = ((0.66, 0.38, 0.29), (0.72, 0.66, 0.58), (0.45, 0.52, 0.60))
-WOODS: tuple[Color, ...] = ((0.63, 0.45, 0.30), (0.50, 0.36, 0.25), (0.72, 0.58, 0.42))
-RUGS: tuple[Color, ...] = ((0.55, 0.24, 0.22), (0.25, 0.36, 0.50), (0.36, 0.46, 0.30))
-COATS: tuple[Color, ...] = (
+WALLS: tuple[Triple, ...] = ((0.86, 0.82, 0.74), (0.74, 0.81, 0.84), (0.80, 0.84, 0.74))
+ACCENTS: tuple[Triple, ...] = ((0.66, 0.38, 0.29), (0.72, 0.66, 0.58), (0.45, 0.52, 0.60))
+WOODS: tuple[Triple, ...] = ((0.63, 0.45, 0.30), (0.50, 0.36, 0.25), (0.72, 0.58, 0.42))
+RUGS: tuple[Triple, ...] = ((0.55, 0.24, 0.22), (0.25, 0.36, 0.50), (0.36, 0.46, 0.30))
+COATS: tuple[Triple, ...] = (
     (0.80, 0.33, 0.25),
     (0.24, 0.48, 0.56),
     (0.88, 0.71, 0.32),
@@ -51,89 +49,10 @@ class Room:
     lamps: tuple[Lamp, ...]
 
 
-@dataclass(eq=False)
-class _Frame:
-    """A place in the room: its origin, and the angle of its first axis."""
-
-    origin: Float64
-    yaw: float = 0.0
-
-    def axes(self) -> Float64:
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
-        return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-
-    def world(self, x: float, y: float, z: float) -> Float64:
-        return self.origin + np.array([x, y, z]) @ self.axes()
-
-
-@dataclass(eq=False)
-class _Builder:
-    rng: np.random.Generator
-    patches: list[Patch] = field(default_factory=list)
-    solids: list[Solid] = field(default_factory=list)
-    lamps: list[Lamp] = field(default_factory=list)
-
-    def pick(self, choices: tuple[Color, ...]) -> Color:
-        """One of the colours, slightly varied."""
-        color = np.array(choices[self.rng.integers(len(choices))])
-        return tuple(np.clip(color * self.rng.uniform(0.92, 1.06, 3), 0, 1).tolist())
-
-    def flat(
-        self,
-        origin: Float64,
-        u: Float64,
-        v: Float64,
-        *,
-        texture: Texture,
-        once: bool = False,
-        round: bool = False,
-        emission: float = 0.0,
-    ) -> None:
-        length, breadth = float(np.linalg.norm(u)), float(np.linalg.norm(v))
-        tiles = (1.0, 1.0) if once else (length / TILE, breadth / TILE)
-        self.patches.append(Flat(texture, tiles, emission, origin, u, v, round))
-
-    def box(
-        self, at: _Frame, low: Color, high: Color, *, texture: Texture, shadow: bool = True
-    ) -> None:
-        """A box between two corners in a place's axes."""
-        low_, high_ = np.array(low), np.array(high)
-        x, y, z = np.diag(high_ - low_) @ at.axes()
-        a = at.world(*low_)
-        b = at.world(*high_)
-        for origin, u, v in (
-            (a + z, x, -z), (b, -x, -z), (b - x, -y, -z), (a + x + z, y, -z), (a + z + y, x, -y),
-            (a, x, y),
-        ):
-            # Lower faces stay undrawn on the floor, where no camera can see them.
-            if u is x and v is y and a[2] < 0.02:
-                continue
-            flipped = np.cross(v, u) @ (origin + (u + v) / 2 - (a + b) / 2) < 0
-            if flipped:
-                origin, u = origin + u, -u
-            self.flat(origin, u, v, texture=texture)
-        if shadow:
-            self.solids.append(Block((a + b) / 2, (high_ - low_) / 2, at.yaw))
-
-    def post(self, foot: Float64, radius: float, height: float, *, texture: Texture) -> None:
-        """A cylinder with its lid."""
-        around = max(1.0, round(2 * np.pi * radius / TILE))
-        self.patches.append(Tube(texture, (around, height / TILE), 0.0, foot, radius, height))
-        corner = foot + np.array([-radius, radius, height])
-        u, v = np.array([2 * radius, 0, 0]), np.array([0, -2 * radius, 0])
-        self.flat(corner, u, v, texture=texture, round=True)
-        self.solids.append(Cylinder(foot, radius, height))
-
-    def ball(self, center: Float64, radius: float, *, texture: Texture) -> None:
-        """A sphere under one of :func:`globe`'s textures."""
-        self.patches.append(Ball(texture, (1.0, 0.5), 0.0, center, radius))
-        self.solids.append(Sphere(center, radius))
-
-
 def furnished_room(seed: int) -> Room:
     """The room of a seed: another seed gives other sizes, materials, furniture and pictures."""
     rng = np.random.default_rng([seed, 20])
-    build = _Builder(rng)
+    build = Builder(rng)
     size = np.array([rng.uniform(5.6, 6.8), rng.uniform(4.8, 5.6), rng.uniform(2.5, 2.9)])
     _shell(build, size)
     _walls(build, size)
@@ -142,7 +61,7 @@ def furnished_room(seed: int) -> Room:
     return Room(size, tuple(build.patches), tuple(build.solids), tuple(build.lamps))
 
 
-def _shell(build: _Builder, size: Float64) -> None:
+def _shell(build: Builder, size: Float64) -> None:
     rng = build.rng
     x, y, z = np.diag(size)
     zero = np.zeros(3)
@@ -169,7 +88,7 @@ def _shell(build: _Builder, size: Float64) -> None:
     build.lamps.append(Lamp(corner, u, v, np.array([1.0, 0.95, 0.86]) * 3.0))
 
 
-def _walls(build: _Builder, size: Float64) -> None:
+def _walls(build: Builder, size: Float64) -> None:
     """Each wall gets slots; a slot gets one piece of furniture and what hangs above it."""
     rng = build.rng
     names = list(rng.permutation(PICTURES))
@@ -179,7 +98,7 @@ def _walls(build: _Builder, size: Float64) -> None:
     along = (size[0], size[1], size[0], size[1])
     corners = ((0.0, 0.0), (size[0], 0.0), (size[0], size[1]), (0.0, size[1]))
     for wall in range(4):
-        at = _Frame(np.array([*corners[wall], 0.0]), wall * np.pi / 2)
+        at = Place(np.array([*corners[wall], 0.0]), wall * np.pi / 2)
         count = 2 if along[wall] < 5.3 else 3
         room_for = (along[wall] - 1.7) / count
         for slot in range(count):
@@ -194,7 +113,7 @@ def _walls(build: _Builder, size: Float64) -> None:
                 _hang(build, at, start + width / 2, names.pop())
 
 
-def _hang(build: _Builder, at: _Frame, middle: float, name: str) -> None:
+def _hang(build: Builder, at: Place, middle: float, name: str) -> None:
     """A framed photograph."""
     rng = build.rng
     texture = picture(str(name))
@@ -216,9 +135,9 @@ def _hang(build: _Builder, at: _Frame, middle: float, name: str) -> None:
 
 
 def _face(
-    build: _Builder,
-    at: _Frame,
-    corner: Color,
+    build: Builder,
+    at: Place,
+    corner: Triple,
     width: float,
     height: float,
     *,
@@ -226,19 +145,17 @@ def _face(
     emission: float = 0.0,
 ) -> None:
     """A picture on a wall, seen upright from inside the room; corner: lower left along the wall."""
-    u, _, _ = at.axes()
+    u = at.axes()[0]
     origin = at.world(corner[0] + width, corner[1], corner[2] + height)
     build.flat(
         origin, -u * width, np.array([0, 0, -height]), texture=texture, once=True, emission=emission
     )
 
 
-def _window(build: _Builder, at: _Frame, start: float, width: float) -> None:
+def _window(build: Builder, at: Place, start: float, width: float) -> None:
     """A window onto the launch pad at dusk, with slim bars, and the daylight that it lets in."""
     width, low, height = min(width, 1.7), 0.85, 1.2
-    _face(
-        build, at, (start, 0.004, low), width, height, texture=picture("rocket"), emission=0.8
-    )
+    _face(build, at, (start, 0.004, low), width, height, texture=picture("rocket"), emission=0.8)
     bar = paint((0.93, 0.92, 0.90), grain=0.01)
     thick, deep = 0.035, 0.06
     for x in (0.0, width / 2 - thick / 2, width - thick):
@@ -246,17 +163,17 @@ def _window(build: _Builder, at: _Frame, start: float, width: float) -> None:
     for z in (0.0, height * 0.62, height - thick):
         build.box(at, (start, 0, low + z), (start + width, deep, low + z + thick), texture=bar)
     build.box(at, (start - 0.1, 0, low - 0.05), (start + width + 0.1, 0.16, low), texture=bar)
-    u, inward, _ = at.axes()
+    u = at.axes()[0]
     origin = at.world(start + width, 0.09, low + height)
     power = np.array([0.75, 0.88, 1.1]) * 1.5
     build.lamps.append(Lamp(origin, -u * width, np.array([0, 0, -height]), power))
 
 
-def _nothing(build: _Builder, at: _Frame, start: float, width: float) -> float:
+def _nothing(build: Builder, at: Place, start: float, width: float) -> float:
     return 0.0
 
 
-def _shelf(build: _Builder, at: _Frame, start: float, width: float) -> float:
+def _shelf(build: Builder, at: Place, start: float, width: float) -> float:
     """A bookcase with rows of books."""
     rng = build.rng
     width, deep, height, board = min(width, 1.15), 0.3, rng.uniform(1.75, 1.95), 0.03
@@ -273,7 +190,11 @@ def _shelf(build: _Builder, at: _Frame, start: float, width: float) -> float:
     for z in levels[:-1]:
         x = start + board + rng.uniform(0.0, 0.1)
         while x < start + width - board - 0.13:
-            thick, tall, back = rng.uniform(0.05, 0.12), rng.uniform(0.22, 0.33), rng.uniform(0.03, 0.1)
+            thick, tall, back = (
+                rng.uniform(0.05, 0.12),
+                rng.uniform(0.22, 0.33),
+                rng.uniform(0.03, 0.1),
+            )
             build.box(
                 at,
                 (x, 0.03, z + board),
@@ -285,7 +206,7 @@ def _shelf(build: _Builder, at: _Frame, start: float, width: float) -> float:
     return height
 
 
-def _cabinet(build: _Builder, at: _Frame, start: float, width: float) -> float:
+def _cabinet(build: Builder, at: Place, start: float, width: float) -> float:
     """A painted chest with a round thing on it."""
     rng = build.rng
     deep, height = rng.uniform(0.4, 0.5), rng.uniform(0.7, 0.85)
@@ -293,7 +214,10 @@ def _cabinet(build: _Builder, at: _Frame, start: float, width: float) -> float:
     build.box(at, (start, 0.02, 0.08), (start + width, deep, height), texture=coat)
     top = planks(build.pick(WOODS), rng)
     build.box(
-        at, (start - 0.02, 0, height), (start + width + 0.02, deep + 0.03, height + 0.03), texture=top
+        at,
+        (start - 0.02, 0, height),
+        (start + width + 0.02, deep + 0.03, height + 0.03),
+        texture=top,
     )
     for i in range(2):
         x = start + width * (0.27 + 0.46 * i)
@@ -309,7 +233,7 @@ def _cabinet(build: _Builder, at: _Frame, start: float, width: float) -> float:
     return height + 0.03 + 2 * radius
 
 
-def _crates(build: _Builder, at: _Frame, start: float, width: float) -> float:
+def _crates(build: Builder, at: Place, start: float, width: float) -> float:
     """Two or three boxes, one on another."""
     rng = build.rng
     sides = rng.uniform(0.38, 0.52, 3)
@@ -320,20 +244,17 @@ def _crates(build: _Builder, at: _Frame, start: float, width: float) -> float:
     for i, side in enumerate(sides):
         x = (middle - 0.28, middle + 0.3, middle - 0.25)[i]
         z = sides[0] if i == 2 else 0.0
-        spot = _Frame(at.world(x, 0.36, z), at.yaw + rng.uniform(-0.25, 0.25))
+        spot = Place(at.world(x, 0.36, z), at.yaw + rng.uniform(-0.25, 0.25))
         half = side / 2
-        build.box(
-            spot, (-half, -half, 0), (half, half, side), texture=other if i == 1 else texture
-        )
+        build.box(spot, (-half, -half, 0), (half, half, side), texture=other if i == 1 else texture)
         top = max(top, z + side)
         if i == 1 and rng.random() < 0.4:
             break
     return top
 
 
-def _bench(build: _Builder, at: _Frame, start: float, width: float) -> float:
+def _bench(build: Builder, at: Place, start: float, width: float) -> float:
     """A padded bench on four thin legs."""
-    rng = build.rng
     deep, seat = 0.5, 0.42
     cloth = tiled("grass", build.pick(RUGS), contrast=0.45)
     build.box(at, (start, 0.04, seat - 0.12), (start + width, deep, seat), texture=cloth)
@@ -345,7 +266,7 @@ def _bench(build: _Builder, at: _Frame, start: float, width: float) -> float:
     return seat + 0.38
 
 
-def _corners(build: _Builder, size: Float64) -> None:
+def _corners(build: Builder, size: Float64) -> None:
     """A column in one corner, a floor lamp in another."""
     rng = build.rng
     inset = 0.42
@@ -362,16 +283,19 @@ def _corners(build: _Builder, size: Float64) -> None:
     metal = paint((0.25, 0.24, 0.24), grain=0.02)
     foot = spots[second]
     build.post(foot, 0.14, 0.025, texture=metal)
-    build.post(foot + [0, 0, 0.025], 0.014, 1.45, texture=metal)
+    build.post(foot + np.array([0, 0, 0.025]), 0.014, 1.45, texture=metal)
     build.post(
-        foot + [0, 0, 1.4], 0.18, 0.26, texture=paint(build.pick(((0.93, 0.85, 0.66),)), grain=0.02)
+        foot + np.array([0, 0, 1.4]),
+        0.18,
+        0.26,
+        texture=paint(build.pick(((0.93, 0.85, 0.66),)), grain=0.02),
     )
 
 
-def _middle(build: _Builder, size: Float64) -> None:
+def _middle(build: Builder, size: Float64) -> None:
     """A rug, a table with things on it, two chairs."""
     rng = build.rng
-    at = _Frame(np.array([size[0] / 2, size[1] / 2, 0.0]), rng.uniform(-0.5, 0.5))
+    at = Place(np.array([size[0] / 2, size[1] / 2, 0.0]), rng.uniform(-0.5, 0.5))
     rug = tiled("grass", build.pick(RUGS), contrast=0.8)
     build.box(at, (-1.15, -0.85, 0), (1.15, 0.85, 0.012), texture=rug)
     half = np.array([rng.uniform(0.55, 0.72), rng.uniform(0.36, 0.44)])
@@ -389,8 +313,10 @@ def _middle(build: _Builder, size: Float64) -> None:
         0.15,
         texture=globe(("moon", "retina", "astronaut")[rng.integers(3)]),
     )
-    build.post(at.world(half[0] * 0.1, -half[1] * 0.5, top), 0.045, 0.1, texture=paint(build.pick(COATS)))
-    spot = _Frame(at.world(half[0] * 0.6, half[1] * 0.25, top), at.yaw + rng.uniform(-0.6, 0.6))
+    build.post(
+        at.world(half[0] * 0.1, -half[1] * 0.5, top), 0.045, 0.1, texture=paint(build.pick(COATS))
+    )
+    spot = Place(at.world(half[0] * 0.6, half[1] * 0.25, top), at.yaw + rng.uniform(-0.6, 0.6))
     z = 0.0
     for _ in range(3):
         x, y, thick = rng.uniform(0.1, 0.15), rng.uniform(0.07, 0.1), rng.uniform(0.025, 0.05)
@@ -399,12 +325,11 @@ def _middle(build: _Builder, size: Float64) -> None:
         z += thick
     for side in (-1, 1):
         turn = at.yaw + (np.pi if side > 0 else 0.0) + rng.uniform(-0.35, 0.35)
-        _chair(build, _Frame(at.world(rng.uniform(-0.2, 0.2), side * (half[1] + 0.3), 0), turn))
+        _chair(build, Place(at.world(rng.uniform(-0.2, 0.2), side * (half[1] + 0.3), 0), turn))
 
 
-def _chair(build: _Builder, at: _Frame) -> None:
+def _chair(build: Builder, at: Place) -> None:
     """A chair that faces its second axis."""
-    rng = build.rng
     coat = paint(build.pick(COATS), grain=0.04)
     build.box(at, (-0.21, -0.2, 0.42), (0.21, 0.2, 0.46), texture=coat)
     for x in (-0.2, 0.17):
@@ -413,4 +338,3 @@ def _chair(build: _Builder, at: _Frame) -> None:
             build.box(at, (x, y, 0), (x + 0.03, y + 0.03, tall), texture=coat)
     for z in (0.6, 0.76):
         build.box(at, (-0.17, -0.185, z), (0.17, -0.165, z + 0.08), texture=coat)
-    rng.random()

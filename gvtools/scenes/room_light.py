@@ -70,9 +70,7 @@ class Sphere:
     def interval(self, origin: Float64, ray: Float64) -> tuple[Float64, Float64]:
         """Where (N, 3) rays enter and leave, in multiples of ``ray``; entry > exit: missed."""
         offset = origin - self.center
-        return _roots(
-            _dot(ray, ray), _dot(ray, offset), _dot(offset, offset) - self.radius**2
-        )
+        return _roots(_dot(ray, ray), _dot(ray, offset), _dot(offset, offset) - self.radius**2)
 
 
 @dataclass(frozen=True, eq=False)

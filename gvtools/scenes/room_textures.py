@@ -144,32 +144,38 @@ def tiled(
     return _pyramid(_mirrored(_tinted(relief, color)), repeats=True, aspect=1)
 
 
-def planks(color: tuple[float, float, float], rng: np.random.Generator, *, rows: int = 8) -> Texture:
+def planks(
+    color: tuple[float, float, float], rng: np.random.Generator, *, rows: int = 8
+) -> Texture:
     """Boards cut from the table under the cup of coffee; one tile is ``rows`` boards high."""
     from PIL import Image
+    from scipy.ndimage import gaussian_filter
 
-    # The grain of that table runs 38 degrees up to the right; this quadrilateral (upper left,
+    # The grain of that table runs 32 degrees up to the right; this quadrilateral (upper left,
     # lower left, lower right, upper right) follows it beside the saucer.
-    corners = (497, 150, 497, 399, 598, 320, 598, 71)
+    corners = (497, 141, 497, 398, 598, 334, 598, 77)
     wood = Image.fromarray(photograph("coffee")).transform(
         (128, 256), Image.Transform.QUAD, corners, Image.Resampling.BICUBIC
     )
-    grain = np.asarray(wood)
+    grey = np.asarray(wood).astype(np.float64).mean(-1)
+    grain = 1 + 0.8 * (grey / gaussian_filter(grey, (12, 20), mode="mirror") - 1)
     thickness = SIDE // rows
     boards = []
     for _ in range(rows):
         top = rng.integers(0, 256 - 60)
         strip = grain[top : top + 60][:: rng.choice([-1, 1]), :: rng.choice([-1, 1])]
-        half = _resized(strip, SIDE // 2, thickness).astype(np.float64)
-        board = np.concatenate([half, half[:, ::-1]], axis=1) * rng.uniform(0.85, 1.12)
+        half = np.asarray(
+            Image.fromarray(strip.astype(np.float32)).resize(
+                (SIDE // 2, thickness), Image.Resampling.BICUBIC
+            )
+        )
+        board = np.concatenate([half, half[:, ::-1]], axis=1) * rng.uniform(0.8, 1.15)
         board = np.roll(board, int(rng.integers(SIDE)), axis=1)
-        joint = int(rng.integers(SIDE))
+        joint = int(rng.integers(SIDE - 3))
         board[:, joint : joint + 3] *= 0.45
         board[-2:] *= 0.45
         boards.append(board)
-    relief = np.concatenate(boards)
-    relief = relief / relief.mean()
-    return _pyramid(_tinted(relief.mean(-1, keepdims=True), color), repeats=True, aspect=1)
+    return _pyramid(_tinted(np.concatenate(boards)[..., None], color), repeats=True, aspect=1)
 
 
 def _resized(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

@@ -124,8 +124,13 @@ def _path(
         eye = np.array([*(size[:2] / 2 + axis), up])
         aim = np.array([*(size[:2] / 2 - 0.5 * axis), 0.95])
         poses.append(look_at(eye, aim))
+    count = len(poses)
     return Cameras(
-        np.repeat(K[None], len(poses), axis=0), np.stack(poses), width, height, context + targets
+        np.repeat(K[None], count, axis=0),
+        np.stack(poses),
+        np.full(count, width),
+        np.full(count, height),
+        context + targets,
     )
 
 
