@@ -91,14 +91,16 @@ class Cameras:
         K = self.K.copy()
         K[:, 0] *= (width / self.width)[:, None]
         K[:, 1] *= (height / self.height)[:, None]
-        return replace(self, K=K, width=width, height=height)
+        count = len(self)
+        return replace(self, K=K, width=np.full(count, width), height=np.full(count, height))
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Cameras:
         """The same cameras for the window of the images that starts at (left, top), pixels."""
         K = self.K.copy()
         K[:, 0, 2] -= left
         K[:, 1, 2] -= top
-        return replace(self, K=K, width=width, height=height)
+        count = len(self)
+        return replace(self, K=K, width=np.full(count, width), height=np.full(count, height))
 
     def project(self, points: ArrayLike) -> tuple[Float64, Float64]:
         """World points seen by each camera.
@@ -174,7 +176,9 @@ def rigid_transform(matrix: ArrayLike, *, what: str) -> tuple[Float64, float]:
     if matrix.shape not in ((3, 4), (4, 4)):
         raise ShapeError(f"{what}: a pose of shape {matrix.shape}; expected 4x4 or 3x4")
     if not np.isfinite(matrix).all():
-        raise ShapeError(f"{what}: the pose holds NaN or infinity; remove the view or mend the pose")
+        raise ShapeError(
+            f"{what}: the pose holds NaN or infinity; mend it or drop the view"
+        )
     if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
         raise ShapeError(f"{what}: the pose's last row is {matrix[3].tolist()}; expected 0 0 0 1")
     rotation = matrix[:3, :3]

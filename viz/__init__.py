@@ -1,0 +1,1 @@
+"""Pictures of runs: functions that take data and draw."""

@@ -1,0 +1,1 @@
+"""Where the depth of a view comes from."""

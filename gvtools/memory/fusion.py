@@ -126,8 +126,8 @@ def fuse_blocks(
     """Fuse one view's points, grouped by block; returns (records, runs, agreements).
 
     New records are appended block by block, so each (block, view) is one contiguous run with a
-    tight bounding box (``run_box``: min xyz, max xyz, largest spacing). Records of earlier rounds are never
-    changed: what agrees with one is logged as (record, confidence).
+    tight bounding box (``run_box``: min xyz, max xyz, largest spacing). Records of earlier rounds
+    are never changed: what agrees with one is logged as (record, confidence).
     """
     largest = 0
     for g in range(len(touched)):
@@ -193,10 +193,8 @@ def fuse_blocks(
             for k in range(3):
                 p[k] = t_sum[t, k] / weight
             own = np.float64(t_best[t])
-            # Several pixels in one voxel cover it together.
-            width = t_spacing[t] / weight
-            if t_points[t] > 1:
-                width = min(1.0 / inverse_edge, width * np.sqrt(np.float64(t_points[t])))
+            # Where pixels are finer than voxels, neighbours stand a voxel apart.
+            width = max(t_spacing[t] / weight, 1.0 / inverse_edge)
             best = NO_RECORD
             cosine = -2.0
             length = 0

@@ -51,13 +51,15 @@ def save_memory(memory: SpatialMemory, path: Path) -> None:
         "names": [memory.views[i].camera.names[0] for i in range(len(memory.views))],
         "arrays": {name: [array.dtype.str, list(array.shape)] for name, array in arrays.items()},
     }
-    with replaced_when_written(path) as temporary:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-            _write(archive, "header.json", json.dumps(header, indent=1).encode())
-            for name, array in arrays.items():
-                buffer = io.BytesIO()
-                np.save(buffer, array, allow_pickle=False)
-                _write(archive, f"{name}.npy", buffer.getvalue())
+    with (
+        replaced_when_written(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive,
+    ):
+        _write(archive, "header.json", json.dumps(header, indent=1).encode())
+        for name, array in arrays.items():
+            buffer = io.BytesIO()
+            np.save(buffer, array, allow_pickle=False)
+            _write(archive, f"{name}.npy", buffer.getvalue())
 
 
 def load_memory(path: Path) -> SpatialMemory:
@@ -191,7 +193,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 def _check_consistency(arrays: dict[str, NDArray[Any]], views: int) -> None:
     count = len(arrays["record_view"])
     columns = {
-        "record_x": (count,), "record_y": (count,), "record_z": (count,), "record_color": (count, 3), "record_confidence": (count,),
+        "record_x": (count,), "record_y": (count,), "record_z": (count,),
+        "record_color": (count, 3), "record_confidence": (count,),
         "record_spacing": (count,), "record_agreement": (count,),
         "view_K": (views, 3, 3), "view_cam_from_world": (views, 4, 4), "view_size": (views, 2),
         "view_round": (views,), "view_generated": (views,), "grid_shape": (views, 2),

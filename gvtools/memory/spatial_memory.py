@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -199,7 +199,9 @@ class SpatialMemory:
             )
             free = int((hit & keep).sum())
             keep &= ~hit
-        columns = [points.positions, points.colors, points.confidence, points.spacing]
+        columns: list[NDArray[Any]] = [
+            points.positions, points.colors, points.confidence, points.spacing
+        ]
         if not keep.all():
             columns = [column[keep] for column in columns]
         grid = points.free_depth if points.free_depth is not None else np.zeros((0, 0), np.float32)
@@ -223,7 +225,7 @@ class SpatialMemory:
             if not views.generated[i]
         ]
 
-    def _fuse_columns(self, columns: list[NDArray], view: int) -> FuseReport:
+    def _fuse_columns(self, columns: list[NDArray[Any]], view: int) -> FuseReport:
         positions, colors, confidence, spacing = (np.ascontiguousarray(c) for c in columns)
         count = len(positions)
         keys = np.empty(count, np.int64)

@@ -2,21 +2,23 @@
 
 Views near the target know best how it looks from there, so observations are splatted in tiers,
 nearest views first, and a later tier writes only pixels that are still open; runs whose rectangle
-holds no open pixel are not touched at all. Last, what later tiers know to stand clearly in front is
-let through, unless a view already used saw that space to be free.
+holds no open pixel are not touched at all. Generated views come in tiers of their own after all
+observed ones. Last, what observed views of later tiers know to stand clearly in front is let
+through, unless a view of the first tier saw that space to be free.
+
+Which runs go into which pixels is decided here; a back end (``Splatter``) does the splatting.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.errors import ShapeError
+from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 from gvtools.memory import splat_kernels
 from gvtools.memory.occlusion import in_free_space
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 NEAREST = 1e-4
 # An occluder must hold a square of this many pixels.
 OCCLUDER_SIDE = 5
+BACKENDS = ("cpu", "torch", "nearest", "open3d")
+DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +47,9 @@ class SplatOptions:
         support: kernel sum that makes a pixel valid.
         size_cap: widest footprint, pixels; what a memory this coarse leaves open is a hole.
         occluders: look for things in front that the first tiers did not see.
+        backend: "cpu" (compiled), "torch" (the same on ``device``), or without blending, one pixel
+            a point: "nearest" (our own) and "open3d" (``project_to_rgbd_image``).
+        device: where "torch" computes: "cpu", "cuda", or "auto" for CUDA where there is one.
     """
 
     nearest_views: int = 2
@@ -53,6 +60,79 @@ class SplatOptions:
     support: float = 0.5
     size_cap: float = 16.0
     occluders: bool = True
+    backend: str = "cpu"
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+            ("backend", self.backend, BACKENDS),
+            ("device", self.device, DEVICES),
+        ):
+            if value not in known:
+                raise OptionError(f"splat {name} {value!r}; expected one of {', '.join(known)}")
+
+
+@dataclass(eq=False)
+class Target:
+    """One target camera and the images being written.
+
+    Attributes:
+        camera: a batch of one.
+        cam_from_local: (4, 4) float64, from the memory's frame.
+        rect: (R, 4) int32, image rectangle of each run, see splat_kernels.cull_runs.
+        near: what is nearer is behind or inside the camera, scene units.
+        rgb: (H, W, 3) float32 in [0, 1].
+        depth: (H, W) float32, scene units.
+        valid: (H, W) bool.
+        confidence: (H, W) float32.
+        generated: (H, W) bool.
+    """
+
+    camera: Cameras
+    cam_from_local: NDArray[np.float64]
+    rect: NDArray[np.int32]
+    near: np.float32
+    rgb: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    confidence: NDArray[np.float32]
+    generated: NDArray[np.bool_]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width, pixels."""
+        return int(self.camera.height[0]), int(self.camera.width[0])
+
+
+class Splatter(Protocol):
+    """A back end: splats runs of one memory, with one set of options, into targets."""
+
+    def splat(
+        self,
+        target: Target,
+        chosen: NDArray[np.int64],
+        limit: NDArray[np.float32],
+        *,
+        weight: NDArray[np.float32],
+        table: NDArray[np.int32] | None,
+        blend: bool,
+    ) -> NDArray[np.float32]:
+        """Splat the runs ``chosen`` and keep the sums until ``resolve``.
+
+        Args:
+            target: the camera.
+            chosen: (n,) rows of the memory's runs.
+            limit: (H, W), only what is nearer is written; 0 shuts a pixel.
+            weight: (views,) proximity.
+            table: summed-area table of the pixels to be written, where these are few.
+            blend: False stops after the depth pass.
+
+        Returns:
+            (H, W) nearest depth, inf where none.
+        """
+
+    def resolve(self, target: Target, open_: NDArray[np.bool_]) -> None:
+        """Write the last splat's pixels where ``open_`` and the support suffices."""
 
 
 def view_distance(memory: SpatialMemory, camera: Cameras, scale: float) -> NDArray[np.float64]:
@@ -81,53 +161,78 @@ def project(
             f"projection into cameras of {len(sizes)} image sizes; expected one; "
             "project each size by itself"
         )
-    parts = [_Projection(memory, camera, options or SplatOptions()).run() for camera in cameras]
+    options = options or SplatOptions()
+    if options.backend in ("nearest", "open3d"):
+        from gvtools.memory.one_pixel import project_one_pixel
+
+        return project_one_pixel(memory, cameras, open3d=options.backend == "open3d")
+    splatter = _splatter(memory, options)
+    return joined(cameras, [_Projection(memory, c, options, splatter).run() for c in cameras])
+
+
+def joined(cameras: Cameras, parts: list[Guidance]) -> Guidance:
+    """The views of ``parts`` as one batch."""
+    names = ("rgb", "depth", "valid", "confidence", "generated")
     return Guidance(
-        cameras,
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("rgb", "depth", "valid", "confidence", "generated")
-        ),
+        cameras, *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
     )
 
 
-class _Projection:
-    """One target camera: the images being written and the steps that write them."""
+def _splatter(memory: SpatialMemory, options: SplatOptions) -> Splatter:
+    if options.backend == "torch":
+        from gvtools.memory.splat_torch import TorchSplatter
 
-    def __init__(self, memory: SpatialMemory, camera: Cameras, options: SplatOptions) -> None:
+        return TorchSplatter(memory, options)
+    from gvtools.memory.splat_cpu import CpuSplatter
+
+    return CpuSplatter(memory, options)
+
+
+class _Projection:
+    """The steps that write one target camera's images."""
+
+    def __init__(
+        self, memory: SpatialMemory, camera: Cameras, options: SplatOptions, splatter: Splatter
+    ) -> None:
         self.memory, self.camera, self.options = memory, camera, options
-        height, width = int(camera.height[0]), int(camera.width[0])
-        self.shape = (height, width)
-        self.rgb = np.zeros((height, width, 3), np.float32)
-        self.depth = np.zeros(self.shape, np.float32)
-        self.valid = np.zeros(self.shape, np.bool_)
-        self.confidence = np.zeros(self.shape, np.float32)
-        self.generated = np.zeros(self.shape, np.bool_)
-        self.cam_from_local = camera.cam_from_world[0].copy()
-        self.cam_from_local[:3, 3] += self.cam_from_local[:3, :3] @ memory.origin
+        self.splatter = splatter
+        shape = (int(camera.height[0]), int(camera.width[0]))
+        cam_from_local = camera.cam_from_world[0].copy()
+        cam_from_local[:3, 3] += cam_from_local[:3, :3] @ memory.origin
+        self.target = Target(
+            camera,
+            cam_from_local,
+            np.empty((memory.runs.count, 4), np.int32),
+            np.float32(0),
+            np.zeros((*shape, 3), np.float32),
+            np.zeros(shape, np.float32),
+            np.zeros(shape, np.bool_),
+            np.zeros(shape, np.float32),
+            np.zeros(shape, np.bool_),
+        )
 
     def run(self) -> Guidance:
         if self._cull():
             self._splat_tiers()
             if self.options.occluders:
                 self._splat_occluders()
-        images = (self.rgb, self.depth, self.valid, self.confidence, self.generated)
+        t = self.target
+        images = (t.rgb, t.depth, t.valid, t.confidence, t.generated)
         return Guidance(self.camera, *(image[None] for image in images))
 
     def _cull(self) -> bool:
         """Find the runs in view and rank the views that they come from."""
-        memory, runs = self.memory, self.memory.runs
-        self.rect = np.empty((runs.count, 4), np.int32)
+        memory, runs, target = self.memory, self.memory.runs, self.target
         self.z_range = np.empty((runs.count, 2), np.float32)
         splat_kernels.cull_runs(
-            runs.box[: runs.count], self.cam_from_local, self.camera.K[0],
-            self.shape[1], self.shape[0], self.options.blend_reach, self.rect, self.z_range,
+            runs.box[: runs.count], target.cam_from_local, self.camera.K[0],
+            target.shape[1], target.shape[0], self.options.blend_reach, target.rect, self.z_range,
         )  # fmt: skip
-        self.seen = np.flatnonzero(self.rect[:, 1] >= 0)
+        self.seen = np.flatnonzero(target.rect[:, 1] >= 0)
         if not len(self.seen):
             return False
         scale = float(np.median(self.z_range[self.seen, 1]))
-        self.near = np.float32(NEAREST * scale)
+        target.near = np.float32(NEAREST * scale)
         self.distance = view_distance(memory, self.camera, scale)
         present = np.bincount(
             runs.view[self.seen], runs.length[self.seen], minlength=len(memory.views)
@@ -135,110 +240,93 @@ class _Projection:
         # Observed views come before generated ones, however near those are.
         order = np.lexsort((self.distance, memory.views.generated))
         self.ranked = order[present[order] > 0]
-        self.weight = np.zeros(len(memory.views), np.float32)
         self.tier = np.full(len(memory.views), -1)
-        self.zbuffer = np.empty(self.shape, np.float32)
-        self.total = np.empty((*self.shape, splat_kernels.CHANNELS), np.float32)
         return True
+
+    def _tiers(self) -> list[NDArray[np.int64]]:
+        """The ranked views cut into tiers that double in size; observed and generated apart."""
+        made = self.memory.views.generated[self.ranked]
+        tiers = []
+        size = self.options.nearest_views
+        for part in (self.ranked[~made], self.ranked[made]):
+            at = 0
+            while at < len(part):
+                tiers.append(part[at : at + size])
+                at += size
+                size *= 2
+        return tiers
 
     def _splat_tiers(self) -> None:
         """Nearest views first; each later tier writes what is still open."""
-        at, size = 0, self.options.nearest_views
-        views = self.memory.runs.view
-        while at < len(self.ranked):
-            members = self.ranked[at : at + size]
-            self.tier[members] = at
-            nearest = self.distance[members].min()
-            self.weight[members] = np.exp(
-                -self.options.proximity * (self.distance[members] - nearest)
-            )
-            open_ = ~self.valid
-            chosen = self.seen[self.tier[views[self.seen]] == at]
+        views, target = self.memory.runs.view, self.target
+        for number, members in enumerate(self._tiers()):
+            self.tier[members] = number
+            open_ = ~target.valid
+            chosen = self.seen[self.tier[views[self.seen]] == number]
             table = None
-            if at:
+            if number:
                 table = splat_kernels.summed_area(open_)
                 if not table[-1, -1]:
                     return
-                chosen = splat_kernels.touching(self.rect, table, chosen)
+                chosen = splat_kernels.touching(target.rect, table, chosen)
             limit = np.where(open_, np.float32(np.inf), np.float32(0))
-            self._splat(chosen, limit, open_, table)
-            at += size
-            size *= 2
+            self._write(chosen, limit, open_, members=members, table=table)
+
+    def _write(
+        self,
+        chosen: NDArray[np.int64],
+        limit: NDArray[np.float32],
+        open_: NDArray[np.bool_],
+        *,
+        members: NDArray[np.int64],
+        table: NDArray[np.int32] | None,
+    ) -> None:
+        """Splat and write; proximity counts from the nearest of the views ``members``."""
+        beyond = np.maximum(self.distance - self.distance[members].min(), 0)
+        weight = np.exp(-self.options.proximity * beyond).astype(np.float32)
+        self.splatter.splat(self.target, chosen, limit, weight=weight, table=table, blend=True)
+        self.splatter.resolve(self.target, open_)
 
     def _splat_occluders(self) -> None:
         """Let through what unused observations know to stand clearly in front.
 
         A view of the first tier may have looked past an object that only others saw. Where a
         first-tier view saw the object's place to be free, the object is noise or has moved.
+        Generated content is never let through: it must not stand before what was observed.
         """
-        views = self.memory.runs.view
-        first = self.ranked[: self.options.nearest_views]
-        later = self.seen[self.tier[views[self.seen]] != 0]
-        runs, records = self.memory.runs, self.memory.records
+        memory, target = self.memory, self.target
+        runs, records, K = memory.runs, memory.records, self.camera.K[0]
+        view = runs.view[self.seen]
+        later = self.seen[(self.tier[view] != 0) & ~memory.views.generated[view]]
         chosen = splat_kernels.in_front(
-            later, runs.start, runs.length, self.rect, self.z_range,
-            records.x, records.y, records.z, self.cam_from_local, self.camera.K[0],
-            self.depth, _tile_farthest(self.depth), 2 * self.options.band,
+            later, runs.start, runs.length, target.rect, self.z_range,
+            records.x, records.y, records.z, target.cam_from_local, K,
+            target.depth, _tile_farthest(target.depth), 2 * self.options.band,
         )  # fmt: skip
         if not len(chosen):
             return
-        limit = self.depth * np.float32(1 - 2 * self.options.band)
-        self._splat(chosen, limit, None)
-        rows, cols = np.nonzero(np.isfinite(self.zbuffer))
+        limit = target.depth * np.float32(1 - 2 * self.options.band)
+        none = np.zeros(len(memory.views), np.float32)
+        zbuffer = self.splatter.splat(target, chosen, limit, weight=none, table=None, blend=False)
+        rows, cols = np.nonzero(np.isfinite(zbuffer))
         if not len(rows):
             return
-        z = self.zbuffer[rows, cols].astype(np.float64)
-        K = self.camera.K[0]
+        z = zbuffer[rows, cols].astype(np.float64)
         y = (rows + 0.5 - K[1, 2]) / K[1, 1]
         x = (cols + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
-        local = np.stack([x * z, y * z, z], axis=1) - self.cam_from_local[:3, 3]
-        local = (local @ self.cam_from_local[:3, :3]).astype(np.float32)
-        memory = self.memory
-        grids = memory.observed_grids(first)
+        local = np.stack([x * z, y * z, z], axis=1) - target.cam_from_local[:3, 3]
+        local = (local @ target.cam_from_local[:3, :3]).astype(np.float32)
+        grids = memory.observed_grids(np.flatnonzero(self.tier == 0))
         free = in_free_space(local, grids, tolerance=memory.options.free_space_tolerance)
-        front = np.zeros(self.shape, np.bool_)
+        front = np.zeros(target.shape, np.bool_)
         front[rows[~free], cols[~free]] = True
         # Slivers along silhouettes are what an error of a pixel in a pose looks like.
         front = splat_kernels.opened(front, OCCLUDER_SIDE)
         table = splat_kernels.summed_area(front)
         if table[-1, -1]:
-            chosen = splat_kernels.touching(self.rect, table, chosen)
-            nearest = self.distance[self.ranked].min()
-            self.weight = np.exp(-self.options.proximity * (self.distance - nearest)).astype(
-                np.float32
-            )
-            self._splat(chosen, np.where(front, limit, np.float32(0)), front, table)
-
-    def _splat(
-        self,
-        chosen: NDArray[np.int64],
-        limit: NDArray[np.float32],
-        open_: NDArray[np.bool_] | None,
-        table: NDArray[np.int32] | None = None,
-    ) -> None:
-        """Splat runs; ``open_`` None stops after the depth pass.
-
-        ``table`` is the summed-area table of ``open_`` where that is a small part of the image.
-        """
-        memory, options = self.memory, self.options
-        records, runs = memory.records, memory.runs
-        reachable = np.empty(0, np.bool_) if table is None else splat_kernels.near_to(table)
-        splat_kernels.splat_runs(
-            chosen, runs.start, runs.length, runs.view, self.rect,
-            records.x, records.y, records.z, records.color, records.confidence,
-            records.agreement, records.spacing, self.weight, memory.views.generated,
-            self.cam_from_local.astype(np.float32), self.camera.K[0], self.near, limit.reshape(-1), reachable,
-            np.float32(options.band), np.float32(options.depth_reach),
-            np.float32(options.blend_reach), np.float32(options.size_cap),
-            np.float32(memory.options.weight_cap), numba.get_num_threads(), open_ is not None,
-            self.shape[1], self.shape[0], self.zbuffer.reshape(-1),
-            self.total.reshape(-1, splat_kernels.CHANNELS),
-        )  # fmt: skip
-        if open_ is not None:
-            splat_kernels.resolve(
-                self.total, open_, np.float32(options.support),
-                self.rgb, self.depth, self.valid, self.confidence, self.generated,
-            )  # fmt: skip
+            chosen = splat_kernels.touching(target.rect, table, chosen)
+            limit = np.where(front, limit, np.float32(0))
+            self._write(chosen, limit, front, members=self.ranked, table=table)
 
 
 def _tile_farthest(depth: NDArray[np.float32]) -> NDArray[np.float32]:

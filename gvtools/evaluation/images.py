@@ -1,0 +1,138 @@
+"""Image and depth metrics of one view: PSNR, SSIM and relative depth error, whole or masked.
+
+Colours are compared in [0, 1] and in float64. SSIM has the settings of Wang et al. 2004, as
+scikit-image documents them: a Gaussian window of sigma 1.5 (11 x 11 pixels) and population
+covariances. A figure that has no pixels to stand on is None, never a number.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gvtools.errors import ShapeError
+
+# Half of the 11-pixel window: nearer to the border, windows would see reflected pixels.
+SSIM_BORDER = 5
+SIGMA = 1.5
+
+
+def psnr(image: ArrayLike, truth: ArrayLike, *, mask: ArrayLike | None = None) -> float | None:
+    """Peak signal-to-noise ratio, dB, for a peak of 1.
+
+    Args:
+        image: (H, W, C) floats in [0, 1], or uint8, which stands for 255 times that.
+        truth: likewise.
+        mask: (H, W) bool, True = compare; None compares all pixels.
+
+    Returns:
+        The ratio; infinity when the compared pixels are equal; None when there are none.
+
+    Raises:
+        ShapeError: shapes or types that do not fit.
+    """
+    first, second, where = _pair(image, truth, mask)
+    if where is not None:
+        first, second = first[where], second[where]
+    if not first.size:
+        return None
+    error = float(np.mean((first - second) ** 2))
+    return float("inf") if error == 0 else float(-10 * np.log10(error))
+
+
+def ssim(image: ArrayLike, truth: ArrayLike, *, mask: ArrayLike | None = None) -> float | None:
+    """Structural similarity, -1 to 1: the mean of the SSIM map over the compared pixels.
+
+    The outermost 5 pixels are never compared, with a mask or without, so that a mask of all pixels
+    gives the figure of no mask. Windows at the rim of a mask see pixels outside it.
+
+    Args:
+        image: (H, W, C) floats in [0, 1], or uint8, which stands for 255 times that.
+        truth: likewise.
+        mask: (H, W) bool, True = compare; None compares all pixels.
+
+    Returns:
+        The mean over pixels and channels; None when no pixel is compared.
+
+    Raises:
+        ShapeError: shapes or types that do not fit, or images below 11 x 11 pixels.
+    """
+    from skimage.metrics import structural_similarity
+
+    first, second, where = _pair(image, truth, mask)
+    side = 2 * SSIM_BORDER + 1
+    if min(first.shape[:2]) < side:
+        raise ShapeError(
+            f"SSIM of {first.shape[1]}x{first.shape[0]} pixels; expected at least {side}x{side}"
+        )
+    _, similarity = structural_similarity(
+        first,
+        second,
+        gaussian_weights=True,
+        sigma=SIGMA,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+        full=True,
+    )
+    inner = (slice(SSIM_BORDER, -SSIM_BORDER),) * 2
+    chosen = similarity[inner]
+    if where is not None:
+        chosen = chosen[where[inner]]
+    return float(chosen.mean()) if chosen.size else None
+
+
+def relative_depth_error(
+    depth: ArrayLike, truth: ArrayLike, *, mask: ArrayLike | None = None
+) -> float | None:
+    """Median of |depth - truth| / truth over the pixels where both are there.
+
+    Args:
+        depth: (H, W) z-depth, scene units, 0 = none.
+        truth: likewise, in the same unit.
+        mask: (H, W) bool, True = compare.
+
+    Returns:
+        The share of the true depth; None where no pixel has both.
+
+    Raises:
+        ShapeError: shapes that differ.
+    """
+    first, second = np.asarray(depth, np.float64), np.asarray(truth, np.float64)
+    if first.shape != second.shape or first.ndim != 2:
+        raise ShapeError(f"depth maps of {first.shape} and {second.shape}; expected equal (H, W)")
+    with np.errstate(invalid="ignore"):
+        both = (first > 0) & (second > 0) & np.isfinite(first) & np.isfinite(second)
+    where = _mask(mask, first.shape)
+    if where is not None:
+        both &= where
+    if not both.any():
+        return None
+    return float(np.median(np.abs(first[both] - second[both]) / second[both]))
+
+
+def _pair(
+    image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_] | None]:
+    first, second = _unit(image), _unit(truth)
+    if first.ndim != 3 or first.shape != second.shape:
+        raise ShapeError(f"images of {first.shape} and {second.shape}; expected equal (H, W, C)")
+    return first, second, _mask(mask, first.shape[:2])
+
+
+def _unit(image: ArrayLike) -> NDArray[np.float64]:
+    array = np.asarray(image)
+    if array.dtype == np.uint8:
+        return array / 255.0
+    if not np.issubdtype(array.dtype, np.floating):
+        raise ShapeError(f"an image of {array.dtype}; expected uint8 or floats in [0, 1]")
+    return array.astype(np.float64)
+
+
+def _mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+    if mask is None:
+        return None
+    array = np.asarray(mask)
+    if array.shape != shape or array.dtype != np.bool_:
+        raise ShapeError(f"a mask of {array.dtype} {array.shape}; expected bool {shape}")
+    return array

@@ -1,0 +1,87 @@
+"""The program ``gvtools``: one command a module, errors in one line, exit status 0, 2 or 1."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import NoReturn
+
+import gvtools
+from gvtools.errors import GvError
+from pipelines.console import Console
+
+# Each module has SUMMARY, EXAMPLES, add_arguments(parser) and run(args, console).
+COMMANDS = {
+    "demo": "pipelines.demo",
+    "check": "pipelines.check",
+    "reconstruct": "pipelines.reconstruct",
+    "render": "pipelines.render",
+    "export": "pipelines.export",
+    "bench": "pipelines.bench",
+}
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argument parser whose complaint is one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"gvtools: {message}; see '{self.prog} --help'\n")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    parser = _Parser(
+        prog="gvtools",
+        description="Grow a coloured point-cloud memory from posed photographs or RGB-D, project "
+        "it into new cameras, complete what it does not know, and measure the result.",
+        epilog="gvtools COMMAND --help tells more of each command.",
+    )
+    parser.add_argument("--version", action="version", version=f"gvtools {gvtools.__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+    for name, path in COMMANDS.items():
+        module = import_module(path)
+        examples = "\n".join(f"  {line}" for line in module.EXAMPLES)
+        command = commands.add_parser(
+            name,
+            help=module.SUMMARY,
+            description=f"examples:\n{examples}\n\n{module.SUMMARY}.",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        module.add_arguments(command)
+        command.add_argument("--quiet", action="store_true", help="print nothing but warnings")
+        command.add_argument("--debug", action="store_true", help="show tracebacks of errors")
+        command.set_defaults(module=module)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status: 0 done, 2 wrong input or options, 1 otherwise."""
+    parser = build_parser()
+    args = parser.parse_args(argv)
+    if args.command is None:
+        parser.print_help()
+        return 2
+    try:
+        args.module.run(args, Console(quiet=args.quiet))
+    except GvError as error:
+        if args.debug:
+            raise
+        print(f"gvtools: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("gvtools: interrupted; --resume continues a run", file=sys.stderr)
+        return 1
+    except Exception as error:
+        if args.debug:
+            raise
+        name = type(error).__name__
+        print(f"gvtools: unexpected {name}: {error}; --debug shows where", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,212 @@
+"""The settings of a run: defaults, profile, file, then --set; unknown keys name the nearest."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from gvtools.errors import OptionError
+from gvtools.memory.back_projection import BackProjectionOptions
+from gvtools.memory.spatial_memory import MemoryOptions
+from gvtools.memory.splat import SplatOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class FusionOptions:
+    """What is taken of depth and of completions.
+
+    Attributes:
+        min_confidence: generated pixels below this are not fused.
+        max_scale_residual: a completion whose depth fits the memory's worse than this relative
+            residual is refused.
+        voxel_percentile: the automatic voxel edge follows this percentile of the context's pixel
+            footprints; near surfaces are what a coarse voxel blurs.
+        voxel_scale: how many such footprints the edge is.
+    """
+
+    min_confidence: float = 0.08
+    max_scale_residual: float = 0.1
+    voxel_percentile: float = 25.0
+    voxel_scale: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """Everything that decides what a run computes.
+
+    Attributes:
+        context: which views are given (a selection).
+        targets: which cameras to complete (a selection, a path such as ``orbit:24``, a trajectory
+            file, or another project).
+        views_per_round: targets a round takes at most.
+        rounds: how many rounds; None takes as many as the targets need.
+        depth: where the context's depth comes from.
+        completer: by registered name.
+        profile: fast, balanced or accurate.
+        voxel: voxel edge, scene units; None derives it from the pixel footprints.
+        seed: of everything random.
+        device: auto, cpu or cuda.
+        allow_overlap: whether a view may be context and target.
+        back_projection: see BackProjectionOptions.
+        memory: see MemoryOptions.
+        splat: see SplatOptions.
+        fusion: see FusionOptions.
+        completer_options: options of the completer by name.
+    """
+
+    context: str = "all"
+    targets: str = "interpolate:12"
+    views_per_round: int = 6
+    rounds: int | None = None
+    depth: str = "auto"
+    completer: str = "inpaint"
+    profile: str = "balanced"
+    voxel: float | None = None
+    seed: int = 0
+    device: str = "auto"
+    allow_overlap: bool = False
+    back_projection: BackProjectionOptions = field(default_factory=BackProjectionOptions)
+    memory: MemoryOptions = field(default_factory=MemoryOptions)
+    splat: SplatOptions = field(default_factory=SplatOptions)
+    fusion: FusionOptions = field(default_factory=FusionOptions)
+    completer_options: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return asdict(self)
+
+
+# What each profile changes; "balanced" is the defaults.
+PROFILES: dict[str, dict[str, Any]] = {
+    "fast": {
+        "fusion.voxel_scale": 2.0,
+        "memory.same_direction": 8.0,
+        "memory.observations_per_voxel": 4,
+        "splat.blend_reach": 1.25,
+    },
+    "balanced": {},
+    "accurate": {
+        "fusion.voxel_percentile": 10.0,
+        "memory.same_direction": 0.0,
+        "memory.observations_per_voxel": 64,
+    },
+}
+
+
+def with_profile(config: RunConfig, name: str) -> RunConfig:
+    """``config`` with a profile's settings.
+
+    Raises:
+        OptionError: no such profile.
+    """
+    if name not in PROFILES:
+        raise OptionError(f"profile {name!r}; expected one of {', '.join(PROFILES)}")
+    for key, value in PROFILES[name].items():
+        config = with_setting(config, key, value)
+    return replace(config, profile=name)
+
+
+def with_file(config: RunConfig, path: Path) -> RunConfig:
+    """``config`` with the settings of a JSON file (nested or dotted keys).
+
+    Raises:
+        OptionError: unreadable, no JSON object, an unknown key or a wrong value.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise OptionError(f"{path}: no readable JSON configuration ({error})") from None
+    if not isinstance(data, dict):
+        raise OptionError(f"{path}: holds a {type(data).__name__}; expected an object of settings")
+    if "profile" in data:
+        config = with_profile(config, str(data["profile"]))
+    for key, value in _flat(data):
+        if key != "profile":
+            config = with_setting(config, key, value)
+    return config
+
+
+def with_settings(config: RunConfig, texts: Iterable[str]) -> RunConfig:
+    """``config`` with ``key=value`` texts applied in order.
+
+    Raises:
+        OptionError: a text without ``=``, an unknown key or a wrong value.
+    """
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise OptionError(f"--set {text!r}; expected KEY=VALUE, such as splat.band=0.03")
+        config = with_setting(config, key.strip(), value.strip())
+    return config
+
+
+def with_setting(config: RunConfig, key: str, value: Any) -> RunConfig:
+    """``config`` with one dotted key changed; texts are converted to the field's type."""
+    head, _, rest = key.partition(".")
+    names = [entry.name for entry in fields(config)]
+    if head == "completer" and rest:
+        options = {**config.completer_options, rest: value}
+        return replace(config, completer_options=options)
+    if head == "completer_options" and rest:
+        return with_setting(config, f"completer.{rest}", value)
+    if head not in names:
+        raise _unknown(key, config)
+    current = getattr(config, head)
+    if is_dataclass(current):
+        known = [entry.name for entry in fields(current)]
+        if rest not in known:
+            raise _unknown(key, config)
+        converted = _converted(key, get_type_hints(type(current))[rest], value)
+        section: Any = replace(current, **{rest: converted})
+        return _with(config, head, section)
+    if rest:
+        raise _unknown(key, config)
+    return _with(config, head, _converted(key, get_type_hints(RunConfig)[head], value))
+
+
+def _with(config: RunConfig, name: str, value: Any) -> RunConfig:
+    changes: dict[str, Any] = {name: value}
+    return replace(config, **changes)
+
+
+def _flat(data: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    for key, value in data.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _unknown(key: str, config: RunConfig) -> OptionError:
+    known = [name for name, _ in _flat(config.to_dict())] + ["completer.OPTION"]
+    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
+    return OptionError(f"no setting {key!r}; {hint}")
+
+
+def _converted(key: str, kind: Any, value: Any) -> Any:
+    choices = getattr(kind, "__args__", None) or (kind,)
+    empty = value is None or str(value).lower() in ("none", "null", "auto")
+    if empty and type(None) in choices:
+        return None
+    for choice in choices:
+        if choice is type(None):
+            continue
+        try:
+            if choice is bool:
+                if isinstance(value, bool) or str(value).lower() in ("true", "false"):
+                    return str(value).lower() == "true"
+            elif choice is int and float(value) == int(float(value)):
+                return int(float(value))
+            elif choice is float and not isinstance(value, bool):
+                return float(value)
+            elif choice is str:
+                return str(value)
+        except (TypeError, ValueError, OverflowError):
+            continue
+    name = getattr(kind, "__name__", str(kind))
+    raise OptionError(f"setting {key}={value!r}; expected {name}")

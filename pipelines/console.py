@@ -1,0 +1,71 @@
+"""Talking to the user: lines, tables, progress; silence with --quiet."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gvtools.files import write_text
+
+
+class Console:
+    """Progress bars on a terminal, plain lines otherwise, nothing with ``quiet``."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self.quiet = quiet
+        self.interactive = sys.stdout.isatty() and not quiet
+
+    def line(self, text: str) -> None:
+        """One line on standard output."""
+        if not self.quiet:
+            print(text, flush=True)
+
+    def warn(self, text: str) -> None:
+        """One line on standard error, also with ``quiet``."""
+        print(f"warning: {text}", file=sys.stderr, flush=True)
+
+    def table(self, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+        """Aligned columns; None prints as a dash, floats with four significant digits."""
+        if self.quiet:
+            return
+        cells = [list(columns)] + [[_cell(value) for value in row] for row in rows]
+        widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
+        for row in cells:
+            print("  ".join(text.rjust(w) for text, w in zip(row, widths, strict=True)).rstrip())
+        sys.stdout.flush()
+
+    def track(self, items: Sequence[Any], label: str) -> Iterator[Any]:
+        """The items, with a bar on a terminal and one line elsewhere."""
+        if not self.interactive:
+            self.line(f"{label}: {len(items)}")
+            yield from items
+            return
+        from rich.progress import track
+
+        yield from track(items, description=label, transient=True)
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return str(value)
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """One JSON object; NaN and infinity become null."""
+    write_text(path, json.dumps(_finite(data), indent=1) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float) and not (abs(value) < float("inf")):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return value

@@ -1,0 +1,57 @@
+"""The pictures and arrays that a round leaves for each target."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.guidance import Guidance
+from pipelines.rounds import TargetResult
+
+
+def file_stem(name: str) -> str:
+    """A view's name as part of a file name: without folders and ending."""
+    return str(PurePosixPath(name).with_suffix("")).replace("/", "__")
+
+
+def write_target(folder: Path, result: TargetResult, after: Guidance) -> None:
+    """Write what the memory knew of a target, what the completer made, and what memory knows now.
+
+    ``guidance_NAME.png`` (holes black), ``valid_NAME.png``, ``generated_NAME.png`` (the completed
+    picture), ``after_NAME.png`` (the memory after the round), and ``depth_NAME.npz`` with the keys
+    guidance and completion (float32 z-depth, scene units, 0 = none) and fused (bool).
+    """
+    stem = file_stem(result.guidance.cameras.names[0])
+    write_png(folder / f"guidance_{stem}.png", to_bytes(result.guidance.rgb[0]))
+    write_png(folder / f"valid_{stem}.png", result.guidance.valid[0].astype(np.uint8) * 255)
+    write_png(folder / f"generated_{stem}.png", to_bytes(result.completion.rgb[0]))
+    write_png(folder / f"after_{stem}.png", to_bytes(after.rgb[0]))
+    np.savez_compressed(
+        folder / f"depth_{stem}.npz",
+        guidance=result.guidance.depth[0],
+        completion=result.completion.depth[0],
+        fused=result.fused,
+    )
+
+
+def to_bytes(rgb: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    """Colours in [0, 1] as uint8."""
+    return np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """One PNG."""
+    from PIL import Image
+
+    Image.fromarray(image).save(path, format="PNG", compress_level=4)
+
+
+def read_png(path: Path) -> NDArray[np.uint8]:
+    """Its pixels."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return np.asarray(image)

@@ -1,0 +1,226 @@
+"""One round: lift the context, or project, complete, align and fuse the round's targets."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.completers.base import Completer, Completion, ContextView
+from gvtools.depth.source import DepthSource
+from gvtools.errors import ProjectError
+from gvtools.guidance import Guidance
+from gvtools.memory.back_projection import back_project
+from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
+from gvtools.scenes.scene import Scene
+from gvtools.similarity import align_depth_scale
+from pipelines.config import RunConfig
+
+STAGES = ("depth", "fuse", "project", "complete", "align")
+
+
+@dataclass
+class Clock:
+    """Seconds spent in each stage."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the block's time to stage ``name``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] += time.perf_counter() - start
+
+
+@dataclass(frozen=True, eq=False)
+class TargetResult:
+    """One completed target.
+
+    Attributes:
+        guidance: what memory knew before the round, a batch of one.
+        completion: what the completer made of it, a batch of one.
+        fused: which pixels went to fusion.
+        report: figures of the view for the round's report.
+    """
+
+    guidance: Guidance
+    completion: Completion
+    fused: NDArray[np.bool_]
+    report: dict[str, Any]
+
+
+def observe_context(
+    scene: Scene,
+    names: Sequence[str],
+    *,
+    source: DepthSource,
+    memory: SpatialMemory,
+    config: RunConfig,
+    clock: Clock,
+    progress: Any,
+) -> tuple[FuseReport, dict[str, int]]:
+    """Round 0: lift the context views and fuse them; returns the sum and pixels dropped."""
+    total = FuseReport()
+    dropped: dict[str, int] = {}
+    for name in progress(names, "context views"):
+        view = scene[name]
+        if not view.has_depth:
+            dropped["views without depth"] = dropped.get("views without depth", 0) + 1
+            continue
+        with clock.stage("depth"):
+            frame = view.load()
+            depth_map = source.depth(scene, view, frame)
+        with clock.stage("fuse"):
+            points = back_project(
+                frame.rgb,
+                depth_map.depth,
+                view.camera,
+                origin=memory.origin,
+                confidence=depth_map.confidence,
+                mask=frame.mask,
+                options=config.back_projection,
+            )
+            total += memory.fuse(points, round=0)
+        for reason, count in points.dropped.items():
+            dropped[reason] = dropped.get(reason, 0) + count
+    if not len(memory):
+        raise ProjectError(
+            f"{scene.root}: the context's depth gave no point; look at 'gvtools check' and at the "
+            "depth's unit"
+        )
+    return total, dropped
+
+
+def load_context(scene: Scene, names: Sequence[str], source: DepthSource) -> list[ContextView]:
+    """The context as completers see it."""
+    out = []
+    for name in names:
+        view = scene[name]
+        frame = view.load()
+        depth = source.depth(scene, view, frame) if frame.depth is not None else None
+        out.append(
+            ContextView(
+                name,
+                view.camera,
+                frame.rgb.astype(np.float32) / 255,
+                depth.depth if depth else None,
+                depth.confidence if depth else None,
+            )
+        )
+    return out
+
+
+def complete_targets(
+    cameras: Cameras,
+    number: int,
+    *,
+    memory: SpatialMemory,
+    completer: Completer,
+    context: Sequence[ContextView],
+    config: RunConfig,
+    clock: Clock,
+    progress: Any,
+) -> tuple[list[TargetResult], FuseReport]:
+    """Rounds 1, 2, ...: project, complete, align and fuse the round's targets.
+
+    A completer that looks at several targets at once (``joint``) gets them all; for any other, each
+    view is completed on what the views before it added, so that they agree with each other.
+    """
+    seed = config.seed + number
+    if getattr(completer, "joint", False):
+        with clock.stage("project"):
+            guidance = memory.project(cameras, options=config.splat)
+        with clock.stage("complete"):
+            completion = completer.complete(context, guidance, seed=seed)
+        pairs = [(guidance[i], _row(completion, i)) for i in range(len(cameras))]
+        results = []
+        total = FuseReport()
+        for known, made in progress(pairs, f"round {number}"):
+            result, report = _align_and_fuse(known, made, number, memory, config, clock)
+            results.append(result)
+            total += report
+        return results, total
+    results = []
+    total = FuseReport()
+    for camera in progress(list(cameras), f"round {number}"):
+        with clock.stage("project"):
+            guidance = memory.project(camera, options=config.splat)
+        with clock.stage("complete"):
+            completion = completer.complete(context, guidance, seed=seed)
+        result, report = _align_and_fuse(guidance, completion, number, memory, config, clock)
+        results.append(result)
+        total += report
+    return results, total
+
+
+def _row(completion: Completion, index: int) -> Completion:
+    rows = slice(index, index + 1)
+    rays = None if completion.rays is None else completion.rays[rows]
+    return Completion(
+        completion.rgb[rows],
+        completion.depth[rows],
+        completion.confidence[rows],
+        rays,
+        completion.spent,
+    )
+
+
+def _align_and_fuse(
+    guidance: Guidance,
+    completion: Completion,
+    number: int,
+    memory: SpatialMemory,
+    config: RunConfig,
+    clock: Clock,
+) -> tuple[TargetResult, FuseReport]:
+    valid, depth = guidance.valid[0], completion.depth[0]
+    confidence = completion.confidence[0]
+    with clock.stage("align"):
+        fit = align_depth_scale(
+            depth,
+            guidance.depth[0],
+            valid=valid & (depth > 0),
+            confidence=guidance.confidence[0],
+            max_residual=config.fusion.max_scale_residual,
+        )
+    made = ~valid & (depth > 0)
+    fused = made & (confidence >= config.fusion.min_confidence)
+    report = FuseReport()
+    if not fit.ok:
+        fused = np.zeros_like(fused)
+    elif fused.any():
+        with clock.stage("fuse"):
+            points = back_project(
+                np.rint(np.clip(completion.rgb[0], 0, 1) * 255).astype(np.uint8),
+                (depth * np.float32(fit.scale)).astype(np.float32),
+                guidance.cameras,
+                origin=memory.origin,
+                confidence=np.where(confidence > 0, confidence, np.float32(1)),
+                mask=fused,
+                options=config.back_projection,
+            )
+            report = memory.fuse(points, round=number, generated=True)
+    figures = {
+        "name": guidance.cameras.names[0],
+        "coverage": guidance.coverage,
+        "completed": float((valid | made).mean()),
+        "fused_pixels": int(fused.sum()),
+        "scale": {
+            "status": fit.status,
+            "scale": fit.scale,
+            "inlier_share": fit.inlier_share,
+            "residual": fit.residual,
+            "support": fit.support,
+        },
+        "fuse": asdict(report),
+    }
+    return TargetResult(guidance, completion, fused, figures), report

@@ -1,0 +1,94 @@
+"""Which cameras a run completes: hold-outs, paths between or around cameras, files, projects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from gvtools.cameras import Cameras
+from gvtools.errors import OptionError
+from gvtools.scenes.scene import Scene, View
+from gvtools.scenes.selection import check_disjoint, select
+
+PATHS = ("interpolate", "orbit", "spiral")
+FORMS = (
+    "a selection of the project's views, interpolate:N, orbit:N, spiral:N, a trajectory file "
+    "(TUM or KITTI), or another project as PATH or PATH@SELECTION"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """The cameras to complete, in order.
+
+    Attributes:
+        cameras: V cameras.
+        truth: per camera the view that shows the truth, None where there is none.
+        kind: "hold-out", the path's name, "trajectory" or "project".
+        files: what was read beside the project.
+    """
+
+    cameras: Cameras
+    truth: tuple[View | None, ...]
+    kind: str
+    files: tuple[Path, ...] = ()
+
+
+def resolve_targets(
+    scene: Scene, context: tuple[str, ...], spec: str, *, allow_overlap: bool = False
+) -> Targets:
+    """The target cameras that ``spec`` means.
+
+    Raises:
+        OptionError: an unknown form, an empty selection, or hold-outs that overlap the context.
+    """
+    known = scene.subset(context).cameras
+    name, _, count = spec.partition(":")
+    if name in PATHS and spec not in scene.names:
+        if not count.isdecimal() or int(count) < 1:
+            raise OptionError(f"targets {spec!r}; expected {name}:N with N >= 1")
+        return _path(known, name, int(count))
+    path, at, selection = spec.partition("@")
+    if path and Path(path).exists() and spec not in scene.names:
+        if Path(path).is_dir() or Path(path).suffix == ".json":
+            return _project(Path(path), selection if at else "all")
+        return _file(Path(path), known)
+    try:
+        chosen = select(scene.names, spec)
+    except OptionError as error:
+        raise OptionError(f"targets {spec!r}: {error}; or give {FORMS}") from None
+    if not allow_overlap:
+        check_disjoint(context, chosen)
+    views = tuple(scene[name] for name in chosen)
+    return Targets(scene.subset(chosen).cameras, views, "hold-out")
+
+
+def _path(known: Cameras, name: str, count: int) -> Targets:
+    from gvtools import trajectories
+
+    cameras = getattr(trajectories, name)(known, count)
+    named = Cameras(
+        cameras.K,
+        cameras.cam_from_world,
+        cameras.width,
+        cameras.height,
+        tuple(f"{name}_{i:04d}" for i in range(count)),
+    )
+    return Targets(named, (None,) * count, name)
+
+
+def _file(path: Path, known: Cameras) -> Targets:
+    from gvtools.trajectory_files import read_trajectory
+
+    cameras = read_trajectory(path, known[0])
+    return Targets(cameras, (None,) * len(cameras), "trajectory", (path,))
+
+
+def _project(path: Path, selection: str) -> Targets:
+    from gvtools.scenes.project import open_project
+
+    other = open_project(path)
+    chosen = select(other.names, selection)
+    views = tuple(other[name] for name in chosen)
+    files = tuple(file for view in views for file in view.files)
+    return Targets(other.subset(chosen).cameras, views, "project", files)
