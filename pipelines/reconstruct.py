@@ -200,6 +200,8 @@ def make_plan(scene: Scene, config: RunConfig) -> Plan:
         )
     if config.device not in ("auto", "cpu", "cuda"):
         raise OptionError(f"device {config.device!r}; expected auto, cpu or cuda")
+    if config.voxel is not None and not 0 < config.voxel < float("inf"):
+        raise OptionError(f"voxel edge {config.voxel}; expected auto or a positive length")
     create(config.completer, **config.completer_options)
     context = select(scene.names, config.context)
     targets = resolve_targets(scene, context, config.targets, allow_overlap=config.allow_overlap)

@@ -95,7 +95,10 @@ class RunDirectory:
             )
         for leftover in self.path.glob(".round_*.part"):
             shutil.rmtree(leftover)
-        return len(self.reports())
+        done = len(self.reports())
+        if done:
+            self._settle(done - 1)
+        return done
 
     def reports(self) -> list[dict[str, Any]]:
         """The reports of the whole rounds, in order."""
@@ -137,11 +140,11 @@ class RunDirectory:
         except BaseException:
             shutil.rmtree(part, ignore_errors=True)
             raise
+        self._settle(number)
+
+    def _settle(self, number: int) -> None:
+        """What follows from round ``number`` being whole; safe to repeat after a kill."""
         if number:
             self.round_memory(number - 1).unlink(missing_ok=True)
-        self.write_rounds()
-
-    def write_rounds(self) -> None:
-        """rounds.jsonl, one line per whole round."""
         lines = [json.dumps(report) for report in self.reports()]
         write_text(self.path / "rounds.jsonl", "".join(f"{line}\n" for line in lines))

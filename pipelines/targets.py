@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError
 from gvtools.scenes.scene import Scene, View
@@ -47,7 +49,7 @@ def resolve_targets(
     if name in PATHS and spec not in scene.names:
         if not count.isdecimal() or int(count) < 1:
             raise OptionError(f"targets {spec!r}; expected {name}:N with N >= 1")
-        return _path(known, name, int(count))
+        return _path(scene, context, name, int(count))
     path, at, selection = spec.partition("@")
     if path and Path(path).exists() and spec not in scene.names:
         if Path(path).is_dir() or Path(path).suffix == ".json":
@@ -63,10 +65,24 @@ def resolve_targets(
     return Targets(scene.subset(chosen).cameras, views, "hold-out")
 
 
-def _path(known: Cameras, name: str, count: int) -> Targets:
+def _path(scene: Scene, context: tuple[str, ...], name: str, count: int) -> Targets:
     from gvtools import trajectories
+    from gvtools.errors import DegenerateError
 
-    cameras = getattr(trajectories, name)(known, count)
+    known = scene.subset(context).cameras
+    make = getattr(trajectories, name)
+    try:
+        cameras = make(known, count)
+    except DegenerateError:
+        # Parallel views have no common focus; what they look at lies at their median depth.
+        if name != "orbit":
+            raise
+        view = scene[context[len(context) // 2]]
+        depth = view.load().depth if view.has_depth else None
+        if depth is None or not (depth > 0).any():
+            raise
+        ahead = view.camera.world_from_cam[0, :3, 2] * float(np.median(depth[depth > 0]))
+        cameras = make(known, count, center=known.centers.mean(axis=0) + ahead)
     named = Cameras(
         cameras.K,
         cameras.cam_from_world,

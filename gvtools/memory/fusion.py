@@ -82,8 +82,13 @@ def group_by_block(blocks, total):
 
 
 @compiled(fastmath={"nsz", "arcp", "contract"})
-def _most_similar(head, p, spacing, center, view_centers, r_view, r_spacing, r_next):
-    """The chain's observation seen from the most similar direction: (record, cosine, length)."""
+def _most_similar(
+    head, p, spacing, center, view_centers, view_generated, generated, r_view, r_spacing, r_next
+):
+    """The chain's observation seen from the most similar direction: (record, cosine, length).
+
+    Generated content never stands in for observed content: observed points pass it by.
+    """
     ax = center[0] - p[0]
     ay = center[1] - p[1]
     az = center[2] - p[2]
@@ -94,6 +99,9 @@ def _most_similar(head, p, spacing, center, view_centers, r_view, r_spacing, r_n
     length = 0
     m = head
     while m != NO_RECORD:
+        if view_generated[r_view[m]] and not generated:
+            m = r_next[m]
+            continue
         length += 1
         c = view_centers[r_view[m]]
         bx = c[0] - p[0]
@@ -121,13 +129,14 @@ def fuse_blocks(
     r_x, r_y, r_z, r_color, r_confidence, r_spacing, r_view, r_next, count,
     view, center, view_centers, view_round, view_generated,
     cosine_same, finer, capacity, weight_cap, inverse_edge,
-    run_start, run_count, run_box, agreed_record, agreed_weight, report,
+    old_start, old_box, run_start, run_count, run_box, agreed_record, agreed_weight, report,
 ):  # fmt: skip
     """Fuse one view's points, grouped by block; returns (records, runs, agreements).
 
     New records are appended block by block, so each (block, view) is one contiguous run with a
     tight bounding box (``run_box``: min xyz, max xyz, largest spacing). Records of earlier rounds
-    are never changed: what agrees with one is logged as (record, confidence).
+    are never changed: what agrees with one is logged as (record, confidence). ``old_start`` and
+    ``old_box`` are those of the runs that were there before.
     """
     largest = 0
     for g in range(len(touched)):
@@ -143,6 +152,7 @@ def fuse_blocks(
     p = np.empty(3, np.float64)
     runs = 0
     agreed = 0
+    merged_into = 0
     generated = view_generated[view]
     for g in range(len(touched)):
         block = touched[g]
@@ -204,10 +214,9 @@ def fuse_blocks(
                     report[REJECTED_OBSERVED] += t_points[t]
                     continue
                 best, cosine, length = _most_similar(
-                    head, p, width, center, view_centers, r_view, r_spacing, r_next
-                )
-                if best != NO_RECORD and not generated and view_generated[r_view[best]]:
-                    best = NO_RECORD  # generated content never stands in for observed content
+                    head, p, width, center, view_centers, view_generated, generated,
+                    r_view, r_spacing, r_next,
+                )  # fmt: skip
             if best != NO_RECORD and (
                 length >= capacity or (cosine >= cosine_same and width >= finer * r_spacing[best])
             ):
@@ -219,6 +228,12 @@ def fuse_blocks(
                         best, p, t_sum[t], weight, own, width, view, inverse_edge,
                         r_x, r_y, r_z, r_color, r_confidence, r_spacing, r_view, weight_cap,
                     )  # fmt: skip
+                    # Neighbours mostly merge into the same run.
+                    if old_start[merged_into] > best or (
+                        merged_into + 1 < len(old_start) and old_start[merged_into + 1] <= best
+                    ):
+                        merged_into = np.searchsorted(old_start, best, side="right") - 1
+                    _include(old_box[merged_into], r_x[best], r_y[best], r_z[best], r_spacing[best])
                 else:
                     report[AGREED] += 1
                     agreed_record[agreed] = best
@@ -295,6 +310,18 @@ def _merge(m, p, sums, weight, own, width, view, inverse_edge, r_x, r_y, r_z, r_
     if own > old:
         r_view[m] = view
     r_confidence[m] = min(old + own, weight_cap)
+
+
+@compiled(inline="always")
+def _include(box, x, y, z, spacing):
+    """Widen a run's box to a point that has moved."""
+    box[0] = min(box[0], x)
+    box[1] = min(box[1], y)
+    box[2] = min(box[2], z)
+    box[3] = max(box[3], x)
+    box[4] = max(box[4], y)
+    box[5] = max(box[5], z)
+    box[6] = max(box[6], spacing)
 
 
 @compiled()

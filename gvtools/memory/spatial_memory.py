@@ -51,7 +51,9 @@ class MemoryOptions:
 
 @dataclass(frozen=True)
 class FuseReport:
-    """What became of the points of one ``fuse``; the first four add up to ``points``.
+    """What became of the points of one ``fuse``.
+
+    ``added``, ``merged`` and ``rejected`` add up to ``points``.
 
     Attributes:
         points: points that arrived.
@@ -259,6 +261,7 @@ class SpatialMemory:
             view, views.centers[view], views.centers, views.round, views.generated,
             np.cos(np.radians(options.same_direction)), options.finer,
             options.observations_per_voxel, options.weight_cap, 1.0 / self.voxel,
+            self.runs.start[: self.runs.count], self.runs.box[: self.runs.count],
             run_start, run_length, run_box, agreed_record, agreed_weight, tally,
         )  # fmt: skip
         records.agreement[first : records.count] = 0

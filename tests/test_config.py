@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from gvtools.errors import OptionError
+from pipelines.config import PROFILES, RunConfig, with_file, with_profile, with_setting, with_settings
+
+
+def test_settings_are_converted_to_the_fields_type():
+    config = with_settings(
+        RunConfig(),
+        ["splat.band=0.03", "views_per_round=4", "voxel=auto", "splat.occluders=false"],
+    )
+    assert config.splat.band == 0.03
+    assert config.views_per_round == 4
+    assert config.voxel is None
+    assert config.splat.occluders is False
+
+
+def test_completer_options_go_by_their_prefix():
+    config = with_settings(RunConfig(), ["completer.sweeps=3", "completer=none"])
+    assert config.completer == "none"
+    assert config.completer_options == {"sweeps": "3"}
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("splat.bnad=1", "splat.band"),
+        ("viewsperround=1", "views_per_round"),
+        ("memory.same_directon=1", "memory.same_direction"),
+    ],
+)
+def test_an_unknown_key_names_the_nearest(text, named):
+    with pytest.raises(OptionError, match=named):
+        with_settings(RunConfig(), [text])
+
+
+@pytest.mark.parametrize(
+    "text", ["views_per_round=two", "views_per_round=1.5", "splat.band=wide", "splat.band", "seed="]
+)
+def test_a_value_of_the_wrong_type_is_refused(text):
+    with pytest.raises(OptionError):
+        with_settings(RunConfig(), [text])
+
+
+def test_a_saved_configuration_reads_back_equal(tmp_path):
+    config = with_profile(RunConfig(), "fast")
+    config = with_settings(config, ["seed=7", "completer.sweeps=3", "voxel=0.01"])
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps(config.to_dict()))
+    assert with_file(RunConfig(), path) == config
+
+
+def test_the_file_s_own_settings_win_over_its_profile(tmp_path):
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps({"fusion": {"voxel_scale": 3.5}, "profile": "fast"}))
+    config = with_file(RunConfig(), path)
+    assert config.fusion.voxel_scale == 3.5
+    assert config.memory.observations_per_voxel == 4
+
+
+@pytest.mark.parametrize("text", ["[1]", "{", '{"nosuch": 1}'])
+def test_a_bad_file_is_refused(tmp_path, text):
+    path = tmp_path / "c.json"
+    path.write_text(text)
+    with pytest.raises(OptionError):
+        with_file(RunConfig(), path)
+
+
+def test_profiles_only_hold_known_settings():
+    for name in PROFILES:
+        assert with_profile(RunConfig(), name).profile == name
+    with pytest.raises(OptionError, match="balanced"):
+        with_profile(RunConfig(), "quick")
+
+
+def test_a_section_cannot_be_set_as_a_whole():
+    with pytest.raises(OptionError):
+        with_setting(RunConfig(), "splat", "1")

@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tiny_scan import write_scan
+
+from gvtools.errors import OptionError
+from gvtools.scenes.project import open_project
+from gvtools.trajectory_files import write_trajectory
+from pipelines.reconstruct import make_schedule
+from pipelines.targets import resolve_targets
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return open_project(write_scan(tmp_path_factory.mktemp("scan")))
+
+
+def test_hold_outs_come_with_their_truth(scene):
+    targets = resolve_targets(scene, scene.names[::2], "every:2+1")
+    assert targets.kind == "hold-out"
+    assert targets.cameras.names == scene.names[1::2]
+    assert [view.name for view in targets.truth] == list(scene.names[1::2])
+
+
+def test_hold_outs_may_not_overlap_the_context(scene):
+    with pytest.raises(OptionError, match="allow-overlap"):
+        resolve_targets(scene, scene.names, "first:2")
+    assert len(resolve_targets(scene, scene.names, "first:2", allow_overlap=True).cameras) == 2
+
+
+@pytest.mark.parametrize("name", ["interpolate", "orbit", "spiral"])
+def test_paths_have_as_many_cameras_as_asked(scene, name):
+    targets = resolve_targets(scene, scene.names, f"{name}:5")
+    assert len(targets.cameras) == 5
+    assert targets.truth == (None,) * 5
+    assert len(set(targets.cameras.names)) == 5
+
+
+@pytest.mark.parametrize("spec", ["orbit", "orbit:0", "orbit:x", "nosuchview", "evry:2"])
+def test_bad_specifications_are_refused(scene, spec):
+    with pytest.raises(OptionError):
+        resolve_targets(scene, scene.names, spec)
+
+
+def test_a_trajectory_file_gives_the_poses(scene, tmp_path):
+    path = tmp_path / "path.txt"
+    write_trajectory(path, scene.cameras)
+    targets = resolve_targets(scene, scene.names, str(path))
+    np.testing.assert_allclose(
+        targets.cameras.cam_from_world, scene.cameras.cam_from_world, atol=1e-6
+    )
+    assert targets.kind == "trajectory"
+
+
+def test_a_second_project_gives_cameras_and_truth(scene, tmp_path):
+    other = write_scan(tmp_path / "other", views=3)
+    targets = resolve_targets(scene, scene.names, f"{other}@first:2")
+    assert len(targets.cameras) == 2
+    assert targets.truth[0] is not None
+
+
+@pytest.mark.parametrize(
+    ("targets", "size", "rounds", "expected"),
+    [
+        (5, 6, 3, (1, 2, 2)),
+        (12, 4, None, (4, 4, 4)),
+        (7, 3, None, (2, 2, 3)),
+        (12, 3, 2, (3, 3)),
+        (2, 6, 5, (1, 1)),
+        (4, 2, 0, ()),
+    ],
+)
+def test_the_schedule_takes_targets_in_order(targets, size, rounds, expected):
+    schedule = make_schedule(targets, size, rounds)
+    assert tuple(len(rows) for rows in schedule) == expected
+    assert [row for rows in schedule for row in rows] == list(range(sum(expected)))
+    assert all(len(rows) <= size for rows in schedule)
