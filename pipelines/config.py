@@ -30,7 +30,7 @@ class FusionOptions:
 
     min_confidence: float = 0.08
     max_scale_residual: float = 0.1
-    voxel_percentile: float = 25.0
+    voxel_percentile: float = 50.0
     voxel_scale: float = 1.0
 
 
@@ -90,7 +90,7 @@ PROFILES: dict[str, dict[str, Any]] = {
     },
     "balanced": {},
     "accurate": {
-        "fusion.voxel_percentile": 10.0,
+        "fusion.voxel_percentile": 25.0,
         "memory.same_direction": 0.0,
         "memory.observations_per_voxel": 64,
     },
@@ -156,12 +156,13 @@ def with_setting(config: RunConfig, key: str, value: Any) -> RunConfig:
     if head not in names:
         raise _unknown(key, config)
     current = getattr(config, head)
-    if is_dataclass(current):
+    if is_dataclass(current) and not isinstance(current, type):
         known = [entry.name for entry in fields(current)]
         if rest not in known:
             raise _unknown(key, config)
         converted = _converted(key, get_type_hints(type(current))[rest], value)
-        section: Any = replace(current, **{rest: converted})
+        change: dict[str, Any] = {rest: converted}
+        section = replace(current, **change)
         return _with(config, head, section)
     if rest:
         raise _unknown(key, config)

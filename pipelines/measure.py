@@ -74,7 +74,7 @@ def mean_of(views: list[dict[str, Any]], name: str) -> float | None:
 
 
 def _against(truth: Any, folder: Path) -> dict[str, Any]:
-    from gvtools.evaluation.images import relative_depth_error, psnr, ssim
+    from gvtools.evaluation.images import psnr, relative_depth_error, ssim
 
     frame = truth.load()
     stem = file_stem(truth.name)

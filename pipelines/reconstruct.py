@@ -49,9 +49,7 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
     parser.add_argument("--views-per-round", type=int, metavar="N", help="at most (default 6)")
     parser.add_argument("--rounds", type=int, metavar="N", help="default: as the targets need")
     parser.add_argument("--depth", metavar="SOURCE", help="auto, sensor or colmap (default auto)")
-    parser.add_argument(
-        "--completer", metavar="NAME", help="default inpaint"
-    )
+    parser.add_argument("--completer", metavar="NAME", help="default inpaint")
     parser.add_argument("--profile", metavar="NAME", help="fast, balanced or accurate")
     parser.add_argument("--voxel", metavar="EDGE", help="auto, or scene units")
     parser.add_argument("--device", metavar="NAME", help="auto, cpu or cuda (default auto)")

@@ -111,7 +111,7 @@ def load_context(scene: Scene, names: Sequence[str], source: DepthSource) -> lis
             ContextView(
                 name,
                 view.camera,
-                frame.rgb.astype(np.float32) / 255,
+                (frame.rgb / np.float32(255)).astype(np.float32),
                 depth.depth if depth else None,
                 depth.confidence if depth else None,
             )

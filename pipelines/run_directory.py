@@ -131,15 +131,16 @@ class RunDirectory:
             part.mkdir(parents=True)
             yield part
             os.replace(part, self.round_path(number))
-        except OSError as error:
+        except BaseException as error:
             shutil.rmtree(part, ignore_errors=True)
+            # A file that could not be written names itself; the user's concern is the round.
+            cause = error.__cause__ if isinstance(error, ProjectError) else error
+            if not isinstance(cause, OSError):
+                raise
             raise ProjectError(
-                f"{self.path}: round {number} cannot be written ({error.strerror or error}); free "
+                f"{self.path}: round {number} cannot be written ({cause.strerror or cause}); free "
                 "some space and add --resume; earlier rounds are intact"
-            ) from error
-        except BaseException:
-            shutil.rmtree(part, ignore_errors=True)
-            raise
+            ) from cause
         self._settle(number)
 
     def _settle(self, number: int) -> None:

@@ -5,7 +5,14 @@ import json
 import pytest
 
 from gvtools.errors import OptionError
-from pipelines.config import PROFILES, RunConfig, with_file, with_profile, with_setting, with_settings
+from pipelines.config import (
+    PROFILES,
+    RunConfig,
+    with_file,
+    with_profile,
+    with_setting,
+    with_settings,
+)
 
 
 def test_settings_are_converted_to_the_fields_type():

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -126,10 +127,8 @@ def test_resuming_after_a_stop_gives_the_bytes_of_an_uninterrupted_run(
 
     monkeypatch.setattr(os, "replace", replace)
     monkeypatch.setattr(Path, "replace", rename)
-    try:
+    with contextlib.suppress(Killed):
         run(scan, out)
-    except Killed:
-        pass
     monkeypatch.undo()
     run(scan, out, resume=True)
     assert results(out) == results(whole)

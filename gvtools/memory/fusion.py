@@ -6,6 +6,8 @@ same direction at no finer detail (agreement raises the confidence), or with the
 once the chain is full, and stands beside the others otherwise.
 """
 
+# mypy: no-check-untyped-defs
+
 from __future__ import annotations
 
 import numpy as np
@@ -232,7 +234,7 @@ def fuse_blocks(
                     if old_start[merged_into] > best or (
                         merged_into + 1 < len(old_start) and old_start[merged_into + 1] <= best
                     ):
-                        merged_into = np.searchsorted(old_start, best, side="right") - 1
+                        merged_into = int(np.searchsorted(old_start, best, side="right")) - 1
                     _include(old_box[merged_into], r_x[best], r_y[best], r_z[best], r_spacing[best])
                 else:
                     report[AGREED] += 1

@@ -14,6 +14,7 @@ from numba import prange
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import Cameras
+from gvtools.errors import OptionError
 from gvtools.memory.compiled import FAST, compiled
 
 CHUNK = 512
@@ -152,9 +153,17 @@ def project_open3d(
 
     Returns:
         depth (H, W) float32, scene units, 0 where empty, and rgb (H, W, 3) float32.
+
+    Raises:
+        OptionError: the camera has skew, which Open3D would ignore.
     """
     import open3d as o3d
 
+    if camera.K[0, 0, 1] != 0:
+        raise OptionError(
+            f"{camera.names[0]}: Open3D's projection ignores skew and K has {camera.K[0, 0, 1]:g} "
+            "px of it; choose another splat backend"
+        )
     tensor = o3d.core.Tensor.from_numpy
     cloud = o3d.t.geometry.PointCloud(tensor(np.ascontiguousarray(positions, np.float32)))
     cloud.point.colors = tensor(np.ascontiguousarray(colors, np.float32))

@@ -128,7 +128,7 @@ class SpatialMemory:
         return (
             f"SpatialMemory({len(self):,} observations ({generated:,} generated) in "
             f"{self.voxels:,} voxels of {self.voxel:g}, {len(self.views)} views, "
-            f"rounds {self.rounds or 'none'}, {self.nbytes / 2**20:.1f} MiB)"
+            f"rounds {list(self.rounds)}, {self.nbytes / 2**20:.1f} MiB)"
         )
 
     @property
@@ -202,7 +202,10 @@ class SpatialMemory:
             free = int((hit & keep).sum())
             keep &= ~hit
         columns: list[NDArray[Any]] = [
-            points.positions, points.colors, points.confidence, points.spacing
+            points.positions,
+            points.colors,
+            points.confidence,
+            points.spacing,
         ]
         if not keep.all():
             columns = [column[keep] for column in columns]

@@ -217,8 +217,14 @@ class _Projection:
             if self.options.occluders:
                 self._splat_occluders()
         t = self.target
-        images = (t.rgb, t.depth, t.valid, t.confidence, t.generated)
-        return Guidance(self.camera, *(image[None] for image in images))
+        return Guidance(
+            self.camera,
+            t.rgb[None],
+            t.depth[None],
+            t.valid[None],
+            t.confidence[None],
+            t.generated[None],
+        )
 
     def _cull(self) -> bool:
         """Find the runs in view and rank the views that they come from."""
@@ -314,8 +320,8 @@ class _Projection:
         z = zbuffer[rows, cols].astype(np.float64)
         y = (rows + 0.5 - K[1, 2]) / K[1, 1]
         x = (cols + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
-        local = np.stack([x * z, y * z, z], axis=1) - target.cam_from_local[:3, 3]
-        local = (local @ target.cam_from_local[:3, :3]).astype(np.float32)
+        from_center = np.stack([x * z, y * z, z], axis=1) - target.cam_from_local[:3, 3]
+        local = (from_center @ target.cam_from_local[:3, :3]).astype(np.float32)
         grids = memory.observed_grids(np.flatnonzero(self.tier == 0))
         free = in_free_space(local, grids, tolerance=memory.options.free_space_tolerance)
         front = np.zeros(target.shape, np.bool_)

@@ -108,7 +108,7 @@ class TorchSplatter:
             use = z[i] < limits[cell]
             zbuffer.scatter_reduce_(0, cell[use], z[i[use]], "amin")
         if blend:
-            farthest = zbuffer * np.float32(1 + self.options.band)
+            farthest = zbuffer * (1 + self.options.band)
             scale = self.trust[rows] * self._tensor(weight)[view]
             made = self.generated[view]
             self.total = torch.zeros((height * width, CHANNELS), device=self.device)

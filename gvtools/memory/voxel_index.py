@@ -6,6 +6,8 @@ of a chain of observations. A frame touches some thousand blocks, so its cost fo
 that arrive, not the memory that is there, and the tables of one block lie together in the cache.
 """
 
+# mypy: no-check-untyped-defs
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,0 +1,120 @@
+"""``gvtools render``: a saved memory seen from cameras, as pictures and as figures."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError
+from pipelines.scene_arguments import add_scene_arguments, open_scene
+
+if TYPE_CHECKING:
+    from gvtools.cameras import Cameras
+    from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.memory.splat import SplatOptions
+    from gvtools.scenes.scene import Scene
+    from pipelines.console import Console
+
+SUMMARY = "project a saved memory into cameras, and measure it against their pictures"
+EXAMPLES = (
+    "gvtools render runs/kitchen --cameras scans/kitchen --views every:20 --out renders",
+    "gvtools render runs/kitchen --cameras scans/kitchen --views every:20+10 --against-images "
+    "--out renders --json figures.json",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("memory", type=Path, metavar="MEMORY_OR_RUN", help="a memory.npz or a run")
+    parser.add_argument(
+        "--cameras",
+        type=Path,
+        required=True,
+        metavar="PROJECT",
+        help="a project whose cameras to take, or a TUM or KITTI trajectory (camera as the "
+        "memory's first view)",
+    )
+    parser.add_argument("--views", default="all", metavar="SPEC", help="which (all)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="for the pictures")
+    parser.add_argument(
+        "--against-images", action="store_true", help="compare with the project's own pictures"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="splat.KEY=VALUE",
+        help="a setting of the projection, such as splat.band=0.03",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    add_scene_arguments(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Project, write pictures, measure.
+
+    Raises:
+        GvError: the memory, the cameras, the selection or the output folder is wrong.
+    """
+    from gvtools.scenes.selection import select
+    from pipelines.console import write_json
+    from pipelines.memory_source import open_memory
+    from pipelines.render_figures import measure, render_view, summary
+    from pipelines.render_files import file_stems, write_view
+
+    options = splat_options(args.set)
+    memory = open_memory(args.memory)
+    if not len(memory.views):
+        raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
+    cameras, scene = _cameras(args, memory)
+    if args.against_images and scene is None:
+        raise OptionError(
+            f"--against-images: {args.cameras} is a trajectory without pictures; give a project"
+        )
+    names = select(cameras.names, args.views)
+    row_of = {name: row for row, name in enumerate(cameras.names)}
+    stems = file_stems(names)
+    # The first projection compiles or loads the kernels and is not timed.
+    memory.project(cameras[row_of[names[0]]], options=options)
+    views = []
+    for name in console.track(names, "rendering"):
+        guidance, seconds = render_view(memory, cameras[row_of[name]], options)
+        frame = scene[name].load() if scene is not None and args.against_images else None
+        write_view(args.out, stems[name], guidance)
+        views.append(measure(name, guidance, frame, seconds=seconds))
+    figures = summary(views, compared=args.against_images)
+    if args.json is not None:
+        write_json(args.json, figures)
+    else:
+        columns = ("view", "psnr", "ssim", "psnr_valid", "ssim_valid", "depth_rel_valid",
+                   "coverage", "seconds")  # fmt: skip
+        console.table(columns, [[view[column] for column in columns] for view in views])
+        mean = {**figures, "view": "all", "seconds": figures["seconds_per_view"]}
+        console.table(columns, [[mean[column] for column in columns]])
+        for key, reason in figures["notes"].items():
+            console.line(f"{key}: {reason}")
+    console.line(f"{len(views)} views in {args.out}")
+
+
+def splat_options(texts: list[str]) -> SplatOptions:
+    """The projection's options, changed by ``splat.KEY=VALUE`` texts.
+
+    Raises:
+        OptionError: another key or a wrong value.
+    """
+    from pipelines.config import RunConfig, with_settings
+
+    for text in texts:
+        if not text.strip().startswith("splat."):
+            raise OptionError(f"--set {text!r}: render takes splat.KEY=VALUE alone")
+    return with_settings(RunConfig(), texts).splat
+
+
+def _cameras(args: argparse.Namespace, memory: SpatialMemory) -> tuple[Cameras, Scene | None]:
+    if args.cameras.is_file() and args.cameras.suffix.lower() != ".json":
+        from gvtools.trajectory_files import read_trajectory
+
+        return read_trajectory(args.cameras, memory.views[0].camera), None
+    scene = open_scene(args.cameras, args)
+    return scene.cameras, scene

@@ -1,0 +1,59 @@
+"""One point for each voxel of a memory, and which observations it stands for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.memory.spatial_memory import SpatialMemory
+
+# Three voxel indices fit one 64-bit key while the memory is below two million voxels a side.
+KEY_BITS = 21
+
+
+@dataclass(frozen=True, eq=False)
+class Thinned:
+    """P points out of N observations.
+
+    Attributes:
+        rows: (P,) int64, the observation that is kept: the most confident of its voxel.
+        group: (N,) int64, for each observation the point that stands for it.
+        edge: voxel edge of the thinning, scene units.
+    """
+
+    rows: NDArray[np.int64]
+    group: NDArray[np.int64]
+    edge: float
+
+
+def thinned(memory: SpatialMemory, max_points: int | None) -> Thinned:
+    """One point per voxel; voxels grow from the memory's own until at most ``max_points`` remain.
+
+    Args:
+        memory: with at least one observation.
+        max_points: at least 1; None keeps the memory's voxels.
+    """
+    positions = memory.records.position.astype(np.float64)
+    # The most confident first; of equals, the earlier observation.
+    order = np.argsort(-memory.confidence, kind="stable")
+    edge = memory.voxel
+    while True:
+        cells = np.floor(positions / edge).astype(np.int64)
+        cells -= cells.min(axis=0)
+        if int(cells.max()) < 1 << KEY_BITS:
+            keys = (cells[:, 0] << (2 * KEY_BITS)) | (cells[:, 1] << KEY_BITS) | cells[:, 2]
+            _, first, group = np.unique(keys[order], return_index=True, return_inverse=True)
+            if max_points is None or len(first) <= max_points:
+                break
+            edge *= max(1.1, float(np.sqrt(len(first) / max_points)))
+        else:
+            edge *= 2.0
+    # Points in the order of their observations, so that equal memories give equal files.
+    rank = np.argsort(order[first], kind="stable")
+    place = np.empty(len(rank), np.int64)
+    place[rank] = np.arange(len(rank))
+    of_observation = np.empty(len(order), np.int64)
+    of_observation[order] = place[group]
+    return Thinned(order[first][rank], of_observation, edge)
