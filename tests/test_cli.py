@@ -207,7 +207,7 @@ def test_a_malformed_text_model_is_refused(capsys, tmp_path):
     (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
     (model / "points3D.txt").write_text("")
     line = refused(capsys, *reconstruct(tmp_path, "--out", tmp_path / "run"))
-    assert "cameras.txt" in line
+    assert "parameters" in line
 
 
 def test_a_debug_run_shows_where(scan, tmp_path):
