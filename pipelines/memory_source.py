@@ -17,7 +17,7 @@ def open_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
     """The memory in a file or of a run.
 
     Args:
-        path: a memory file, or a run's folder; an unfinished run gives its last whole round's.
+        path: a memory file, a coloured PLY, or a run's folder; an unfinished run gives its last whole round's.
         up_to: forget the rounds after this one; None keeps all.
 
     Raises:
@@ -27,7 +27,12 @@ def open_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
     """
     from gvtools.memory.spatial_memory import SpatialMemory
 
-    memory = SpatialMemory.load(memory_file(path))
+    if path.suffix.lower() == ".ply":
+        from gvtools.memory.ply_memory import memory_from_ply
+
+        memory = memory_from_ply(path)
+    else:
+        memory = SpatialMemory.load(memory_file(path))
     if up_to is not None:
         if up_to not in memory.rounds:
             raise OptionError(

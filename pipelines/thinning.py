@@ -40,7 +40,8 @@ def thinned(memory: SpatialMemory, max_points: int | None) -> Thinned:
     order = np.argsort(-memory.confidence, kind="stable")
     edge = memory.voxel
     while True:
-        cells = np.floor(positions / edge).astype(np.int64)
+        # Times the inverse, as the memory counts its voxels.
+        cells = np.floor(positions * (1.0 / edge)).astype(np.int64)
         cells -= cells.min(axis=0)
         if int(cells.max()) < 1 << KEY_BITS:
             keys = (cells[:, 0] << (2 * KEY_BITS)) | (cells[:, 1] << KEY_BITS) | cells[:, 2]

@@ -14,7 +14,8 @@ from gvtools.scenes.scene import Scene
 from gvtools.scenes.transforms_json import read_transforms, write_transforms
 from pipelines.procedural_cloud import inside_camera, photograph
 
-SIZE = np.array([3.0, 1.8, 2.4])
+# Walls in the middle of a voxel, where rounding cannot move them into another.
+SIZE = np.array([3.03, 1.83, 2.43])
 WIDTH, HEIGHT = 96, 72
 VOXEL = 0.03
 

@@ -202,7 +202,8 @@ def _draw_times(axes: Axes, rounds: Rounds) -> None:
     axes.set_title("time")
     axes.set_ylabel("seconds")
     axes.set_ylim(0, 1.22 * max(1e-3, *bottom))
-    axes.legend(ncols=5, loc="upper left", frameon=False, fontsize="small")
+    if any(bottom):
+        axes.legend(ncols=5, loc="upper left", frameon=False, fontsize="small")
 
 
 def _engineering(axes: Axes) -> None:

@@ -1,0 +1,222 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from memory_scenes import camera, plane_view, points, random_memory, random_points, saved_bytes
+
+from gvtools.errors import OptionError, ShapeError
+from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+
+OPTIONS = MemoryOptions(observations_per_voxel=3, same_direction=8)
+
+
+def _rounds(seed: int, rounds: int) -> list[list[tuple]]:
+    """For each round, point sets and whether they are generated; places overlap."""
+    rng = np.random.default_rng(seed)
+    return [
+        [
+            (random_points(rng, 60, name=f"r{number}v{view}"), bool(number and view == 1))
+            for view in range(3)
+        ]
+        for number in range(rounds)
+    ]
+
+
+def _fused(rounds, *, start=0, memory: SpatialMemory | None = None) -> SpatialMemory:
+    memory = memory or SpatialMemory(0.4, options=OPTIONS)
+    for number, views in enumerate(rounds, start):
+        for fresh, generated in views:
+            memory.fuse(fresh, round=number, generated=generated)
+    return memory
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_forgetting_the_last_round_leaves_no_trace(seed, tmp_path):
+    rounds = _rounds(seed, 3)
+    before = saved_bytes(_fused(rounds[:2]), tmp_path)
+    memory = _fused(rounds)
+    added = len(memory)
+    assert saved_bytes(memory, tmp_path) != before
+    assert memory.agreements[2]
+    removed = memory.forget(round=2)
+    assert removed == added - len(memory) > 0
+    assert saved_bytes(memory, tmp_path) == before
+    # What comes after is that of a memory that never saw the round.
+    again = _fused(rounds[2:], start=2, memory=memory)
+    assert saved_bytes(again, tmp_path) == saved_bytes(_fused(rounds), tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_forgetting_after_loading_is_forgetting(seed, tmp_path):
+    rounds = _rounds(seed, 3)
+    before = saved_bytes(_fused(rounds[:2]), tmp_path)
+    _fused(rounds).save(tmp_path / "whole.npz")
+    loaded = SpatialMemory.load(tmp_path / "whole.npz")
+    loaded.forget(round=2)
+    assert saved_bytes(loaded, tmp_path) == before
+
+
+@pytest.mark.parametrize("forgotten", [0, 1])
+def test_forgetting_an_earlier_round_keeps_what_later_ones_stored(forgotten, tmp_path):
+    memory = _fused(_rounds(4, 3))
+    n = len(memory)
+    stays = memory.views.round[memory.records.view[:n]] != forgotten
+    columns = {
+        name: getattr(memory.records, name)[:n][stays].copy()
+        for name in ("x", "y", "z", "color", "confidence", "spacing")
+    }
+    assert memory.forget(round=forgotten) == n - stays.sum()
+    for name, column in columns.items():
+        np.testing.assert_array_equal(getattr(memory.records, name)[: len(memory)], column)
+    assert forgotten not in memory.rounds
+    # The confidence that other rounds added is what is left of the log.
+    added = np.zeros(len(memory), np.float32)
+    for log in memory.agreements.values():
+        for rows, weights in log:
+            np.add.at(added, rows, weights)
+    np.testing.assert_array_equal(memory.records.agreement, added)
+    assert added.any()
+    runs, records = memory.runs, memory.records
+    run = np.repeat(np.arange(runs.count), runs.length[: runs.count])
+    assert len(run) == len(memory)
+    assert (records.position >= runs.box[run, :3]).all()
+    assert (records.position <= runs.box[run, 3:6]).all()
+    cells = np.floor(records.position.astype(float) * (1.0 / memory.voxel))
+    assert memory.voxels == len(np.unique(cells, axis=0))
+    # All of it forgotten is an empty memory.
+    for number in memory.rounds:
+        memory.forget(round=number)
+    assert saved_bytes(memory, tmp_path) == saved_bytes(
+        SpatialMemory(0.4, options=OPTIONS), tmp_path
+    )
+
+
+@pytest.mark.parametrize("cut", [1, 2])
+def test_resuming_from_a_file_gives_the_bytes_of_an_uninterrupted_run(cut, tmp_path):
+    rounds = _rounds(7, 3)
+    whole = saved_bytes(_fused(rounds), tmp_path)
+    _fused(rounds[:cut]).save(tmp_path / "half.npz")
+    resumed = SpatialMemory.load(tmp_path / "half.npz")
+    assert saved_bytes(_fused(rounds[cut:], start=cut, memory=resumed), tmp_path) == whole
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), cut=st.integers(1, 199))
+def test_fusing_in_two_parts_fills_the_same_voxels(seed, cut):
+    rng = np.random.default_rng(seed)
+    where = rng.normal(0, 0.5, (200, 3)) + (0, 0, 3)
+    whole, parts = SpatialMemory(0.2), SpatialMemory(0.2)
+    whole.fuse(points(where), round=0)
+    parts.fuse(points(where[:cut]), round=0)
+    parts.fuse(points(where[cut:]), round=0)
+    assert parts.voxels == whole.voxels == len(whole) == len(parts)
+
+    def cells(memory):
+        return np.unique(np.floor(memory.records.position.astype(float) * (1.0 / 0.2)), axis=0)
+
+    np.testing.assert_array_equal(cells(whole), cells(parts))
+
+
+def test_agreement_of_later_rounds_raises_confidence_and_changes_nothing_else():
+    memory = SpatialMemory(0.5)
+    memory.fuse(points([(0.1, 0.1, 2.1)], confidence=0.5, colors=(10, 20, 30)), round=0)
+    report = memory.fuse(points([(0.3, 0.3, 2.3)], confidence=0.75, colors=(90, 90, 90)), round=1)
+    assert (report.agreed, report.merged, report.added) == (1, 1, 0)
+    np.testing.assert_array_equal(memory.records.color[0], (10, 20, 30))
+    np.testing.assert_allclose(memory.positions, [(0.1, 0.1, 2.1)], rtol=1e-6)
+    assert memory.confidence.tolist() == [1.25]
+    memory.forget(round=1)
+    assert memory.confidence.tolist() == [0.5]
+
+
+def test_generated_points_do_not_enter_space_that_was_seen_to_be_free():
+    source = camera(width=64, height=48, focal=60)
+    memory = SpatialMemory(0.02)
+    memory.fuse(plane_view(source, 4.0), round=0)
+    made = points([(0, 0, 2), (0.1, 0, 3.8), (0.1, 0.1, 3.95), (0, 0, 5), (30, 0, 4)])
+    report = memory.fuse(made, round=1, generated=True)
+    assert report.rejected_free == 2
+    assert report.added == 3
+    # Observed points may: the surface may have been seen from elsewhere.
+    assert memory.fuse(made, round=1).rejected_free == 0
+
+
+def test_what_cannot_be_stored_is_counted():
+    memory = SpatialMemory(0.001)
+    bad = points(
+        [(np.nan, 0, 1), (0, 0, 1), (0, 0, 1), (0, 0, 1), (1e9, 0, 1), (0, 0, 1)],
+        confidence=(1, 0, np.inf, 1, 1, 1),
+        spacing=(1, 1, 1, np.nan, 1, 1),
+    )
+    report = memory.fuse(bad, round=0)
+    assert (report.points, report.added, report.out_of_reach) == (6, 1, 5)
+    assert report.rejected == 5
+
+
+def test_a_far_origin_keeps_a_millimetre():
+    origin = np.array([5e6, -5e6, 5e6])
+    rng = np.random.default_rng(0)
+    where = origin + rng.uniform(-20, 20, (500, 3))
+    source = camera(center=origin)
+    memory = SpatialMemory(1e-4, origin=origin)
+    memory.fuse(points(where, source=source, origin=origin), round=0)
+    assert len(memory) == 500
+    order, expected = np.lexsort(memory.positions.T), np.lexsort(where.T)
+    assert abs(memory.positions[order] - where[expected]).max() < 1e-5
+
+
+def test_points_of_another_origin_and_earlier_rounds_are_refused():
+    memory = SpatialMemory(0.1, origin=(1, 2, 3))
+    with pytest.raises(ShapeError, match="another origin|relative to"):
+        memory.fuse(points([(0, 0, 1)]), round=0)
+    memory.fuse(points([(0, 0, 1)], origin=(1, 2, 3)), round=2)
+    with pytest.raises(OptionError, match="rounds only go forward"):
+        memory.fuse(points([(0, 0, 1)], origin=(1, 2, 3)), round=1)
+    with pytest.raises(OptionError, match="round 1 is not in the memory"):
+        memory.forget(round=1)
+
+
+@pytest.mark.parametrize("voxel", [0, -1, np.nan, np.inf])
+def test_a_voxel_without_extent_is_refused(voxel):
+    with pytest.raises(OptionError, match="positive length"):
+        SpatialMemory(voxel)
+
+
+@pytest.mark.parametrize("origin", [(0, 0), (0, np.nan, 0)])
+def test_an_origin_that_is_no_point_is_refused(origin):
+    with pytest.raises(ShapeError, match="three finite numbers"):
+        SpatialMemory(1, origin=origin)
+
+
+def test_the_open3d_cloud_holds_every_attribute():
+    memory = random_memory(3)
+    cloud = memory.point_cloud()
+    n = len(memory)
+    np.testing.assert_allclose(
+        cloud.point.positions.numpy().astype(float) + memory.origin, memory.positions
+    )
+    np.testing.assert_array_equal(cloud.point.colors.numpy(), memory.records.color[:n])
+    view = memory.records.view[:n]
+    for name, expected in (
+        ("confidence", memory.confidence),
+        ("spacing", memory.records.spacing[:n]),
+        ("round", memory.views.round[view]),
+        ("view", view),
+        ("generated", memory.generated),
+    ):
+        found = cloud.point[name].numpy()
+        assert found.shape == (n, 1)
+        np.testing.assert_array_equal(found[:, 0], expected)
+
+
+def test_an_observation_takes_at_most_48_bytes():
+    """Runs, voxels and views included, for a surface that several views saw."""
+    memory = SpatialMemory(0.01)
+    for x in (0, 0.3, 0.6):
+        source = camera(width=200, height=150, focal=200, center=(x, 0, 0))
+        memory.fuse(plane_view(source, 2.0), round=0)
+    assert len(memory) > 60_000
+    assert memory.nbytes / len(memory) <= 48
+    assert f"{len(memory):,} observations (0 generated)" in repr(memory)
