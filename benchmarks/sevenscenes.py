@@ -52,7 +52,7 @@ class Shot:
 
 def main() -> None:
     """Measure the parts that are asked for, print them, and write them as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--repeat", type=int, default=9)
@@ -151,7 +151,7 @@ def quality(context: list[Shot], targets: list[Shot], console: Console) -> list[
             cloud_s,
         ),
     ]
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, method, fuse_s in methods:
         values, covered = [], []
         for target in targets:

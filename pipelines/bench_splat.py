@@ -19,7 +19,9 @@ ONE_PIXEL_SIDE = 504
 SPLAT_BOX = 3_200_000  # voxels of the box's walls
 
 
-def splat_rows(points: int, *, repeat: int, width: int = 640, height: int = 480) -> list[Comparison]:
+def splat_rows(
+    points: int, *, repeat: int, width: int = 640, height: int = 480
+) -> list[Comparison]:
     """Our splatting against ray_cast, then one-pixel projection of ``points`` / 4 and ``points``.
 
     The memory and the TSDF hold the same frames of a box that surrounds them.

@@ -41,9 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="thin to at most N points, one a voxel (ply: all; colmap: 200000; glb: 2 million)",
     )
-    parser.add_argument(
-        "--round", type=int, metavar="R", help="the memory as it was after round R"
-    )
+    parser.add_argument("--round", type=int, metavar="R", help="the memory as it was after round R")
     parser.add_argument(
         "--images",
         default="images",

@@ -165,7 +165,9 @@ def _generated_pictures(memory: SpatialMemory, run: Path) -> dict[str, Path | No
 
 def _write_generated(memory: SpatialMemory, path: Path, run: Path) -> int:
     pictures = _generated_pictures(memory, run)
-    lines = [name if picture is None else f"{name}\t{picture}" for name, picture in pictures.items()]
+    lines = [
+        name if picture is None else f"{name}\t{picture}" for name, picture in pictures.items()
+    ]
     header = "# views that a completer made: name, and its picture where the run kept it"
     write_text(path, "\n".join([header, *lines]) + "\n")
     return len(pictures)

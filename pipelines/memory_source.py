@@ -17,7 +17,8 @@ def open_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
     """The memory in a file or of a run.
 
     Args:
-        path: a memory file, a coloured PLY, or a run's folder; an unfinished run gives its last whole round's.
+        path: a memory file, a coloured PLY, or a run's folder; an unfinished run gives that of its
+            last whole round.
         up_to: forget the rounds after this one; None keeps all.
 
     Raises:

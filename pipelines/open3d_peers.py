@@ -5,6 +5,8 @@ Open3D counts pixel centres as integers; K is moved by half a pixel on the way i
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
@@ -81,11 +83,14 @@ def images(
 
 
 def cloud(
-    positions: NDArray[np.float32], colors: NDArray[np.float32]
+    positions: NDArray[np.floating[Any]], colors: NDArray[np.floating[Any]]
 ) -> o3d.t.geometry.PointCloud:
-    """A tensor point cloud; positions (N, 3) scene units, colours (N, 3) in [0, 1]."""
-    points = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.ascontiguousarray(positions)))
-    points.point.colors = o3d.core.Tensor(np.ascontiguousarray(colors))
+    """A tensor point cloud, held as float32; positions (N, 3) scene units, colours (N, 3)."""
+    tensors = [
+        o3d.core.Tensor(np.ascontiguousarray(array, np.float32)) for array in (positions, colors)
+    ]
+    points = o3d.t.geometry.PointCloud(tensors[0])
+    points.point.colors = tensors[1]
     return points
 
 

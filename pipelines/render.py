@@ -89,9 +89,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     else:
         columns = ("view", "psnr", "ssim", "psnr_valid", "ssim_valid", "depth_rel_valid",
                    "coverage", "seconds")  # fmt: skip
-        console.table(columns, [[view[column] for column in columns] for view in views])
         mean = {**figures, "view": "all", "seconds": figures["seconds_per_view"]}
-        console.table(columns, [[mean[column] for column in columns]])
+        console.table(columns, [[row[column] for column in columns] for row in [*views, mean]])
         for key, reason in figures["notes"].items():
             console.line(f"{key}: {reason}")
     console.line(f"{len(views)} views in {args.out}")

@@ -5,10 +5,9 @@ from __future__ import annotations
 import gc
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
-
 
 # OpenMP workers of the call before keep a core busy for up to 0.2 s, waiting for more work.
 SETTLE_SECONDS = 0.25
@@ -55,7 +54,7 @@ class Comparison:
 
 
 def alternate(
-    calls: list[Callable[[int], object]],
+    calls: Sequence[Callable[[int], object]],
     repeat: int,
     *,
     warm_up: int = 1,

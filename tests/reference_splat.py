@@ -67,7 +67,8 @@ class Reference:
     def _local(self, positions: np.ndarray) -> np.ndarray:
         """Camera-frame coordinates of positions that are relative to the memory's origin."""
         world = positions.astype(np.float64) + self.memory.origin
-        return world @ self.camera.cam_from_world[0, :3, :3].T + self.camera.cam_from_world[0, :3, 3]
+        pose = self.camera.cam_from_world[0]
+        return world @ pose[:3, :3].T + pose[:3, 3]
 
     def _rank_views(self) -> bool:
         """Which views have runs in view, observed first, and then by their distance."""
@@ -84,7 +85,8 @@ class Reference:
                 xy = xy[:, :2] / xy[:, 2:]
                 reach = self.options.blend_reach * spacing * max(K[0, 0], K[1, 1])
                 pad = max(1.0, reach / local[:, 2].min()) + 1.0
-                if (xy.max(0) + pad < 0).any() or (xy.min(0) - pad >= (self.width, self.height)).any():
+                size = (self.width, self.height)
+                if (xy.max(0) + pad < 0).any() or (xy.min(0) - pad >= size).any():
                     continue
             seen.append(r)
             farthest.append(local[:, 2].max())
@@ -202,7 +204,7 @@ class Reference:
         keep = np.isfinite(zbuffer)
         if not keep.any():
             return
-        rays = np.stack([self.cols[keep], self.rows[keep], np.ones(keep.sum())], 1) + (0.5, 0.5, 0)
+        rays = np.stack([self.cols[keep] + 0.5, self.rows[keep] + 0.5, np.ones(keep.sum())], 1)
         local = rays @ np.linalg.inv(K).T * zbuffer[keep][:, None]
         pose = self.camera.cam_from_world[0]
         world = (local - pose[:3, 3]) @ pose[:3, :3]

@@ -15,7 +15,7 @@ from gvtools.memory.voxel_index import EMPTY_KEY, MAX_VOXEL
 def _cloud(rng: np.random.Generator, count: int, source):
     """Points crowded into few voxels."""
     return points(
-        rng.normal(0, 0.15, (count, 3)) + (0, 0, 2),
+        rng.normal((0, 0, 2), 0.15, (count, 3)),
         source=source,
         colors=rng.integers(0, 256, (count, 3)),
         confidence=rng.uniform(0.1, 3, count),
@@ -32,9 +32,7 @@ def _cloud(rng: np.random.Generator, count: int, source):
 )
 def test_fusion_does_what_a_plain_dictionary_does(seed, views, capacity, degrees):
     rng = np.random.default_rng(seed)
-    options = MemoryOptions(
-        same_direction=degrees, observations_per_voxel=capacity, weight_cap=4.0
-    )
+    options = MemoryOptions(same_direction=degrees, observations_per_voxel=capacity, weight_cap=4.0)
     memory, reference = SpatialMemory(0.1, options=options), ReferenceMemory(0.1, options)
     for view in range(views):
         source = camera(center=rng.normal(0, 0.3, 3))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -36,8 +37,13 @@ def heights(axes, label):
     return [patch.get_height() for patch in container]
 
 
+def points(dots) -> np.ndarray:
+    return np.asarray(dots.get_offsets())
+
+
 def test_the_bars_are_the_figures():
-    stored, fates, coverage, times = draw_growth(rounds(), title="room").axes
+    panels: list[Any] = draw_growth(rounds(), title="room").axes
+    stored, fates, coverage, times = panels
     assert heights(stored, "observed") == [1000, 1000, 1000]
     assert heights(stored, "generated") == [0, 200, 400]
     assert list(stored.lines[0].get_ydata()) == [600, 750, 900]
@@ -45,7 +51,7 @@ def test_the_bars_are_the_figures():
     assert heights(fates, "merged") == [300, 40, 40]
     assert heights(fates, "rejected") == [0, 25, 25]
     assert heights(fates, "new voxels") == [600, 150, 150]
-    before, after = (c.get_offsets().tolist() for c in coverage.collections[1:])
+    before, after = (points(dots) for dots in coverage.collections[1:])
     np.testing.assert_allclose(before, [[1, 60], [2, 70]])
     np.testing.assert_allclose(after, [[1, 80], [2, 90]])
     assert sum(bar.get_height() for bar in times.patches) == pytest.approx(3 * 1.8)

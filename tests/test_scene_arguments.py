@@ -7,6 +7,7 @@ import pytest
 from scenes_workspace import sevenscenes, workspace
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.scene import Scene
 from pipelines.scene_arguments import add_scene_arguments, open_scene, rgbd_options
 
 
@@ -14,6 +15,12 @@ def parsed(*words: object) -> argparse.Namespace:
     parser = argparse.ArgumentParser(exit_on_error=False)
     add_scene_arguments(parser)
     return parser.parse_args([str(word) for word in words])
+
+
+def depth_of(scene: Scene) -> np.ndarray:
+    depth = scene.views[0].load().depth
+    assert depth is not None
+    return depth
 
 
 def test_nothing_given_is_no_rgbd_option(tmp_path):
@@ -38,15 +45,13 @@ def test_depth_unit_and_intrinsics_change_what_is_read(tmp_path):
     sevenscenes(tmp_path)
     plain = open_scene(tmp_path, parsed())
     double = open_scene(tmp_path, parsed("--depth-unit", 0.002))
-    first, second = plain.views[0].load().depth, double.views[0].load().depth
-    np.testing.assert_allclose(second, 2 * first)
+    np.testing.assert_allclose(depth_of(double), 2 * depth_of(plain))
     other = open_scene(tmp_path, parsed("--color-intrinsics", "100,101,40,30"))
     # Published with the first pixel's centre at (0, 0), here at (0.5, 0.5).
-    np.testing.assert_allclose(
-        other.views[0].camera.K[0], [[100, 0, 40.5], [0, 101, 30.5], [0, 0, 1]]
-    )
+    expected = np.array([[100, 0, 40.5], [0, 101, 30.5], [0, 0, 1]])
+    np.testing.assert_allclose(other.views[0].camera.K[0], expected)
     near = open_scene(tmp_path, parsed("--depth-max", 1.0))
-    assert not near.views[0].load().depth.any()
+    assert not depth_of(near).any()
 
 
 def test_registration_takes_the_matrix_of_a_file(tmp_path):
@@ -56,8 +61,8 @@ def test_registration_takes_the_matrix_of_a_file(tmp_path):
     moved[0, 3] = 0.2
     np.savetxt(file, moved)
     args = parsed("--depth-intrinsics", "90,90,47.5,35.5", "--color-from-depth", file)
-    depth = open_scene(tmp_path, args).views[0].load().depth
-    plain = open_scene(tmp_path, parsed()).views[0].load().depth
+    depth = depth_of(open_scene(tmp_path, args))
+    plain = depth_of(open_scene(tmp_path, parsed()))
     # A wall at 2 m moves by 90 x 0.2 / 2 = 9 pixels: the left edge has none now.
     assert not depth[:, :8].any()
     np.testing.assert_allclose(depth[10:60, 12:90], plain[10:60, 3:81], rtol=1e-3)

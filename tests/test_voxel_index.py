@@ -29,7 +29,8 @@ def test_block_keys_are_unique_and_not_negative():
 def test_blocks_are_numbered_like_a_dictionary_would(seed, batches):
     """Also across growth: the table starts with room for 512 blocks."""
     rng = np.random.default_rng(seed)
-    index, known = VoxelIndex(), {}
+    index = VoxelIndex()
+    known: dict[int, int] = {}
     for _ in range(batches):
         keys = rng.integers(0, 900, 700) * 1_000_003
         expected = [known.setdefault(key, len(known)) for key in keys.tolist()]

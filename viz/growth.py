@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError
@@ -92,7 +93,9 @@ def growth_text(rounds: Rounds, width: int = 72) -> str:
         total = entry["observed"] + entry["generated"]
         length = round(room * total / largest)
         # What is there at all is drawn at least once.
-        plus = min(length, max(bool(entry["generated"]), round(room * entry["generated"] / largest)))
+        plus = min(
+            length, max(bool(entry["generated"]), round(room * entry["generated"] / largest))
+        )
         bar = "#" * (length - plus) + "+" * plus
         covered = "-"
         if entry["coverage_after"] is not None:
@@ -116,7 +119,7 @@ def _check(rounds: Rounds) -> None:
 
 def _new_voxels(rounds: Rounds) -> list[int]:
     totals = [0, *(entry["voxels"] for entry in rounds)]
-    return [after - before for before, after in zip(totals, totals[1:], strict=False)]
+    return [after - before for before, after in pairwise(totals)]
 
 
 def _draw_stored(axes: Axes, rounds: Rounds) -> None:

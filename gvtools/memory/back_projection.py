@@ -93,6 +93,8 @@ def back_project(
         positions, colors, weight, spacing,
     )  # fmt: skip
     far = np.inf if options.depth_max is None else options.depth_max
+    # A depth that is not trusted says nothing of the space before it.
+    sure = z if confidence is None else np.where(trust > 0, z, np.float32(0))
     return PointSet(
         positions[:count].copy(),
         colors[:count].copy(),
@@ -100,7 +102,7 @@ def back_project(
         spacing[:count].copy(),
         camera,
         origin,
-        _free_depth(z, use, np.float32(far)),
+        _free_depth(sure, use, np.float32(far)),
         {"no depth": invalid, "depth edge": edges, "masked": masked},
     )
 

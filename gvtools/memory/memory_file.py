@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.errors import MemoryFileError
+from gvtools.errors import GvError, MemoryFileError
 from gvtools.files import replaced_when_written
 from gvtools.memory.views import SourceView, ViewTable
 
@@ -68,20 +68,22 @@ def load_memory(path: Path) -> SpatialMemory:
     Raises:
         MemoryFileError: absent, truncated, altered, of another kind or version.
     """
-    from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-
     header, arrays = _read(path)
     try:
-        known = {f.name for f in fields(MemoryOptions)}
-        options = MemoryOptions(**{k: v for k, v in header["options"].items() if k in known})
-        memory = SpatialMemory(
-            float.fromhex(header["voxel"]),
-            origin=[float.fromhex(x) for x in header["origin"]],
-            options=options,
-        )
-        _check_consistency(arrays, len(header["names"]))
-    except (KeyError, TypeError, ValueError) as error:
+        return _assembled(header, arrays)
+    except (GvError, IndexError, KeyError, TypeError, ValueError) as error:
         raise MemoryFileError(f"{path}: the memory's parts do not fit together ({error})") from None
+
+
+def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> SpatialMemory:
+    from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+
+    memory = SpatialMemory(
+        float.fromhex(header["voxel"]),
+        origin=[float.fromhex(x) for x in header["origin"]],
+        options=MemoryOptions(**header["options"]),
+    )
+    _check_consistency(arrays, len(header["names"]))
     count = len(arrays["record_view"])
     records, runs = memory.records, memory.runs
     records.count = count

@@ -70,6 +70,8 @@ class Runs:
         view: (C,) int32, row of the view table.
         box: (C, 7) float32, scene units: bounding box of the positions (min xyz, max xyz) and the
             largest spacing.
+        groups: rows of ``group_box`` in use.
+        group_box: (D, 7) float32, the box around each GROUP consecutive runs.
     """
 
     count: int = 0
@@ -77,8 +79,13 @@ class Runs:
     length: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     view: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     box: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 7), np.float32))
+    groups: int = 0
+    group_box: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 7), np.float32))
 
     ARRAYS = ("start", "length", "view", "box")
+
+    # Consecutive runs lie near each other; culling asks groups of this many first.
+    GROUP = 32
 
     def append(
         self,
@@ -95,9 +102,25 @@ class Runs:
                 setattr(self, name, extended(getattr(self, name), size, self.count))
         for name, rows in zip(self.ARRAYS, (start, length, view, box), strict=True):
             getattr(self, name)[self.count : need] = rows
+        first = self.count // self.GROUP
         self.count = need
+        self._box_groups(first)
+
+    def _box_groups(self, first: int) -> None:
+        """Bring the groups' boxes from group ``first`` on up to date."""
+        groups = -(-self.count // self.GROUP)
+        if groups > len(self.group_box):
+            self.group_box = extended(self.group_box, max(groups, 2 * len(self.group_box)), first)
+        self.groups = groups
+        box = self.box[first * self.GROUP : self.count]
+        if len(box):
+            starts = np.arange(0, len(box), self.GROUP)
+            rows = self.group_box[first:groups]
+            rows[:, :3] = np.minimum.reduceat(box[:, :3], starts)
+            rows[:, 3:] = np.maximum.reduceat(box[:, 3:], starts)
 
     @property
     def nbytes(self) -> int:
         """Bytes of the rows in use."""
-        return sum(getattr(self, name)[: self.count].nbytes for name in self.ARRAYS)
+        rows = sum(getattr(self, name)[: self.count].nbytes for name in self.ARRAYS)
+        return rows + self.group_box[: self.groups].nbytes

@@ -230,11 +230,14 @@ class _Projection:
         """Find the runs in view and rank the views that they come from."""
         memory, runs, target = self.memory, self.memory.runs, self.target
         self.z_range = np.empty((runs.count, 2), np.float32)
-        splat_kernels.cull_runs(
-            runs.box[: runs.count], target.cam_from_local, self.camera.K[0],
-            target.shape[1], target.shape[0], self.options.blend_reach, target.rect, self.z_range,
-        )  # fmt: skip
-        self.seen = np.flatnonzero(target.rect[:, 1] >= 0)
+        groups = np.arange(runs.groups)
+        group_rect = np.empty((runs.groups, 4), np.int32)
+        self._cull_boxes(runs.group_box, groups, group_rect, np.empty((runs.groups, 2), np.float32))
+        rows = groups[group_rect[:, 1] >= 0, None] * runs.GROUP + np.arange(runs.GROUP)
+        rows = rows.ravel()
+        rows = rows[rows < runs.count]
+        self._cull_boxes(runs.box, rows, target.rect, self.z_range)
+        self.seen = rows[target.rect[rows, 1] >= 0]
         if not len(self.seen):
             return False
         scale = float(np.median(self.z_range[self.seen, 1]))
@@ -248,6 +251,19 @@ class _Projection:
         self.ranked = order[present[order] > 0]
         self.tier = np.full(len(memory.views), -1)
         return True
+
+    def _cull_boxes(
+        self,
+        boxes: NDArray[np.float32],
+        rows: NDArray[np.int64],
+        rect: NDArray[np.int32],
+        z_range: NDArray[np.float32],
+    ) -> None:
+        height, width = self.target.shape
+        splat_kernels.cull_runs(
+            boxes, rows, self.target.cam_from_local, self.camera.K[0], width, height,
+            self.options.blend_reach, rect, z_range,
+        )  # fmt: skip
 
     def _tiers(self) -> list[NDArray[np.int64]]:
         """The ranked views cut into tiers that double in size; observed and generated apart."""

@@ -21,11 +21,12 @@ REACHABLE = 3
 
 
 @compiled(parallel=True)
-def cull_runs(boxes, cam_from_local, K, width, height, reach, rect, z_range):
+def cull_runs(boxes, rows, cam_from_local, K, width, height, reach, rect, z_range):
     """Image rectangle and depth range of each run's box.
 
     Args:
         boxes: (R, 7) float32, see Runs.
+        rows: (n,) int64, the boxes that are asked.
         cam_from_local: (4, 4) float64.
         K: (3, 3) float64.
         width: pixels.
@@ -36,7 +37,8 @@ def cull_runs(boxes, cam_from_local, K, width, height, reach, rect, z_range):
         z_range: out (R, 2) float32, nearest and farthest depth.
     """
     focal = max(K[0, 0], K[1, 1])
-    for i in prange(len(boxes)):
+    for k in prange(len(rows)):
+        i = rows[k]
         low_u = np.inf
         high_u = -np.inf
         low_v = np.inf

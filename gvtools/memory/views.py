@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,10 +31,15 @@ class SourceView:
 class ViewTable:
     """The fused views in order, and their columns as arrays for the kernels."""
 
-    def __init__(self, origin: NDArray[np.float64], views: list[SourceView] | None = None) -> None:
+    def __init__(self, origin: NDArray[np.float64], views: Iterable[SourceView] = ()) -> None:
         self.origin = origin
-        self._views: list[SourceView] = list(views or [])
-        self._columns()
+        self._views: list[SourceView] = []
+        self.round: NDArray[np.int32] = np.zeros(0, np.int32)
+        self.generated: NDArray[np.bool_] = np.zeros(0, np.bool_)
+        self.centers: NDArray[np.float64] = np.zeros((0, 3))
+        self.cam_from_local: NDArray[np.float64] = np.zeros((0, 4, 4))
+        for view in views:
+            self.append(view)
 
     def __len__(self) -> int:
         return len(self._views)
@@ -41,30 +47,19 @@ class ViewTable:
     def __getitem__(self, index: int) -> SourceView:
         return self._views[index]
 
+    @property
+    def cameras(self) -> Cameras | None:
+        """All cameras, in the world frame; None when there are no views."""
+        return concatenate([view.camera for view in self._views]) if self._views else None
+
     def append(self, view: SourceView) -> int:
         """Add a view; returns its row."""
         self._views.append(view)
-        self._columns()
+        self.round = np.append(self.round, np.int32(view.round))
+        self.generated = np.append(self.generated, view.generated)
+        self.centers = np.concatenate([self.centers, view.camera.centers - self.origin])
+        local = view.camera.cam_from_world.copy()
+        # x_cam = R x_world + t = R (x_local + origin) + t
+        local[:, :3, 3] += local[0, :3, :3] @ self.origin
+        self.cam_from_local = np.concatenate([self.cam_from_local, local])
         return len(self._views) - 1
-
-    def drop_last(self) -> None:
-        """Take the last view back (its points turned out to be none)."""
-        self._views.pop()
-        self._columns()
-
-    def _columns(self) -> None:
-        views = self._views
-        self.round: NDArray[np.int32] = np.array([v.round for v in views], np.int32)
-        self.generated: NDArray[np.bool_] = np.array([v.generated for v in views], np.bool_)
-        if views:
-            cameras = concatenate([v.camera for v in views])
-            self.cameras: Cameras | None = cameras
-            self.centers: NDArray[np.float64] = cameras.centers - self.origin
-            local = cameras.cam_from_world.copy()
-            # x_cam = R (x_world) + t = R (x_local + origin) + t
-            local[:, :3, 3] += np.einsum("vij,j->vi", local[:, :3, :3], self.origin)
-            self.cam_from_local: NDArray[np.float64] = local
-        else:
-            self.cameras = None
-            self.centers = np.zeros((0, 3))
-            self.cam_from_local = np.zeros((0, 4, 4))

@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from memory_scenes import camera, plane_view, random_camera
+
+from gvtools.memory.back_projection import FREE_CELL
+from gvtools.memory.occlusion import in_free_space
+
+
+def _view(source, grid):
+    return source.K[0], source.cam_from_world[0], grid
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("tolerance", [0.0, 0.03, 0.3])
+def test_points_in_front_of_a_cell_by_the_margin_are_in_free_space(seed, tolerance):
+    rng = np.random.default_rng(seed)
+    where = rng.uniform((-3, -3, -1), (3, 3, 6), (2000, 3)).astype(np.float32)
+    sources = [random_camera(rng, spread=0.5) for _ in range(3)]
+    grids = [rng.uniform(-1, 6, (6, 8)).clip(0).astype(np.float32) for _ in sources]
+    expected = np.zeros(len(where), bool)
+    for source, grid in zip(sources, grids, strict=True):
+        xy, z = source.project(where)
+        for i in np.flatnonzero(z[0] > 0):
+            column, row = np.floor(xy[0, i] / FREE_CELL).astype(int)
+            if 0 <= row < 6 and 0 <= column < 8:
+                expected[i] |= z[0, i] < grid[row, column] * (1 - tolerance)
+    views = [_view(*pair) for pair in zip(sources, grids, strict=True)]
+    found = in_free_space(where, views, tolerance=tolerance)
+    assert 0.02 < expected.mean() < 0.9
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_a_wall_frees_what_is_before_it_and_nothing_else():
+    source = camera(width=64, height=48, focal=60)
+    grid = plane_view(source, 4.0).free_depth
+    where = np.array(
+        [(0, 0, 2), (0, 0, 3.8), (0, 0, 3.95), (0, 0, 5), (0, 0, -2), (9, 0, 2)], np.float32
+    )
+    found = in_free_space(where, [_view(source, grid)], tolerance=0.03)
+    assert found.tolist() == [True, True, False, False, False, False]
+
+
+def test_a_cell_with_an_unmeasured_pixel_frees_nothing():
+    source = camera(width=64, height=48, focal=60)
+    depth = np.full((48, 64), 4, np.float32)
+    depth[24, 32] = 0
+    grid = plane_view(source, depth).free_depth
+    where = np.array([(0.01, 0.01, 2), (0.5, 0.01, 2)], np.float32)
+    found = in_free_space(where, [_view(source, grid)], tolerance=0.03)
+    assert found.tolist() == [False, True]
+
+
+def test_no_view_and_no_grid_free_nothing():
+    where = np.array([(0, 0, 2)], np.float32)
+    assert not in_free_space(where, [], tolerance=0).any()
+    nothing = np.zeros((0, 0), np.float32)
+    assert not in_free_space(where, [_view(camera(), nothing)], tolerance=0).any()
