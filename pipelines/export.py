@@ -63,6 +63,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
         raise OptionError(f"--max-points {args.max_points}; expected 1 or more")
     if args.format == "transforms" and args.max_points is not None:
         raise OptionError("--max-points: a transforms.json holds no points; leave it out")
+    if args.format in ("colmap", "transforms") and args.memory.suffix.lower() == ".ply":
+        raise OptionError(
+            f"--format {args.format}: {args.memory} is a PLY, which holds no cameras; give the "
+            "run's folder or its memory.npz"
+        )
     memory = open_memory(args.memory, up_to=args.round)
     if not len(memory):
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")

@@ -47,6 +47,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="splat.KEY=VALUE",
         help="a setting of the projection, such as splat.band=0.03",
     )
+    parser.add_argument(
+        "--backend", metavar="NAME", help="short for --set splat.backend=NAME (cpu, torch, ...)"
+    )
+    parser.add_argument(
+        "--device", metavar="NAME", help="short for --set splat.device=NAME (auto, cpu, cuda)"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     add_scene_arguments(parser)
 
@@ -63,7 +69,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from pipelines.render_figures import measure, render_view, summary
     from pipelines.render_files import file_stems, write_view
 
-    options = splat_options(args.set)
+    short = {"backend": args.backend, "device": args.device}
+    given = [f"splat.{key}={value}" for key, value in short.items() if value is not None]
+    options = splat_options([*given, *args.set])
     memory = open_memory(args.memory)
     if not len(memory.views):
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
@@ -114,6 +122,11 @@ def _cameras(args: argparse.Namespace, memory: SpatialMemory) -> tuple[Cameras, 
     if args.cameras.is_file() and args.cameras.suffix.lower() != ".json":
         from gvtools.trajectory_files import read_trajectory
 
+        if args.memory.suffix.lower() == ".ply":
+            raise OptionError(
+                f"--cameras {args.cameras}: a trajectory takes its camera from the memory's views, "
+                f"and {args.memory} is a PLY without any; give the run or its memory.npz"
+            )
         return read_trajectory(args.cameras, memory.views[0].camera), None
     scene = open_scene(args.cameras, args)
     return scene.cameras, scene

@@ -12,6 +12,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.memory.ply import export_memory_ply
 from gvtools.scenes.project import open_project
 from pipelines import export
 from pipelines.console import Console
@@ -225,6 +226,14 @@ def test_options_that_make_no_sense(saved, tmp_path):
         run(saved, "--format", "ply", "--out", tmp_path / "a.ply", "--max-points", 0)
     with pytest.raises(OptionError, match="holds no points"):
         run(saved, "--format", "transforms", "--out", tmp_path / "a", "--max-points", 5)
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_a_ply_has_no_cameras_to_export(memory, tmp_path, kind):
+    export_memory_ply(memory, tmp_path / "cloud.ply")
+    with pytest.raises(OptionError, match="a PLY, which holds no cameras"):
+        run(tmp_path / "cloud.ply", "--format", kind, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("kind", export.FORMATS)

@@ -11,6 +11,7 @@ from skimage.metrics import structural_similarity
 
 from gvtools.cameras import concatenate
 from gvtools.errors import OptionError, ProjectError
+from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.trajectory_files import write_trajectory
 from pipelines import render
@@ -162,6 +163,27 @@ def test_settings_of_the_projection(box, tmp_path):
         run(*arguments, "--out", tmp_path / "c", "--set", "seed=2")
     with pytest.raises(OptionError, match="did you mean"):
         run(*arguments, "--out", tmp_path / "c", "--set", "splat.bnd=2")
+
+
+def test_back_ends_are_chosen_by_name(box, tmp_path):
+    arguments = (box / "run", "--cameras", box / "project", "--views", "first:1")
+    run(*arguments, "--out", tmp_path / "a", "--backend", "nearest")
+    run(*arguments, "--out", tmp_path / "b", "--set", "splat.backend=open3d")
+    first, second = (rendered(tmp_path / name, "view_0")[1] for name in "ab")
+    np.testing.assert_allclose(first, second, rtol=1e-4)
+    with pytest.raises(OptionError, match="backend 'gpu'"):
+        run(*arguments, "--out", tmp_path / "c", "--backend", "gpu")
+
+
+def test_a_ply_has_no_camera_for_a_trajectory(box, tmp_path):
+    export_memory_ply(SpatialMemory.load(box / "run" / "memory.npz"), tmp_path / "cloud.ply")
+    camera = inside_camera(SIZE, turn=0.1, width=WIDTH, height=HEIGHT)
+    write_trajectory(tmp_path / "path.txt", camera)
+    with pytest.raises(OptionError, match="is a PLY without any"):
+        run(tmp_path / "cloud.ply", "--cameras", tmp_path / "path.txt", "--out", tmp_path / "out")
+    run(tmp_path / "cloud.ply", "--cameras", box / "project", "--views", "first:1", "--out",
+        tmp_path / "out")  # fmt: skip
+    assert rendered(tmp_path / "out", "view_0")[2].mean() > 0.8 * 255
 
 
 def test_what_is_no_memory(box, tmp_path):

@@ -95,15 +95,16 @@ class TorchSplatter:
         table: NDArray[np.int32] | None,
         blend: bool,
     ) -> NDArray[np.float32]:
-        """See gvtools.memory.splat.Splatter; ``table`` is of no use here."""
+        """See gvtools.memory.splat.Splatter."""
         height, width = target.shape
         limits = self._tensor(limit.reshape(-1))
+        sums = None if table is None else self._tensor(table)
         zbuffer = torch.full((height * width,), torch.inf, device=self.device)
         rows, view = self._observations(chosen)
         u, v, z, size = self._project(target, rows)
         ahead = z > target.near
         rows, view, u, v, z, size = (column[ahead] for column in (rows, view, u, v, z, size))
-        for i, row, col in self._pairs(u, v, self.options.depth_reach * size, target.shape):
+        for i, row, col in self._pairs(u, v, self.options.depth_reach * size, target.shape, sums):
             cell = row * width + col
             use = z[i] < limits[cell]
             zbuffer.scatter_reduce_(0, cell[use], z[i[use]], "amin")
@@ -113,7 +114,7 @@ class TorchSplatter:
             made = self.generated[view]
             self.total = torch.zeros((height * width, CHANNELS), device=self.device)
             reach = self.options.blend_reach * size
-            for i, row, col in self._pairs(u, v, reach, target.shape):
+            for i, row, col in self._pairs(u, v, reach, target.shape, sums):
                 cell = row * width + col
                 use = (z[i] <= farthest[cell]) & (z[i] < limits[cell])
                 i, row, col, cell = i[use], row[use], col[use], cell[use]
@@ -158,7 +159,12 @@ class TorchSplatter:
         return u, v, z, size.clamp(1, self.options.size_cap)
 
     def _pairs(
-        self, u: torch.Tensor, v: torch.Tensor, half: torch.Tensor, shape: tuple[int, int]
+        self,
+        u: torch.Tensor,
+        v: torch.Tensor,
+        half: torch.Tensor,
+        shape: tuple[int, int],
+        table: torch.Tensor | None,
     ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
         """Yield (observation, row, column) of the pixel centres within ``half``, in parts."""
         height, width = shape
@@ -169,6 +175,11 @@ class TorchSplatter:
         bottom = torch.floor(v + half).clamp(-1, height - 1).long()
         across = (right - left + 1).clamp(min=0)
         count = across * (bottom - top + 1).clamp(min=0)
+        if table is not None:
+            # Footprints without a pixel to be written are most of those of a late tier.
+            r0, r1, c0, c1 = top, bottom + 1, left, right + 1
+            opened = table[r1, c1] - table[r0, c1] - table[r1, c0] + table[r0, c0]
+            count = count * (opened > 0)
         inside = torch.nonzero(count)[:, 0]
         left, top, across, count = (c[inside] for c in (left, top, across, count))
         end = count.cumsum(0)
