@@ -165,24 +165,23 @@ class Reference:
         p, views = self.points, self.memory.views
         zbuffer = self._nearest_depth(chosen, limit)
         shape = self.rows.shape
-        total, support, trust = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        total, support = np.zeros(shape), np.zeros(shape)
         depth, made, rgb = np.zeros(shape), np.zeros(shape), np.zeros((*shape, 3))
         for i in np.flatnonzero(chosen & (p.z > self.near)):
             reach = self.options.blend_reach * p.size[i]
             squared = (self.cols - p.u[i]) ** 2 + (self.rows - p.v[i]) ** 2
             kernel = np.maximum(1 - squared / reach**2, 0) ** 2
-            kernel[(p.z[i] > zbuffer * (1 + self.options.band)) | (p.z[i] >= limit)] = 0
+            kernel[p.z[i] > np.minimum(zbuffer, limit) * (1 + self.options.band)] = 0
             w = kernel * p.trust[i] * weight[p.view[i]]
             rgb += w[..., None] * p.color[i]
             depth += w * p.z[i]
             made += w * views.generated[p.view[i]]
             total += w
             support += kernel
-            trust += kernel * p.trust[i]
         done = open_ & (support >= self.options.support) & (total > 0)
         self.rgb[done] = rgb[done] / total[done][:, None]
         self.depth[done] = depth[done] / total[done]
-        self.confidence[done] = trust[done] / support[done]
+        self.confidence[done] = total[done] / support[done]
         self.generated[done] = made[done] > 0.5 * total[done]
         self.valid |= done
 

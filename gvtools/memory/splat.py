@@ -58,7 +58,7 @@ class SplatOptions:
     depth_reach: float = 0.5
     blend_reach: float = 1.5
     support: float = 0.5
-    size_cap: float = 16.0
+    size_cap: float = 32.0
     occluders: bool = True
     backend: str = "cpu"
     device: str = "auto"
@@ -128,11 +128,15 @@ class Splatter(Protocol):
             blend: False stops after the depth pass.
 
         Returns:
-            (H, W) nearest depth, inf where none.
+            (H, W) nearest depth, inf where none; of use without ``blend`` only.
         """
 
-    def resolve(self, target: Target, open_: NDArray[np.bool_]) -> None:
-        """Write the last splat's pixels where ``open_`` and the support suffices."""
+    def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
+        """Write the last splat's pixels where ``open_`` and the support suffices.
+
+        The confidence is the mean of the observations' confidence x proximity; ``generated`` says
+        what kind the splatted observations are.
+        """
 
 
 def view_distance(memory: SpatialMemory, camera: Cameras, scale: float) -> NDArray[np.float64]:
@@ -307,7 +311,8 @@ class _Projection:
         beyond = np.maximum(self.distance - self.distance[members].min(), 0)
         weight = np.exp(-self.options.proximity * beyond).astype(np.float32)
         self.splatter.splat(self.target, chosen, limit, weight=weight, table=table, blend=True)
-        self.splatter.resolve(self.target, open_)
+        made = bool(self.memory.views.generated[members[0]])
+        self.splatter.resolve(self.target, open_, generated=made)
 
     def _splat_occluders(self) -> None:
         """Let through what unused observations know to stand clearly in front.
@@ -348,7 +353,8 @@ class _Projection:
         if table[-1, -1]:
             chosen = splat_kernels.touching(target.rect, table, chosen)
             limit = np.where(front, limit, np.float32(0))
-            self._write(chosen, limit, front, members=self.ranked, table=table)
+            observed = self.ranked[~memory.views.generated[self.ranked]]
+            self._write(chosen, limit, front, members=observed, table=table)
 
 
 def _tile_farthest(depth: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -44,7 +44,7 @@ class CpuSplatter:
         splat_kernels.splat_runs(
             chosen, runs.start, runs.length, runs.view, target.rect,
             records.x, records.y, records.z, records.color, records.confidence,
-            records.agreement, records.spacing, weight, memory.views.generated,
+            records.agreement, records.spacing, weight,
             target.cam_from_local.astype(np.float32), target.camera.K[0], target.near,
             limit.reshape(-1), reachable,
             np.float32(options.band), np.float32(options.depth_reach),
@@ -53,11 +53,13 @@ class CpuSplatter:
             width, height, self.zbuffer.reshape(-1),
             self.total.reshape(-1, splat_kernels.CHANNELS),
         )  # fmt: skip
-        return self.zbuffer
+        if blend:
+            return self.zbuffer
+        return np.where(self.zbuffer < limit, self.zbuffer, np.float32(np.inf))
 
-    def resolve(self, target: Target, open_: NDArray[np.bool_]) -> None:
+    def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
         """See gvtools.memory.splat.Splatter."""
         splat_kernels.resolve(
-            self.total, open_, np.float32(self.options.support),
+            self.total, open_, np.float32(self.options.support), generated,
             target.rgb, target.depth, target.valid, target.confidence, target.generated,
         )  # fmt: skip

@@ -11,9 +11,8 @@ from numba import prange
 
 from gvtools.memory.compiled import FAST, compiled
 
-# Channels of the accumulator: weighted rgb, weight, weighted z, kernel, kernel x confidence,
-# generated weight.
-CHANNELS = 8
+# Channels of the accumulator: weighted rgb, weight, weighted z, kernel.
+CHANNELS = 6
 NEAR = 1e-6
 TILE = 16
 SAMPLE = 6
@@ -149,12 +148,12 @@ def summed_area(mask):
     return table
 
 
-@compiled()
+@compiled(parallel=True)
 def near_to(table):
     """(H x W,) bool: pixels with one of the summed-area ``table`` within REACHABLE pixels."""
     height, width = table.shape[0] - 1, table.shape[1] - 1
     out = np.empty(height * width, np.bool_)
-    for row in range(height):
+    for row in prange(height):
         r0, r1 = max(row - REACHABLE, 0), min(row + REACHABLE + 1, height)
         for col in range(width):
             c0, c1 = max(col - REACHABLE, 0), min(col + REACHABLE + 1, width)
@@ -192,45 +191,63 @@ def opened(mask, side):
 
 
 @compiled(fastmath=FAST)
-def _project_run(x, y, z, spacing, M, fx, fy, skew, cx, cy, focal, near, u, v, depth, size):
-    """Centre-of-pixel coordinates, depth and footprint width (pixels) of one run's points."""
+def _project_run(
+    x, y, z, spacing, M, fx, fy, skew, cx, cy, focal, near, factor, size_cap, width, top, bottom,
+    u, v, depth, reach, c0, c1, r0, r1,
+):  # fmt: skip
+    """Centre-of-pixel coordinates, depth, reach (pixels) and window of one run's points.
+
+    The window is the pixels within reach, cut to the image and to the rows ``top`` to ``bottom``;
+    it is empty behind the camera.
+    """
     m00, m01, m02, m03 = M[0, 0], M[0, 1], M[0, 2], M[0, 3]
     m10, m11, m12, m13 = M[1, 0], M[1, 1], M[1, 2], M[1, 3]
     m20, m21, m22, m23 = M[2, 0], M[2, 1], M[2, 2], M[2, 3]
     one = np.float32(1)
+    left = np.float32(-1)
+    right = np.float32(width)
+    above = np.float32(top - 1)
+    below = np.float32(bottom + 1)
     for k in range(len(x)):
         px = m00 * x[k] + m01 * y[k] + m02 * z[k] + m03
         py = m10 * x[k] + m11 * y[k] + m12 * z[k] + m13
         pz = m20 * x[k] + m21 * y[k] + m22 * z[k] + m23
         depth[k] = pz
         inverse = one / max(pz, near)
-        u[k] = (fx * px + skew * py) * inverse + cx
-        v[k] = fy * py * inverse + cy
-        size[k] = max(spacing[k] * focal * inverse, one)
+        col = (fx * px + skew * py) * inverse + cx
+        row = fy * py * inverse + cy
+        h = factor * min(max(spacing[k] * focal * inverse, one), size_cap)
+        u[k] = col
+        v[k] = row
+        reach[k] = h
+        # Clamped before the conversion: far out of view a column exceeds every integer.
+        first_col = np.int32(np.ceil(min(max(col - h, left), right)))
+        last_col = np.int32(np.floor(min(max(col + h, left), right)))
+        first_row = np.int32(np.ceil(min(max(row - h, above), below)))
+        last_row = np.int32(np.floor(min(max(row + h, above), below)))
+        c0[k] = max(first_col, np.int32(0))
+        c1[k] = min(last_col, np.int32(width - 1))
+        r0[k] = max(first_row, np.int32(top))
+        r1[k] = min(last_row, np.int32(bottom)) if pz > near else np.int32(-1)
 
 
 @compiled(parallel=True, fastmath=FAST)
 def splat_runs(
     runs, run_start, run_length, run_view, rect, x, y, z, color, confidence, agreement, spacing,
-    view_weight, view_generated, M, K, near, limit, reachable, band, depth_reach, blend_reach, size_cap,
-    weight_cap, threads, blend, width, height, depth, total,
+    view_weight, M, K, near, limit, reachable, band, depth_reach, blend_reach, size_cap, weight_cap,
+    threads, blend, width, height, depth, total,
 ):  # fmt: skip
     """Depth pass, then blending inside the depth band.
 
-    Args:
-        runs: (n,) which runs, in the order they are to be added.
-        limit: (H x W,) float32, only what is nearer than this is written; 0 shuts a pixel.
-        reachable: (H x W,) bool, pixels within REACHABLE pixels of one to be written; empty when
-            most of the image is open.
-        band: relative depth band that is blended.
-        depth_reach: half width of the depth footprint, spacings.
-        blend_reach: radius of the blending kernel, spacings.
-        size_cap: footprints wider than this many pixels are cut to it.
-        blend: False stops after the depth pass.
-        width: of the image, pixels.
-        height: of the image, pixels.
-        depth: out (H x W,) float32, nearest depth, inf where none.
-        total: out (H x W, CHANNELS) float32, zeroed here.
+    ``runs`` (n,) are added in their order. Only what is nearer than ``limit`` (H x W,) makes a
+    depth; 0 shuts a pixel. ``reachable`` (H x W,) bool holds the pixels within REACHABLE pixels of
+    one to be written; it is empty when most of the image is open. ``band`` is the relative depth
+    band that blends; ``depth_reach`` and ``blend_reach`` are the footprints' half width and the
+    kernel's radius in spacings; footprints wider than ``size_cap`` pixels are cut to it. Without
+    ``blend`` it stops after the depth pass.
+
+    Writes ``depth`` (H x W,) float32, the nearest depth, or ``limit`` where nothing is nearer, and
+    ``total`` (H x W, CHANNELS) float32.
     """
     fx = np.float32(K[0, 0])
     fy = np.float32(K[1, 1])
@@ -242,6 +259,7 @@ def splat_runs(
     for r in runs:
         longest = max(longest, run_length[r])
     one = np.float32(1)
+    zero = np.float32(0)
     bands = max(1, min(4, height // (16 * threads)))
     for task in prange(bands * threads):
         # Neighbouring bands go to different threads: what is open tends to lie together.
@@ -251,92 +269,78 @@ def splat_runs(
         u = np.empty(longest, np.float32)
         v = np.empty(longest, np.float32)
         depths = np.empty(longest, np.float32)
-        size = np.empty(longest, np.float32)
+        reach = np.empty(longest, np.float32)
+        c0 = np.empty(longest, np.int32)
+        c1 = np.empty(longest, np.int32)
+        r0 = np.empty(longest, np.int32)
+        r1 = np.empty(longest, np.int32)
         for i in range(top * width, (bottom + 1) * width):
-            depth[i] = np.inf
+            depth[i] = limit[i]
             if blend and limit[i] > 0:
                 total[i] = 0
         for r in runs:
             if rect[r, 3] < top or rect[r, 2] > bottom:
                 continue
-            length = run_length[r]
             first = run_start[r]
-            last = first + length
-            _project_run(x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx,
-                         fy, skew, cx, cy, focal, near, u, v, depths, size)  # fmt: skip
-            for k in range(length):
+            last = first + run_length[r]
+            _project_run(
+                x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx, fy, skew,
+                cx, cy, focal, near, depth_reach, size_cap, width, top, bottom,
+                u, v, depths, reach, c0, c1, r0, r1,
+            )  # fmt: skip
+            for k in range(last - first):
+                if closed_off(u[k], v[k], reach[k], width, height, reachable):
+                    continue
                 zk = depths[k]
-                if zk <= near:
-                    continue
-                h = depth_reach * min(size[k], size_cap)
-                if closed_off(u[k], v[k], h, width, height, reachable):
-                    continue
-                r0 = max(np.int64(np.ceil(v[k] - h)), top)
-                r1 = min(np.int64(np.floor(v[k] + h)), bottom)
-                c0 = max(np.int64(np.ceil(u[k] - h)), 0)
-                c1 = min(np.int64(np.floor(u[k] + h)), width - 1)
-                for row in range(r0, r1 + 1):
-                    for col in range(c0, c1 + 1):
+                for row in range(r0[k], r1[k] + 1):
+                    for col in range(c0[k], c1[k] + 1):
                         # Unsigned: the compiler need not ask for negative indices.
                         cell = np.uint64(row * width + col)
-                        if zk < depth[cell] and zk < limit[cell]:
+                        if zk < depth[cell]:
                             depth[cell] = zk
         if not blend:
             continue
         for r in runs:
             if rect[r, 3] < top or rect[r, 2] > bottom:
                 continue
-            length = run_length[r]
             first = run_start[r]
+            last = first + run_length[r]
             proximity = view_weight[run_view[r]]
-            made = np.float32(view_generated[run_view[r]])
-            last = first + length
-            _project_run(x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx,
-                         fy, skew, cx, cy, focal, near, u, v, depths, size)  # fmt: skip
-            for k in range(length):
+            _project_run(
+                x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx, fy, skew,
+                cx, cy, focal, near, blend_reach, size_cap, width, top, bottom,
+                u, v, depths, reach, c0, c1, r0, r1,
+            )  # fmt: skip
+            for k in range(last - first):
+                if r0[k] > r1[k] or closed_off(u[k], v[k], reach[k], width, height, reachable):
+                    continue
                 zk = depths[k]
-                if zk <= near:
-                    continue
-                reach = blend_reach * min(size[k], size_cap)
-                if closed_off(u[k], v[k], reach, width, height, reachable):
-                    continue
-                r0 = max(np.int64(np.ceil(v[k] - reach)), top)
-                r1 = min(np.int64(np.floor(v[k] + reach)), bottom)
-                c0 = max(np.int64(np.ceil(u[k] - reach)), 0)
-                c1 = min(np.int64(np.floor(u[k] + reach)), width - 1)
-                if r0 > r1 or c0 > c1:
-                    continue
-                q = one / (reach * reach)
+                q = one / (reach[k] * reach[k])
                 near_side = zk / (one + band)
-                trust = min(confidence[first + k] + agreement[first + k], weight_cap)
-                scale = trust * proximity
-                red = np.float32(color[first + k, 0])
-                green = np.float32(color[first + k, 1])
-                blue = np.float32(color[first + k, 2])
-                for row in range(r0, r1 + 1):
+                scale = min(confidence[first + k] + agreement[first + k], weight_cap) * proximity
+                red = scale * np.float32(color[first + k, 0])
+                green = scale * np.float32(color[first + k, 1])
+                blue = scale * np.float32(color[first + k, 2])
+                far = scale * zk
+                for row in range(r0[k], r1[k] + 1):
                     dy = np.float32(row) - v[k]
-                    for col in range(c0, c1 + 1):
+                    for col in range(c0[k], c1[k] + 1):
                         cell = np.uint64(row * width + col)
-                        if near_side > depth[cell] or zk >= limit[cell]:
+                        if near_side > depth[cell]:
                             continue
                         dx = np.float32(col) - u[k]
-                        kernel = one - q * (dx * dx + dy * dy)
-                        if kernel <= 0:
-                            continue
+                        kernel = max(one - q * (dx * dx + dy * dy), zero)
                         kernel *= kernel
-                        w = scale * kernel
-                        total[cell, 0] += w * red
-                        total[cell, 1] += w * green
-                        total[cell, 2] += w * blue
-                        total[cell, 3] += w
-                        total[cell, 4] += w * zk
+                        total[cell, 0] += kernel * red
+                        total[cell, 1] += kernel * green
+                        total[cell, 2] += kernel * blue
+                        total[cell, 3] += kernel * scale
+                        total[cell, 4] += kernel * far
                         total[cell, 5] += kernel
-                        total[cell, 6] += kernel * trust
-                        total[cell, 7] += w * made
 
 
 @compiled(parallel=True, fastmath=FAST)
-def resolve(total, open_, support, rgb, depth, valid, confidence, generated):
+def resolve(total, open_, support, made, rgb, depth, valid, confidence, generated):
     """Turn accumulators into pixels where ``open_`` and the support suffices."""
     for row in prange(total.shape[0]):
         for col in range(total.shape[1]):
@@ -350,6 +354,6 @@ def resolve(total, open_, support, rgb, depth, valid, confidence, generated):
             for c in range(3):
                 rgb[row, col, c] = total[row, col, c] * scale * np.float32(1 / 255)
             depth[row, col] = total[row, col, 4] * scale
-            confidence[row, col] = total[row, col, 6] / kernel
-            generated[row, col] = total[row, col, 7] * 2 > weight
+            confidence[row, col] = weight / kernel
+            generated[row, col] = made
             valid[row, col] = True

@@ -75,7 +75,6 @@ class TorchSplatter:
         self.start = self._tensor(runs.start[: runs.count])
         self.length = self._tensor(runs.length[: runs.count].astype(np.int64))
         self.run_view = self._tensor(runs.view[: runs.count].astype(np.int64))
-        self.generated = self._tensor(memory.views.generated.astype(np.float32))
         self.xyz = self._tensor(records.position)
         self.color = self._tensor(records.color[:n])
         self.trust = self._tensor(memory.confidence)
@@ -99,7 +98,7 @@ class TorchSplatter:
         height, width = target.shape
         limits = self._tensor(limit.reshape(-1))
         sums = None if table is None else self._tensor(table)
-        zbuffer = torch.full((height * width,), torch.inf, device=self.device)
+        zbuffer = limits.clone()
         rows, view = self._observations(chosen)
         u, v, z, size = self._project(target, rows)
         ahead = z > target.near
@@ -111,19 +110,19 @@ class TorchSplatter:
         if blend:
             farthest = zbuffer * (1 + self.options.band)
             scale = self.trust[rows] * self._tensor(weight)[view]
-            made = self.generated[view]
             self.total = torch.zeros((height * width, CHANNELS), device=self.device)
             reach = self.options.blend_reach * size
             for i, row, col in self._pairs(u, v, reach, target.shape, sums):
                 cell = row * width + col
-                use = (z[i] <= farthest[cell]) & (z[i] < limits[cell])
+                use = z[i] <= farthest[cell]
                 i, row, col, cell = i[use], row[use], col[use], cell[use]
                 squared = (col - u[i]) ** 2 + (row - v[i]) ** 2
                 kernel = (1 - squared / reach[i] ** 2).clamp(min=0) ** 2
-                self._add(cell, kernel, scale[i], rows[i], z=z[i], made=made[i])
+                self._add(cell, kernel, scale[i], rows[i], z=z[i])
+        zbuffer[zbuffer >= limits] = torch.inf
         return zbuffer.reshape(height, width).cpu().numpy()
 
-    def resolve(self, target: Target, open_: NDArray[np.bool_]) -> None:
+    def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
         """See gvtools.memory.splat.Splatter."""
         kernel, weight = self.total[:, 5], self.total[:, 3]
         done = self._tensor(open_.reshape(-1)) & (kernel >= self.options.support) & (weight > 0)
@@ -133,8 +132,8 @@ class TorchSplatter:
         at = cells.cpu().numpy()
         target.rgb.reshape(-1, 3)[at] = (total[:, :3] / weight[:, None] / 255).cpu().numpy()
         target.depth.reshape(-1)[at] = (total[:, 4] / weight).cpu().numpy()
-        target.confidence.reshape(-1)[at] = (total[:, 6] / kernel).cpu().numpy()
-        target.generated.reshape(-1)[at] = (2 * total[:, 7] > weight).cpu().numpy()
+        target.confidence.reshape(-1)[at] = (weight / kernel).cpu().numpy()
+        target.generated.reshape(-1)[at] = generated
         target.valid.reshape(-1)[at] = True
 
     def _observations(self, chosen: NDArray[np.int64]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -205,7 +204,6 @@ class TorchSplatter:
         rows: torch.Tensor,
         *,
         z: torch.Tensor,
-        made: torch.Tensor,
     ) -> None:
         """Add the pairs' contributions to the sums of their pixels."""
         w = scale * kernel
@@ -214,8 +212,6 @@ class TorchSplatter:
         channels[:, 3] = w
         channels[:, 4] = w * z
         channels[:, 5] = kernel
-        channels[:, 6] = kernel * self.trust[rows]
-        channels[:, 7] = w * made
         if self.device.type == "cuda":
             # index_add_ adds in no fixed order on CUDA; index_put_ sorts first.
             self.total.index_put_((cell,), channels, accumulate=True)
