@@ -176,9 +176,7 @@ def rigid_transform(matrix: ArrayLike, *, what: str) -> tuple[Float64, float]:
     if matrix.shape not in ((3, 4), (4, 4)):
         raise ShapeError(f"{what}: a pose of shape {matrix.shape}; expected 4x4 or 3x4")
     if not np.isfinite(matrix).all():
-        raise ShapeError(
-            f"{what}: the pose holds NaN or infinity; mend it or drop the view"
-        )
+        raise ShapeError(f"{what}: the pose holds NaN or infinity; mend it or drop the view")
     if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
         raise ShapeError(f"{what}: the pose's last row is {matrix[3].tolist()}; expected 0 0 0 1")
     rotation = matrix[:3, :3]

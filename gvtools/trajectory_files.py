@@ -6,7 +6,6 @@ intrinsics and the image size come from given cameras.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
+from gvtools.files import write_text
 
 Float64 = NDArray[np.float64]
 
@@ -96,13 +96,7 @@ def write_trajectory(path: str | Path, cameras: Cameras, *, layout: str = "tum")
         lines = [" ".join(f"{x:.17g}" for x in pose[:3].ravel()) for pose in world]
     else:
         raise ProjectError(f"{path}: trajectory layout {layout!r}; expected 'tum' or 'kitti'")
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_text("".join(line + "\n" for line in lines), encoding="ascii")
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise ProjectError(f"{path}: cannot be written ({error.strerror})") from error
+    write_text(path, "".join(line + "\n" for line in lines))
 
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:

@@ -16,10 +16,10 @@ from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
 from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.thinning import thinned
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.transforms_json import FILE as TRANSFORMS
 from gvtools.scenes.transforms_json import write_transforms
-from pipelines.thinning import thinned
 
 GENERATED = "generated.txt"
 

@@ -16,7 +16,7 @@ import numpy as np
 from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written
 from gvtools.memory.spatial_memory import SpatialMemory
-from pipelines.thinning import thinned
+from gvtools.memory.thinning import thinned
 
 NODE = "gvtools_memory"
 FRAME = "input world frame, scene units, axes as in the input (not turned to y up)"

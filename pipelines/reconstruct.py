@@ -200,6 +200,8 @@ def make_plan(scene: Scene, config: RunConfig) -> Plan:
         raise OptionError(f"device {config.device!r}; expected auto, cpu or cuda")
     if config.voxel is not None and not 0 < config.voxel < float("inf"):
         raise OptionError(f"voxel edge {config.voxel}; expected auto or a positive length")
+    if config.device == "cuda":
+        config = replace(config, splat=replace(config.splat, backend="torch", device="cuda"))
     create(config.completer, **config.completer_options)
     context = select(scene.names, config.context)
     targets = resolve_targets(scene, context, config.targets, allow_overlap=config.allow_overlap)
@@ -368,11 +370,10 @@ def _round_line(report: dict[str, Any]) -> str:
 
 def _finish(plan: Plan, memory: SpatialMemory, directory: Any, console: Console) -> None:
     """The run's end products, all derived from the last round's memory."""
-    from viz.growth import draw_growth, growth_text
-
     from gvtools.files import replaced_when_written
     from gvtools.memory.ply import export_memory_ply
     from pipelines.measure import measure_run
+    from viz.growth import draw_growth, growth_text
 
     out = directory.path
     last = directory.round_memory(len(plan.schedule))

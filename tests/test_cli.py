@@ -194,7 +194,8 @@ def test_a_model_without_images_is_refused(capsys, tmp_path):
     from gvtools.scenes.colmap import write_colmap
 
     K = np.array([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
-    write_colmap(tmp_path / "sparse" / "0", Cameras(K, np.eye(4)[None], 64, 48, ("a.png",)))
+    camera = Cameras(K, np.eye(4)[None], np.array([64]), np.array([48]), ("a.png",))
+    write_colmap(tmp_path / "sparse" / "0", camera)
     line = refused(capsys, *reconstruct(tmp_path, "--out", tmp_path / "run"))
     assert "a.png" in line or "image" in line
 

@@ -13,10 +13,10 @@ from plyfile import PlyData
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.ply import export_memory_ply
+from gvtools.memory.thinning import thinned
 from gvtools.scenes.project import open_project
 from pipelines import export
 from pipelines.console import Console
-from pipelines.thinning import thinned
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 

@@ -30,7 +30,7 @@ def test_a_wall_is_seen_where_it_stands(tmp_path, offset):
     K = np.array([[[100.0, 0, 24], [0, 100, 24], [0, 0, 1]]])
     pose = np.eye(4)
     pose[0, 3] = -offset
-    seen = memory.project(Cameras(K, pose[None], 48, 48, ("a",)))
+    seen = memory.project(Cameras(K, pose[None], np.array([48]), np.array([48]), ("a",)))
     assert seen.coverage == 1.0
     np.testing.assert_allclose(seen.depth, 2.0, atol=1e-5)
     np.testing.assert_allclose(seen.rgb[0, 20, 20] * 255, [200, 100, 50], atol=1e-3)

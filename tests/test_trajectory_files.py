@@ -117,7 +117,8 @@ def test_absent_files_unknown_layouts_and_lost_folders_are_refused(tmp_path):
     with pytest.raises(ProjectError, match="'tum' or 'kitti'"):
         write_trajectory(tmp_path / "path.txt", _cameras(1), layout="euroc")
     with pytest.raises(ProjectError, match="cannot be written"):
-        write_trajectory(tmp_path / "no" / "path.txt", _cameras(1))
+        (tmp_path / "file").write_text("no folder")
+        write_trajectory(tmp_path / "file" / "path.txt", _cameras(1))
 
 
 @pytest.mark.data

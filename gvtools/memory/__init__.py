@@ -5,4 +5,4 @@ from __future__ import annotations
 import numba
 
 # Open3D brings an older TBB, about which numba would warn at every start.
-numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]

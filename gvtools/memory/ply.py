@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
 from gvtools.files import replaced_when_written
+from gvtools.memory.thinning import thinned
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -111,7 +112,10 @@ def export_memory_ply(
     Returns:
         Points written, and the voxel edge they were thinned to (0 when all were kept).
     """
-    rows, edge = _thinned(memory, max_points)
+    rows, edge = np.arange(len(memory)), 0.0
+    if max_points is not None and len(memory) > max_points:
+        thin = thinned(memory, max_points)
+        rows, edge = thin.rows, thin.edge
     positions = memory.positions[rows]
     reach = float(np.abs(positions).max(initial=0))
     coordinate = "<f8" if reach * 2.0**-24 > 0.1 * memory.voxel else "<f4"
@@ -133,18 +137,3 @@ def export_memory_ply(
     vertices["generated"] = views.generated[view]
     write_ply(path, vertices, comments=("gvtools memory, input world frame, scene units",))
     return len(rows), edge
-
-
-def _thinned(memory: SpatialMemory, max_points: int | None) -> tuple[NDArray[np.int64], float]:
-    count = len(memory)
-    if max_points is None or count <= max_points:
-        return np.arange(count), 0.0
-    edge = memory.voxel
-    positions = memory.records.position.astype(np.float64)
-    order = np.argsort(-memory.confidence, kind="stable")
-    while True:
-        keys = np.floor(positions[order] / edge).astype(np.int64)
-        _, first = np.unique(keys, axis=0, return_index=True)
-        if len(first) <= max_points:
-            return np.sort(order[first]), edge
-        edge *= max(1.1, float(np.sqrt(len(first) / max_points)))

@@ -110,7 +110,7 @@ class SpatialMemory:
         self.voxel = float(voxel)
         self.origin: NDArray[np.float64] = np.array(origin, np.float64)
         if self.origin.shape != (3,) or not np.isfinite(self.origin).all():
-            raise ShapeError(f"memory origin {origin}; expected three finite numbers")
+            raise ShapeError(f"memory origin {self.origin.tolist()}; expected three finite numbers")
         self.options = options or MemoryOptions()
         self.records = Records()
         self.runs = Runs()
@@ -128,7 +128,7 @@ class SpatialMemory:
         return (
             f"SpatialMemory({len(self):,} observations ({generated:,} generated) in "
             f"{self.voxels:,} voxels of {self.voxel:g}, {len(self.views)} views, "
-            f"rounds {list(self.rounds)}, {self.nbytes / 2**20:.1f} MiB)"
+            f"rounds {self.rounds!r}, {self.nbytes / 2**20:.1f} MiB)"
         )
 
     @property

@@ -18,6 +18,7 @@ import numpy as np
 
 from gvtools.cameras import Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
+from gvtools.files import write_text
 from gvtools.scenes.images import read_depth, read_header
 from gvtools.scenes.lens_parameters import lens_parameters
 from gvtools.scenes.photographs import (
@@ -156,14 +157,7 @@ def write_transforms(
     if depth_paths is not None:
         data["depth_unit_scale_factor"] = 1.0
     text = json.dumps({**data, "frames": frames}, indent=2)
-    partial_path = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial_path.write_text(text, encoding="utf-8")
-        partial_path.replace(path)
-    except OSError as error:
-        partial_path.unlink(missing_ok=True)
-        raise ProjectError(f"{path}: could not be written ({error})") from None
+    write_text(path, text)
 
 
 def _relative(file: str | Path, folder: Path) -> str:

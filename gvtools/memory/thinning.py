@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory.spatial_memory import SpatialMemory
+if TYPE_CHECKING:
+    from gvtools.memory.spatial_memory import SpatialMemory
 
 # Three voxel indices fit one 64-bit key while the memory is below two million voxels a side.
 KEY_BITS = 21
