@@ -16,6 +16,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -123,9 +124,12 @@ def quality(context: list[Shot], targets: list[Shot], console: Console) -> list[
 
     Times are of the three taking turns on the same target, the first target being the warm-up.
     """
-    start = time.perf_counter()
-    memory = built(context, VOXEL)
-    ours_s = (time.perf_counter() - start) / len(context)
+    memories, ours_s = {}, {}
+    for voxel in (TSDF_VOXEL, VOXEL):
+        start = time.perf_counter()
+        memories[voxel] = built(context, voxel)
+        ours_s[voxel] = (time.perf_counter() - start) / len(context)
+    memory = memories[VOXEL]
     volume = open3d_peers.TsdfVolume(TSDF_VOXEL)
     start = time.perf_counter()
     for shot in context:
@@ -138,12 +142,15 @@ def quality(context: list[Shot], targets: list[Shot], console: Console) -> list[
     cloud_s = (time.perf_counter() - start) / len(context)
     del positions, colors
 
-    def project(camera: Cameras) -> tuple[NDArray[Any], NDArray[Any]]:
-        guidance = memory.project(camera)
+    def project(voxel: float, camera: Cameras) -> tuple[NDArray[Any], NDArray[Any]]:
+        guidance = memories[voxel].project(camera)
         return guidance.rgb[0], guidance.depth[0]
 
     methods: list[tuple[str, Callable[[Cameras], tuple[Any, Any]], float]] = [
-        ("ours", project, ours_s),
+        *(
+            (f"ours, {voxel * 1e3:g} mm", partial(project, voxel), ours_s[voxel])
+            for voxel in memories
+        ),
         (f"TSDF {TSDF_VOXEL * 1e3:g} mm, ray_cast", volume.ray_cast, volume_s),
         (
             f"voxel_down_sample {VOXEL * 1e3:g} mm, project_to_rgbd_image",
@@ -173,15 +180,16 @@ def quality(context: list[Shot], targets: list[Shot], console: Console) -> list[
         row["s_per_view"] = statistics.median(seconds)
         row["s_per_view_min"] = min(seconds)
     for row in rows:
-        row["ratio_to_ray_cast"] = row["s_per_view"] / rows[1]["s_per_view"]
-    rows[0]["bytes_per_observation"] = memory.nbytes / len(memory)
-    rows[0]["observations"], rows[0]["voxels"] = len(memory), memory.voxels
+        row["ratio_to_ray_cast"] = row["s_per_view"] / rows[len(memories)]["s_per_view"]
+    for row, stored in zip(rows, memories.values(), strict=False):
+        row["bytes_per_observation"] = stored.nbytes / len(stored)
+        row["observations"], row["voxels"] = len(stored), stored.voxels
     columns = ("method", "psnr_valid", "coverage", "s_per_view", "s_per_view_min",
                "ratio_to_ray_cast", "fuse_s_per_view")  # fmt: skip
     console.table(columns, [[row[column] for column in columns] for row in rows])
     console.line(
         f"{len(memory):,} observations in {memory.voxels:,} voxels, "
-        f"{rows[0]['bytes_per_observation']:.1f} bytes each"
+        f"{memory.nbytes / len(memory):.1f} bytes each"
     )
     return rows
 

@@ -198,6 +198,12 @@ class Reference:
         sampled &= ~np.isin(p.view, self.first) & ~memory.views.generated[p.view]
         at = np.flatnonzero(sampled)
         front = p.z[at] < margin * self.depth[row[at].astype(int), col[at].astype(int)]
+        n = len(p.z)
+        front &= ~in_free_space(
+            memory.records.position[:n][at],
+            memory.observed_grids(self.first),
+            tolerance=memory.options.free_space_tolerance,
+        )
         chosen = np.isin(p.run, p.run[at[front]])
         zbuffer = self._nearest_depth(chosen, margin * self.depth)
         keep = np.isfinite(zbuffer)

@@ -21,7 +21,6 @@ from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 from gvtools.memory import splat_kernels
-from gvtools.memory.occlusion import in_free_space
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -56,7 +55,7 @@ class SplatOptions:
     proximity: float = 4.0
     band: float = 0.05
     depth_reach: float = 0.5
-    blend_reach: float = 1.5
+    blend_reach: float = 1.4
     support: float = 0.5
     size_cap: float = 32.0
     occluders: bool = True
@@ -128,7 +127,7 @@ class Splatter(Protocol):
             blend: False stops after the depth pass.
 
         Returns:
-            (H, W) nearest depth, inf where none; of use without ``blend`` only.
+            (H, W) float32 nearest depth, ``limit`` where nothing is nearer.
         """
 
     def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
@@ -284,18 +283,20 @@ class _Projection:
 
     def _splat_tiers(self) -> None:
         """Nearest views first; each later tier writes what is still open."""
-        views, target = self.memory.runs.view, self.target
+        target = self.target
+        view = self.memory.runs.view[self.seen]
+        open_ = np.empty(target.shape, np.bool_)
+        limit = np.empty(target.shape, np.float32)
         for number, members in enumerate(self._tiers()):
             self.tier[members] = number
-            open_ = ~target.valid
-            chosen = self.seen[self.tier[views[self.seen]] == number]
+            splat_kernels.still_open(target.valid, open_, limit)
+            chosen = self.seen[self.tier[view] == number]
             table = None
             if number:
                 table = splat_kernels.summed_area(open_)
                 if not table[-1, -1]:
                     return
                 chosen = splat_kernels.touching(target.rect, table, chosen)
-            limit = np.where(open_, np.float32(np.inf), np.float32(0))
             self._write(chosen, limit, open_, members=members, table=table)
 
     def _write(
@@ -325,28 +326,22 @@ class _Projection:
         runs, records, K = memory.runs, memory.records, self.camera.K[0]
         view = runs.view[self.seen]
         later = self.seen[(self.tier[view] != 0) & ~memory.views.generated[view]]
+        seen_free = _stacked(memory.observed_grids(np.flatnonzero(self.tier == 0)))
+        tolerance = memory.options.free_space_tolerance
         chosen = splat_kernels.in_front(
             later, runs.start, runs.length, target.rect, self.z_range,
             records.x, records.y, records.z, target.cam_from_local, K,
-            target.depth, _tile_farthest(target.depth), 2 * self.options.band,
+            target.depth, splat_kernels.tile_farthest(target.depth), 2 * self.options.band,
+            *seen_free, tolerance,
         )  # fmt: skip
         if not len(chosen):
             return
         limit = target.depth * np.float32(1 - 2 * self.options.band)
         none = np.zeros(len(memory.views), np.float32)
         zbuffer = self.splatter.splat(target, chosen, limit, weight=none, table=None, blend=False)
-        rows, cols = np.nonzero(np.isfinite(zbuffer))
-        if not len(rows):
-            return
-        z = zbuffer[rows, cols].astype(np.float64)
-        y = (rows + 0.5 - K[1, 2]) / K[1, 1]
-        x = (cols + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
-        from_center = np.stack([x * z, y * z, z], axis=1) - target.cam_from_local[:3, 3]
-        local = (from_center @ target.cam_from_local[:3, :3]).astype(np.float32)
-        grids = memory.observed_grids(np.flatnonzero(self.tier == 0))
-        free = in_free_space(local, grids, tolerance=memory.options.free_space_tolerance)
-        front = np.zeros(target.shape, np.bool_)
-        front[rows[~free], cols[~free]] = True
+        front = splat_kernels.not_free(
+            zbuffer, limit, target.cam_from_local, K, *seen_free, tolerance
+        )
         # Slivers along silhouettes are what an error of a pixel in a pose looks like.
         front = splat_kernels.opened(front, OCCLUDER_SIDE)
         table = splat_kernels.summed_area(front)
@@ -357,9 +352,13 @@ class _Projection:
             self._write(chosen, limit, front, members=observed, table=table)
 
 
-def _tile_farthest(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The farthest depth in each tile of ``splat_kernels.TILE`` pixels."""
-    tile = splat_kernels.TILE
-    height, width = depth.shape
-    padded = np.pad(depth, ((0, -height % tile), (0, -width % tile)))
-    return padded.reshape(padded.shape[0] // tile, tile, -1, tile).max(axis=(1, 3))
+def _stacked(
+    grids: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
+    """K (T, 3, 3), cam_from_local (T, 4, 4) and the grids (T, h, w), padded with 0 = unknown."""
+    shape = np.max([grid.shape for _, _, grid in grids], axis=0, initial=1)
+    stack = np.zeros((len(grids), *shape), np.float32)
+    for row, (_, _, grid) in zip(stack, grids, strict=True):
+        row[: grid.shape[0], : grid.shape[1]] = grid
+    K = np.array([K for K, _, _ in grids]).reshape(-1, 3, 3)
+    return K, np.array([M for _, M, _ in grids]).reshape(-1, 4, 4), stack

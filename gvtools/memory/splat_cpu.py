@@ -53,9 +53,7 @@ class CpuSplatter:
             width, height, self.zbuffer.reshape(-1),
             self.total.reshape(-1, splat_kernels.CHANNELS),
         )  # fmt: skip
-        if blend:
-            return self.zbuffer
-        return np.where(self.zbuffer < limit, self.zbuffer, np.float32(np.inf))
+        return self.zbuffer
 
     def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
         """See gvtools.memory.splat.Splatter."""

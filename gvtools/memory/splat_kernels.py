@@ -10,6 +10,7 @@ import numpy as np
 from numba import prange
 
 from gvtools.memory.compiled import FAST, compiled
+from gvtools.memory.occlusion import seen_through
 
 # Channels of the accumulator: weighted rgb, weight, weighted z, kernel.
 CHANNELS = 6
@@ -102,11 +103,15 @@ def touching(rect, writable, runs):
 
 
 @compiled(parallel=True, fastmath=FAST)
-def in_front(runs, run_start, run_length, rect, z_range, x, y, z, M, K, depth, farthest, margin):
+def in_front(
+    runs, run_start, run_length, rect, z_range, x, y, z, M, K, depth, farthest, margin,
+    grid_K, grid_cam, grids, tolerance,
+):  # fmt: skip
     """Those of ``runs`` (n,) of which a sampled point lies in front of ``depth`` by ``margin``.
 
     A run wholly behind the farthest depth of its rectangle's tiles (``farthest``) is not sampled;
-    of the others, every SAMPLE-th point is looked up in the image.
+    of the others, every SAMPLE-th point is looked up in the image. A point in space that one of
+    the T views with free-space ``grids`` (T, h, w) saw through does not count.
     """
     height, width = depth.shape
     hit = np.zeros(len(runs), np.bool_)
@@ -129,10 +134,27 @@ def in_front(runs, run_start, run_length, rect, z_range, x, y, z, M, K, depth, f
             u = (K[0, 0] * px + K[0, 1] * py) / pz + K[0, 2]
             v = K[1, 1] * py / pz + K[1, 2]
             inside = u >= 0 and u < width and v >= 0 and v < height
-            if inside and pz < depth[np.int64(v), np.int64(u)] * share:
+            if not inside or pz >= depth[np.int64(v), np.int64(u)] * share:
+                continue
+            free = False
+            for t in range(len(grids)):
+                free = free or seen_through(
+                    x[p], y[p], z[p], grid_K[t], grid_cam[t], grids[t], tolerance
+                )
+            if not free:
                 hit[i] = True
                 break
     return runs[hit]
+
+
+@compiled(parallel=True)
+def still_open(valid, open_, limit):
+    """Write what later tiers may fill: ``open_`` where not ``valid``, and as limit inf or 0."""
+    for row in prange(valid.shape[0]):
+        for col in range(valid.shape[1]):
+            done = valid[row, col]
+            open_[row, col] = not done
+            limit[row, col] = np.float32(0) if done else np.float32(np.inf)
 
 
 @compiled()
@@ -172,14 +194,53 @@ def closed_off(u, v, reach, width, height, reachable):
     return not reachable[np.uint64(np.int64(v) * width + np.int64(u))]
 
 
-@compiled()
+@compiled(parallel=True)
+def tile_farthest(depth):
+    """The farthest depth of each tile of TILE pixels."""
+    height, width = depth.shape
+    out = np.zeros(((height + TILE - 1) // TILE, (width + TILE - 1) // TILE), np.float32)
+    for i in prange(out.shape[0]):
+        for row in range(i * TILE, min((i + 1) * TILE, height)):
+            for col in range(width):
+                out[i, col // TILE] = max(out[i, col // TILE], depth[row, col])
+    return out
+
+
+@compiled(parallel=True)
+def not_free(depth, limit, cam_from_local, K, grid_K, grid_cam, grids, tolerance):
+    """(H, W) bool: pixels with a depth below ``limit`` whose place no grid's view saw through."""
+    height, width = depth.shape
+    out = np.zeros((height, width), np.bool_)
+    for row in prange(height):
+        ry = (row + 0.5 - K[1, 2]) / K[1, 1]
+        for col in range(width):
+            z = np.float64(depth[row, col])
+            if not z < limit[row, col]:
+                continue
+            rx = (col + 0.5 - K[0, 2] - K[0, 1] * ry) / K[0, 0]
+            a = rx * z - cam_from_local[0, 3]
+            b = ry * z - cam_from_local[1, 3]
+            c = z - cam_from_local[2, 3]
+            M = cam_from_local
+            x = np.float32(M[0, 0] * a + M[1, 0] * b + M[2, 0] * c)
+            y = np.float32(M[0, 1] * a + M[1, 1] * b + M[2, 1] * c)
+            w = np.float32(M[0, 2] * a + M[1, 2] * b + M[2, 2] * c)
+            free = False
+            for t in range(len(grids)):
+                free = free or seen_through(x, y, w, grid_K[t], grid_cam[t], grids[t], tolerance)
+            out[row, col] = not free
+    return out
+
+
+@compiled(parallel=True)
 def opened(mask, side):
     """``mask`` without what holds no square of ``side`` pixels (odd) around any of its pixels."""
     half = side // 2
     height, width = mask.shape
     table = summed_area(mask)
     out = np.zeros_like(mask)
-    for row in range(half, height - half):
+    # Rows of several threads may write a pixel twice, but only ever the same True.
+    for row in prange(half, height - half):
         for col in range(half, width - half):
             if not mask[row, col]:
                 continue

@@ -119,7 +119,6 @@ class TorchSplatter:
                 squared = (col - u[i]) ** 2 + (row - v[i]) ** 2
                 kernel = (1 - squared / reach[i] ** 2).clamp(min=0) ** 2
                 self._add(cell, kernel, scale[i], rows[i], z=z[i])
-        zbuffer[zbuffer >= limits] = torch.inf
         return zbuffer.reshape(height, width).cpu().numpy()
 
     def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
