@@ -87,12 +87,10 @@ def compare_one_pixel(
     ordered = open3d_peers.cloud(points, colors)
     random = open3d_peers.cloud(points[shuffled], colors[shuffled])
 
-    def ours(_: int) -> tuple[NearestImage, NDArray[np.float32]]:
-        image = project_nearest((x, y, z), camera)
-        # Empty pixels are -1 and take the first point's colour, for the caller to mask.
-        return image, np.take(colors, image.index, axis=0, mode="clip")
+    def ours(_: int) -> NearestImage:
+        return project_nearest((x, y, z), camera, colors=colors)
 
-    image, _ = ours(0)
+    image = ours(0)
     peer_rgb, peer_depth = open3d_peers.one_pixel(ordered, camera)
     both = (image.index >= 0) & (peer_depth > 0)
     same = float((image.index == peer_rgb[..., 0].astype(np.int64))[both].mean())

@@ -36,7 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "memory's first view)",
     )
     parser.add_argument("--views", default="all", metavar="SPEC", help="which (all)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="for the pictures")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="for the pictures; with --against-images it may be left out, for the figures alone",
+    )
     parser.add_argument(
         "--against-images", action="store_true", help="compare with the project's own pictures"
     )
@@ -69,6 +74,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from pipelines.render_figures import measure, render_view, summary
     from pipelines.render_files import file_stems, write_view
 
+    if args.out is None and not args.against_images:
+        raise OptionError("--out: nothing would be left; give a folder, or --against-images")
     short = {"backend": args.backend, "device": args.device}
     given = [f"splat.{key}={value}" for key, value in short.items() if value is not None]
     options = splat_options([*given, *args.set])
@@ -89,7 +96,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     for name in console.track(names, "rendering"):
         guidance, seconds = render_view(memory, cameras[row_of[name]], options)
         frame = scene[name].load() if scene is not None and args.against_images else None
-        write_view(args.out, stems[name], guidance)
+        if args.out is not None:
+            write_view(args.out, stems[name], guidance)
         views.append(measure(name, guidance, frame, seconds=seconds))
     figures = summary(views, compared=args.against_images)
     if args.json is not None:
@@ -101,7 +109,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
         console.table(columns, [[row[column] for column in columns] for row in [*views, mean]])
         for key, reason in figures["notes"].items():
             console.line(f"{key}: {reason}")
-    console.line(f"{len(views)} views in {args.out}")
+    if args.out is not None:
+        console.line(f"{len(views)} views in {args.out}")
 
 
 def splat_options(texts: list[str]) -> SplatOptions:

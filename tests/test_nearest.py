@@ -146,3 +146,16 @@ def test_skew_is_honoured_here_and_refused_for_open3d():
     assert image.index[tuple(np.floor(xy[0, ::-1]).astype(int))] == 0
     with pytest.raises(OptionError, match="ignores skew and K has 8 px"):
         project_open3d(cloud, cloud, target)
+
+
+def test_the_winners_colours_come_along():
+    rng = np.random.default_rng(5)
+    cloud = rng.uniform((-1, -1, 1), (1, 1, 3), (500, 3)).astype(np.float32)
+    colors = rng.integers(1, 255, (500, 3)).astype(np.uint8)
+    image = project_nearest(_columns(cloud), camera(), colors=colors)
+    seen = image.index >= 0
+    assert seen.any()
+    assert not seen.all()
+    assert image.colors is not None
+    np.testing.assert_array_equal(image.colors[seen], colors[image.index[seen]])
+    assert not image.colors[~seen].any()

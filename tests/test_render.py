@@ -203,3 +203,13 @@ def test_an_unfinished_run_gives_its_last_round(box, tmp_path):
     target.write_bytes((box / "run" / "memory.npz").read_bytes())
     run(tmp_path, "--cameras", box / "project", "--views", "first:1", "--out", tmp_path / "out")
     assert (tmp_path / "out" / "view_0.rgb.png").is_file()
+
+
+def test_figures_alone_need_no_folder(box, tmp_path):
+    file = tmp_path / "figures.json"
+    words = (box / "run", "--cameras", box / "project", "--views", "view_1.png")
+    run(*words, "--against-images", "--json", file)
+    assert json.loads(file.read_text())["psnr"] > 0
+    assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]
+    with pytest.raises(OptionError, match="--against-images"):
+        run(*words)

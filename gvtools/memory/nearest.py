@@ -7,6 +7,7 @@ voxel order, so consecutive points hit neighbouring pixels and the buffer stays 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -27,10 +28,12 @@ class NearestImage:
     Attributes:
         depth: (H, W) float32 z-depth, scene units; 0 where empty.
         index: (H, W) int32, the winning point; -1 where empty. Equal depths go to the lower index.
+        colors: (H, W, 3), the winners' colours, 0 where empty; None when none were given.
     """
 
     depth: NDArray[np.float32]
     index: NDArray[np.int32]
+    colors: NDArray[Any] | None = None
 
 
 @compiled(fastmath=FAST)
@@ -97,10 +100,18 @@ def _merge(buffers, depth, bits, index):
             bits[i] = np.int32(key >> 32)
 
 
+@compiled(parallel=True)
+def _gather(colors, index, out):
+    for i in prange(len(index)):
+        for c in range(3):
+            out[i, c] = colors[index[i], c] if index[i] >= 0 else 0
+
+
 def project_nearest(
     xyz: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
     camera: Cameras,
     *,
+    colors: NDArray[Any] | None = None,
     origin: ArrayLike = (0.0, 0.0, 0.0),
     depth_max: float = np.inf,
 ) -> NearestImage:
@@ -109,6 +120,7 @@ def project_nearest(
     Args:
         xyz: x, y and z, (N,) float32 each, scene units, relative to ``origin``; N < 2³¹.
         camera: a batch of one.
+        colors: (N, 3) of any type, to be looked up for the winners.
         origin: (3,) world frame.
         depth_max: points beyond are left out, scene units.
     """
@@ -128,7 +140,12 @@ def project_nearest(
     depth = np.empty(height * width, np.float32)
     index = np.empty(height * width, np.int32)
     _merge(buffers[:, : height * width], depth, depth.view(np.int32), index)
-    return NearestImage(depth.reshape(height, width), index.reshape(height, width))
+    rgb = None
+    if colors is not None:
+        rgb = np.empty((height * width, 3), colors.dtype)
+        _gather(colors, index, rgb)
+        rgb = rgb.reshape(height, width, 3)
+    return NearestImage(depth.reshape(height, width), index.reshape(height, width), rgb)
 
 
 def project_open3d(
