@@ -6,6 +6,7 @@ beside the export: one name a line and, where a run has it, the path of the pict
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -152,15 +153,25 @@ def _tracks(
 
 def _generated_pictures(memory: SpatialMemory, run: Path) -> dict[str, Path | None]:
     """Names of the generated views, and the pictures that a run kept of them."""
-    from pipelines.round_files import file_stem
-
     out: dict[str, Path | None] = {}
     for i in np.flatnonzero(memory.views.generated):
         source = memory.views[int(i)]
         name = source.camera.names[0]
-        picture = run / f"round_{source.round:03d}" / f"generated_{file_stem(name)}.png"
+        folder = run / f"round_{source.round:03d}"
+        picture = folder / f"generated_{_stem(folder, name)}.png"
         out[name] = picture if picture.is_file() else None
     return out
+
+
+def _stem(folder: Path, name: str) -> str:
+    """By what a round's files call a target."""
+    from pipelines.round_files import target_stems
+
+    try:
+        views = json.loads((folder / "report.json").read_text(encoding="utf-8"))["views"]
+        return next(view["stem"] for view in views if view["name"] == name)
+    except (OSError, ValueError, KeyError, StopIteration):
+        return target_stems((name,))[0]
 
 
 def _write_generated(memory: SpatialMemory, path: Path, run: Path) -> int:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.round_files import file_stem, read_png
+from pipelines.round_files import read_png
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -42,7 +42,7 @@ def measure_run(
                 "coverage_after": entry["coverage_after"],
             }
             if truth is not None:
-                figures |= _against(truth, directory.round_path(number))
+                figures |= _against(truth, directory.round_path(number), entry["stem"])
             views.append(figures)
     notes = ["lpips is null: no perceptual network is part of this version"]
     if not any("psnr" in view for view in views):
@@ -73,11 +73,10 @@ def mean_of(views: list[dict[str, Any]], name: str) -> float | None:
     return float(np.mean(values)) if values else None
 
 
-def _against(truth: Any, folder: Path) -> dict[str, Any]:
+def _against(truth: Any, folder: Path, stem: str) -> dict[str, Any]:
     from gvtools.evaluation.images import psnr, relative_depth_error, ssim
 
     frame = truth.load()
-    stem = file_stem(truth.name)
     reference = frame.rgb.astype(np.float32) / 255
     completed = read_png(folder / f"generated_{stem}.png").astype(np.float32) / 255
     guidance = read_png(folder / f"guidance_{stem}.png").astype(np.float32) / 255

@@ -303,7 +303,7 @@ def _round(
 ) -> dict[str, Any]:
     from gvtools.completers.base import create
     from pipelines import rounds
-    from pipelines.round_files import write_target
+    from pipelines.round_files import target_stems, write_target
 
     clock = rounds.Clock()
     start = time.perf_counter()
@@ -329,9 +329,12 @@ def _round(
         with clock.stage("project"):
             grown = [memory.project(camera, options=plan.config.splat) for camera in cameras]
         after = _mean([guidance.coverage for guidance in grown])
-        for result, guidance in zip(results, grown, strict=True):
-            write_target(folder, result, guidance)
-            views.append({**result.report, "coverage_after": guidance.coverage})
+        stems = target_stems(plan.targets.cameras.names)
+        rows = plan.schedule[number - 1]
+        for row, result, guidance in zip(rows, results, grown, strict=True):
+            write_target(folder, stems[row], result, guidance)
+            added = {"stem": stems[row], "coverage_after": guidance.coverage}
+            views.append({**result.report, **added})
     generated = int(memory.generated.sum())
     return {
         "round": number,

@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.guidance import Guidance
+from pipelines.render_files import file_stems
 from pipelines.rounds import TargetResult
 
 
-def file_stem(name: str) -> str:
-    """A view's name as part of a file name: without folders and ending."""
-    return str(PurePosixPath(name).with_suffix("")).replace("/", "__")
+def target_stems(names: Sequence[str]) -> tuple[str, ...]:
+    """For each target a distinct part of file names: without folders, and mostly without ending."""
+    stems = [str(stem).replace("/", "__") for stem in file_stems(names).values()]
+    twice = {stem.lower() for stem in stems if [s.lower() for s in stems].count(stem.lower()) > 1}
+    return tuple(f"{s}_{i:04d}" if s.lower() in twice else s for i, s in enumerate(stems))
 
 
-def write_target(folder: Path, result: TargetResult, after: Guidance) -> None:
+def write_target(folder: Path, stem: str, result: TargetResult, after: Guidance) -> None:
     """Write what the memory knew of a target, what the completer made, and what memory knows now.
 
     ``guidance_NAME.png`` (holes black), ``valid_NAME.png``, ``generated_NAME.png`` (the completed
     picture), ``after_NAME.png`` (the memory after the round), and ``depth_NAME.npz`` with the keys
-    guidance and completion (float32 z-depth, scene units, 0 = none) and fused (bool).
+    guidance and completion (float32 z-depth, scene units, 0 = none) and fused (bool). NAME is the
+    target's stem, see target_stems.
     """
-    stem = file_stem(result.guidance.cameras.names[0])
     write_png(folder / f"guidance_{stem}.png", to_bytes(result.guidance.rgb[0]))
     write_png(folder / f"valid_{stem}.png", result.guidance.valid[0].astype(np.uint8) * 255)
     write_png(folder / f"generated_{stem}.png", to_bytes(result.completion.rgb[0]))

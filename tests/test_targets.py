@@ -8,6 +8,7 @@ from gvtools.errors import OptionError
 from gvtools.scenes.project import open_project
 from gvtools.trajectory_files import write_trajectory
 from pipelines.reconstruct import make_schedule
+from pipelines.round_files import target_stems
 from pipelines.targets import resolve_targets
 
 
@@ -76,3 +77,11 @@ def test_the_schedule_takes_targets_in_order(targets, size, rounds, expected):
     assert tuple(len(rows) for rows in schedule) == expected
     assert [row for rows in schedule for row in rows] == list(range(sum(expected)))
     assert all(len(rows) <= size for rows in schedule)
+
+
+def test_targets_with_alike_names_have_files_of_their_own():
+    names = ("a.png", "a.jpg", "sub/a.png", "sub__a.png", "b.png", "interpolate_0001")
+    stems = target_stems(names)
+    assert len({stem.lower() for stem in stems}) == len(names)
+    assert not any("/" in stem for stem in stems)
+    assert stems[4:] == ("b", "interpolate_0001")
