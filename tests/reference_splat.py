@@ -11,10 +11,10 @@ import numpy as np
 
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
+from gvtools.memory.culling import NEAR, SAMPLE
 from gvtools.memory.occlusion import in_free_space
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat import NEAREST, OCCLUDER_SIDE, SplatOptions
-from gvtools.memory.splat_kernels import NEAR, SAMPLE
 
 
 @dataclass

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
-from gvtools.memory import splat_kernels
+from gvtools.memory import culling
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -78,7 +78,7 @@ class Target:
     Attributes:
         camera: a batch of one.
         cam_from_local: (4, 4) float64, from the memory's frame.
-        rect: (R, 4) int32, image rectangle of each run, see splat_kernels.cull_runs.
+        rect: (R, 4) int32, image rectangle of each run, see culling.cull_runs.
         near: what is nearer is behind or inside the camera, scene units.
         rgb: (H, W, 3) float32 in [0, 1].
         depth: (H, W) float32, scene units.
@@ -263,7 +263,7 @@ class _Projection:
         z_range: NDArray[np.float32],
     ) -> None:
         height, width = self.target.shape
-        splat_kernels.cull_runs(
+        culling.cull_runs(
             boxes, rows, self.target.cam_from_local, self.camera.K[0], width, height,
             self.options.blend_reach, rect, z_range,
         )  # fmt: skip
@@ -289,14 +289,14 @@ class _Projection:
         limit = np.empty(target.shape, np.float32)
         for number, members in enumerate(self._tiers()):
             self.tier[members] = number
-            splat_kernels.still_open(target.valid, open_, limit)
+            culling.still_open(target.valid, open_, limit)
             chosen = self.seen[self.tier[view] == number]
             table = None
             if number:
-                table = splat_kernels.summed_area(open_)
+                table = culling.summed_area(open_)
                 if not table[-1, -1]:
                     return
-                chosen = splat_kernels.touching(target.rect, table, chosen)
+                chosen = culling.touching(target.rect, table, chosen)
             self._write(chosen, limit, open_, members=members, table=table)
 
     def _write(
@@ -328,10 +328,10 @@ class _Projection:
         later = self.seen[(self.tier[view] != 0) & ~memory.views.generated[view]]
         seen_free = _stacked(memory.observed_grids(np.flatnonzero(self.tier == 0)))
         tolerance = memory.options.free_space_tolerance
-        chosen = splat_kernels.in_front(
+        chosen = culling.in_front(
             later, runs.start, runs.length, target.rect, self.z_range,
             records.x, records.y, records.z, target.cam_from_local, K,
-            target.depth, splat_kernels.tile_farthest(target.depth), 2 * self.options.band,
+            target.depth, culling.tile_farthest(target.depth), 2 * self.options.band,
             *seen_free, tolerance,
         )  # fmt: skip
         if not len(chosen):
@@ -339,14 +339,12 @@ class _Projection:
         limit = target.depth * np.float32(1 - 2 * self.options.band)
         none = np.zeros(len(memory.views), np.float32)
         zbuffer = self.splatter.splat(target, chosen, limit, weight=none, table=None, blend=False)
-        front = splat_kernels.not_free(
-            zbuffer, limit, target.cam_from_local, K, *seen_free, tolerance
-        )
+        front = culling.not_free(zbuffer, limit, target.cam_from_local, K, *seen_free, tolerance)
         # Slivers along silhouettes are what an error of a pixel in a pose looks like.
-        front = splat_kernels.opened(front, OCCLUDER_SIDE)
-        table = splat_kernels.summed_area(front)
+        front = culling.opened(front, OCCLUDER_SIDE)
+        table = culling.summed_area(front)
         if table[-1, -1]:
-            chosen = splat_kernels.touching(target.rect, table, chosen)
+            chosen = culling.touching(target.rect, table, chosen)
             limit = np.where(front, limit, np.float32(0))
             observed = self.ranked[~memory.views.generated[self.ranked]]
             self._write(chosen, limit, front, members=observed, table=table)

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory import splat_kernels
+from gvtools.memory import culling, splat_kernels
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -40,7 +40,7 @@ class CpuSplatter:
             self.total = np.empty((height, width, splat_kernels.CHANNELS), np.float32)
         memory, options = self.memory, self.options
         records, runs = memory.records, memory.runs
-        reachable = np.empty(0, np.bool_) if table is None else splat_kernels.near_to(table)
+        reachable = np.empty(0, np.bool_) if table is None else culling.near_to(table)
         splat_kernels.splat_runs(
             chosen, runs.start, runs.length, runs.view, target.rect,
             records.x, records.y, records.z, records.color, records.confidence,
