@@ -209,5 +209,5 @@ def _converted(key: str, kind: Any, value: Any) -> Any:
                 return str(value)
         except (TypeError, ValueError, OverflowError):
             continue
-    name = getattr(kind, "__name__", str(kind))
-    raise OptionError(f"setting {key}={value!r}; expected {name}")
+    names = ["auto" if choice is type(None) else choice.__name__ for choice in choices]
+    raise OptionError(f"setting {key}={value!r}; expected {' or '.join(names)}")
