@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -140,7 +141,10 @@ def with_settings(config: RunConfig, texts: Iterable[str]) -> RunConfig:
         key, equals, value = text.partition("=")
         if not equals:
             raise OptionError(f"--set {text!r}; expected KEY=VALUE, such as splat.band=0.03")
-        config = with_setting(config, key.strip(), value.strip())
+        if key.strip() == "profile":
+            config = with_profile(config, value.strip())
+        else:
+            config = with_setting(config, key.strip(), value.strip())
     return config
 
 
@@ -204,7 +208,8 @@ def _converted(key: str, kind: Any, value: Any) -> Any:
             elif choice is int and float(value) == int(float(value)):
                 return int(float(value))
             elif choice is float and not isinstance(value, bool):
-                return float(value)
+                if math.isfinite(float(value)):
+                    return float(value)
             elif choice is str:
                 return str(value)
         except (TypeError, ValueError, OverflowError):

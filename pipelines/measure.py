@@ -91,6 +91,8 @@ def _against(truth: Any, folder: Path, stem: str) -> dict[str, Any]:
         "ssim": ssim(completed, reference, mask=usable),
     }
     if frame.depth is not None:
-        figures["depth_rel_valid"] = relative_depth_error(known, frame.depth, mask=valid)
-        figures["depth_rel_generated"] = relative_depth_error(made, frame.depth, mask=~valid)
+        figures["depth_rel_valid"] = relative_depth_error(known, frame.depth, mask=valid & usable)
+        figures["depth_rel_generated"] = relative_depth_error(
+            made, frame.depth, mask=~valid & usable
+        )
     return figures

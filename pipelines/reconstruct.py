@@ -149,6 +149,7 @@ def reconstruct(
     identity = {
         "project": str(scene.root.resolve()),
         "fingerprint": fingerprint([*files, *plan.targets.files]),
+        "cameras": _camera_digest(plan),
         "config": plan.config.to_dict(),
         "context": list(plan.context),
         "targets": list(plan.targets.cameras.names),
@@ -162,6 +163,9 @@ def reconstruct(
         console.line(f"resuming after round {done - 1}")
         kept = directory.round_memory(done - 1)
         memory = SpatialMemory.load(kept if kept.exists() else out / "memory.npz")
+        # A finished run's memory holds every round, also one whose folder was removed since.
+        for later in [number for number in reversed(memory.rounds) if number >= done]:
+            memory.forget(round=later)
     context: list[ContextView] | None = None
     for number in range(done, len(plan.schedule) + 1):
         if number and context is None:
@@ -175,6 +179,17 @@ def reconstruct(
         console.line(_round_line(report))
     _finish(plan, memory, directory, console)
     return out
+
+
+def _camera_digest(plan: Plan) -> str:
+    """A digest of the intrinsics, poses and sizes of context and targets."""
+    import hashlib
+
+    digest = hashlib.sha256()
+    for cameras in (plan.scene.subset(plan.context).cameras, plan.targets.cameras):
+        for array in (cameras.K, cameras.cam_from_world, cameras.width, cameras.height):
+            digest.update(array.tobytes())
+    return digest.hexdigest()
 
 
 def make_plan(scene: Scene, config: RunConfig) -> Plan:

@@ -18,7 +18,15 @@ def target_stems(names: Sequence[str]) -> tuple[str, ...]:
     """For each target a distinct part of file names: without folders, and mostly without ending."""
     stems = [str(stem).replace("/", "__") for stem in file_stems(names).values()]
     twice = {stem.lower() for stem in stems if [s.lower() for s in stems].count(stem.lower()) > 1}
-    return tuple(f"{s}_{i:04d}" if s.lower() in twice else s for i, s in enumerate(stems))
+    taken = {stem.lower() for stem in stems} - twice
+    out = []
+    for i, stem in enumerate(stems):
+        candidate, number = stem, i
+        while stem.lower() in twice and (candidate == stem or candidate.lower() in taken):
+            candidate, number = f"{stem}_{number:04d}", number + len(stems)
+        taken.add(candidate.lower())
+        out.append(candidate)
+    return tuple(out)
 
 
 def write_target(folder: Path, stem: str, result: TargetResult, after: Guidance) -> None:

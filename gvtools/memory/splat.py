@@ -63,6 +63,11 @@ class SplatOptions:
     device: str = "auto"
 
     def __post_init__(self) -> None:
+        if self.nearest_views < 1:
+            raise OptionError(f"splat.nearest_views {self.nearest_views}; expected at least 1")
+        for key in ("band", "depth_reach", "blend_reach", "support", "size_cap"):
+            if not getattr(self, key) > 0:
+                raise OptionError(f"splat.{key} {getattr(self, key)}; expected more than 0")
         for name, value, known in (
             ("backend", self.backend, BACKENDS),
             ("device", self.device, DEVICES),
