@@ -51,6 +51,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _refuse_foreign(form: str, out: Path) -> None:
+    """Keep models and transforms that an export did not write: those have no generated.txt."""
+    found: list[Path] = []
+    if form == "colmap":
+        found = [path for path in (out / "sparse", out / "cameras.bin") if path.exists()]
+        side = out
+    elif form == "transforms":
+        file = out if out.suffix == ".json" else out / "transforms.json"
+        found = [file] if file.is_file() else []
+        side = file.parent
+    if found and not list(side.rglob("*generated.txt")):
+        raise OptionError(
+            f"{found[0]}: is there already and is no export of gvtools; give another --out"
+        )
+
+
 def run(args: argparse.Namespace, console: Console) -> None:
     """Write the export.
 
@@ -68,6 +84,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             f"--format {args.format}: {args.memory} is a PLY, which holds no cameras; give the "
             "run's folder or its memory.npz"
         )
+    _refuse_foreign(args.format, args.out)
     memory = open_memory(args.memory, up_to=args.round)
     if not len(memory):
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
