@@ -13,7 +13,8 @@ from typing import Any, get_type_hints
 from gvtools.errors import OptionError
 from gvtools.memory.back_projection import BackProjectionOptions
 from gvtools.memory.spatial_memory import MemoryOptions
-from gvtools.memory.splat import SplatOptions
+from gvtools.memory.splat import DEVICES, SplatOptions
+from gvtools.options import check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +34,12 @@ class FusionOptions:
     max_scale_residual: float = 0.1
     voxel_percentile: float = 50.0
     voxel_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_range("fusion.min_confidence", self.min_confidence, least=0, most=1)
+        check_range("fusion.max_scale_residual", self.max_scale_residual, above=0)
+        check_range("fusion.voxel_percentile", self.voxel_percentile, least=0, most=100)
+        check_range("fusion.voxel_scale", self.voxel_scale, above=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +82,14 @@ class RunConfig:
     splat: SplatOptions = field(default_factory=SplatOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
     completer_options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_range("views_per_round", self.views_per_round, least=1)
+        check_range("rounds", self.rounds, least=0)
+        check_range("voxel", self.voxel, above=0)
+        check_range("seed", self.seed, least=0)
+        if self.device not in DEVICES:
+            raise OptionError(f"device {self.device!r}; expected one of {', '.join(DEVICES)}")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""

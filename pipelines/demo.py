@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipelines.console import Console
-from pipelines.reconstruct import add_run_arguments, config_from, reconstruct
+from pipelines.reconstruct import add_run_arguments, config_from, copy_figures, reconstruct
+from pipelines.run_directory import RunDirectory
 
 SUMMARY = "run the main job on a sample that needs no download"
 EXAMPLES = (
@@ -18,7 +19,10 @@ SAMPLES = ("room", "motorcycle")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``demo``: the sample, and every option of ``reconstruct``."""
+    """The options of ``demo``: the sample, and every option of ``reconstruct``.
+
+    The sample is written beside the run also with ``--dry-run``, which opens it.
+    """
     parser.add_argument("--sample", choices=SAMPLES, default="room", help="default room")
     add_run_arguments(parser, out_required=False)
 
@@ -26,7 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run ``gvtools demo``: write the sample, reconstruct it, say where the results are."""
     config = config_from(args)
-    out = args.out or free_folder(Path("runs") / f"demo-{args.sample}", resume=args.resume)
+    default = Path("runs") / f"demo-{args.sample}"
+    # Absolute, since the sample's folder is named after it, and "." has no name.
+    out = args.out.absolute() if args.out else free_folder(default, resume=args.resume)
+    RunDirectory(out).refuse_foreign()
     sample = out.with_name(f"{out.name}-sample")
     console.line(f"sample {args.sample}, seed {config.seed}: writing {sample}")
     context, targets = _write(args.sample, sample, config.seed)
@@ -46,6 +53,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         resume=args.resume,
         dry_run=args.dry_run,
     )
+    copy_figures(args, out)
     if not args.dry_run:
         console.line(
             f"look at {out / 'growth.png'} and at the pictures in {out}/round_001: guidance_* is "

@@ -11,6 +11,7 @@ from gvtools.errors import OptionError
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
     from pipelines.console import Console
+    from pipelines.export_cameras import Written
 
 SUMMARY = "write a memory as PLY, COLMAP model, transforms.json or GLB, in the input's frame"
 EXAMPLES = (
@@ -52,18 +53,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _refuse_foreign(form: str, out: Path) -> None:
-    """Keep models and transforms that an export did not write: those have no generated.txt."""
-    found: list[Path] = []
-    if form == "colmap":
-        found = [path for path in (out / "sparse", out / "cameras.bin") if path.exists()]
-        side = out
-    elif form == "transforms":
-        file = out if out.suffix == ".json" else out / "transforms.json"
-        found = [file] if file.is_file() else []
-        side = file.parent
-    if found and not list(side.rglob("*generated.txt")):
+    """Keep models and transforms that no export wrote."""
+    from pipelines.export_cameras import foreign_model, foreign_transforms
+
+    found = foreign_model(out) if form == "colmap" else foreign_transforms(out)
+    if found is not None:
         raise OptionError(
-            f"{found[0]}: is there already and is no export of gvtools; give another --out"
+            f"{found}: is there already and was not written by gvtools export; expected a free "
+            "place or an earlier export; give another --out"
         )
 
 
@@ -84,7 +81,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
             f"--format {args.format}: {args.memory} is a PLY, which holds no cameras; give the "
             "run's folder or its memory.npz"
         )
-    _refuse_foreign(args.format, args.out)
+    if args.format in ("colmap", "transforms"):
+        _refuse_foreign(args.format, args.out)
     memory = open_memory(args.memory, up_to=args.round)
     if not len(memory):
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
@@ -98,7 +96,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
         written = write_colmap_export(memory, args.out, max_points=limit, run=args.memory)
         console.line(
-            f"{written.views} views ({written.generated} generated), {written.points} points of "
+            f"{_views(written)}, {written.points} points of "
             f"{len(memory)} observations (voxels of {written.edge:.4g}), {written.elements} track "
             f"elements in {args.out}/sparse/0; no pictures are copied"
         )
@@ -106,7 +104,12 @@ def run(args: argparse.Namespace, console: Console) -> None:
         from pipelines.export_cameras import write_transforms_export
 
         written = write_transforms_export(memory, args.out, images=args.images, run=args.memory)
-        console.line(f"{written.views} views ({written.generated} generated) in {args.out}")
+        console.line(f"{_views(written)} in {args.out}")
+
+
+def _views(written: Written) -> str:
+    renamed = f", {written.renamed} of them renamed as other cameras have their names"
+    return f"{written.views} views ({written.generated} generated{renamed * bool(written.renamed)})"
 
 
 def _ply(memory: SpatialMemory, path: Path, limit: int | None, console: Console) -> None:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.round_files import read_png
+from pipelines.round_files import SUPPORT_OBSERVED, read_png
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
     from pipelines.console import Console
-    from pipelines.reconstruct import Plan
+    from pipelines.plan import Plan
     from pipelines.run_directory import RunDirectory
 
 FIGURES = (
@@ -25,8 +25,10 @@ def measure_run(
 ) -> dict[str, Any]:
     """Means over the targets that have a truth, and the figures of each view.
 
-    ``psnr`` and ``ssim`` are of the completed picture, on all pixels; ``_valid`` on what memory
-    knew before the round, ``_generated`` on what the completer made.
+    ``psnr`` and ``ssim`` are of the completed picture, on all pixels. ``_valid`` is of the memory,
+    on the pixels that observations support; ``_generated`` of the completed picture, on all others
+    that it fills, by a completer's hand in this round or an earlier one. ``coverage`` is the share
+    that memory supports before the round, ``coverage_after`` after it.
     """
     views: list[dict[str, Any]] = []
     reports = directory.reports()
@@ -80,19 +82,18 @@ def _against(truth: Any, folder: Path, stem: str) -> dict[str, Any]:
     reference = frame.rgb.astype(np.float32) / 255
     completed = read_png(folder / f"generated_{stem}.png").astype(np.float32) / 255
     guidance = read_png(folder / f"guidance_{stem}.png").astype(np.float32) / 255
-    valid = read_png(folder / f"valid_{stem}.png") > 0
-    usable = np.ones_like(valid) if frame.mask is None else frame.mask
+    observed = read_png(folder / f"valid_{stem}.png") == SUPPORT_OBSERVED
+    usable = np.ones_like(observed) if frame.mask is None else frame.mask
     with np.load(folder / f"depth_{stem}.npz", allow_pickle=False) as stored:
         known, made = stored["guidance"], stored["completion"]
     figures: dict[str, Any] = {
         "psnr": psnr(completed, reference, mask=usable),
-        "psnr_valid": psnr(guidance, reference, mask=valid & usable),
-        "psnr_generated": psnr(completed, reference, mask=~valid & (made > 0) & usable),
+        "psnr_valid": psnr(guidance, reference, mask=observed & usable),
+        "psnr_generated": psnr(completed, reference, mask=~observed & (made > 0) & usable),
         "ssim": ssim(completed, reference, mask=usable),
     }
     if frame.depth is not None:
-        figures["depth_rel_valid"] = relative_depth_error(known, frame.depth, mask=valid & usable)
-        figures["depth_rel_generated"] = relative_depth_error(
-            made, frame.depth, mask=~valid & usable
-        )
+        for key, depth, mask in (("valid", known, observed), ("generated", made, ~observed)):
+            error = relative_depth_error(depth, frame.depth, mask=mask & usable)
+            figures[f"depth_rel_{key}"] = error
     return figures

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -23,23 +24,39 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".p
 def file_stems(names: Sequence[str]) -> dict[str, PurePosixPath]:
     """For each view name the path that its files start with, below the output folder.
 
-    An image suffix is left out, unless two views then had the same files.
+    An image suffix is left out, unless two views then had the same files; where whole names differ
+    in case alone, or in how they write one path, all but one get a number. No two stems are the
+    same for a file system that ignores case, and their order in ``names`` plays no part.
 
     Raises:
         OptionError: a name that leads out of the folder.
     """
-    short = {}
+    whole, stems = {}, {}
     for name in names:
         path = PurePosixPath(name.replace("\\", "/"))
         if path.is_absolute() or ".." in path.parts or not path.name:
             raise OptionError(f"view {name!r}: leads out of the output folder; rename the view")
-        short[name] = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
-    # File systems that ignore case would mix a.png with A.jpg.
-    count = Counter(str(path).lower() for path in short.values())
-    return {
-        name: path if count[str(path).lower()] == 1 else PurePosixPath(name.replace("\\", "/"))
-        for name, path in short.items()
-    }
+        whole[name] = path
+        stems[name] = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+    # A whole name may be what another one is without its suffix, so look again after each change.
+    while shared := [name for name in _alike(stems) if stems[name] != whole[name]]:
+        stems |= {name: whole[name] for name in shared}
+    taken = {str(path).lower() for path in stems.values()}
+    seen: set[str] = set()
+    for name in sorted(_alike(stems)):
+        path = stems[name]
+        if str(path).lower() in seen:
+            numbered = (path.with_name(f"{path.name}_{number}") for number in count(2))
+            stems[name] = next(path for path in numbered if str(path).lower() not in taken)
+            taken.add(str(stems[name]).lower())
+        seen.add(str(path).lower())
+    return stems
+
+
+def _alike(stems: dict[str, PurePosixPath]) -> list[str]:
+    """The names whose stems are not theirs alone. File systems may ignore case."""
+    number = Counter(str(path).lower() for path in stems.values())
+    return [name for name, path in stems.items() if number[str(path).lower()] > 1]
 
 
 def write_view(folder: Path, stem: PurePosixPath, guidance: Guidance) -> None:

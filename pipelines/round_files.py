@@ -13,6 +13,10 @@ from gvtools.guidance import Guidance
 from pipelines.render_files import file_stems
 from pipelines.rounds import TargetResult
 
+# Grey levels of valid_NAME.png.
+SUPPORT_OBSERVED = 255
+SUPPORT_GENERATED = 128
+
 
 def target_stems(names: Sequence[str]) -> tuple[str, ...]:
     """For each target a distinct part of file names: without folders, and mostly without ending."""
@@ -30,15 +34,19 @@ def target_stems(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def write_target(folder: Path, stem: str, result: TargetResult, after: Guidance) -> None:
-    """Write what the memory knew of a target, what the completer made, and what memory knows now.
+    """Write what the completer of a target was given, what it made, and what memory knows now.
 
-    ``guidance_NAME.png`` (holes black), ``valid_NAME.png``, ``generated_NAME.png`` (the completed
+    ``guidance_NAME.png`` (holes black), ``valid_NAME.png`` (where the guidance stands on what was
+    observed 255, on what was generated before 128, holes 0), ``generated_NAME.png`` (the completed
     picture), ``after_NAME.png`` (the memory after the round), and ``depth_NAME.npz`` with the keys
     guidance and completion (float32 z-depth, scene units, 0 = none) and fused (bool). NAME is the
     target's stem, see target_stems.
     """
+    guidance = result.guidance
+    support = np.where(guidance.generated[0], SUPPORT_GENERATED, SUPPORT_OBSERVED)
+    support = np.where(guidance.valid[0], support, 0).astype(np.uint8)
     write_png(folder / f"guidance_{stem}.png", to_bytes(result.guidance.rgb[0]))
-    write_png(folder / f"valid_{stem}.png", result.guidance.valid[0].astype(np.uint8) * 255)
+    write_png(folder / f"valid_{stem}.png", support)
     write_png(folder / f"generated_{stem}.png", to_bytes(result.completion.rgb[0]))
     write_png(folder / f"after_{stem}.png", to_bytes(after.rgb[0]))
     np.savez_compressed(

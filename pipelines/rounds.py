@@ -46,7 +46,8 @@ class TargetResult:
     """One completed target.
 
     Attributes:
-        guidance: what memory knew before the round, a batch of one.
+        guidance: what the completer was given, a batch of one; a completer that takes one target
+            at a time is given what earlier targets of the round added, too.
         completion: what the completer made of it, a batch of one.
         fused: which pixels went to fusion.
         report: figures of the view for the round's report.
@@ -92,6 +93,12 @@ def observe_context(
             total += memory.fuse(points, round=0)
         for reason, count in points.dropped.items():
             dropped[reason] = dropped.get(reason, 0) + count
+    if not len(memory) and total.out_of_reach:
+        raise ProjectError(
+            f"{scene.root}: all {total.out_of_reach} points of the context lie beyond the "
+            f"{memory.reach:.3g} scene units that voxels of {memory.voxel:g} reach from the "
+            "cameras; expected a greater voxel edge; leave --voxel out, or look at the depth's unit"
+        )
     if not len(memory):
         raise ProjectError(
             f"{scene.root}: the context's depth gave no point; look at 'gvtools check' and at the "
@@ -193,7 +200,7 @@ def _align_and_fuse(
             max_residual=config.fusion.max_scale_residual,
         )
     made = ~valid & (depth > 0)
-    fused = made & (confidence >= config.fusion.min_confidence)
+    fused = made & (confidence >= config.fusion.min_confidence) & (confidence > 0)
     report = FuseReport()
     if not fit.ok:
         fused = np.zeros_like(fused)
@@ -204,14 +211,15 @@ def _align_and_fuse(
                 (depth * np.float32(fit.scale)).astype(np.float32),
                 guidance.cameras,
                 origin=memory.origin,
-                confidence=np.where(confidence > 0, confidence, np.float32(1)),
+                # Unused outside the mask, where it must still be positive.
+                confidence=np.where(fused, confidence, np.float32(1)),
                 mask=fused,
                 options=config.back_projection,
             )
             report = memory.fuse(points, round=number, generated=True)
     figures = {
         "name": guidance.cameras.names[0],
-        "coverage": guidance.coverage,
+        "observed": float((valid & ~guidance.generated[0]).mean()),
         "completed": float((valid | made).mean()),
         "fused_pixels": int(fused.sum()),
         "scale": {

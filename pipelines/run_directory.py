@@ -6,12 +6,11 @@ kill at any moment leaves whole rounds only. The next round drops the previous o
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,19 +19,6 @@ import gvtools
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
 from pipelines.console import write_json
-
-
-def fingerprint(files: Iterable[Path]) -> str:
-    """A digest of the names, sizes and modification times of what a run reads."""
-    digest = hashlib.sha256()
-    for path in sorted(set(files)):
-        try:
-            status = path.stat()
-        except OSError:
-            digest.update(f"{path.name}:absent\n".encode())
-            continue
-        digest.update(f"{path.name}:{status.st_size}:{status.st_mtime_ns}\n".encode())
-    return digest.hexdigest()
 
 
 def versions() -> dict[str, str]:
@@ -54,32 +40,79 @@ class RunDirectory:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def start(self, identity: dict[str, Any], *, resume: bool) -> int:
-        """Make or take up the folder; returns the number of rounds that are done.
+    def refuse_foreign(self) -> None:
+        """Refuse a path that holds something other than a run.
+
+        Raises:
+            ProjectError: a file, or a folder with files but no run.json.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise ProjectError(f"{self.path}: is a file; give another --out")
+        if (
+            self.path.exists()
+            and not (self.path / "run.json").exists()
+            and any(self.path.iterdir())
+        ):
+            raise ProjectError(
+                f"{self.path}: holds files but no run.json, so it is no run of gvtools; give "
+                "another --out"
+            )
+
+    @contextmanager
+    def taken_up(self, identity: dict[str, Any], *, resume: bool) -> Iterator[int]:
+        """Make or take up the folder; gives the number of rounds that are done.
+
+        As long as the block lasts, other processes are kept out.
 
         Args:
             identity: what decides the result; kept in run.json and compared on resuming.
             resume: continue after the last whole round.
 
         Raises:
-            ProjectError: the folder holds something else, another run, or a run and ``resume`` is
-                off; nothing is touched then.
+            ProjectError: the folder holds something else, another run, a run that is at work, or
+                a run and ``resume`` is off; nothing is touched then.
         """
+        self.refuse_foreign()
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            handle = os.open(self.path, os.O_RDONLY)
+        except OSError as error:
+            raise ProjectError(
+                f"{self.path}: cannot be made ({error.strerror}); give another --out"
+            ) from None
+        try:
+            self._lock(handle)
+            yield self._start(identity, resume=resume)
+        finally:
+            os.close(handle)
+
+    def _lock(self, handle: int) -> None:
+        try:
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ProjectError(
+                f"{self.path}: another process is at work on this run; wait for it, or give "
+                "another --out"
+            ) from None
+        except (ImportError, OSError):
+            return  # Where the system or the file system knows no locks, the user has to take care.
+
+    def _start(self, identity: dict[str, Any], *, resume: bool) -> int:
         record = self.path / "run.json"
-        if self.path.exists() and not self.path.is_dir():
-            raise ProjectError(f"{self.path}: is a file; give another --out")
         if not record.exists():
-            if self.path.exists() and any(self.path.iterdir()):
-                raise ProjectError(
-                    f"{self.path}: holds files but no run.json, so it is no run of gvtools; give "
-                    "another --out"
-                )
             write_json(record, {**identity, "versions": versions()})
             return 0
         try:
             before = json.loads(record.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise ProjectError(f"{record}: unreadable ({error}); give another --out") from None
+        if not self.round_path(0).exists():
+            # Nothing came of the first attempt; its options bind nobody.
+            self._drop_leftovers()
+            write_json(record, {**identity, "versions": versions()})
+            return 0
         changed = [
             key for key in identity if before.get(key) != json.loads(json.dumps(identity[key]))
         ]
@@ -93,12 +126,19 @@ class RunDirectory:
                 f"{self.path}: this run is there already; add --resume to continue it, or give "
                 "another --out"
             )
-        for leftover in self.path.glob(".round_*.part"):
-            shutil.rmtree(leftover)
+        self._drop_leftovers()
         done = len(self.reports())
+        # Rounds after a removed one stood on it; they are done anew.
+        for later in sorted(self.path.glob("round_[0-9]*")):
+            if later.name > self.round_path(done - 1).name:
+                shutil.rmtree(later)
         if done:
             self._settle(done - 1)
         return done
+
+    def _drop_leftovers(self) -> None:
+        for leftover in self.path.glob(".round_*.part"):
+            shutil.rmtree(leftover)
 
     def reports(self) -> list[dict[str, Any]]:
         """The reports of the whole rounds, in order."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError
 
@@ -65,6 +65,18 @@ def open_scene(path: Path, args: argparse.Namespace) -> Scene:
     from gvtools.scenes.project import open_project
 
     return open_project(path, images=args.images, masks=args.masks, rgbd=rgbd_options(args))
+
+
+def reading_of(args: argparse.Namespace) -> dict[str, Any]:
+    """What was given of the options of ``add_scene_arguments``, JSON-ready."""
+    names = ("images", "masks", "depth_unit", "depth_max", "color_intrinsics", "depth_intrinsics",
+             "color_from_depth", "max_time_difference")  # fmt: skip
+    given = {name: getattr(args, name) for name in names}
+    return {
+        name: str(value.resolve()) if isinstance(value, Path) else value
+        for name, value in given.items()
+        if value is not None
+    }
 
 
 def rgbd_options(args: argparse.Namespace) -> RgbdOptions | None:

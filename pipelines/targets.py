@@ -53,7 +53,10 @@ def resolve_targets(
     path, at, selection = spec.partition("@")
     if path and Path(path).exists() and spec not in scene.names:
         if Path(path).is_dir() or Path(path).suffix == ".json":
-            return _project(Path(path), selection if at else "all")
+            targets = _project(Path(path), selection if at else "all")
+            if not allow_overlap:
+                _check_pictures(scene, context, targets)
+            return targets
         return _file(Path(path), known)
     try:
         chosen = select(scene.names, spec)
@@ -108,3 +111,32 @@ def _project(path: Path, selection: str) -> Targets:
     views = tuple(other[name] for name in chosen)
     files = tuple(file for view in views for file in view.files)
     return Targets(other.subset(chosen).cameras, views, "project", files)
+
+
+def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) -> None:
+    """Refuse another project's views that are the context's: same file, or same camera and place.
+
+    Raises:
+        OptionError: there is such a view.
+    """
+    given = [scene[name] for name in context]
+    files = {view.files[0].resolve() for view in given if view.files}
+    places = {_place(view.camera) for view in given}
+    both = [
+        view.name
+        for view in targets.truth
+        if view is not None
+        and ((view.files and view.files[0].resolve() in files) or _place(view.camera) in places)
+    ]
+    if both:
+        raise OptionError(
+            f"targets of another project overlap with the context in {len(both)} pictures (first "
+            f"{both[0]!r}: same file, or same camera and place); expected none; change one, or "
+            "pass --allow-overlap"
+        )
+
+
+def _place(camera: Cameras) -> tuple[object, ...]:
+    """Size, intrinsics and pose, rounded to what text files keep."""
+    numbers = np.concatenate([camera.K.ravel(), camera.cam_from_world.ravel()])
+    return int(camera.width[0]), int(camera.height[0]), tuple(np.round(numbers, 5).tolist())

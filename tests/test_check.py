@@ -37,6 +37,14 @@ def test_json_holds_the_report(tmp_path):
     assert data["depth"] is None
 
 
+def test_a_project_without_depth_is_ok_with_a_warning(tmp_path, capsys):
+    workspace(tmp_path)
+    run(tmp_path)
+    out = capsys.readouterr().out
+    assert "warning: none of the 4 views has depth" in out
+    assert "ok: true" in out
+
+
 def test_an_unreadable_picture_is_an_error_after_the_report(tmp_path, capsys):
     sevenscenes(tmp_path / "project")
     (tmp_path / "project" / "frame-000001.color.png").write_bytes(b"no picture")

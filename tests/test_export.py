@@ -206,21 +206,6 @@ def test_a_view_fused_twice_is_one_camera(scene, tmp_path):
     assert sorted(i.name for i in model.images.values()) == ["view_0.png", "view_2.png"]
 
 
-def test_two_cameras_of_one_name_are_refused(scene, tmp_path):
-    from gvtools.memory.views import SourceView
-
-    memory = fused(scene, [0, 2])
-    second = memory.views[1]
-    impostor = type(second.camera)(
-        second.camera.K, second.camera.cam_from_world, second.camera.width,
-        second.camera.height, ("view_0.png",),
-    )  # fmt: skip
-    memory.views.append(SourceView(impostor, 1, False, np.zeros((0, 0), np.float32)))
-    memory.save(tmp_path / "memory.npz")
-    with pytest.raises(ProjectError, match="two different cameras"):
-        run(tmp_path / "memory.npz", "--format", "transforms", "--out", tmp_path / "out")
-
-
 def test_options_that_make_no_sense(saved, tmp_path):
     with pytest.raises(OptionError, match="1 or more"):
         run(saved, "--format", "ply", "--out", tmp_path / "a.ply", "--max-points", 0)

@@ -6,6 +6,8 @@ import json
 import numpy as np
 import pytest
 from box_project import HEIGHT, SIZE, WIDTH, fused, write_box
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 from skimage.metrics import structural_similarity
 
@@ -143,6 +145,35 @@ def test_names_with_folders_and_collisions():
     for name in ("../x.png", "/x.png", "a/../../x.png"):
         with pytest.raises(OptionError, match="leads out"):
             file_stems([name])
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("a.png", "a.jpg", "a.png.png"), ("a.png", "a.jpg", "a.png.png")),
+        (("a.png.png", "a.jpg", "a.png"), ("a.png.png", "a.jpg", "a.png")),
+        (("a.png", "A.png", "b.png"), ("a.png_2", "A.png", "b")),
+        (("a.png", "A.png", "a.png_2"), ("a.png_3", "A.png", "a.png_2")),
+        (("x/a.png", "x//a.png", "x\\a.png"), ("x/a.png_2", "x/a.png", "x/a.png_3")),
+        (("1", "1.png", "1.PNG"), ("1", "1.png_2", "1.PNG")),
+    ],
+)
+def test_stems_differ_also_where_full_names_collide(names, expected):
+    assert tuple(str(stem) for stem in file_stems(names).values()) == expected
+
+
+ENDINGS = ("", ".png", ".PNG", ".jpg", ".png.png", ".png_2")
+
+
+@given(st.lists(st.builds(
+    "a{}{}".format, st.text("aA./_2\\", max_size=3), st.sampled_from(ENDINGS)
+), unique=True, max_size=12))  # fmt: skip
+def test_stems_are_unique_whatever_the_names(names):
+    names = [name for name in names if ".." not in name.replace("\\", "/").split("/")]
+    stems = file_stems(names)
+    assert list(stems) == names
+    assert len({str(stem).lower() for stem in stems.values()}) == len(names)
+    assert file_stems(names[::-1]) == stems
 
 
 def test_sub_folders_are_made(tmp_path):

@@ -2,14 +2,30 @@
 from __future__ import annotations
 
 import json
+import math
+import reprlib
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from scenes_workspace import HEIGHT, WIDTH, depth_picture, pose_matrix, ramp, save, transforms
+from scenes_workspace import (
+    HEIGHT,
+    WIDTH,
+    depth_picture,
+    pose_matrix,
+    ramp,
+    save,
+    transforms,
+    workspace,
+)
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError, ProjectError, ShapeError
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.scene import Finding
 from gvtools.scenes.transforms_json import read_transforms, write_transforms
+from pipelines.cli import main
 
 FLIP = np.diag([1.0, -1, -1, 1])
 PINHOLE = {"fl_x": 90, "fl_y": 91, "cx": 48, "cy": 36, "w": WIDTH, "h": HEIGHT}
@@ -126,6 +142,38 @@ def test_images_and_masks_may_be_given(tmp_path):
     assert not scene.views[0].load().mask.any()
 
 
+def test_a_mask_folder_that_is_not_there_is_refused_as_colmaps(tmp_path):
+    save(tmp_path / "images/a.png", ramp())
+    path = transforms(tmp_path, [frame()], **PINHOLE)
+    with pytest.raises(ProjectError, match=r"no such folder \(masks were expected there\)") as mine:
+        read_transforms(path, masks=tmp_path / "absent")
+    workspace(tmp_path / "colmap")
+    with pytest.raises(ProjectError) as theirs:
+        read_colmap(tmp_path / "colmap", masks=tmp_path / "absent")
+    assert str(mine.value) == str(theirs.value)
+
+
+def test_views_without_a_mask_are_found_as_colmaps(tmp_path):
+    names = ("a.png", "b.png", "c.png", "d.png")
+    black = np.zeros((HEIGHT, WIDTH), np.uint8)
+    for name in names:
+        save(tmp_path / "images" / name, ramp())
+    save(tmp_path / "ignore/a.png.png", black)
+    save(tmp_path / "own.png", black)
+    frames = [frame(f"images/{name}") for name in names]
+    frames[1]["mask_path"] = "own.png"
+    path = transforms(tmp_path, frames, **PINHOLE)
+    scene = read_transforms(path, masks=tmp_path / "ignore")
+    assert Finding("warning", "2 views have no mask in ignore") in scene.findings
+    assert [view.load().mask is None for view in scene] == [False, False, True, True]
+    assert "no mask" not in messages(read_transforms(path))
+    reconstruction = workspace(tmp_path / "colmap")
+    for image in list(reconstruction.images.values())[2:]:
+        save(tmp_path / "ignore" / f"{image.name}.png", black)
+    theirs = read_colmap(tmp_path / "colmap", masks=tmp_path / "ignore")
+    assert Finding("warning", "2 views have no mask in ignore") in theirs.findings
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -133,7 +181,6 @@ def test_images_and_masks_may_be_given(tmp_path):
         ({"k4": 0.1}, "k4 = 0.1 of a perspective camera"),
         ({"k1": "0.1"}, "k1 is '0.1'"),
         ({"fl_x": None}, "fl_x is None"),
-        ({"fl_x": -3}, "not positive"),
         ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix is no matrix"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "frame 0"),
         ({"transform_matrix": (np.eye(4) * np.nan).tolist()}, "NaN"),
@@ -147,6 +194,93 @@ def test_malformed_frames_say_what_and_where(tmp_path, change, told):
         read_transforms(path)
     assert "transforms.json, frame 0" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+WRONG: dict[str, tuple[Any, ...]] = {
+    "fl_x": (0, -3, "90", True, math.nan, 10**400),
+    "fl_y": (0, -1.5, [91]),
+    "w": (0, -96, 96.5, "96", None, 10**30),
+    "h": (0, 71.9, math.inf),
+    "cx": ("48", {}),
+    "k2": (math.nan, 10**400),
+    "depth_unit_scale_factor": (0, -1e-3, "1", math.inf),
+    "mask_path": (5, ["m.png"], True),
+    "depth_file_path": (["x"], {}, 0),
+    "camera_model": (5, ["OPENCV"]),
+    "is_fisheye": ("false", 2),
+}
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [(key, value) for key, values in WRONG.items() for value in values],
+    ids=reprlib.repr,
+)
+def test_wrong_values_name_the_frame_the_key_and_the_value(tmp_path, capsys, key, value, shared):
+    save(tmp_path / "images/a.png", ramp())
+    save(tmp_path / "images/b.png", ramp())
+    frames = [frame(), frame("images/b.png")]
+    common = dict(PINHOLE)
+    if shared and key not in ("mask_path", "depth_file_path"):
+        common[key] = value
+    else:
+        frames[1][key] = value
+    path = transforms(tmp_path, frames, **common)
+    assert main(["check", str(path)]) == 2
+    told = capsys.readouterr().err
+    first = "frame 1 (b.png)" if key in frames[1] else "frame 0 (a.png)"
+    assert f"transforms.json, {first}: {key} is {reprlib.repr(value)}; expected " in told
+    assert told.count("\n") == 1
+    assert "unexpected" not in told
+
+
+@pytest.mark.parametrize("angle", [0, -0.6, math.pi, 4, 5e-324, math.nan, "0.6", None])
+def test_an_angle_of_view_lies_between_0_and_pi(tmp_path, capsys, angle):
+    save(tmp_path / "images/a.png", ramp())
+    path = transforms(tmp_path, [frame()], camera_angle_x=angle)
+    assert main(["check", str(path)]) == 2
+    told = capsys.readouterr().err
+    assert f"frame 0 (a.png): camera_angle_x is {angle!r}; expected " in told
+    assert told.count("\n") == 1
+    assert "unexpected" not in told
+
+
+def test_whole_numbers_may_be_written_as_floats(tmp_path):
+    save(tmp_path / "images/a.png", ramp())
+    shared = {**PINHOLE, "w": float(WIDTH), "h": float(HEIGHT), "is_fisheye": 0}
+    one = frame(mask_path=None, depth_file_path="")
+    scene = read_transforms(transforms(tmp_path, [one], **shared))
+    assert scene.cameras.width.tolist() == [WIDTH]
+    assert not scene.views[0].has_depth
+
+
+@pytest.mark.parametrize("matrix", [[["1"] * 4] * 4, [[10**400] * 4] * 4, [[True] * 4] * 4, {}])
+def test_poses_hold_numbers(tmp_path, matrix):
+    save(tmp_path / "images/a.png", ramp())
+    path = transforms(tmp_path, [{**frame(), "transform_matrix": matrix}], **PINHOLE)
+    with pytest.raises(ProjectError, match=r"frame 0 \(a.png\): transform_matrix is no matrix"):
+        read_transforms(path)
+
+
+@pytest.mark.parametrize("name", ["/", "images/" + "a" * 5000, "a\0b.png"], ids=reprlib.repr)
+def test_paths_that_no_file_has_are_absent_or_refused(tmp_path, name):
+    save(tmp_path / "images/a.png", ramp())
+    with pytest.raises(ProjectError, match=r"file_path|none of the pictures"):
+        read_transforms(transforms(tmp_path, [frame(name)], **PINHOLE))
+    if name != "/":
+        scene = read_transforms(transforms(tmp_path, [frame(mask_path=name)], **PINHOLE))
+        assert "is absent on disk" in messages(scene)
+
+
+def test_absolute_and_relative_pictures_may_be_mixed(tmp_path, monkeypatch):
+    save(tmp_path / "project/images/a.png", ramp())
+    save(tmp_path / "elsewhere/b.png", ramp())
+    frames = [frame(), frame(str(tmp_path / "elsewhere/b.png"))]
+    transforms(tmp_path / "project", frames, **PINHOLE)
+    monkeypatch.chdir(tmp_path)
+    scene = read_transforms(Path("project"))
+    assert scene.names == ("elsewhere/b.png", "project/images/a.png")
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"frames": []}', '{"frames": [1]}'])

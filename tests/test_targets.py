@@ -7,7 +7,7 @@ from tiny_scan import write_scan
 from gvtools.errors import OptionError
 from gvtools.scenes.project import open_project
 from gvtools.trajectory_files import write_trajectory
-from pipelines.reconstruct import make_schedule
+from pipelines.plan import make_schedule
 from pipelines.round_files import target_stems
 from pipelines.targets import resolve_targets
 
@@ -56,9 +56,17 @@ def test_a_trajectory_file_gives_the_poses(scene, tmp_path):
 
 def test_a_second_project_gives_cameras_and_truth(scene, tmp_path):
     other = write_scan(tmp_path / "other", views=3)
-    targets = resolve_targets(scene, scene.names, f"{other}@first:2")
+    targets = resolve_targets(scene, scene.names[2:], f"{other}@first:2")
     assert len(targets.cameras) == 2
     assert targets.truth[0] is not None
+
+
+def test_a_second_project_with_the_contexts_pictures_is_refused(scene, tmp_path):
+    copied = write_scan(tmp_path / "other", views=3)
+    for spec in (str(scene.root), f"{copied}@first:2"):
+        with pytest.raises(OptionError, match="overlap"):
+            resolve_targets(scene, scene.names, spec)
+        assert len(resolve_targets(scene, scene.names, spec, allow_overlap=True).cameras) >= 2
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,12 @@ class ExemplarCompleter(InpaintCompleter):
     levels: int = 4
     iterations: int = 5
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check("source_views", least=0)
+        self._check("levels", least=1)
+        self._check("iterations", least=1)
+
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:

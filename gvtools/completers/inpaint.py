@@ -20,8 +20,8 @@ from gvtools.completers.base import Completion, ContextView
 from gvtools.completers.context_color import depth_error, look_up
 from gvtools.completers.hole_color import fill_color
 from gvtools.completers.hole_depth import HoleDepth, fill_depth
-from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
+from gvtools.options import check_range
 
 # Weight of a reliable photograph against one neighbour, in the diffusion.
 EVIDENCE_WEIGHT = 8.0
@@ -56,7 +56,17 @@ class InpaintCompleter:
     sweeps: int = 60
 
     def __post_init__(self) -> None:
-        check_options(self.name, confidence=self.confidence, reach=self.confidence_reach)
+        # Only observed pixels have a confidence of 1.
+        self._check("confidence", above=0, below=1)
+        self._check("confidence_reach", above=0)
+        self._check("reach", above=0)
+        self._check("context_views", least=0)
+        self._check("steepest_deg", above=0, below=90)
+        self._check("min_support", least=1)
+        self._check("sweeps", least=0)
+
+    def _check(self, key: str, **ends: float) -> None:
+        check_range(f"completer.{key}", getattr(self, key), **ends)
 
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
@@ -152,14 +162,3 @@ def _confidence(
     value[~valid] = options.confidence * agreement * np.exp(-distance / length)
     value[~valid] /= np.sqrt(1 + extent / length)
     return value
-
-
-def check_options(completer: str, *, confidence: float, reach: float) -> None:
-    """Raise OptionError for values that no completion could honour."""
-    if not 0 < confidence < 1:
-        raise OptionError(
-            f"completer {completer}: confidence {confidence}; expected more than 0 and less than "
-            "1, which only observed pixels have"
-        )
-    if reach <= 0:
-        raise OptionError(f"completer {completer}: confidence_reach {reach}; expected more than 0")

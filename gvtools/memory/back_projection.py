@@ -11,6 +11,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import ShapeError
 from gvtools.memory.compiled import compiled
 from gvtools.memory.points import PointSet
+from gvtools.options import check_range
 
 # Side of a cell of the free-space grid, pixels.
 FREE_CELL = 4
@@ -31,6 +32,11 @@ class BackProjectionOptions:
     edge: float = 0.05
     depth_max: float | None = None
     grazing: float = 0.05
+
+    def __post_init__(self) -> None:
+        check_range("back_projection.edge", self.edge, above=0)
+        check_range("back_projection.depth_max", self.depth_max, above=0)
+        check_range("back_projection.grazing", self.grazing, least=0, below=1)
 
 
 def back_project(

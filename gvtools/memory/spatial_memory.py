@@ -17,7 +17,8 @@ from gvtools.memory.occlusion import in_free_space
 from gvtools.memory.points import PointSet
 from gvtools.memory.records import Records, Runs
 from gvtools.memory.views import SourceView, ViewTable
-from gvtools.memory.voxel_index import EMPTY_KEY, VoxelIndex
+from gvtools.memory.voxel_index import EMPTY_KEY, MAX_VOXEL, VoxelIndex
+from gvtools.options import check_range
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -47,6 +48,13 @@ class MemoryOptions:
     observations_per_voxel: int = 12
     weight_cap: float = 100.0
     free_space_tolerance: float = 0.03
+
+    def __post_init__(self) -> None:
+        check_range("memory.same_direction", self.same_direction, least=0, most=180)
+        check_range("memory.finer", self.finer, least=0, most=1)
+        check_range("memory.observations_per_voxel", self.observations_per_voxel, least=1)
+        check_range("memory.weight_cap", self.weight_cap, above=0)
+        check_range("memory.free_space_tolerance", self.free_space_tolerance, least=0, below=1)
 
 
 @dataclass(frozen=True)
@@ -135,6 +143,11 @@ class SpatialMemory:
     def voxels(self) -> int:
         """Number of occupied voxels."""
         return self._index.voxels
+
+    @property
+    def reach(self) -> float:
+        """How far from the origin, along each axis, voxels go, scene units."""
+        return MAX_VOXEL * self.voxel
 
     @property
     def rounds(self) -> tuple[int, ...]:

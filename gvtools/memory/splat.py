@@ -21,6 +21,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 from gvtools.memory import culling
+from gvtools.options import check_range
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -63,11 +64,10 @@ class SplatOptions:
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        if self.nearest_views < 1:
-            raise OptionError(f"splat.nearest_views {self.nearest_views}; expected at least 1")
+        check_range("splat.nearest_views", self.nearest_views, least=1)
+        check_range("splat.proximity", self.proximity, least=0)
         for key in ("band", "depth_reach", "blend_reach", "support", "size_cap"):
-            if not getattr(self, key) > 0:
-                raise OptionError(f"splat.{key} {getattr(self, key)}; expected more than 0")
+            check_range(f"splat.{key}", getattr(self, key), above=0)
         for name, value, known in (
             ("backend", self.backend, BACKENDS),
             ("device", self.device, DEVICES),

@@ -13,7 +13,14 @@ from gvtools.scenes.colmap_files import find_model
 from gvtools.scenes.colmap_model import ColmapModel, load_model, sparse_points
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import read_depth, same_aspect
-from gvtools.scenes.photographs import Photograph, header_findings, lens_findings, named
+from gvtools.scenes.photographs import (
+    Photograph,
+    given_folder,
+    header_findings,
+    lens_findings,
+    mask_findings,
+    named,
+)
 from gvtools.scenes.scene import Finding, Scene
 
 __all__ = ["read_colmap", "write_colmap"]
@@ -97,9 +104,7 @@ def _image_folder(given: Path | None, homes: list[Path], folder: Path) -> Path:
 
 def _beside(given: Path | None, name: str, homes: list[Path]) -> Path | None:
     if given is not None:
-        if not Path(given).is_dir():
-            raise ProjectError(f"{given}: no such folder ({name} were expected there)")
-        return Path(given)
+        return given_folder(given, name)
     return next((home / name for home in homes if (home / name).is_dir()), None)
 
 
@@ -110,7 +115,7 @@ def _photographs(
     depth_folder: Path | None,
     findings: list[Finding],
 ) -> tuple[list[Photograph], list[int]]:
-    photographs, ids, absent, unmasked = [], [], [], []
+    photographs, ids, absent, unmasked = [], [], [], 0
     for image in model.images:
         path = image_folder / image.name
         if not path.is_file():
@@ -118,7 +123,7 @@ def _photographs(
             continue
         mask = None if mask_folder is None else mask_folder / f"{image.name}.png"
         if mask is not None and not mask.is_file():
-            unmasked.append(image.name)
+            unmasked += 1
             mask = None
         depth = None if depth_folder is None else _depth_file(depth_folder, image.name)
         reader = read_depth_map if depth is not None and depth.suffix == ".bin" else read_depth
@@ -147,10 +152,7 @@ def _photographs(
                 + named(absent),
             )
         )
-    if mask_folder is not None and unmasked:
-        findings.append(
-            Finding("warning", f"{len(unmasked)} views have no mask in {mask_folder.name}")
-        )
+    findings += mask_findings(unmasked, mask_folder)
     return photographs, ids
 
 

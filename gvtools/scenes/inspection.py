@@ -11,6 +11,13 @@ import numpy as np
 from gvtools.errors import GvError
 from gvtools.scenes.scene import Finding, Scene, SparsePoints, View
 
+# What to add to a project of each kind that has no depth.
+ADD_DEPTH = {
+    "colmap": "run COLMAP's patch_match_stereo on an undistorted workspace and give that folder "
+    "(stereo/depth_maps is then read)",
+    "transforms": "name each frame's depth map in its depth_file_path",
+    "rgbd": "add the depth maps of the recording",
+}
 SAMPLED_VIEWS = 16  # opened when only a sample is asked for, spread over the scene
 
 
@@ -101,6 +108,7 @@ def inspect(scene: Scene, *, read_pixels: bool | Literal["sample"] = True) -> Sc
     if len(scene.views) > 1 and not np.ptp(centers, axis=0).any():
         findings.append(Finding("warning", "all cameras stand at the same place: no parallax"))
     errors = reprojection_errors(scene)
+    findings += _views_without_depth(scene)
     _depth_without_pixels(opened, findings)
     return SceneReport(
         root=str(scene.root),
@@ -177,6 +185,18 @@ def _open(views: list[View], findings: list[Finding]) -> list[dict[str, Any]]:
                 )
         opened.append(item)
     return opened
+
+
+def _views_without_depth(scene: Scene) -> list[Finding]:
+    without = sum(not view.has_depth for view in scene.views)
+    if not without:
+        return []
+    if without < len(scene):
+        message = f"{without} of {len(scene)} views have no depth; a run takes no points from them"
+        return [Finding("warning", message)]
+    advice = ADD_DEPTH.get(scene.kind, "add depth maps")
+    message = f"none of the {without} views has depth, which a run needs; {advice}"
+    return [Finding("warning", message)]
 
 
 def _depth_without_pixels(opened: list[dict[str, Any]], findings: list[Finding]) -> None:

@@ -110,6 +110,29 @@ class Photograph:
         )
 
 
+def given_folder(folder: Path, held: str) -> Path:
+    """The folder that the caller gave for what lies beside pictures.
+
+    Args:
+        folder: as it was given.
+        held: what it should hold, in the plural, for the message.
+
+    Raises:
+        ProjectError: there is no such folder.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ProjectError(f"{folder}: no such folder ({held} were expected there)")
+    return folder
+
+
+def mask_findings(unmasked: int, folder: Path | None) -> list[Finding]:
+    """A warning when some views have no mask in the folder of masks."""
+    if folder is None or not unmasked:
+        return []
+    return [Finding("warning", f"{unmasked} views have no mask in {folder.name}")]
+
+
 def header_findings(pictures: Sequence[tuple[Path, tuple[int, int]]]) -> list[Finding]:
     """What the headers of pictures tell before any is decoded.
 

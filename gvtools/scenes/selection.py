@@ -16,6 +16,7 @@ from gvtools.errors import OptionError
 
 GRAMMAR = "all, every:K, every:K+OFFSET, first:N, last:N, range:A-B, not:SPEC, names, or @file"
 _KEYWORDS = ("every", "first", "last", "range", "not")
+_EXAMPLES = ("all", "every:2", "first:6", "last:6", "range:0-5", "not:first:6")
 _FORMS = {
     "every": r"(\d+)(?:\+(\d+))?",
     "first": r"(\d+)",
@@ -89,7 +90,7 @@ def _by_name(names: Sequence[str], listed: Sequence[str], what: str) -> set[int]
     wanted = [name for name in listed if name]
     unknown = [name for name in wanted if name not in index]
     if unknown:
-        near = difflib.get_close_matches(unknown[0], [*names, "all", *_KEYWORDS], n=1, cutoff=0.4)
+        near = difflib.get_close_matches(unknown[0], [*names, *_EXAMPLES], n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"expected {GRAMMAR}"
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
         raise OptionError(f"{what}: no view named {unknown[0]!r}{more} among {len(names)}; {hint}")

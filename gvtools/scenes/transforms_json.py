@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import math
 import os
+import reprlib
+import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -20,11 +22,13 @@ from gvtools.cameras import Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.files import write_text
 from gvtools.scenes.images import read_depth, read_header
-from gvtools.scenes.lens_parameters import lens_parameters
+from gvtools.scenes.lens_parameters import COEFFICIENTS, lens_parameters
 from gvtools.scenes.photographs import (
     Photograph,
+    given_folder,
     header_findings,
     lens_findings,
+    mask_findings,
     named,
     rotation_findings,
 )
@@ -34,6 +38,7 @@ from gvtools.scenes.undistort import Undistortion, undistortion
 FILE = "transforms.json"
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 MILLIMETRES = 1e-3
+LARGEST = 1_000_000  # pixels; cameras of wider pictures are not read
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg")  # Blender's files name pictures without a suffix
 
 
@@ -54,7 +59,8 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
         The scene, in the file's world frame and scale.
 
     Raises:
-        ProjectError: no such file, malformed, without frames on disk, or a spherical camera.
+        ProjectError: no such file or folder, malformed, without frames on disk, or a spherical
+            camera.
         ShapeError: a pose with NaN, a scale or a mirror.
     """
     path = Path(path)
@@ -63,34 +69,41 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     frames = data["frames"]
     findings: list[Finding] = []
     files = [_picture(path.parent, frame, f"{path}, frame {i}") for i, frame in enumerate(frames)]
-    shared = Path(os.path.commonpath([file.parent for file in files]))
-    names = [file.relative_to(shared).as_posix() for file in files]
+    names = _names(files)
+    masks = None if masks is None else given_folder(masks, "masks")
     if images is not None:
         if not Path(images).is_dir():
             raise ProjectError(f"{images}: no such image folder")
         files = [Path(images) / name for name in names]
     lenses: dict[tuple[Any, ...], Undistortion] = {}
-    photographs, absent, defects = [], [], []
+    photographs, absent, defects, unmasked = [], [], [], 0
     for i, (frame, file, name) in enumerate(zip(frames, files, names, strict=True)):
         what = f"{path}, frame {i} ({name})"
-        if not file.is_file():
+        if not os.path.isfile(file):
             absent.append(name)
             continue
         pose, defect = rigid_transform(_matrix(frame, what), what=what)
         defects.append(defect)
         lens = _lens({**data, **frame}, file, what, lenses)
-        mask, depth, lost = _beside(path.parent, frame, masks, name)
+        mask = _beside(path.parent, frame, "mask_path", what)
+        depth = _beside(path.parent, frame, "depth_file_path", what)
+        lost = [item.name for item in (mask, depth) if item and not os.path.isfile(item)]
         if lost:
-            findings.append(Finding("warning", f"{what}: {lost} is absent on disk"))
-        unit = _number({**data, **frame}, "depth_unit_scale_factor", what, MILLIMETRES)
+            findings.append(Finding("warning", f"{what}: {', '.join(lost)} is absent on disk"))
+        if mask is None and masks is not None:
+            mask = masks / f"{name}.png"
+            unmasked += not os.path.isfile(mask)
+        unit = _number(
+            {**data, **frame}, "depth_unit_scale_factor", what, MILLIMETRES, positive=True
+        )
         photographs.append(
             Photograph(
                 name,
                 file,
                 lens,
                 invert_rigid(pose @ OPENCV_FROM_OPENGL),
-                mask,
-                depth,
+                mask if mask and os.path.isfile(mask) else None,
+                depth if depth and os.path.isfile(depth) else None,
                 partial(read_depth, unit=unit),
             )
         )
@@ -103,6 +116,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     if absent:
         message = f"{len(absent)} of {len(frames)} frames are absent on disk: {named(absent)}"
         findings.append(Finding("warning", message))
+    findings += mask_findings(unmasked, masks)
     photographs.sort(key=lambda item: natural_key(item.name))
     findings += rotation_findings(defects)
     findings += lens_findings([item.lens for item in photographs])
@@ -171,7 +185,7 @@ def _load(path: Path) -> dict[str, Any]:
         data = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ProjectError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ProjectError(f"{path}: no JSON ({error}); expected a transforms.json") from None
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
@@ -186,77 +200,120 @@ def _picture(folder: Path, frame: dict[str, Any], what: str) -> Path:
     if not isinstance(name, str) or not name:
         raise ProjectError(f"{what}: no file_path; expected the picture's path")
     file = Path(os.path.normpath(folder / name.replace("\\", "/")))
-    if file.is_file() or file.suffix.lower() in GUESSED_SUFFIXES:
+    if not file.name:
+        raise _wrong("file_path", name, what, "the picture's path")
+    # Unlike Path.is_file, this takes names that no file can have for absent ones.
+    if os.path.isfile(file) or file.suffix.lower() in GUESSED_SUFFIXES:
         return file
     guesses = [file.with_name(file.name + suffix) for suffix in GUESSED_SUFFIXES]
-    return next((guess for guess in guesses if guess.is_file()), guesses[0])
+    return next((guess for guess in guesses if os.path.isfile(guess)), guesses[0])
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """The views' names: the pictures' paths below the deepest folder that they share."""
+    # Absolute, as a file may name some pictures by absolute paths and others by relative ones.
+    whole = [Path(os.path.abspath(file)) for file in files]
+    shared = Path(os.path.commonpath([file.parent for file in whole]))
+    return [file.relative_to(shared).as_posix() for file in whole]
 
 
 def _matrix(frame: dict[str, Any], what: str) -> np.ndarray:
+    if "transform_matrix" not in frame:
+        raise ProjectError(f"{what}: no transform_matrix; expected a 4x4 pose")
     try:
-        return np.array(frame["transform_matrix"], np.float64)
-    except KeyError:
-        raise ProjectError(f"{what}: no transform_matrix; expected a 4x4 pose") from None
-    except (TypeError, ValueError):
-        raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers") from None
+        matrix = np.array(frame["transform_matrix"])
+    except ValueError:
+        matrix = np.array(None)
+    if matrix.dtype.kind not in "iuf":
+        raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers")
+    return matrix.astype(np.float64)
 
 
 def _lens(
     values: dict[str, Any], file: Path, what: str, known: dict[tuple[Any, ...], Undistortion]
 ) -> Undistortion:
     """The frame's camera; frames with equal intrinsics share one mapping."""
+    model = values.get("camera_model", "")
+    if not isinstance(model, str):
+        raise _wrong("camera_model", model, what, "a model's name")
+    if values.get("is_fisheye") not in (None, False, True):
+        raise _wrong("is_fisheye", values["is_fisheye"], what, "true or false")
+    for key in COEFFICIENTS:
+        _number(values, key, what, 0.0)
     width, height = _size(values, file, what)
-    model, focal = str(values.get("camera_model", "")), _focal(values, width, what)
     params = lens_parameters(
         {key: value for key, value in values.items() if key not in ("frames", "transform_matrix")},
-        focal=focal,
+        focal=_focal(values, width, what),
         center=(
             _number(values, "cx", what, width / 2),
             _number(values, "cy", what, height / 2),
         ),
         what=what,
     )
-    key = (model, params, width, height)
-    if key not in known:
-        known[key] = undistortion(params.model, params.values, (width, height), what=what)
-    return known[key]
+    camera = (model, params, width, height)
+    if camera not in known:
+        known[camera] = undistortion(params.model, params.values, (width, height), what=what)
+    return known[camera]
 
 
 def _size(values: dict[str, Any], file: Path, what: str) -> tuple[int, int]:
-    if "w" in values and "h" in values:
-        return round(_number(values, "w", what)), round(_number(values, "h", what))
+    size = []
+    for key in ("w", "h"):
+        if key in values:
+            pixels = _number(values, key, what)
+            if not (1 <= pixels <= LARGEST and pixels.is_integer()):
+                raise _wrong(key, values[key], what, f"a whole number from 1 to {LARGEST}")
+            size.append(int(pixels))
+    if len(size) == 2:
+        return size[0], size[1]
     header = read_header(file)
     return header.width, header.height
 
 
 def _focal(values: dict[str, Any], width: int, what: str) -> tuple[float, float]:
     if "fl_x" in values or "fl_y" in values:
-        x = _number(values, "fl_x" if "fl_x" in values else "fl_y", what)
-        return x, _number(values, "fl_y", what, x)
+        x = _number(values, "fl_x" if "fl_x" in values else "fl_y", what, positive=True)
+        return x, _number(values, "fl_y", what, x, positive=True)
     if "camera_angle_x" not in values:
         raise ProjectError(f"{what}: neither fl_x nor camera_angle_x; expected one of them")
-    x = 0.5 * width / math.tan(0.5 * _number(values, "camera_angle_x", what))
+    half = 0.5 * _number(values, "camera_angle_x", what)
+    if not 0 < half < 0.5 * math.pi:
+        angle = values["camera_angle_x"]
+        raise _wrong("camera_angle_x", angle, what, "radians between 0 and pi")
+    x = 0.5 * width / math.tan(half)
     return x, x
 
 
-def _number(values: dict[str, Any], key: str, what: str, default: float | None = None) -> float:
+def _number(
+    values: dict[str, Any],
+    key: str,
+    what: str,
+    default: float | None = None,
+    *,
+    positive: bool = False,
+) -> float:
     value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ProjectError(f"{what}: {key} is {value!r}; expected a number")
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float))
+        # Also for NaN, infinity and whole numbers that no float can hold.
+        or not abs(value) <= sys.float_info.max
+        or (positive and value <= 0)
+    ):
+        raise _wrong(key, value, what, "a positive number" if positive else "a number")
     return float(value)
 
 
-def _beside(
-    folder: Path, frame: dict[str, Any], masks: Path | None, name: str
-) -> tuple[Path | None, Path | None, str]:
-    """Mask and depth of a frame, and which of the files that it names is absent."""
-    mask = folder / frame["mask_path"] if frame.get("mask_path") else None
-    depth = folder / frame["depth_file_path"] if frame.get("depth_file_path") else None
-    lost = ", ".join(path.name for path in (mask, depth) if path and not path.is_file())
-    if mask is None and masks is not None:
-        mask = Path(masks) / f"{name}.png"
-    return (
-        mask if mask is not None and mask.is_file() else None,
-        depth if depth is not None and depth.is_file() else None,
-        lost,
+def _beside(folder: Path, frame: dict[str, Any], key: str, what: str) -> Path | None:
+    """The file that a frame names under ``key``, on disk or not; None when it names none."""
+    value = frame.get(key)
+    if value is not None and not isinstance(value, str):
+        raise _wrong(key, value, what, "a file's path")
+    return folder / value if value else None
+
+
+def _wrong(key: str, value: object, what: str, expected: str) -> ProjectError:
+    return ProjectError(
+        f"{what}: {key} is {reprlib.repr(value)}; expected {expected}; mend it or export the file "
+        "again"
     )

@@ -1,0 +1,162 @@
+"""A run before its first round: what is given, what is completed when, and from which depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from pipelines.console import Console
+
+if TYPE_CHECKING:
+    from gvtools.depth.source import DepthSource
+    from gvtools.scenes.scene import Scene
+    from pipelines.config import RunConfig
+    from pipelines.targets import Targets
+
+# Views that are opened to find a voxel edge, and to tell two readings of a project apart.
+SAMPLED_VIEWS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A run before its first round.
+
+    Attributes:
+        scene: the project.
+        config: with everything derived filled in.
+        context: names of the given views.
+        targets: the cameras to complete.
+        schedule: per round (from 1) the rows of the targets.
+        source: where depth comes from.
+    """
+
+    scene: Scene
+    config: RunConfig
+    context: tuple[str, ...]
+    targets: Targets
+    schedule: tuple[tuple[int, ...], ...]
+    source: DepthSource
+
+
+def make_plan(scene: Scene, config: RunConfig) -> Plan:
+    """Resolve selections, depth source, voxel edge and schedule."""
+    from gvtools.completers.base import create
+    from gvtools.depth.source import choose_source
+    from gvtools.errors import ProjectError
+    from gvtools.scenes.selection import select
+    from pipelines.targets import resolve_targets
+
+    errors = [finding.message for finding in scene.findings if finding.level == "error"]
+    if errors:
+        raise ProjectError(
+            f"{scene.root}: {errors[0]}"
+            + (f" (and {len(errors) - 1} more; see 'gvtools check')" if len(errors) > 1 else "")
+        )
+    config = _on_device(config)
+    create(config.completer, **config.completer_options)
+    context = select(scene.names, config.context)
+    targets = resolve_targets(scene, context, config.targets, allow_overlap=config.allow_overlap)
+    source = choose_source(scene, context, config.depth)
+    if config.voxel is None:
+        edge = automatic_voxel(scene, context, source, percentile=config.fusion.voxel_percentile)
+        edge *= config.fusion.voxel_scale
+        config = replace(config, voxel=float(f"{edge:.3g}"))
+    schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
+    config = replace(config, rounds=len(schedule))
+    return Plan(scene, config, context, targets, schedule, source)
+
+
+def _on_device(config: RunConfig) -> RunConfig:
+    """The projection on the run's device: "cuda" takes the torch back end there, "cpu" no other."""
+    from gvtools.errors import OptionError
+
+    splat = config.splat
+    if config.device == "cpu" and splat.device != "cpu":
+        return replace(config, splat=replace(splat, device="cpu"))
+    if config.device != "cuda":
+        return config
+    if splat.backend in ("nearest", "open3d"):
+        raise OptionError(
+            f"device cuda with splat.backend {splat.backend}, which computes on the CPU; expected "
+            "torch; leave one of them out"
+        )
+    import torch
+
+    if not torch.cuda.is_available():
+        raise OptionError(
+            f"device cuda: torch {torch.__version__} finds no CUDA device; expected one; use "
+            "--device cpu, or install a CUDA build of torch"
+        )
+    return replace(config, splat=replace(splat, backend="torch", device="cuda"))
+
+
+def sampled(names: Sequence[str]) -> Sequence[str]:
+    """At most SAMPLED_VIEWS of the names, evenly spread."""
+    return names[:: -(-len(names) // SAMPLED_VIEWS)] if names else names
+
+
+def make_schedule(
+    targets: int, views_per_round: int, rounds: int | None
+) -> tuple[tuple[int, ...], ...]:
+    """Rows of the targets for each round, in order.
+
+    Without ``rounds``, as many as it takes. With more rounds than full rounds need, the targets
+    are spread evenly over them; what does not fit into them stays out, and is reported.
+    """
+    if rounds is None:
+        rounds = -(-targets // views_per_round)
+    rounds = min(rounds, targets)
+    if not rounds:
+        return ()
+    used = min(targets, rounds * views_per_round)
+    cuts = [i * used // rounds for i in range(rounds + 1)]
+    return tuple(tuple(range(a, b)) for a, b in pairwise(cuts))
+
+
+def automatic_voxel(
+    scene: Scene, context: Sequence[str], source: DepthSource, *, percentile: float
+) -> float:
+    """A percentile of the pixel footprints z / f of the context's depth, scene units."""
+    import numpy as np
+
+    footprints = []
+    for name in sampled([name for name in context if scene[name].has_depth]):
+        view = scene[name]
+        depth = source.depth(scene, view, view.load()).depth
+        known = depth[depth > 0]
+        if known.size:
+            focal = float(np.sqrt(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
+            footprints.append(float(np.percentile(known, percentile)) / focal)
+    from gvtools.errors import ProjectError
+
+    if not footprints:
+        raise ProjectError(f"{scene.root}: the context's depth maps are empty; see 'gvtools check'")
+    return float(np.median(footprints))
+
+
+def describe(plan: Plan, console: Console) -> None:
+    """Say what the run reads and will do."""
+    config, targets = plan.config, plan.targets
+    sizes = sorted(set(zip(targets.cameras.width.tolist(), targets.cameras.height.tolist(),
+                           strict=True)))  # fmt: skip
+    scheduled = sum(len(rows) for rows in plan.schedule)
+    console.line(
+        f"{plan.scene.root} ({plan.scene.kind}): {len(plan.scene)} views; context "
+        f"{len(plan.context)}, targets {len(targets.cameras)} ({targets.kind}, "
+        f"{', '.join(f'{w}x{h}' for w, h in sizes)})"
+    )
+    console.line(
+        f"depth {plan.source.name}, voxel {config.voxel:g}, completer {config.completer}, "
+        f"{len(plan.schedule)} rounds of at most {config.views_per_round} targets, seed "
+        f"{config.seed}"
+    )
+    if scheduled < len(targets.cameras):
+        console.warn(
+            f"{len(targets.cameras) - scheduled} of {len(targets.cameras)} targets are in no "
+            "round; raise --rounds or --views-per-round"
+        )
+    for finding in plan.scene.findings:
+        if finding.level == "warning":
+            console.warn(finding.message)
