@@ -16,6 +16,8 @@ Float64 = NDArray[np.float64]
 COLLINEAR = 1e-3
 # Spreads below this share of the coordinates' magnitude are rounding, not geometry.
 COINCIDENT = 1e-13
+# Squares below this share of the spread's are sums of cancelling terms.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,8 @@ class SimilarityFit:
         rmse: weighted root mean square of the residuals, target units.
         source_center: (3,) float64, weighted centroid of the source.
         target_center: (3,) float64, weighted centroid of the target.
+        mirrored: whether a reflection would leave less than half of the rmse: no rotation makes
+            one handedness of the other.
     """
 
     status: str
@@ -44,6 +48,7 @@ class SimilarityFit:
     rmse: float
     source_center: Float64
     target_center: Float64
+    mirrored: bool = False
 
     @property
     def ok(self) -> bool:
@@ -66,8 +71,10 @@ def fit_similarity(
     """The least-squares similarity between paired points, in closed form.
 
     Follows S. Umeyama, "Least-squares estimation of transformation parameters between two point
-    patterns", PAMI 13(4), 1991; equation numbers are its own. Camera centres on a line (a straight
-    dolly) leave the rotation about that line open and are reported as degenerate.
+    patterns", PAMI 13(4), 1991; equation numbers are its own. Without weights the solution is
+    pycolmap's, about the centroids, wherever it gives one; whether the points determine a solution
+    is found out here. Camera centres on a line (a straight dolly) leave the rotation about that
+    line open and are reported as degenerate.
 
     Args:
         source: (N, 3).
@@ -109,12 +116,37 @@ def fit_similarity(
     sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0  # (39), (43)
     rotation = (u * sign) @ vt  # (40)
     scale = float((d * sign).sum() / variance) if with_scale else 1.0  # (42)
+    if weights is None:
+        rotation, scale = _by_pycolmap(x, y, with_scale=with_scale) or (rotation, scale)
     translation = target_center - scale * rotation @ source_center  # (41)
     residuals = np.linalg.norm(y - scale * x @ rotation.T, axis=1)
     rmse = float(np.sqrt(weight @ residuals**2))
+    mirrored = False
+    if sign[2] < 0:
+        size = float(weight @ (y**2).sum(axis=1))
+        best = d.sum() / variance if with_scale else 1.0
+        square = size - 2 * best * d.sum() + best**2 * variance  # (33), of the reflection
+        mirrored = bool(square < rmse**2 / 4 and rmse**2 > ROUNDING * size)
     return SimilarityFit(
-        "aligned", scale, rotation, translation, residuals, rmse, source_center, target_center
-    )
+        "aligned", scale, rotation, translation, residuals, rmse, source_center, target_center,
+        mirrored,
+    )  # fmt: skip
+
+
+def _by_pycolmap(
+    source: Float64, target: Float64, *, with_scale: bool
+) -> tuple[Float64, float] | None:
+    """Rotation and scale between centred points; None where pycolmap refuses.
+
+    It refuses some sets that determine the motion, such as many of three points.
+    """
+    import pycolmap
+
+    solve = pycolmap.estimate_sim3d if with_scale else pycolmap.estimate_rigid3d
+    fit = solve(source, target)
+    if fit is None:
+        return None
+    return np.asarray(fit.rotation.matrix()), float(getattr(fit, "scale", 1.0))
 
 
 def _centroid(points: Float64, weight: Float64) -> Float64:

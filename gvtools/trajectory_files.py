@@ -1,11 +1,13 @@
-"""Trajectory files: TUM (timestamped quaternions) and KITTI (rows of 3x4 matrices).
+"""Trajectory files: TUM (timestamped quaternions), KITTI (rows of 3x4 matrices), EuRoC (CSV).
 
-Both hold camera-to-world poses, OpenCV axes, in scene units, and nothing of the camera itself: the
-intrinsics and the image size come from given cameras.
+They hold poses to world, in scene units, and nothing of the camera itself: the intrinsics and the
+image size come from given cameras. TUM's and KITTI's poses are those of a camera with OpenCV axes,
+EuRoC's those of the inertial unit.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,21 +21,42 @@ Float64 = NDArray[np.float64]
 
 # A quaternion written with few digits may be this far from unit length; farther, it is none.
 QUATERNION_TOLERANCE = 1e-2
+# A rotation nearer to orthonormal than this is as good as text with few digits can be.
+ROUNDING = 1e-5
+# Numbers of a line that are read.
+_COUNTS = {"tum": 8, "kitti": 12, "euroc": 8}
 
 
-def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") -> Cameras:
-    """Cameras on the poses of a trajectory file.
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses in the order of a file or project.
+
+    Attributes:
+        poses: (N, 4, 4) float64, camera (or body) to world, scene units.
+        names: N names; empty when poses are told apart by time or by order alone.
+        stamps: (N,) float64, seconds; None where there are no times.
+    """
+
+    poses: Float64
+    names: tuple[str, ...] = ()
+    stamps: Float64 | None = None
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
+    """The poses of a trajectory file.
 
     Args:
         path: a text file; blank lines and lines that start with # are passed over.
-        like: intrinsics and size: those of the first camera for all, or row by row when there are
-            as many cameras as poses.
-        layout: "tum" (timestamp tx ty tz qx qy qz qw), "kitti" (12 numbers, a 3x4 matrix by rows)
-            or "auto" (by the count of numbers in the first line: 8 or 12).
+        layout: "tum" (timestamp tx ty tz qx qy qz qw), "kitti" (12 numbers, a 3x4 matrix by rows),
+            "euroc" (CSV: nanoseconds, x, y, z, qw, qx, qy, qz, and more that is not read) or "auto"
+            (a .csv file is EuRoC's; else by the count of numbers in the first line: 8 or 12).
 
     Returns:
-        V cameras; the names are the timestamps as written (TUM; a repeated one gets _1, _2, ...)
-        or running numbers (KITTI).
+        N poses, with stamps for TUM and EuRoC. Rotations that are off by more than rounded digits
+        are replaced by the nearest ones.
 
     Raises:
         ProjectError: unreadable or empty; a line with another count of numbers, something that is
@@ -41,34 +64,65 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
     """
     path = Path(path)
     rows = _rows(path)
-    count = {"tum": 8, "kitti": 12, "auto": len(rows[0][1])}.get(layout)
-    if count not in (8, 12):
+    if layout == "auto":
+        counted = {8: "tum", 12: "kitti"}
+        layout = "euroc" if path.suffix.lower() == ".csv" else counted.get(len(rows[0][1]), layout)
+    if layout not in _COUNTS:
         raise ProjectError(
             f"{path}:{rows[0][0]}: {len(rows[0][1])} numbers with layout {layout!r}; expected 8 "
-            "(tum: timestamp tx ty tz qx qy qz qw) or 12 (kitti: a 3x4 matrix)"
+            "(tum: timestamp tx ty tz qx qy qz qw) or 12 (kitti: a 3x4 matrix), or euroc's .csv"
         )
-    poses: list[Float64] = []
-    names: list[str] = []
-    repeats: dict[str, int] = {}
-    for number, words in rows:
-        values = _numbers(words, count, where=f"{path}:{number}")
-        if count == 8:
-            matrix = np.eye(4)
-            matrix[:3, :3] = _rotation(values[4:], where=f"{path}:{number}")
-            matrix[:3, 3] = values[1:4]
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    stamps = np.empty(len(rows))
+    for i, (number, words) in enumerate(rows):
+        where = f"{path}:{number}"
+        if layout == "euroc":
+            words = words[: _COUNTS[layout]]
+        values = _numbers(words, _COUNTS[layout], where=where)
+        if layout == "kitti":
+            poses[i, :3] = values.reshape(3, 4)
         else:
-            matrix = values.reshape(3, 4)
+            quaternion = values[4:] if layout == "tum" else values[[5, 6, 7, 4]]
+            poses[i, :3, :3] = _rotation(quaternion, where=where)
+            poses[i, :3, 3] = values[1:4]
+            stamps[i] = values[0] if layout == "tum" else values[0] * 1e-9
         try:
-            poses.append(rigid_transform(matrix, what=f"{path}:{number}")[0])
+            nearest, defect = rigid_transform(poses[i], what=where)
         except ShapeError as error:
             raise ProjectError(str(error)) from None
-        name = words[0] if count == 8 else f"{len(names):06d}"
+        if defect > ROUNDING:
+            poses[i] = nearest
+    return Trajectory(poses, (), None if layout == "kitti" else stamps)
+
+
+def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") -> Cameras:
+    """Cameras on the poses of a trajectory file.
+
+    Args:
+        path: as of ``read_poses``.
+        like: intrinsics and size: those of the first camera for all, or row by row when there are
+            as many cameras as poses.
+        layout: as of ``read_poses``.
+
+    Returns:
+        V cameras; the names are the timestamps as written (TUM, EuRoC; a repeated one gets _1, _2,
+        ...) or running numbers (KITTI).
+
+    Raises:
+        ProjectError: as of ``read_poses``.
+    """
+    path = Path(path)
+    track = read_poses(path, layout=layout)
+    names: list[str] = []
+    repeats: dict[str, int] = {}
+    for _, words in _rows(path):
+        name = words[0] if track.stamps is not None else f"{len(names):06d}"
         # Published ground truth holds repeated timestamps; names have to differ.
         repeats[name] = repeats.get(name, -1) + 1
         if repeats[name]:
             name = f"{name}_{repeats[name]}"
         names.append(name)
-    return _with_intrinsics(np.array(poses), like, names, path)
+    return _with_intrinsics(track.poses, like, names, path)
 
 
 def write_trajectory(path: str | Path, cameras: Cameras, *, layout: str = "tum") -> None:
@@ -159,6 +213,7 @@ def _with_intrinsics(poses: Float64, like: Cameras, names: list[str], path: Path
     if len(like) < 1:
         raise ProjectError(f"{path}: no camera to take the intrinsics from; give at least one")
     rows = np.arange(len(poses)) if len(like) == len(poses) else np.zeros(len(poses), np.int64)
+    rigid = np.array([rigid_transform(pose, what=str(path))[0] for pose in poses])
     return Cameras(
-        like.K[rows], invert_rigid(poses), like.width[rows], like.height[rows], tuple(names)
+        like.K[rows], invert_rigid(rigid), like.width[rows], like.height[rows], tuple(names)
     )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.round_files import SUPPORT_OBSERVED, read_png
+from gvtools.evaluation.view_figures import FIGURES, view_figures
+from pipelines.round_files import read_target
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -15,9 +15,8 @@ if TYPE_CHECKING:
     from pipelines.plan import Plan
     from pipelines.run_directory import RunDirectory
 
-FIGURES = (
-    "psnr", "psnr_valid", "psnr_generated", "ssim", "depth_rel_valid", "depth_rel_generated",
-)  # fmt: skip
+TABLE = ("psnr", "psnr_valid", "psnr_generated", "ssim", "depth_rel_valid", "depth_rel_generated")
+NO_LPIPS = "lpips is null here: gvtools evaluate measures it, where its weights are"
 
 
 def measure_run(
@@ -25,10 +24,10 @@ def measure_run(
 ) -> dict[str, Any]:
     """Means over the targets that have a truth, and the figures of each view.
 
-    ``psnr`` and ``ssim`` are of the completed picture, on all pixels. ``_valid`` is of the memory,
-    on the pixels that observations support; ``_generated`` of the completed picture, on all others
-    that it fills, by a completer's hand in this round or an earlier one. ``coverage`` is the share
-    that memory supports before the round, ``coverage_after`` after it.
+    All figures are of the completed picture: ``_valid`` on the pixels that observations support,
+    ``_generated`` on all others that it fills, by a completer's hand in this round or an earlier
+    one. ``coverage`` is the share that memory supports before the round, ``coverage_after`` after
+    it.
     """
     views: list[dict[str, Any]] = []
     reports = directory.reports()
@@ -44,14 +43,20 @@ def measure_run(
                 "coverage_after": entry["coverage_after"],
             }
             if truth is not None:
-                figures |= _against(truth, directory.round_path(number), entry["stem"])
+                target = read_target(directory.round_path(number), entry)
+                figures |= view_figures(
+                    target.picture,
+                    truth.load(),
+                    observed=target.observed,
+                    generated=target.generated,
+                    depth=target.depth,
+                )
             views.append(figures)
-    notes = ["lpips is null: no perceptual network is part of this version"]
+    notes = [NO_LPIPS]
     if not any("psnr" in view for view in views):
         notes.append("no target has a true picture, so there are no image figures")
     summary: dict[str, Any] = {name: mean_of(views, name) for name in FIGURES}
     summary |= {
-        "lpips": None,
         "coverage": mean_of(views, "coverage"),
         "coverage_after": mean_of(views, "coverage_after"),
         "targets": len(views),
@@ -61,8 +66,8 @@ def measure_run(
         "notes": notes,
     }
     if views:
-        columns = ["target", "round", "coverage", "after", *FIGURES]
-        keys = ["name", "round", "coverage", "coverage_after", *FIGURES]
+        columns = ["target", "round", "coverage", "after", *TABLE]
+        keys = ["name", "round", "coverage", "coverage_after", *TABLE]
         body = [[view.get(key) for key in keys] for view in views]
         mean = ["mean", None, *(summary[key] for key in keys[2:])]
         console.table(columns, [*body, mean])
@@ -73,27 +78,3 @@ def mean_of(views: list[dict[str, Any]], name: str) -> float | None:
     """The mean over the views that have the figure."""
     values = [view[name] for view in views if view.get(name) is not None]
     return float(np.mean(values)) if values else None
-
-
-def _against(truth: Any, folder: Path, stem: str) -> dict[str, Any]:
-    from gvtools.evaluation.images import psnr, relative_depth_error, ssim
-
-    frame = truth.load()
-    reference = frame.rgb.astype(np.float32) / 255
-    completed = read_png(folder / f"generated_{stem}.png").astype(np.float32) / 255
-    guidance = read_png(folder / f"guidance_{stem}.png").astype(np.float32) / 255
-    observed = read_png(folder / f"valid_{stem}.png") == SUPPORT_OBSERVED
-    usable = np.ones_like(observed) if frame.mask is None else frame.mask
-    with np.load(folder / f"depth_{stem}.npz", allow_pickle=False) as stored:
-        known, made = stored["guidance"], stored["completion"]
-    figures: dict[str, Any] = {
-        "psnr": psnr(completed, reference, mask=usable),
-        "psnr_valid": psnr(guidance, reference, mask=observed & usable),
-        "psnr_generated": psnr(completed, reference, mask=~observed & (made > 0) & usable),
-        "ssim": ssim(completed, reference, mask=usable),
-    }
-    if frame.depth is not None:
-        for key, depth, mask in (("valid", known, observed), ("generated", made, ~observed)):
-            error = relative_depth_error(depth, frame.depth, mask=mask & usable)
-            figures[f"depth_rel_{key}"] = error
-    return figures

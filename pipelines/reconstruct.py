@@ -200,7 +200,7 @@ def _round(
 ) -> dict[str, Any]:
     from gvtools.completers.base import create
     from pipelines import rounds
-    from pipelines.round_files import target_stems, write_target
+    from pipelines.round_files import camera_entry, target_stems, write_target
 
     clock = rounds.Clock()
     start = time.perf_counter()
@@ -228,14 +228,15 @@ def _round(
         after = _mean([guidance.coverage for guidance in grown])
         stems = target_stems(plan.targets.cameras.names)
         rows = plan.schedule[number - 1]
-        for row, result, start_of_round, end_of_round in zip(
-            rows, results, known, grown, strict=True
+        for at, (row, result, start_of_round, end_of_round) in enumerate(
+            zip(rows, results, known, grown, strict=True)
         ):
             write_target(folder, stems[row], result, end_of_round)
             views.append(
                 {
                     **result.report,
                     "stem": stems[row],
+                    "camera": camera_entry(cameras[at]),
                     "coverage": start_of_round.coverage,
                     "coverage_after": end_of_round.coverage,
                 }

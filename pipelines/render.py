@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
+from pipelines.lpips_arguments import add_lpips_arguments, open_lpips
 from pipelines.scene_arguments import add_scene_arguments, open_scene
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--device", metavar="NAME", help="short for --set splat.device=NAME (auto, cpu, cuda)"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    add_lpips_arguments(parser)
     add_scene_arguments(parser)
 
 
@@ -90,6 +92,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     names = select(cameras.names, args.views)
     row_of = {name: row for row, name in enumerate(cameras.names)}
     stems = file_stems(names)
+    lpips, no_lpips = open_lpips(args) if args.against_images else (None, None)
     # The first projection compiles or loads the kernels and is not timed.
     memory.project(cameras[row_of[names[0]]], options=options)
     views = []
@@ -98,8 +101,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
         frame = scene[name].load() if scene is not None and args.against_images else None
         if args.out is not None:
             write_view(args.out, stems[name], guidance)
-        views.append(measure(name, guidance, frame, seconds=seconds))
-    figures = summary(views, compared=args.against_images)
+        views.append(measure(name, guidance, frame, seconds=seconds, lpips=lpips))
+    figures = summary(views, compared=args.against_images, no_lpips=no_lpips)
     if args.json is not None:
         write_json(args.json, figures)
     else:
@@ -107,8 +110,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
                    "coverage", "seconds")  # fmt: skip
         mean = {**figures, "view": "all", "seconds": figures["seconds_per_view"]}
         console.table(columns, [[row[column] for column in columns] for row in [*views, mean]])
-        for key, reason in figures["notes"].items():
-            console.line(f"{key}: {reason}")
+        for reason in dict.fromkeys(figures["notes"].values()):
+            keys = [key for key, note in figures["notes"].items() if note == reason]
+            console.line(f"{', '.join(keys)}: {reason}")
     if args.out is not None:
         console.line(f"{len(views)} views in {args.out}")
 

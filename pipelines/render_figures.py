@@ -7,27 +7,13 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from gvtools.cameras import Cameras
-from gvtools.errors import ShapeError
-from gvtools.evaluation.images import SSIM_BORDER, psnr, relative_depth_error, ssim
+from gvtools.evaluation.lpips_distance import Lpips
+from gvtools.evaluation.view_figures import FIGURES, view_figures
 from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat import SplatOptions
 from gvtools.scenes.scene import Frame
-
-METRICS = (
-    "psnr",
-    "ssim",
-    "lpips",
-    "psnr_valid",
-    "ssim_valid",
-    "psnr_generated",
-    "depth_rel_valid",
-    "depth_rel_generated",
-)
-NO_LPIPS = "no LPIPS: the weights of its network are not part of this installation"
 
 
 def render_view(
@@ -40,7 +26,12 @@ def render_view(
 
 
 def measure(
-    name: str, guidance: Guidance, frame: Frame | None, *, seconds: float
+    name: str,
+    guidance: Guidance,
+    frame: Frame | None,
+    *,
+    seconds: float,
+    lpips: Lpips | None = None,
 ) -> dict[str, Any]:
     """The figures of one view; those that need a picture are None without one.
 
@@ -52,43 +43,42 @@ def measure(
         guidance: a batch of one.
         frame: the picture, and depth where there is some, of the same camera.
         seconds: what the projection took.
+        lpips: the network; None leaves LPIPS out.
 
     Raises:
         ShapeError: the picture is of another size.
     """
     figures: dict[str, Any] = {"view": name, "coverage": guidance.coverage, "seconds": seconds}
-    figures |= dict.fromkeys(METRICS)
+    figures |= dict.fromkeys(FIGURES)
     if frame is None:
         return figures
-    rgb, depth, valid = guidance.rgb[0], guidance.depth[0], guidance.valid[0]
-    if frame.rgb.shape != rgb.shape:
-        raise ShapeError(f"{name}: the picture is {frame.rgb.shape}; its camera needs {rgb.shape}")
-    use = np.ones(valid.shape, np.bool_) if frame.mask is None else frame.mask
-    generated = guidance.generated[0] & valid & use
-    whole = None if frame.mask is None else use
-    figures["psnr"] = psnr(rgb, frame.rgb, mask=whole)
-    figures["psnr_valid"] = psnr(rgb, frame.rgb, mask=valid & use)
-    figures["psnr_generated"] = psnr(rgb, frame.rgb, mask=generated)
-    if min(valid.shape) > 2 * SSIM_BORDER:
-        figures["ssim"] = ssim(rgb, frame.rgb, mask=whole)
-        figures["ssim_valid"] = ssim(rgb, frame.rgb, mask=valid & use)
-    if frame.depth is not None:
-        figures["depth_rel_valid"] = relative_depth_error(depth, frame.depth, mask=valid & use)
-        figures["depth_rel_generated"] = relative_depth_error(depth, frame.depth, mask=generated)
-    return figures
+    generated = guidance.generated[0] & guidance.valid[0]
+    return figures | view_figures(
+        guidance.rgb[0],
+        frame,
+        observed=guidance.valid[0] & ~generated,
+        generated=generated,
+        depth=guidance.depth[0],
+        lpips=lpips,
+    )
 
 
-def summary(views: Sequence[dict[str, Any]], *, compared: bool) -> dict[str, Any]:
-    """Means over the views that have a figure (time: median), with reasons for what is missing."""
+def summary(
+    views: Sequence[dict[str, Any]], *, compared: bool, no_lpips: str | None
+) -> dict[str, Any]:
+    """Means over the views that have a figure (time: median), with reasons for what is missing.
+
+    ``no_lpips`` is the reason why there is no LPIPS; None where there is.
+    """
     out: dict[str, Any] = {}
     notes: dict[str, str] = {}
-    for key in METRICS:
+    for key in FIGURES:
         values = [view[key] for view in views if view[key] is not None]
         out[key] = statistics.fmean(values) if values else None
-        if key == "lpips":
-            notes[key] = NO_LPIPS
-        elif not compared:
+        if not compared:
             notes[key] = "not compared: add --against-images"
+        elif key.startswith("lpips") and no_lpips is not None:
+            notes[key] = no_lpips
         elif not values:
             notes[key] = _reason(key)
         elif len(values) < len(views):

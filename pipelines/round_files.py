@@ -1,14 +1,17 @@
-"""The pictures and arrays that a round leaves for each target."""
+"""The pictures and arrays that a round leaves for each target: written and read."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.cameras import Cameras
+from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance
 from pipelines.render_files import file_stems
 from pipelines.rounds import TargetResult
@@ -55,6 +58,74 @@ def write_target(folder: Path, stem: str, result: TargetResult, after: Guidance)
         completion=result.completion.depth[0],
         fused=result.fused,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class TargetFiles:
+    """What a round left of one target.
+
+    Attributes:
+        name: of the target.
+        camera: a batch of one.
+        picture: (H, W, 3) uint8, completed; holes are black.
+        depth: (H, W) float32 z-depth of the picture, brought to the memory's scale, scene units,
+            0 = none.
+        observed: (H, W) bool, pixels that stand on observations.
+        generated: (H, W) bool, pixels that a completer made, in this round or an earlier one.
+    """
+
+    name: str
+    camera: Cameras
+    picture: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    observed: NDArray[np.bool_]
+    generated: NDArray[np.bool_]
+
+
+def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
+    """One target of a round.
+
+    Args:
+        folder: the round's.
+        entry: the target's, of the round's report.
+
+    Raises:
+        ProjectError: files of the round are absent or damaged, or of an older version.
+    """
+    try:
+        stem, view = entry["stem"], entry["camera"]
+        camera = Cameras(
+            np.array(view["K"])[None],
+            np.array(view["cam_from_world"])[None],
+            np.array([view["width"]]),
+            np.array([view["height"]]),
+            (entry["name"],),
+        )
+        picture = read_png(folder / f"generated_{stem}.png")
+        support = read_png(folder / f"valid_{stem}.png")
+        with np.load(folder / f"depth_{stem}.npz", allow_pickle=False) as stored:
+            depth = stored["completion"]
+        scale = entry["scale"]["scale"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ProjectError(
+            f"{folder}: the target {entry.get('name', '?')} cannot be read ({error!r}); expected a "
+            "round of this version; run reconstruct again"
+        ) from error
+    observed = support == SUPPORT_OBSERVED
+    aligned = depth * np.float32(scale) if scale is not None and scale == scale else depth
+    return TargetFiles(
+        str(entry["name"]), camera, picture, aligned, observed, ~observed & (depth > 0)
+    )
+
+
+def camera_entry(camera: Cameras) -> dict[str, Any]:
+    """A camera, a batch of one, as a report holds it."""
+    return {
+        "K": camera.K[0].tolist(),
+        "cam_from_world": camera.cam_from_world[0].tolist(),
+        "width": int(camera.width[0]),
+        "height": int(camera.height[0]),
+    }
 
 
 def to_bytes(rgb: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:

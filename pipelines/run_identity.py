@@ -28,6 +28,8 @@ def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
         "config": plan.config.to_dict(),
         "context": list(plan.context),
         "targets": list(plan.targets.cameras.names),
+        "targets_kind": plan.targets.kind,
+        "targets_project": None if plan.targets.project is None else str(plan.targets.project),
         "schedule": [list(rows) for rows in plan.schedule],
     }
 

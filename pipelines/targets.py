@@ -28,12 +28,14 @@ class Targets:
         truth: per camera the view that shows the truth, None where there is none.
         kind: "hold-out", the path's name, "trajectory" or "project".
         files: what was read beside the project.
+        project: the other project that ``truth`` is of; None when it is the run's own.
     """
 
     cameras: Cameras
     truth: tuple[View | None, ...]
     kind: str
     files: tuple[Path, ...] = ()
+    project: Path | None = None
 
 
 def resolve_targets(
@@ -110,7 +112,7 @@ def _project(path: Path, selection: str) -> Targets:
     chosen = select(other.names, selection)
     views = tuple(other[name] for name in chosen)
     files = tuple(file for view in views for file in view.files)
-    return Targets(other.subset(chosen).cameras, views, "project", files)
+    return Targets(other.subset(chosen).cameras, views, "project", files, path.resolve())
 
 
 def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) -> None:

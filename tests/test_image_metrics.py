@@ -5,7 +5,8 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from gvtools.errors import ShapeError
-from gvtools.evaluation.images import psnr, relative_depth_error, ssim
+from gvtools.evaluation.images import image_figures, psnr, relative_depth_error, ssim
+from gvtools.evaluation.ssim_map import ssim_map
 
 SSIM = {
     "gaussian_weights": True,
@@ -97,3 +98,56 @@ def test_what_does_not_fit_is_refused():
         ssim(image[:10], image[:10])
     with pytest.raises(ShapeError, match=r"expected equal \(H, W\)"):
         relative_depth_error(image, image)
+
+
+@pytest.mark.parametrize("sample", [False, True])
+def test_the_compiled_map_is_scikit_images(sample):
+    rng = np.random.default_rng(5)
+    first = rng.random((37, 53, 3))
+    second = np.clip(first + 0.2 * rng.standard_normal(first.shape), 0, 1)
+    _, expected = structural_similarity(
+        first, second, gaussian_weights=True, sigma=1.5, use_sample_covariance=sample,
+        data_range=1.0, channel_axis=-1, full=True,
+    )  # fmt: skip
+    ours = ssim_map(first, second, sample_covariance=sample)
+    np.testing.assert_allclose(ours, expected[5:-5, 5:-5].mean(axis=-1), atol=1e-12)
+
+
+def test_regions_have_the_figures_of_their_masks():
+    rng = np.random.default_rng(6)
+    first = (rng.random((40, 50, 3)) * 255).astype(np.uint8)
+    second = (rng.random((40, 50, 3)) * 255).astype(np.uint8)
+    mask = rng.random((40, 50)) > 0.4
+    found = image_figures(first, second, {"all": None, "some": mask, "none": mask & ~mask})
+    assert found["all"]["psnr"] == pytest.approx(psnr(first, second))
+    assert found["all"]["ssim"] == pytest.approx(ssim(first, second))
+    assert found["some"]["psnr"] == pytest.approx(psnr(first, second, mask=mask))
+    assert found["some"]["ssim"] == pytest.approx(ssim(first, second, mask=mask))
+    assert found["none"] == {"psnr": None, "ssim": None}
+    small = image_figures(first[:9], second[:9], {"all": None})
+    assert small["all"]["ssim"] is None
+
+
+@pytest.mark.parametrize("kind", ["blur", "noise", "shift", "darker"])
+def test_figures_fall_as_the_picture_gets_worse(kind):
+    from scipy.ndimage import gaussian_filter
+    from skimage import data
+
+    truth = data.astronaut()[100:260, 100:300]
+    rng = np.random.default_rng(7)
+
+    def worse(amount: float) -> np.ndarray:
+        if kind == "blur":
+            out = gaussian_filter(truth.astype(float), (amount, amount, 0))
+        elif kind == "noise":
+            out = truth + 10 * amount * rng.standard_normal(truth.shape)
+        elif kind == "shift":
+            out = np.roll(truth, int(amount), axis=1).astype(float)
+        else:
+            out = truth * (1 - 0.1 * amount)
+        return np.clip(out, 0, 255).astype(np.uint8)
+
+    ratios = [psnr(worse(amount), truth) or 0 for amount in (1, 2, 4)]
+    likeness = [ssim(worse(amount), truth) or 0 for amount in (1, 2, 4)]
+    assert ratios[0] > ratios[1] > ratios[2]
+    assert 1 > likeness[0] > likeness[1] > likeness[2]

@@ -1,0 +1,327 @@
+"""Pose errors between an estimated trajectory and its reference: ATE, RPE, and pose AUC.
+
+ATE and RPE follow J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS
+2012, with the conventions of evo: the estimate is aligned to the reference by its camera centres;
+the absolute error is taken pose by pose, the relative one between poses a number of frames apart.
+Poses are camera-to-world, (N, 4, 4) float64. What the data do not determine has a status and no
+number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gvtools.errors import OptionError, ShapeError
+from gvtools.similarity import SimilarityFit, fit_similarity
+
+Float64 = NDArray[np.float64]
+
+ALIGNMENTS = ("none", "se3", "sim3")
+AUC_THRESHOLDS = (3.0, 5.0, 10.0, 30.0)
+AUC_BINS = 1000
+ALIGNED = "aligned"
+UNALIGNED = "not aligned"
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What a set of errors sums up to; the unit is that of the errors.
+
+    Attributes:
+        rmse: root of the mean square.
+        mean: mean.
+        median: median.
+        std: standard deviation of the population.
+        min: smallest.
+        max: largest.
+        n: how many.
+    """
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+    n: int
+
+    @staticmethod
+    def of(errors: ArrayLike) -> Statistics | None:
+        """Of (N,) errors; None when there are none."""
+        values = np.asarray(errors, np.float64)
+        if not values.size:
+            return None
+        return Statistics(
+            float(np.sqrt(np.mean(values**2))),
+            float(values.mean()),
+            float(np.median(values)),
+            float(values.std()),
+            float(values.min()),
+            float(values.max()),
+            int(values.size),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Errors of an estimated trajectory.
+
+    Attributes:
+        status: "aligned", "not aligned" (none was asked for), or "degenerate: ..." with the
+            reason; then every figure is None.
+        translation: scene units of the reference.
+        translation_share: the same, divided by ``extent``; None also when the extent is 0.
+        rotation_deg: degrees.
+        scale: reference units per unit of the estimate; 1 when it was not fitted.
+        extent: twice the largest distance of a reference centre from their mean, scene units.
+        translation_errors: (N,) float64 of each pose or pair; empty without figures.
+        rotation_errors_deg: (N,) float64, likewise.
+    """
+
+    status: str
+    translation: Statistics | None
+    translation_share: Statistics | None
+    rotation_deg: Statistics | None
+    scale: float | None
+    extent: float
+    translation_errors: Float64
+    rotation_errors_deg: Float64
+
+    @property
+    def ok(self) -> bool:
+        """Whether there are figures."""
+        return self.translation is not None
+
+
+def absolute_errors(
+    reference: ArrayLike,
+    estimate: ArrayLike,
+    *,
+    align: str = "sim3",
+    refuse_mirrored: bool = True,
+) -> PoseErrors:
+    """Absolute trajectory error (ATE): how far each pose is off after one alignment.
+
+    Args:
+        reference: (N, 4, 4) world_from_cam, scene units.
+        estimate: (N, 4, 4), row by row the same cameras.
+        align: "none", "se3" or "sim3".
+        refuse_mirrored: refuse an estimate that fits the reference's mirror image far better.
+            No rotation mends that, so the best one is reported with False.
+
+    Raises:
+        ShapeError: wrong shapes, or values that are not finite.
+        OptionError: an unknown alignment.
+    """
+    first, second = _poses(reference, estimate)
+    status, fit = _aligned(first, second, align, refuse_mirrored)
+    extent = _extent(first)
+    if not (status in (ALIGNED, UNALIGNED) and len(first)):
+        return _none(status, extent)
+    centers, rotations = second[:, :3, 3], second[:, :3, :3]
+    if fit is not None:
+        # Residuals are taken about the centroids, so that great offsets keep their digits.
+        translation, rotations = fit.residuals, fit.rotation @ rotations
+    else:
+        translation = np.linalg.norm(centers - first[:, :3, 3], axis=1)
+    rotation = _angles_deg(np.swapaxes(first[:, :3, :3], 1, 2) @ rotations)
+    return _figures(status, translation, rotation, extent, fit)
+
+
+def relative_errors(
+    reference: ArrayLike,
+    estimate: ArrayLike,
+    *,
+    align: str = "sim3",
+    delta: int = 1,
+    all_pairs: bool = False,
+    refuse_mirrored: bool = True,
+) -> PoseErrors:
+    """Relative pose error (RPE): how far the motion over ``delta`` frames is off.
+
+    Of the alignment, only the scale matters here.
+
+    Args:
+        reference: (N, 4, 4) world_from_cam, scene units.
+        estimate: (N, 4, 4), row by row the same cameras.
+        align: "none", "se3" or "sim3".
+        delta: frames from the first pose of a pair to the second.
+        all_pairs: pairs start at every frame; otherwise each starts where the last one ended.
+        refuse_mirrored: as of ``absolute_errors``.
+
+    Raises:
+        ShapeError: wrong shapes, or values that are not finite.
+        OptionError: an unknown alignment, or a delta below 1.
+    """
+    if delta < 1:
+        raise OptionError(f"RPE delta {delta}; expected 1 frame or more")
+    first, second = _poses(reference, estimate)
+    status, fit = _aligned(first, second, align, refuse_mirrored)
+    extent = _extent(first)
+    start = np.arange(0, max(len(first) - delta, 0), 1 if all_pairs else delta)
+    if status not in (ALIGNED, UNALIGNED):
+        return _none(status, extent)
+    if not len(start):
+        return _none(f"degenerate: {len(first)} poses, no pair is {delta} frames apart", extent)
+    scale = 1.0 if fit is None else fit.scale
+    motion, rotation = _motions(first, start, start + delta)
+    other_motion, other_rotation = _motions(second, start, start + delta)
+    translation = np.linalg.norm(scale * other_motion - motion, axis=1)
+    angle = _angles_deg(np.swapaxes(rotation, 1, 2) @ other_rotation)
+    return _figures(status, translation, angle, extent, fit)
+
+
+@dataclass(frozen=True)
+class PoseAuc:
+    """Scale-free agreement of the poses' pairs.
+
+    An error of a pair is the larger of two angles: between the relative rotations, and between the
+    directions of the relative translations.
+
+    Attributes:
+        status: "measured", or "degenerate: ..." with the reason; then the figures are None.
+        auc: by threshold in degrees, the area under the share of pairs below the error, in [0, 1].
+        pairs: how many.
+        median_rotation_deg: median angle between relative rotations.
+        median_direction_deg: median angle between directions of translation.
+        still: pairs whose reference centres coincide: they have no direction, and count by their
+            rotation alone.
+    """
+
+    status: str
+    auc: dict[float, float | None]
+    pairs: int
+    median_rotation_deg: float | None
+    median_direction_deg: float | None
+    still: int
+
+
+def pose_auc(
+    reference: ArrayLike,
+    estimate: ArrayLike,
+    *,
+    thresholds: tuple[float, ...] = AUC_THRESHOLDS,
+) -> PoseAuc:
+    """Area under the recall of pairwise pose errors: no alignment, no scale, no unit.
+
+    All pairs of poses count once. The area is a sum of trapezoids over AUC_BINS bins, as GLD's
+    evaluation takes it.
+
+    Args:
+        reference: (N, 4, 4) world_from_cam.
+        estimate: (N, 4, 4), row by row the same cameras.
+        thresholds: degrees.
+
+    Raises:
+        ShapeError: wrong shapes, or values that are not finite.
+    """
+    first, second = _poses(reference, estimate)
+    if len(first) < 2:
+        reason = f"degenerate: {len(first)} pose(s), at least 2 are needed"
+        return PoseAuc(reason, dict.fromkeys(thresholds), 0, None, None, 0)
+    i, j = np.array(list(combinations(range(len(first)), 2))).T
+    motion, rotation = _motions(first, i, j)
+    other_motion, other_rotation = _motions(second, i, j)
+    turned = _angles_deg(np.swapaxes(rotation, 1, 2) @ other_rotation)
+    moves = np.linalg.norm(motion, axis=1) > 1e-12 * max(_extent(first), 1e-300)
+    direction = np.where(moves, _between_deg(motion, other_motion), 0.0)
+    error = np.maximum(turned, direction)
+    return PoseAuc(
+        "measured",
+        {threshold: area_under_recall(error, threshold) for threshold in thresholds},
+        len(error),
+        float(np.median(turned)),
+        float(np.median(direction[moves])) if moves.any() else None,
+        int((~moves).sum()),
+    )
+
+
+def area_under_recall(errors: ArrayLike, threshold: float, *, bins: int = AUC_BINS) -> float:
+    """Area under the share of errors below x, for x from 0 to ``threshold``, over the threshold."""
+    edges = np.linspace(0, threshold, bins + 1)
+    values = np.sort(np.asarray(errors, np.float64))
+    share = np.searchsorted(values, edges, side="left") / len(values)
+    return float(np.trapezoid(share, edges) / threshold)
+
+
+def _poses(reference: ArrayLike, estimate: ArrayLike) -> tuple[Float64, Float64]:
+    first, second = np.asarray(reference, np.float64), np.asarray(estimate, np.float64)
+    if first.ndim != 3 or first.shape[1:] != (4, 4) or first.shape != second.shape:
+        raise ShapeError(
+            f"poses: reference {first.shape} and estimate {second.shape}; expected both (N, 4, 4)"
+        )
+    if not (np.isfinite(first).all() and np.isfinite(second).all()):
+        raise ShapeError("poses: NaN or infinity; leave those frames out and say so")
+    return first, second
+
+
+def _aligned(
+    reference: Float64, estimate: Float64, align: str, refuse_mirrored: bool
+) -> tuple[str, SimilarityFit | None]:
+    if align not in ALIGNMENTS:
+        raise OptionError(f"alignment {align!r}; expected one of {', '.join(ALIGNMENTS)}")
+    if not len(reference):
+        return "degenerate: no poses", None
+    if align == "none":
+        return UNALIGNED, None
+    fit = fit_similarity(estimate[:, :3, 3], reference[:, :3, 3], with_scale=align == "sim3")
+    if fit.ok and fit.mirrored and refuse_mirrored:
+        return "degenerate: the estimate fits the mirror image of the reference", None
+    return (ALIGNED, fit) if fit.ok else (fit.status, None)
+
+
+def _extent(poses: Float64) -> float:
+    if not len(poses):
+        return 0.0
+    centered = poses[:, :3, 3] - poses[0, :3, 3]
+    return float(2 * np.linalg.norm(centered - centered.mean(axis=0), axis=1).max())
+
+
+def _motions(poses: Float64, i: NDArray[np.int64], j: NDArray[np.int64]) -> tuple[Float64, Float64]:
+    """Translation (P, 3) and rotation (P, 3, 3) of camera j in camera i's frame."""
+    back = np.swapaxes(poses[i, :3, :3], 1, 2)
+    step = poses[j, :3, 3] - poses[i, :3, 3]
+    return np.einsum("pij,pj->pi", back, step), back @ poses[j, :3, :3]
+
+
+def _angles_deg(rotations: Float64) -> Float64:
+    """(P,) angles of rotations, exact near 0 and near 180 degrees."""
+    from scipy.spatial.transform import Rotation
+
+    return np.degrees(np.asarray(Rotation.from_matrix(rotations).magnitude()))
+
+
+def _between_deg(a: Float64, b: Float64) -> Float64:
+    """(P,) angles between vectors; 90 degrees where one of them is 0."""
+    cross = np.linalg.norm(np.cross(a, b), axis=1)
+    dot = np.einsum("pi,pi->p", a, b)
+    angle = np.degrees(np.arctan2(cross, dot))
+    return np.where((cross == 0) & (dot == 0), 90.0, angle)
+
+
+def _figures(
+    status: str,
+    translation: Float64,
+    rotation: Float64,
+    extent: float,
+    fit: SimilarityFit | None,
+) -> PoseErrors:
+    return PoseErrors(
+        status,
+        Statistics.of(translation),
+        Statistics.of(translation / extent) if extent > 0 else None,
+        Statistics.of(rotation),
+        1.0 if fit is None else fit.scale,
+        extent,
+        translation,
+        rotation,
+    )
+
+
+def _none(status: str, extent: float) -> PoseErrors:
+    empty = np.zeros(0)
+    return PoseErrors(status, None, None, None, None, extent, empty, empty)
