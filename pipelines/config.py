@@ -167,6 +167,8 @@ def with_setting(config: RunConfig, key: str, value: Any) -> RunConfig:
     """``config`` with one dotted key changed; texts are converted to the field's type."""
     head, _, rest = key.partition(".")
     names = [entry.name for entry in fields(config)]
+    if key == "completer.name":
+        return with_setting(config, "completer", value)
     if head == "completer" and rest:
         options = {**config.completer_options, rest: value}
         return replace(config, completer_options=options)

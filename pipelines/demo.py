@@ -54,10 +54,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
         dry_run=args.dry_run,
     )
     copy_figures(args, out)
-    if not args.dry_run:
+    if not args.dry_run and (out / "round_001").is_dir():
         console.line(
             f"look at {out / 'growth.png'} and at the pictures in {out}/round_001: guidance_* is "
-            "what the memory knew, generated_* what was completed, after_* what it knows now"
+            "what the completer was given, generated_* what it made of it, after_* what the memory "
+            "knows now"
         )
 
 

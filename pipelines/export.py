@@ -52,10 +52,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _refuse_foreign(form: str, out: Path) -> None:
-    """Keep models and transforms that no export wrote."""
+# How a file of a format begins, which is also what its name has to end with.
+MAGIC = {"ply": b"ply", "glb": b"glTF"}
+
+
+def _refuse_foreign(form: str, memory: Path, out: Path) -> None:
+    """Keep the input, and models, transforms and files that no export wrote."""
     from pipelines.export_cameras import foreign_model, foreign_transforms
 
+    if form in MAGIC:
+        if out.suffix.lower() != f".{form}":
+            raise OptionError(f"--out {out}: expected a name that ends with .{form}")
+        if out.is_file():
+            with out.open("rb") as file:
+                start = file.read(4)
+            if not start.startswith(MAGIC[form]) or (memory.is_file() and out.samefile(memory)):
+                raise OptionError(
+                    f"{out}: is there already and is "
+                    + ("the input" if start.startswith(MAGIC[form]) else f"no {form.upper()} file")
+                    + "; give another --out"
+                )
+        return
     found = foreign_model(out) if form == "colmap" else foreign_transforms(out)
     if found is not None:
         raise OptionError(
@@ -81,8 +98,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             f"--format {args.format}: {args.memory} is a PLY, which holds no cameras; give the "
             "run's folder or its memory.npz"
         )
-    if args.format in ("colmap", "transforms"):
-        _refuse_foreign(args.format, args.out)
+    _refuse_foreign(args.format, args.memory, args.out)
     memory = open_memory(args.memory, up_to=args.round)
     if not len(memory):
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")

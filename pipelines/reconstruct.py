@@ -140,14 +140,17 @@ def reconstruct(
     """
     plan = make_plan(scene, config)
     describe(plan, console)
-    if dry_run:
-        console.line(f"dry run: no run was started in {out}")
-        return out
     from pipelines.run_directory import RunDirectory
     from pipelines.run_identity import run_identity
 
     directory = RunDirectory(out)
-    with directory.taken_up(run_identity(plan, reading or {}), resume=resume) as done:
+    identity = run_identity(plan, reading or {})
+    if dry_run:
+        there = directory.check(identity, resume=resume)
+        state = "the run in it was left as it is" if there else "no run was started in it"
+        console.line(f"dry run: {out}: {state}")
+        return out
+    with directory.taken_up(identity, resume=resume) as done:
         _run_rounds(plan, directory, done, console)
     return out
 
@@ -156,11 +159,18 @@ def _run_rounds(plan: Plan, directory: RunDirectory, done: int, console: Console
     """The rounds from number ``done`` on, then the end products."""
     memory = _start_memory(plan)
     if done:
+        from gvtools.errors import ProjectError
         from gvtools.memory.spatial_memory import SpatialMemory
 
         console.line(f"resuming after round {done - 1}")
         kept = directory.round_memory(done - 1)
-        memory = SpatialMemory.load(kept if kept.exists() else directory.path / "memory.npz")
+        last = kept if kept.exists() else directory.path / "memory.npz"
+        if not last.exists():
+            raise ProjectError(
+                f"{directory.path}: the memory after round {done - 1} is gone, as with a later "
+                "round's folder that was removed; start again with another --out"
+            )
+        memory = SpatialMemory.load(last)
         # A finished run's memory holds every round, also one whose folder was removed since.
         for later in [number for number in reversed(memory.rounds) if number >= done]:
             memory.forget(round=later)

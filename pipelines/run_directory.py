@@ -12,6 +12,7 @@ import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,10 @@ def versions() -> dict[str, str]:
     return out
 
 
+# What is being written has such a name until it is whole.
+LEFTOVERS = ".*.part"
+
+
 class RunDirectory:
     """The folder of one run."""
 
@@ -48,11 +53,7 @@ class RunDirectory:
         """
         if self.path.exists() and not self.path.is_dir():
             raise ProjectError(f"{self.path}: is a file; give another --out")
-        if (
-            self.path.exists()
-            and not (self.path / "run.json").exists()
-            and any(self.path.iterdir())
-        ):
+        if self.path.exists() and not (self.path / "run.json").exists() and self._results():
             raise ProjectError(
                 f"{self.path}: holds files but no run.json, so it is no run of gvtools; give "
                 "another --out"
@@ -99,20 +100,26 @@ class RunDirectory:
         except (ImportError, OSError):
             return  # Where the system or the file system knows no locks, the user has to take care.
 
-    def _start(self, identity: dict[str, Any], *, resume: bool) -> int:
+    def check(self, identity: dict[str, Any], *, resume: bool) -> bool:
+        """Whether a run is there that ``taken_up`` would continue; touches nothing.
+
+        Raises:
+            ProjectError: as of ``taken_up``.
+        """
+        self.refuse_foreign()
         record = self.path / "run.json"
         if not record.exists():
-            write_json(record, {**identity, "versions": versions()})
-            return 0
+            return False
         try:
             before = json.loads(record.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise ProjectError(f"{record}: unreadable ({error}); give another --out") from None
-        if not self.round_path(0).exists():
+        ours = isinstance(before, dict) and before.keys() >= {*identity, "versions"}
+        if ours and not self._results():
             # Nothing came of the first attempt; its options bind nobody.
-            self._drop_leftovers()
-            write_json(record, {**identity, "versions": versions()})
-            return 0
+            return False
+        if not isinstance(before, dict):
+            before = {}
         changed = [
             key for key in identity if before.get(key) != json.loads(json.dumps(identity[key]))
         ]
@@ -126,6 +133,13 @@ class RunDirectory:
                 f"{self.path}: this run is there already; add --resume to continue it, or give "
                 "another --out"
             )
+        return True
+
+    def _start(self, identity: dict[str, Any], *, resume: bool) -> int:
+        if not self.check(identity, resume=resume):
+            self._drop_leftovers()
+            write_json(self.path / "run.json", {**identity, "versions": versions()})
+            return 0
         self._drop_leftovers()
         done = len(self.reports())
         # Rounds after a removed one stood on it; they are done anew.
@@ -136,9 +150,20 @@ class RunDirectory:
             self._settle(done - 1)
         return done
 
+    def _results(self) -> list[Path]:
+        """What the folder holds beside the run's record and what a kill left half-written."""
+        return [
+            path
+            for path in self.path.iterdir()
+            if path.name != "run.json" and not fnmatch(path.name, LEFTOVERS)
+        ]
+
     def _drop_leftovers(self) -> None:
-        for leftover in self.path.glob(".round_*.part"):
-            shutil.rmtree(leftover)
+        for leftover in self.path.glob(LEFTOVERS):
+            if leftover.is_dir():
+                shutil.rmtree(leftover)
+            else:
+                leftover.unlink()
 
     def reports(self) -> list[dict[str, Any]]:
         """The reports of the whole rounds, in order."""

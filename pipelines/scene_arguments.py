@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,11 +68,25 @@ def open_scene(path: Path, args: argparse.Namespace) -> Scene:
     return open_project(path, images=args.images, masks=args.masks, rgbd=rgbd_options(args))
 
 
+_NAMES = ("images", "masks", "depth_unit", "depth_max", "color_intrinsics", "depth_intrinsics",
+          "color_from_depth", "max_time_difference")  # fmt: skip
+_PATHS = ("images", "masks", "color_from_depth")
+
+
+def reopen_scene(path: Path, reading: Mapping[str, Any]) -> Scene:
+    """The project at ``path``, read as ``reading_of`` recorded.
+
+    Raises:
+        GvError: as of ``open_scene``.
+    """
+    given = {**dict.fromkeys(_NAMES), **reading}
+    paths = {name: Path(given[name]) for name in _PATHS if given[name] is not None}
+    return open_scene(path, argparse.Namespace(**{**given, **paths}))
+
+
 def reading_of(args: argparse.Namespace) -> dict[str, Any]:
     """What was given of the options of ``add_scene_arguments``, JSON-ready."""
-    names = ("images", "masks", "depth_unit", "depth_max", "color_intrinsics", "depth_intrinsics",
-             "color_from_depth", "max_time_difference")  # fmt: skip
-    given = {name: getattr(args, name) for name in names}
+    given = {name: getattr(args, name) for name in _NAMES}
     return {
         name: str(value.resolve()) if isinstance(value, Path) else value
         for name, value in given.items()

@@ -6,12 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import check_disjoint, select
 
+# Two pictures are one shot when their centres are this near (a share of the context's extent) and
+# their rotations differ by no more than this many degrees, whatever their sizes and lenses.
+SAME_PLACE = 1e-4
+SAME_DIRECTION = 0.05
 PATHS = ("interpolate", "orbit", "spiral")
 FORMS = (
     "a selection of the project's views, interpolate:N, orbit:N, spiral:N, a trajectory file "
@@ -116,29 +121,33 @@ def _project(path: Path, selection: str) -> Targets:
 
 
 def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) -> None:
-    """Refuse another project's views that are the context's: same file, or same camera and place.
+    """Refuse another project's views that are the context's: same file, or same place.
 
     Raises:
         OptionError: there is such a view.
     """
     given = [scene[name] for name in context]
     files = {view.files[0].resolve() for view in given if view.files}
-    places = {_place(view.camera) for view in given}
-    both = [
-        view.name
-        for view in targets.truth
-        if view is not None
-        and ((view.files and view.files[0].resolve() in files) or _place(view.camera) in places)
-    ]
+    known = scene.subset(context).cameras
+    near = SAME_PLACE * max(float(np.ptp(known.centers, axis=0).max()), 1e-9)
+    both = []
+    for view in targets.truth:
+        if view is None:
+            continue
+        same = bool(view.files) and view.files[0].resolve() in files
+        if same or _at_one_place(view.camera, known, near).any():
+            both.append(view.name)
     if both:
         raise OptionError(
             f"targets of another project overlap with the context in {len(both)} pictures (first "
-            f"{both[0]!r}: same file, or same camera and place); expected none; change one, or "
+            f"{both[0]!r}: same file, or same place and direction); expected none; change one, or "
             "pass --allow-overlap"
         )
 
 
-def _place(camera: Cameras) -> tuple[object, ...]:
-    """Size, intrinsics and pose, rounded to what text files keep."""
-    numbers = np.concatenate([camera.K.ravel(), camera.cam_from_world.ravel()])
-    return int(camera.width[0]), int(camera.height[0]), tuple(np.round(numbers, 5).tolist())
+def _at_one_place(camera: Cameras, known: Cameras, near: float) -> NDArray[np.bool_]:
+    """Which of the known cameras stand where ``camera`` does and look where it looks."""
+    apart = np.linalg.norm(known.centers - camera.centers[0], axis=1)
+    rotations = known.cam_from_world[:, :3, :3] @ camera.cam_from_world[0, :3, :3].T
+    cosine = (np.trace(rotations, axis1=1, axis2=2) - 1) / 2
+    return (apart <= near) & (cosine >= np.cos(np.radians(SAME_DIRECTION)))

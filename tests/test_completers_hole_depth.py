@@ -63,6 +63,30 @@ def test_a_hole_around_a_corner_of_the_square_is_the_wall():
     np.testing.assert_allclose(result.inverse[~valid], wall[~valid], rtol=2e-6)
 
 
+def test_what_stands_in_front_does_not_grow_into_a_hole_that_leaves_the_picture():
+    """The wall ends at the left, the square stands free in the hole: nothing faces its rim.
+
+    Beyond the square, where it is all that can be seen, it still goes on.
+    """
+    wall, seen, valid = _square_before_wall()
+    valid[:, 30:] = False
+    valid[35:85, 40:80] = True
+    result = _fill(seen, valid)
+    beside = ~valid & (result.distance > 8)
+    beside[:, 75:] = False
+    assert np.median(np.abs(result.inverse / wall - 1)[beside]) < 0.02
+    assert (np.abs(result.inverse / 0.6 - 1) < 0.1)[beside].mean() < 0.02
+
+
+def test_what_the_pictures_edge_cut_off_goes_on_a_little():
+    """Square and wall end at one straight line, as at the edge of a photograph."""
+    _, seen, valid = _square_before_wall()
+    valid[:, 70:] = False
+    result = _fill(seen, valid)
+    middle = result.inverse[57:63, 70:72]
+    np.testing.assert_allclose(middle, 0.6, rtol=0.02)
+
+
 def test_a_hole_inside_the_square_is_the_square():
     _, seen, _ = _square_before_wall()
     valid = _holes(np.s_[50:70, 52:68])

@@ -223,7 +223,7 @@ def test_a_ply_has_no_cameras_to_export(memory, tmp_path, kind):
 
 @pytest.mark.parametrize("kind", export.FORMATS)
 def test_a_target_that_cannot_be_written(saved, tmp_path, kind):
-    out = tmp_path / "out"
+    out = tmp_path / (f"out.{kind}" if kind in ("ply", "glb") else "out")
     if kind == "colmap":
         out.write_text("in the way")
     else:
@@ -233,3 +233,24 @@ def test_a_target_that_cannot_be_written(saved, tmp_path, kind):
     with pytest.raises(ProjectError, match=r"written"):
         run(saved, "--format", kind, "--out", out)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_files_that_are_no_export_and_the_input_itself_are_kept(saved, tmp_path):
+    memory = saved / "memory.npz"
+    before = memory.read_bytes()
+    for form, out, text in (
+        ("ply", memory, "ends with .ply"),
+        ("glb", tmp_path / "photo.jpg", "ends with .glb"),
+        ("ply", tmp_path, "ends with .ply"),
+    ):
+        with pytest.raises(OptionError, match=text):
+            run(saved, "--format", form, "--out", out)
+    (tmp_path / "mine.ply").write_text("notes")
+    with pytest.raises(OptionError, match="no PLY file"):
+        run(saved, "--format", "ply", "--out", tmp_path / "mine.ply")
+    assert (tmp_path / "mine.ply").read_text() == "notes"
+    assert memory.read_bytes() == before
+    run(saved, "--format", "ply", "--out", tmp_path / "one.ply")
+    run(saved, "--format", "ply", "--out", tmp_path / "one.ply", "--max-points", 50)
+    with pytest.raises(OptionError, match="the input"):
+        run(tmp_path / "one.ply", "--format", "ply", "--out", tmp_path / "one.ply")

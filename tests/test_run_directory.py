@@ -164,3 +164,78 @@ def test_figures_split_the_picture_by_what_observations_support(scan, tmp_path):
     assert any(
         (np.asarray(Image.open(path)) == 128).any() for path in out.glob("round_*/valid_*.png")
     )
+
+
+def test_another_programs_record_is_refused_untouched(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "run.json").write_text('{"experiment": "mine"}')
+    (out / "memory.ply").write_text("precious")
+    for more in ((), ("--resume",)):
+        assert reconstruct(scan, out, *more) == 2
+        assert "another run" in capsys.readouterr().err
+    assert (out / "memory.ply").read_text() == "precious"
+    (out / "memory.ply").unlink()
+    assert reconstruct(scan, out) == 2
+    assert json.loads((out / "run.json").read_text()) == {"experiment": "mine"}
+
+
+def test_a_run_whose_rounds_were_deleted_is_not_overwritten(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    memory = (out / "memory.npz").read_bytes()
+    for folder in out.glob("round_*"):
+        shutil.rmtree(folder)
+    assert reconstruct(scan, out, "--voxel", "0.3") == 2
+    assert "another run" in capsys.readouterr().err
+    assert reconstruct(scan, out) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert (out / "memory.npz").read_bytes() == memory
+    assert reconstruct(scan, out, "--resume") == 0
+    assert (out / "memory.npz").read_bytes() == memory
+
+
+def test_a_run_without_its_first_round_is_done_anew(scan, tmp_path):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    memory = (out / "memory.npz").read_bytes()
+    shutil.rmtree(out / "round_000")
+    assert reconstruct(scan, out) == 2
+    assert reconstruct(scan, out, "--resume") == 0
+    assert (out / "memory.npz").read_bytes() == memory
+    assert sorted(path.name for path in out.glob("round_*")) == [f"round_00{i}" for i in range(3)]
+
+
+def test_a_kill_while_the_record_is_written_leaves_a_usable_folder(scan, tmp_path):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / ".run.json.part").write_text("{")
+    assert reconstruct(scan, out, "--resume") == 0
+    assert not (out / ".run.json.part").exists()
+
+
+def test_a_memory_that_went_with_a_removed_round_is_said(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    shutil.move(out / "memory.npz", out / "round_002" / "memory.npz")
+    shutil.rmtree(out / "round_002")
+    assert reconstruct(scan, out, "--resume") == 2
+    assert "another --out" in capsys.readouterr().err
+
+
+def test_a_dry_run_tells_what_a_run_would_be_refused_for(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    assert reconstruct(scan, out, "--dry-run") == 2
+    assert reconstruct(scan, out, "--dry-run", "--resume") == 0
+    assert reconstruct(scan, out, "--dry-run", "--resume", "--voxel", "0.3") == 2
+    assert "another run" in capsys.readouterr().err
+
+
+def test_a_completer_may_be_named_in_its_section(scan, tmp_path):
+    file = tmp_path / "config.json"
+    file.write_text(json.dumps({"completer": {"name": "inpaint", "sweeps": 3}}))
+    assert reconstruct(scan, tmp_path / "run", "--config", file) == 0
+    config = json.loads((tmp_path / "run" / "run.json").read_text())["config"]
+    assert config["completer"] == "inpaint"
+    assert config["completer_options"] == {"sweeps": 3}

@@ -56,6 +56,9 @@ def test_absurd_inner_count_is_refused(tmp_path):
         ("images", r"^1 \S+ ", "1 ", r"images\.txt, line \d+: malformed"),
         ("images", r"^1 \S+ ", "1 word ", r"images\.txt, line \d+: malformed"),
         ("images", r"^1 \S+ ", "1 nan ", r"images\.txt, line \d+: malformed"),
+        # A lost line: what is read as an image is a line of points.
+        ("images", r"^1 .*\n", "", r"images\.txt, line \d+: malformed"),
+        ("images", r"^1 ", "1e999 ", r"images\.txt, line \d+: malformed"),
         ("images", r"(\S+ \S+) -1 ", r"\1 ", r"images\.txt, line \d+: malformed"),
         ("cameras", r"^1 SIMPLE_RADIAL 96 72", "1 SIMPLE_RADIAL 96", "as many parameters"),
         ("cameras", r"SIMPLE_RADIAL", "SIMPEL_RADIAL", "Camera model does not exist"),

@@ -132,3 +132,21 @@ def test_scene_without_views_is_not_ok(tmp_path):
     assert not report.ok
     assert [finding.message for finding in report.findings] == ["no view; expected at least one"]
     assert report.views == 0
+
+
+def test_intrinsics_that_no_camera_has_and_poses_that_points_contradict_are_warned_of(tmp_path):
+    reconstruction = workspace(tmp_path)
+    for image in reconstruction.images.values():
+        for index, point in enumerate(image.points2D):
+            if point.has_point3D():
+                image.points2D[index].xy = point.xy + np.array([30.0, 40.0])
+    reconstruction.write_binary(tmp_path / "sparse/0")
+    messages = [finding.message for finding in inspect(read_colmap(tmp_path)).findings]
+    assert any("miss their detections by" in message for message in messages)
+    assert not any("no camera has" in message for message in messages)
+    scene = read_colmap(tmp_path)
+    K = scene.views[0].camera.K.copy()
+    K[0, 0, 2] = -1
+    odd = replace(scene.views[0], camera=replace(scene.views[0].camera, K=K))
+    found = inspect(replace(scene, views=(odd, *scene.views[1:]), points=None)).findings
+    assert any("1 views have intrinsics that no camera has" in item.message for item in found)

@@ -69,6 +69,24 @@ def test_a_second_project_with_the_contexts_pictures_is_refused(scene, tmp_path)
         assert len(resolve_targets(scene, scene.names, spec, allow_overlap=True).cameras) >= 2
 
 
+def test_a_second_project_with_smaller_copies_of_the_pictures_is_refused(scene, tmp_path):
+    """Other files, sizes and intrinsics, but the same shots."""
+    from PIL import Image
+
+    from gvtools.scenes.transforms_json import write_transforms
+
+    cameras = scene.cameras.resized(48, 36)
+    for name in cameras.names:
+        Image.new("RGB", (48, 36)).save(tmp_path / f"{name}.png")
+    write_transforms(
+        tmp_path / "transforms.json", cameras, image_paths=[f"{name}.png" for name in cameras.names]
+    )
+    with pytest.raises(OptionError, match="overlap"):
+        resolve_targets(scene, scene.names[:2], str(tmp_path))
+    others = resolve_targets(scene, scene.names[:2], f"{tmp_path}@range:2-5")
+    assert len(others.cameras) == 4
+
+
 @pytest.mark.parametrize(
     ("targets", "size", "rounds", "expected"),
     [

@@ -134,7 +134,7 @@ def available() -> tuple[str, ...]:
     return tuple(_FACTORIES)
 
 
-def create(name: str, **options: object) -> Completer:
+def create(name: str, /, **options: object) -> Completer:
     """The completer called ``name`` with its options.
 
     Args:

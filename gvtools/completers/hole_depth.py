@@ -35,6 +35,9 @@ SAME_SURFACE_PER_PIXEL = 0.0003
 # The quantile of the directions' inverse depths. Steps are told apart pair by pair, so that this
 # needs to lean to the far side only a little.
 FAR_QUANTILE = 0.45
+# A surface in front of another continues into a hole that nothing bounds by at most this share of
+# the way to the other's rim.
+CONTINUED = 0.15
 # A continued plane stays within these multiples of the extreme inverse depths of the view.
 FARTHEST, NEAREST = 0.5, 2.0
 
@@ -260,6 +263,34 @@ def _pair(p, q, px, py, qx, qy, x, y, slope):
 
 
 @numba.njit(cache=True)
+def _unhidden(planes, flat, hits, h, x, y, width, slope):
+    """Weight left to rim pixel ``h``, which nothing faces, by farther surfaces seen from (x, y).
+
+    A surface that stands in front of another ends at its silhouette, unless the hole begins at the
+    edge of what was photographed. So it continues by a share of the way to the farther rim alone.
+    """
+    p = planes[flat[h]]
+    px, py = h % width, h // width
+    near = math.sqrt((x - px) ** 2 + (y - py) ** 2)
+    left = 1.0
+    for k in range(len(hits)):
+        g = hits[k, y, x]
+        if g < 0 or g == h:
+            continue
+        q = planes[flat[g]]
+        if q[0] >= p[0]:
+            continue
+        qx, qy = g % width, g // width
+        far = math.sqrt((x - qx) ** 2 + (y - qy) ** 2)
+        tolerance = SAME_SURFACE + SAME_SURFACE_PER_PIXEL * (near + far) + p[4] + q[4]
+        p_over_q = (p[0] + p[1] * (qx - px) + p[2] * (qy - py)) - q[0]
+        q_over_p = (q[0] + q[1] * (px - qx) + q[2] * (py - qy)) - p[0]
+        if p_over_q > tolerance * q[0] and q_over_p < -tolerance * p[0]:
+            left *= 1.0 - q[3] * min(1.0, near / (CONTINUED * far))
+    return left
+
+
+@numba.njit(cache=True)
 def _combine(inverse, known, hits, planes, plane_of, slope, limits, spread):
     """Write the answer of the eight pairs into each hole pixel; the number of clipped pixels."""
     height, width = known.shape
@@ -287,6 +318,7 @@ def _combine(inverse, known, hits, planes, plane_of, slope, limits, spread):
                     dx, dy = x - h % width, y - h // width
                     values[count] = plane[0] + plane[1] * dx + plane[2] * dy
                     weights[count] = 0.4 * plane[3] / (dx * dx + dy * dy)
+                    weights[count] *= _unhidden(planes, flat, hits, h, x, y, width, slope)
                 count += 1
             if count == 0:
                 continue

@@ -7,7 +7,7 @@ its numbers from elsewhere, and neither raises an error by itself; so every reco
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -204,7 +204,8 @@ def _check_text_images(path: Path) -> dict[int, str]:
         if not line.strip() or line.startswith("#"):
             continue
         tokens = line.split(maxsplit=9)
-        if len(tokens) < 10 or not _are_numbers(tokens[:9]):
+        whole = len(tokens) == 10 and _are_whole((tokens[0], tokens[8]))
+        if not whole or not _are_numbers(tokens[:9]):
             raise _malformed(path, number, line, "ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
         names[int(tokens[0])] = tokens[9].strip()
         number, points = next(lines, (number + 1, ""))
@@ -234,6 +235,13 @@ def _check_text(
 def _are_numbers(tokens: list[str]) -> bool:
     try:
         return all(float(token) == float(token) for token in tokens)
+    except ValueError:
+        return False
+
+
+def _are_whole(tokens: Iterable[str]) -> bool:
+    try:
+        return all(int(token) >= 0 for token in tokens)
     except ValueError:
         return False
 

@@ -18,6 +18,10 @@ ADD_DEPTH = {
     "transforms": "name each frame's depth map in its depth_file_path",
     "rgbd": "add the depth maps of the recording",
 }
+# Focal lengths of usual lenses, over the image's sides.
+FOCAL = (0.1, 50.0)
+# Mean reprojection error, pixels, above which a model is no good one.
+REPROJECTION = 4.0
 SAMPLED_VIEWS = 16  # opened when only a sample is asked for, spread over the scene
 
 
@@ -109,6 +113,7 @@ def inspect(scene: Scene, *, read_pixels: bool | Literal["sample"] = True) -> Sc
         findings.append(Finding("warning", "all cameras stand at the same place: no parallax"))
     errors = reprojection_errors(scene)
     findings += _views_without_depth(scene)
+    findings += _doubtful_cameras(scene, errors)
     _depth_without_pixels(opened, findings)
     return SceneReport(
         root=str(scene.root),
@@ -197,6 +202,35 @@ def _views_without_depth(scene: Scene) -> list[Finding]:
     advice = ADD_DEPTH.get(scene.kind, "add depth maps")
     message = f"none of the {without} views has depth, which a run needs; {advice}"
     return [Finding("warning", message)]
+
+
+def _doubtful_cameras(scene: Scene, errors: np.ndarray) -> list[Finding]:
+    """Intrinsics that no camera has, and poses that the sparse points contradict."""
+    findings = []
+    odd = []
+    for view in scene.views:
+        K = view.camera.K[0]
+        size = np.array([view.camera.width[0], view.camera.height[0]])
+        focal = np.array([K[0, 0], K[1, 1]]) / size
+        center = K[:2, 2] / size
+        if focal.min() < FOCAL[0] or focal.max() > FOCAL[1] or np.abs(center - 0.5).max() > 0.5:
+            odd.append(view.name)
+    if odd:
+        message = (
+            f"{len(odd)} views have intrinsics that no camera has (focal length outside "
+            f"{FOCAL[0]} to {FOCAL[1]:g} image sides, or a principal point outside the image): "
+            f"first {odd[0]}"
+        )
+        findings.append(Finding("warning", message))
+    known = errors[np.isfinite(errors)]
+    mean = float(known.mean()) if known.size else 0.0
+    if mean > REPROJECTION:
+        message = (
+            f"the sparse points miss their detections by {mean:.3g} pixels on average; expected "
+            f"below {REPROJECTION:g}: poses or intrinsics are wrong"
+        )
+        findings.append(Finding("warning", message))
+    return findings
 
 
 def _depth_without_pixels(opened: list[dict[str, Any]], findings: list[Finding]) -> None:

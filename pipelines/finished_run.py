@@ -1,0 +1,121 @@
+"""A run read back: its project, what was given, and what its rounds left of each target."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gvtools.errors import ProjectError
+from pipelines.round_files import TargetFiles, read_target
+from pipelines.run_directory import RunDirectory
+from pipelines.scene_arguments import reopen_scene
+
+if TYPE_CHECKING:
+    from gvtools.evaluation.posed_picture import PosedPicture
+    from gvtools.scenes.scene import Scene, View
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedRun:
+    """A run with at least one round of targets.
+
+    Attributes:
+        path: its folder.
+        record: what run.json holds.
+        scene: the project.
+        truths: the scene whose views show the truth of the targets; None where there is none.
+        reports: of the whole rounds, the context's (round 0) first.
+    """
+
+    path: Path
+    record: Mapping[str, Any]
+    scene: Scene
+    truths: Scene | None
+    reports: tuple[Mapping[str, Any], ...]
+
+    @property
+    def whole(self) -> bool:
+        """Whether every round that was planned is there."""
+        return len(self.reports) == len(self.record["schedule"]) + 1
+
+    def targets(self) -> Iterator[tuple[int, Mapping[str, Any], TargetFiles, View | None]]:
+        """Round, entry of its report, files, and the view that shows the truth, of each target.
+
+        Raises:
+            ProjectError: files are absent or damaged, or the truth is of another camera by now.
+        """
+        for number, report in enumerate(self.reports[1:], start=1):
+            folder = RunDirectory(self.path).round_path(number)
+            for entry in report["views"]:
+                target = read_target(folder, entry)
+                truth = None if self.truths is None else self.truths[target.name]
+                if truth is not None and not _same_camera(truth, target):
+                    raise ProjectError(
+                        f"{self.path}: the camera of {target.name} is another one now than when "
+                        "the run was made; expected the project as it was; run reconstruct again"
+                    )
+                yield number, entry, target, truth
+
+    def context(self) -> list[PosedPicture]:
+        """The given views; the depth of those that have none is the memory's of round 0."""
+        from gvtools.evaluation.posed_picture import PosedPicture
+
+        memory = None
+        out = []
+        for name in self.record["context"]:
+            view = self.scene[name]
+            frame = view.load()
+            depth = frame.depth
+            if depth is None:
+                if memory is None:
+                    from pipelines.memory_source import open_memory
+
+                    memory = open_memory(self.path, up_to=0)
+                depth = memory.project(view.camera).depth[0]
+            out.append(PosedPicture(name, view.camera, frame.rgb, depth, frame.mask))
+        return out
+
+
+def open_run(path: Path, *, project: Path | None = None) -> FinishedRun:
+    """The run in a folder.
+
+    Args:
+        path: the folder.
+        project: where its project lies now; None: where it lay.
+
+    Raises:
+        ProjectError: no run, one without a round of targets, or one whose project is gone.
+    """
+    file = path / "run.json"
+    if not file.is_file():
+        raise ProjectError(f"{path}: holds no run.json; expected the folder of a run")
+    try:
+        record = json.loads(file.read_text(encoding="utf-8"))
+        root, reading = Path(record["project"]), record["reading"]
+        other, kind = record["targets_project"], record["targets_kind"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ProjectError(
+            f"{file}: no record of a run of this version ({error!r}); run reconstruct again"
+        ) from None
+    reports = tuple(RunDirectory(path).reports())
+    if len(reports) < 2:
+        raise ProjectError(f"{path}: no round of targets is done; expected one; add --resume to it")
+    scene = reopen_scene(project or root, reading)
+    truths = {"hold-out": scene}.get(kind)
+    if other is not None:
+        from gvtools.scenes.project import open_project
+
+        truths = open_project(Path(other))
+    return FinishedRun(path, record, scene, truths, reports)
+
+
+def _same_camera(view: View, target: TargetFiles) -> bool:
+    return all(
+        np.allclose(getattr(view.camera, name), getattr(target.camera, name), rtol=1e-9, atol=1e-9)
+        for name in ("K", "cam_from_world", "width", "height")
+    )
