@@ -1,0 +1,1 @@
+"""Layouts that gvtools reads, and benchmarks that it stands beside, as YAML."""

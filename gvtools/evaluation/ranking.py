@@ -1,0 +1,198 @@
+"""What a measurement needs to be ranked beside published figures.
+
+A measured row joins the ranking figure by figure, where its data set, its resolution, its numbers
+of views and the figure's definition are those of the source. What the source leaves open and the
+value depends on (such as the network of LPIPS) agrees with nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from gvtools.errors import OptionError
+from gvtools.evaluation.published import (
+    ASPECTS,
+    Benchmark,
+    Figure,
+    PublishedRow,
+    name_key,
+    unknown,
+)
+from gvtools.evaluation.tables import Cell, Column, Table, Value
+
+PUBLISHED = "published"
+MEASURED = "measured here"
+NO_VALUE = "no value here"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """How figures were measured here. None is "not recorded", and agrees with nothing.
+
+    Attributes:
+        data_set: a benchmark's name; None is a scene of the user's own.
+        resolution: width and height, pixels.
+        context: context views of a round.
+        targets: target views of a round.
+        rounds: how many rounds.
+        scenes: how many scenes the figures are averages over.
+        pixels: which pixels were compared, "all" or a region's name.
+        lpips_net: "vgg" or "alex".
+        poses_from: what estimated the poses of the pictures: "VGGT", "pose probe".
+        pose_unit: of ATE and RPE_t: "data set", or what they are a share of.
+        reprojection: which reprojection error.
+        met3r: "original" for the authors' program, else what stands in for it.
+        hardware: what the time was taken on.
+    """
+
+    data_set: str | None
+    resolution: tuple[int, int]
+    context: int
+    targets: int
+    rounds: int = 1
+    scenes: int = 1
+    pixels: str = "all"
+    lpips_net: str | None = None
+    poses_from: str | None = None
+    pose_unit: str | None = None
+    reprojection: str | None = None
+    met3r: str | None = None
+    hardware: str | None = None
+
+
+@dataclass(frozen=True)
+class MeasuredRow:
+    """What was measured here; None and NaN are figures without a value."""
+
+    system: str
+    figures: Mapping[str, float | None]
+    setting: Setting
+
+
+@dataclass(frozen=True)
+class SideBySideRow:
+    """A system's row of the comparison; everything by the benchmark's names of figures.
+
+    Attributes:
+        system: name.
+        origin: PUBLISHED or MEASURED.
+        figures: values; None for none.
+        ranks: 1 is best; None without a rank.
+        reasons: for each figure without a rank, why.
+    """
+
+    system: str
+    origin: str
+    figures: Mapping[str, float | None]
+    ranks: Mapping[str, int | None]
+    reasons: Mapping[str, tuple[str, ...]]
+
+
+def reasons_not_to_rank(setting: Setting, benchmark: Benchmark, figure: str) -> tuple[str, ...]:
+    """Why a figure measured in ``setting`` has no rank among the published; empty if it has one.
+
+    Raises:
+        OptionError: no such figure in the benchmark.
+    """
+    if figure not in benchmark.figures:
+        raise OptionError(unknown(f"{benchmark.name}: figure", figure, benchmark.figures))
+    reasons: list[str] = []
+    if setting.data_set is None or name_key(setting.data_set) != name_key(benchmark.name):
+        own = setting.data_set or "a scene of one's own"
+        reasons = [f"data set: {own} here, {benchmark.name} published"]
+    elif setting.scenes < 2:
+        reasons = ["scenes: a single one here, the published figures are of a data set"]
+    compared = {
+        "resolution": (f"{x.resolution[0]}x{x.resolution[1]}" for x in (setting, benchmark)),
+        "context views a round": (setting.context, benchmark.context),
+        "target views a round": (setting.targets, benchmark.targets),
+        "rounds": (setting.rounds, benchmark.rounds),
+    }
+    for what, (here, there) in compared.items():
+        if here != there:
+            reasons.append(f"{what}: {here} here, {there} published")
+    for aspect, there in benchmark.figures[figure].definition.items():
+        here = getattr(setting, aspect)
+        if there is None or here is None or name_key(here) != name_key(there):
+            stated = "not stated by the source" if there is None else f"{there} published"
+            reasons.append(f"{ASPECTS[aspect]}: {here or 'not recorded'} here, {stated}")
+    return tuple(reasons)
+
+
+def side_by_side(
+    measured: Sequence[MeasuredRow], benchmark: Benchmark
+) -> tuple[SideBySideRow, ...]:
+    """Published rows, then measured ones, with ranks figure by figure where they are comparable.
+
+    Values are compared as published, in so many decimals; equal ones share a rank.
+
+    Raises:
+        OptionError: a measured figure that the benchmark does not know.
+    """
+    rows: list[PublishedRow | MeasuredRow] = [*benchmark.rows, *measured]
+    why = [_reasons(row, benchmark) for row in rows]
+    ranks = {}
+    for name, figure in benchmark.figures.items():
+        pairs = zip(rows, why, strict=True)
+        ranks[name] = _ranks([None if name in w else r.figures[name] for r, w in pairs], figure)
+    return tuple(
+        SideBySideRow(
+            row.system,
+            MEASURED if isinstance(row, MeasuredRow) else PUBLISHED,
+            {name: row.figures.get(name) for name in ranks},
+            {name: column[i] for name, column in ranks.items()},
+            why[i],
+        )
+        for i, row in enumerate(rows)
+    )
+
+
+def comparison_table(rows: Sequence[SideBySideRow], benchmark: Benchmark) -> Table:
+    """The rows as a table; why values have no rank stands in its notes."""
+    figures = benchmark.figures.values()
+    columns = [Column("System"), Column("Origin")]
+    columns += [Column(f.label, unit=f.unit, better=f.better, digits=f.digits) for f in figures]
+    cells: list[tuple[Value, ...]] = [
+        (row.system, row.origin, *(Cell(row.figures[f.name], row.ranks[f.name]) for f in figures))
+        for row in rows
+    ]
+    notes = [
+        f"Published: {benchmark.source['title']}, {benchmark.source['table']}.",
+        f"Not stated there: {'; '.join(benchmark.not_stated)}.",
+        *(f"In the source, {note}." for note in benchmark.notes),
+        "Ranks count the published rows, and the comparable ones that were measured here.",
+    ]
+    for row in rows:
+        labels: dict[str, list[str]] = {}
+        for figure in figures:
+            for reason in row.reasons.get(figure.name, ()):
+                labels.setdefault(reason, []).append(figure.label)
+        labels.pop(NO_VALUE, None)
+        for reason, of in labels.items():
+            notes.append(f"{row.system}, no rank in {', '.join(of)}: {reason}.")
+    return Table(tuple(columns), tuple(cells), caption=benchmark.name, notes=tuple(notes))
+
+
+def _reasons(row: PublishedRow | MeasuredRow, benchmark: Benchmark) -> dict[str, tuple[str, ...]]:
+    """For each figure without a rank, why."""
+    if isinstance(row, PublishedRow):
+        return {}
+    for name in row.figures:
+        if name not in benchmark.figures:
+            raise OptionError(unknown(f"{row.system}: figure", name, benchmark.figures))
+    out: dict[str, tuple[str, ...]] = {}
+    for name in benchmark.figures:
+        value = row.figures.get(name)
+        absent = value is None or math.isnan(value)
+        out[name] = (NO_VALUE,) if absent else reasons_not_to_rank(row.setting, benchmark, name)
+    return {name: reasons for name, reasons in out.items() if reasons}
+
+
+def _ranks(values: Sequence[float | None], figure: Figure) -> list[int | None]:
+    """Of the values, rounded as published: no digit decides that others do not have."""
+    sign = 1 if figure.better == "higher" else -1
+    worth = [None if value is None else sign * round(value, figure.digits) for value in values]
+    known = [value for value in worth if value is not None]
+    return [None if own is None else 1 + sum(other > own for other in known) for own in worth]

@@ -1,0 +1,240 @@
+"""Tables of figures as CSV, Markdown and LaTeX.
+
+CSV is for programs: full precision, an empty field where there is no value, ranks in columns of
+their own. Markdown and LaTeX (with the package booktabs) are for readers: so many decimals a
+column, a dash where there is no value, an arrow towards the better values, the best of a column
+bold, the second italic in Markdown and underlined in LaTeX.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from numbers import Integral
+
+from gvtools.errors import OptionError, ShapeError
+
+# Significant digits of a column without decimals of its own.
+SIGNIFICANT = 4
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column's heading, and how its numbers are printed.
+
+    Attributes:
+        title: the heading.
+        unit: in brackets behind it; empty for none.
+        better: "higher" or "lower"; None for neither, and for texts.
+        digits: decimals; None prints four significant digits.
+    """
+
+    title: str
+    unit: str = ""
+    better: str | None = None
+    digits: int | None = None
+
+    @property
+    def heading(self) -> str:
+        """Title and unit."""
+        return f"{self.title} ({self.unit})" if self.unit else self.title
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A value with its rank in the column, 1 the best; None for no rank."""
+
+    value: float | None
+    rank: int | None = None
+
+
+Value = str | int | float | Cell | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns, rows of as many values, a caption, and notes below.
+
+    Raises:
+        ShapeError: a row that is longer or shorter than the columns.
+    """
+
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Value, ...], ...]
+    caption: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for number, row in enumerate(self.rows, start=1):
+            if len(row) != len(self.columns):
+                raise ShapeError(
+                    f"table {self.caption!r}: row {number} has {len(row)} values; expected "
+                    f"{len(self.columns)}"
+                )
+
+
+def csv_text(table: Table) -> str:
+    """The table as CSV (RFC 4180), without caption and notes.
+
+    A column with ranks is followed by one named "TITLE rank".
+    """
+    ranked = [any(_rank(row[i]) for row in table.rows) for i in range(len(table.columns))]
+    out = io.StringIO()
+    writer = csv.writer(out)
+    heads: list[str] = []
+    for column, with_ranks in zip(table.columns, ranked, strict=True):
+        heads += [column.heading, f"{column.title} rank"] if with_ranks else [column.heading]
+    writer.writerow(heads)
+    for row in table.rows:
+        fields: list[str | int | float | None] = []
+        for value, with_ranks in zip(row, ranked, strict=True):
+            fields += [_plain(value), _rank(value)] if with_ranks else [_plain(value)]
+        writer.writerow(fields)
+    return out.getvalue()
+
+
+def markdown(table: Table) -> str:
+    """The table in the Markdown of GitHub; caption above, notes below."""
+    arrow = {"higher": " ↑", "lower": " ↓", None: ""}
+    heads = [_markdown_text(column.heading) + arrow[column.better] for column in table.columns]
+    sides = ["---:" if _numeric(table, i) else ":---" for i in range(len(heads))]
+    lines = [f"| {' | '.join(heads)} |", f"| {' | '.join(sides)} |"]
+    for row in table.rows:
+        cells = []
+        for column, value in zip(table.columns, row, strict=True):
+            mark = {1: "**", 2: "*"}.get(_rank(value) or 0, "")
+            cells.append(mark + _markdown_text(_shown(column, value)) + mark)
+        lines.append(f"| {' | '.join(cells)} |")
+    above = [f"{_markdown_paragraph(table.caption)}\n"] if table.caption else []
+    below = [f"\n{_markdown_paragraph(note)}" for note in table.notes]
+    return "\n".join([*above, *lines, *below]) + "\n"
+
+
+def latex(table: Table, *, label: str | None = None) -> str:
+    """A table environment for booktabs; caption above, notes below in small print.
+
+    Args:
+        table: what to print.
+        label: what LaTeX refers to it by; None for none.
+    """
+    arrow = {"higher": r"~$\uparrow$", "lower": r"~$\downarrow$", None: ""}
+    heads = [_latex_text(column.heading) + arrow[column.better] for column in table.columns]
+    sides = "".join("r" if _numeric(table, i) else "l" for i in range(len(heads)))
+    lines = [r"\begin{table}", r"  \centering"]
+    if table.caption:
+        lines.append(rf"  \caption{{{_latex_text(table.caption)}}}")
+    if label:
+        lines.append(rf"  \label{{{label}}}")
+    lines += [rf"  \begin{{tabular}}{{{sides}}}", r"    \toprule"]
+    lines += [f"    {' & '.join(heads)} \\\\", r"    \midrule"]
+    for row in table.rows:
+        cells = []
+        for column, value in zip(table.columns, row, strict=True):
+            mark = {1: r"\textbf{%s}", 2: r"\underline{%s}"}.get(_rank(value) or 0, "%s")
+            cells.append(mark % _latex_value(column, value))
+        lines.append(f"    {' & '.join(cells)} \\\\")
+    lines += [r"    \bottomrule", r"  \end{tabular}"]
+    # A blank line begins the paragraph of each note.
+    lines += [f"\n  {{\\footnotesize {_latex_text(note)}\\par}}" for note in table.notes]
+    return "\n".join([*lines, r"\end{table}"]) + "\n"
+
+
+FORMS: dict[str, Callable[[Table], str]] = {"csv": csv_text, "markdown": markdown, "latex": latex}
+
+
+def render(table: Table, form: str) -> str:
+    """The table in a form of FORMS: csv, markdown or latex.
+
+    Raises:
+        OptionError: another form.
+    """
+    if form not in FORMS:
+        raise OptionError(f"table form {form!r}; expected one of {', '.join(FORMS)}")
+    return FORMS[form](table)
+
+
+def _plain(value: Value) -> str | int | float | None:
+    """Without rank; NaN is no value."""
+    plain = value.value if isinstance(value, Cell) else value
+    return None if not isinstance(plain, str | Integral | None) and math.isnan(plain) else plain
+
+
+def _rank(value: Value) -> int | None:
+    return value.rank if isinstance(value, Cell) and _plain(value) is not None else None
+
+
+def _numeric(table: Table, index: int) -> bool:
+    """Whether a column holds numbers alone."""
+    return not any(isinstance(row[index], str) for row in table.rows)
+
+
+def _shown(column: Column, value: Value) -> str:
+    """For readers: a number other than 0 never reads as 0."""
+    plain = _plain(value)
+    if plain is None:
+        return "–"
+    if isinstance(plain, str | Integral):
+        return str(plain)
+    if math.isinf(plain):
+        return "∞" if plain > 0 else "-∞"
+    if column.digits is None:
+        return f"{plain:.{SIGNIFICANT}g}"
+    text = f"{plain:.{column.digits}f}"
+    if float(text) == 0:
+        return f"{plain:.1g}" if plain else f"{0:.{column.digits}f}"
+    return text
+
+
+def _latex_value(column: Column, value: Value) -> str:
+    shown = _shown(column, value)
+    if isinstance(_plain(value), str):
+        return _latex_text(shown)
+    if shown == "–":
+        return "--"
+    # Only mathematics has a minus sign, infinity and powers.
+    number = re.sub(r"e\+?(-?)0*(\d+)", r"\\cdot10^{\1\2}", shown.replace("∞", r"\infty"))
+    return shown if number == shown and shown[0] != "-" else f"${number}$"
+
+
+_MARKDOWN = re.compile(r"([\\`*_\[\]<>|~&#$])")
+# Brackets and stars would be read as arguments behind the end of a line.
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "|": r"\textbar{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    '"': "''",
+    "[": "{[}",
+    "*": "{*}",
+}
+
+
+def _markdown_text(text: str) -> str:
+    return _MARKDOWN.sub(r"\\\1", _one_line(text))
+
+
+def _markdown_paragraph(text: str) -> str:
+    """Text that does not begin a list, a rule or a heading."""
+    return re.sub(r"^(\d*)([-+=.)])", r"\1\\\2", _markdown_text(text))
+
+
+def _latex_text(text: str) -> str:
+    return "".join(_LATEX.get(sign, sign) for sign in _one_line(text))
+
+
+def _one_line(text: str) -> str:
+    """White space of every kind as single blanks; other control characters left out."""
+    return " ".join("".join(s for s in text if s.isprintable() or s.isspace()).split())

@@ -1,0 +1,319 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+
+import pytest
+import yaml
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.evaluation import published
+from gvtools.evaluation.published import (
+    ASPECTS,
+    benchmark_names,
+    load_benchmark,
+    parse_benchmark,
+)
+from gvtools.evaluation.ranking import (
+    MEASURED,
+    NO_VALUE,
+    PUBLISHED,
+    MeasuredRow,
+    Setting,
+    comparison_table,
+    reasons_not_to_rank,
+    side_by_side,
+)
+
+NAMES = ("dl3dv", "mipnerf360", "realestate10k", "scannetv2")
+FIGURES = ("psnr", "ssim", "lpips", "ate", "rpe_r", "rpe_t", "reproj", "met3r", "time")
+HIGHER = {"psnr", "ssim"}
+# All that a setting can record as the source has it; what is not stated has any value.
+ALIKE = Setting(
+    data_set="DL3DV",
+    resolution=(504, 504),
+    context=2,
+    targets=6,
+    scenes=12,
+    lpips_net="vgg",
+    poses_from="VGGT",
+    pose_unit="data set",
+    reprojection="between views",
+    met3r="original",
+    hardware="A800",
+)
+RANKED = {"psnr", "ssim", "rpe_r", "met3r"}
+
+
+def _paper(shared) -> str:
+    texts = sorted((shared / "paper").glob("*.txt")) if (shared / "paper").is_dir() else []
+    if not texts:
+        pytest.skip(f"no paper/*.txt in {shared}")
+    return texts[0].read_text(encoding="utf-8")
+
+
+def _tabular(paper: str, label: str) -> list[list[str]]:
+    """The cells of a LaTeX table, row by row, as they are written."""
+    start = paper.index(rf"\label{{{label}}}")
+    body = paper[start : paper.index(r"\end{tabular}", start)]
+    lines = [line.strip() for line in body.splitlines() if line.strip().endswith(r"\\")]
+    return [[cell.strip() for cell in line[:-2].split("&")] for line in lines]
+
+
+def _comparison(paper: str) -> dict[str, dict[str, list[str]]]:
+    """Cells of Table 1, by data set and system."""
+    out: dict[str, dict[str, list[str]]] = {}
+    for cells in _tabular(paper, "tab:comparison"):
+        head = re.search(r"rotatebox.*\\textbf\{(.*?)\}", cells[0])
+        if head:
+            rows = out.setdefault(head[1], {})
+        if out and len(cells) == 11:
+            rows[re.sub(r"\\textbf\{(.*)\}", r"\1", cells[1])] = cells[2:]
+    return out
+
+
+def _number(cell: str) -> str:
+    return re.sub(r"\\(textbf|underline)\{(.*)\}", r"\2", cell)
+
+
+def test_every_specification_loads():
+    assert benchmark_names() == NAMES
+    loaded = [load_benchmark(name) for name in NAMES]
+    assert [len(b.rows) for b in loaded] == [8, 8, 8, 5]
+    assert [b.rounds for b in loaded] == [1, 1, 1, 3]
+    for benchmark in loaded:
+        assert tuple(benchmark.figures) == FIGURES
+        assert (benchmark.context, benchmark.targets, benchmark.resolution) == (2, 6, (504, 504))
+        assert {n for n, f in benchmark.figures.items() if f.better == "higher"} == HIGHER
+        for row in benchmark.rows:
+            assert tuple(row.figures) == FIGURES
+        # One wording of the definitions; only the time of several rounds is another.
+        for name in FIGURES[:-1]:
+            assert benchmark.figures[name] == loaded[0].figures[name]
+    assert load_benchmark("Mip-NeRF 360") == load_benchmark("mipnerf360")
+
+
+def test_each_number_is_the_papers(shared):
+    """Also in its decimals, and with no system left out; the paper's Ours is GeoVerse."""
+    tables = _comparison(_paper(shared))
+    assert sorted(tables) == sorted(load_benchmark(name).name for name in NAMES)
+    checked = 0
+    for name in NAMES:
+        benchmark = load_benchmark(name)
+        printed = {s.replace("Ours", "GeoVerse"): c for s, c in tables[benchmark.name].items()}
+        assert [row.system for row in benchmark.rows] == list(printed)
+        for row in benchmark.rows:
+            for figure, cell in zip(benchmark.figures.values(), printed[row.system], strict=True):
+                assert f"{row.figures[figure.name]:.{figure.digits}f}" == _number(cell)
+                checked += 1
+    assert checked == 29 * 9
+
+
+def test_ranks_of_published_rows_are_the_papers_marks(shared):
+    """Bold is the best and underlined the second, in the paper's own table."""
+    tables = _comparison(_paper(shared))
+    for name in NAMES:
+        benchmark = load_benchmark(name)
+        printed = list(tables[benchmark.name].values())
+        for row, cells in zip(side_by_side([], benchmark), printed, strict=True):
+            assert row.origin == PUBLISHED and not row.reasons
+            for figure, cell in zip(FIGURES, cells, strict=True):
+                rank = row.ranks[figure]
+                assert (rank == 1) == cell.startswith(r"\textbf"), (name, row.system, figure)
+                assert (rank == 2) == cell.startswith(r"\underline"), (name, row.system, figure)
+
+
+def test_protocol_and_notes_are_the_papers(shared):
+    paper = _paper(shared)
+    assert r"$N_{\mathcal C}=2$ context views and $N_{\mathcal T}=6$ target views" in paper
+    assert r"$504\times504$ resolution" in paper
+    title = paper.partition(r"\title{")[2].partition("}")[0].replace(r"\\", "")
+    assert load_benchmark("dl3dv").source["title"] == " ".join(title.split())
+    for name in NAMES:
+        assert load_benchmark(name).data_set["cited_as"] in paper
+    # The one figure of GeoVerse on ScanNetV2 that the ablation has otherwise is the one noted.
+    (ablation,) = (c for c in _tabular(paper, "tab:ablation_corrected") if "GeoVerse" in c[0])
+    ours = _geoverse("scannetv2")
+    odd = {n: c for n, c in zip(FIGURES, ablation[1:], strict=True) if ours[n] != float(c)}
+    assert odd == {"rpe_r": "0.223"}
+    assert any("0.233" in n and "0.223" in n for n in load_benchmark("scannetv2").notes)
+    # The few-step study repeats the row on DL3DV, as noted.
+    study = next(c for c in _tabular(paper, "tab:fewstep_analysis") if c[0] == "3")
+    again = [float(_number(cell)) for cell in study[1:7]]
+    assert again == [
+        _geoverse("dl3dv")[n] for n in ("time", "psnr", "ssim", "lpips", "ate", "met3r")
+    ]
+
+
+def _geoverse(name: str):
+    return next(row.figures for row in load_benchmark(name).rows if row.system == "GeoVerse")
+
+
+def _gld(name: str):
+    return next(row.figures for row in load_benchmark(name).rows if row.system == "GLD")
+
+
+def test_differences_that_the_paper_quotes_in_its_text():
+    assert _geoverse("dl3dv")["psnr"] - _gld("dl3dv")["psnr"] == pytest.approx(2.23)
+    assert _geoverse("mipnerf360")["psnr"] - _gld("mipnerf360")["psnr"] == pytest.approx(2.45)
+    fall = 1 - _geoverse("mipnerf360")["ate"] / _gld("mipnerf360")["ate"]
+    assert round(100 * fall, 1) == 32.4
+    speedups = {name: _gld(name)["time"] / _geoverse(name)["time"] for name in NAMES[:3]}
+    for name, speedup in speedups.items():
+        assert any(f"{speedup:.1f}" in note for note in load_benchmark(name).notes)
+
+
+def test_alike_settings_are_ranked_where_the_source_defines_the_figure():
+    benchmark = load_benchmark("dl3dv")
+    for name in FIGURES:
+        reasons = reasons_not_to_rank(ALIKE, benchmark, name)
+        assert (not reasons) == (name in RANKED)
+        if reasons:
+            assert len(reasons) == 1 and reasons[0].endswith("here, not stated by the source")
+
+
+@pytest.mark.parametrize(
+    ("change", "reason", "figures"),
+    [
+        ({"data_set": None}, "data set: a scene of one's own here, DL3DV published", FIGURES),
+        ({"data_set": "RealEstate10K"}, "data set: RealEstate10K here, DL3DV published", FIGURES),
+        ({"scenes": 1}, "scenes: a single one here", FIGURES),
+        ({"resolution": (504, 280)}, "resolution: 504x280 here, 504x504 published", FIGURES),
+        ({"context": 3}, "context views a round: 3 here, 2 published", FIGURES),
+        ({"targets": 12}, "target views a round: 12 here, 6 published", FIGURES),
+        ({"rounds": 3}, "rounds: 3 here, 1 published", FIGURES),
+        ({"pixels": "generated"}, "compared pixels: generated here, all", FIGURES[:3]),
+        ({"poses_from": "pose probe"}, "poses from: pose probe here, VGGT", FIGURES[3:6]),
+        ({"poses_from": None}, "poses from: not recorded here, VGGT published", FIGURES[3:6]),
+        ({"met3r": "ours"}, "MEt3R: ours here, original published", ("met3r",)),
+        ({"met3r": None}, "MEt3R: not recorded here", ("met3r",)),
+        ({"lpips_net": "alex"}, "LPIPS network: alex here, not stated", ("lpips",)),
+        ({"reprojection": None}, "reprojection error: not recorded here, not", ("reproj",)),
+        ({"hardware": "H200"}, "hardware: H200 here, not stated by the source", ("time",)),
+    ],
+)
+def test_each_difference_is_a_reason_for_the_figures_it_concerns(change, reason, figures):
+    benchmark = load_benchmark("dl3dv")
+    setting = dataclasses.replace(ALIKE, **change)
+    for name in FIGURES:
+        found = [r for r in reasons_not_to_rank(setting, benchmark, name) if r.startswith(reason)]
+        assert len(found) == (name in figures), name
+
+
+def test_a_definition_that_the_source_comes_to_state_lets_its_figure_be_ranked():
+    text = _spec_text()
+    told = parse_benchmark(text.replace("lpips_net: null", "lpips_net: VGG"), "told.yaml")
+    assert reasons_not_to_rank(ALIKE, told, "lpips") == ()
+    other = dataclasses.replace(ALIKE, lpips_net="alex")
+    assert reasons_not_to_rank(other, told, "lpips") == ("LPIPS network: alex here, VGG published",)
+
+
+def test_measured_rows_join_the_ranking_only_where_they_are_comparable():
+    benchmark = load_benchmark("dl3dv")
+    values = {"psnr": 18.0, "ssim": 0.5984, "lpips": 0.1, "met3r": 0.9, "rpe_r": math.nan}
+    alone = side_by_side([], benchmark)
+    rows = side_by_side([MeasuredRow("mine", values, ALIKE)], benchmark)
+    mine, ours = rows[-1], rows[-2]
+    assert [row.origin for row in rows] == [PUBLISHED] * 8 + [MEASURED]
+    assert ours.system == "GeoVerse" and ours.figures == alone[-1].figures
+    # 18.0 is between GeoVerse's 19.61 and GLD's 17.38, which is third now.
+    assert (ours.ranks["psnr"], mine.ranks["psnr"], rows[6].ranks["psnr"]) == (1, 2, 3)
+    # In the three decimals that are published, 0.5984 is GeoVerse's 0.598.
+    assert ours.ranks["ssim"] == mine.ranks["ssim"] == 1
+    assert rows[3].system == "MVGenMaster" and rows[3].ranks["ssim"] == 3
+    assert mine.ranks["met3r"] == 9
+    # No rank for what is not defined, and no change to the others'.
+    assert mine.ranks["lpips"] is None and "not stated" in mine.reasons["lpips"][0]
+    for name in ("rpe_r", "ate", "time"):
+        assert mine.ranks[name] is None and mine.reasons[name] == (NO_VALUE,)
+    for name in ("lpips", "rpe_r", "ate", "time"):
+        assert [row.ranks[name] for row in rows[:-1]] == [row.ranks[name] for row in alone]
+
+
+def test_ones_own_scene_stands_beside_without_a_rank_and_with_the_reason():
+    benchmark = load_benchmark("scannetv2")
+    own = dataclasses.replace(ALIKE, data_set=None, rounds=3)
+    rows = side_by_side([MeasuredRow("kitchen", dict.fromkeys(FIGURES, 1e9), own)], benchmark)
+    assert set(rows[-1].ranks.values()) == {None}
+    assert all("one's own" in rows[-1].reasons[name][0] for name in FIGURES)
+    assert [r.ranks for r in rows[:-1]] == [r.ranks for r in side_by_side([], benchmark)]
+
+
+def test_the_table_marks_where_rows_come_from_and_says_why_there_is_no_rank():
+    benchmark = load_benchmark("scannetv2")
+    own = dataclasses.replace(ALIKE, data_set=None, rounds=3)
+    rows = side_by_side([MeasuredRow("kitchen", {"psnr": 21.0, "lpips": 0.3}, own)], benchmark)
+    table = comparison_table(rows, benchmark)
+    assert [row[1] for row in table.rows] == [PUBLISHED] * 5 + [MEASURED]
+    notes = [note for note in table.notes if note.startswith("kitchen")]
+    assert notes == [
+        "kitchen, no rank in PSNR, LPIPS: data set: a scene of one's own here, ScanNetV2 "
+        "published.",
+        "kitchen, no rank in LPIPS: LPIPS network: vgg here, not stated by the source.",
+    ]
+    assert any("World-Consistent" in note and "Table 1" in note for note in table.notes)
+    assert any("0.223" in note for note in table.notes)
+
+
+def test_unknown_names_are_refused_with_the_nearest():
+    with pytest.raises(OptionError, match="did you mean 'scannetv2'"):
+        load_benchmark("scannet")
+    with pytest.raises(OptionError, match="'rpe' is unknown; did you mean 'rpe_"):
+        reasons_not_to_rank(ALIKE, load_benchmark("dl3dv"), "rpe")
+    with pytest.raises(OptionError, match="mine: figure 'sim' is unknown; did you mean 'ssim'"):
+        side_by_side([MeasuredRow("mine", {"sim": 1.0}, ALIKE)], load_benchmark("dl3dv"))
+
+
+def test_aspects_are_fields_of_a_setting():
+    assert set(ASPECTS) <= {entry.name for entry in dataclasses.fields(Setting)}
+
+
+def _spec_text(name: str = "dl3dv") -> str:
+    return published._specs()[name]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("name: DL3DV", "nam: DL3DV", "key 'nam' is unknown; did you mean 'name'"),
+        ("  context: 2\n", "", "protocol: no 'context'; expected the keys context, targets"),
+        ("  context: 2\n", "  context: two\n", "context 'two'; expected int"),
+        ("  context: 2\n", "  context: true\n", "context True; expected int"),
+        ("[504, 504]", "[504]", r"resolution \[504\]; expected \[width, height\]"),
+        ("better: higher", "better: up", "psnr: better 'up'; expected higher or lower"),
+        ("lpips_net: null", "lpips_nte: null", "did you mean 'lpips_net'"),
+        ("lpips_net: null", "lpips_net: 16", "lpips_net 16; expected a text, or null"),
+        (", 286.75]", "]", r"row \['ViewCrafter'.*9 numbers"),
+        ("0.494, 0.367", "0.494, null", r"row \['ViewCrafter'.*9 numbers"),
+        ("0.494, 0.367", "0.494, .nan", r"row \['ViewCrafter'.*9 numbers"),
+        ("0.494, 0.367", '0.494, "0.367"', r"row \['ViewCrafter'.*9 numbers"),
+        ("[NeoVerse,", "[ViewCrafter,", "expected one a system"),
+        ("ssim, lpips, ate", "lpips, ssim, ate", "columns .*; expected "),
+        ("    - one pass\n", "    - one: pass\n", "stated .*; expected list"),
+        ("name: DL3DV", "name: [", "no readable YAML"),
+    ],
+)
+def test_a_wrong_specification_is_refused_in_one_line(old, new, message):
+    text = _spec_text()
+    assert old in text
+    with pytest.raises(ProjectError, match=message) as caught:
+        parse_benchmark(text.replace(old, new, 1), "dl3dv.yaml")
+    assert str(caught.value).startswith("dl3dv.yaml: ") and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("section", ["source", "data_set", "protocol", "published", "notes"])
+def test_no_section_may_be_absent_or_empty(section):
+    data = yaml.safe_load(_spec_text())
+    del data[section]
+    with pytest.raises(ProjectError, match=f"no '{section}'"):
+        parse_benchmark(yaml.safe_dump(data), "x.yaml")
+    data[section] = None
+    with pytest.raises(ProjectError, match=f"{section} None"):
+        parse_benchmark(yaml.safe_dump(data), "x.yaml")
+
+
+def test_absent_specifications_are_said_to_be_absent(monkeypatch, tmp_path):
+    monkeypatch.setattr(published.resources, "files", lambda _: tmp_path)
+    with pytest.raises(ProjectError, match="no benchmarks/"):
+        benchmark_names()
