@@ -1,0 +1,1 @@
+"""How far views agree with one another, without a reference picture: depth, matches, features."""

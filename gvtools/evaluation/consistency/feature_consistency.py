@@ -1,0 +1,306 @@
+"""Feature consistency of two views: features of one, carried into the other by geometry, compared.
+
+In the manner of MEt3R (M. Asim et al., "MEt3R: Measuring Multi-View Consistency in Generated
+Images", CVPR 2025): the mean of 1 - cosine over the overlap; lower is better. MEt3R takes DINO
+features and a geometry that MASt3R guesses from the two pictures; here both are the caller's: a
+`FeatureNetwork`, and the depth and cameras of the pictures. Features are taken from where each
+place of the first view falls in the second, with the occlusion test of `correspond`. The numbers
+are on another scale than MEt3R's, which `met3r_score` calls as it is.
+
+A score alone says little: pictures of nothing are consistent, and so are repeats. Beside it stand
+what the same network and geometry give for the first view with itself, and for content that does
+not belong there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gvtools.cameras import Float64
+from gvtools.errors import ShapeError
+from gvtools.evaluation.consistency.correspondence import Seen, correspond
+from gvtools.evaluation.consistency.dense_gradient import DenseGradient
+from gvtools.evaluation.posed_picture import PosedPicture
+
+Float32 = NDArray[np.float32]
+
+# Where unrelated content scores less than this above the same picture, the features tell nothing
+# apart and neither does the score.
+LEAST_SCALE = 0.02
+ROLLED = "second rolled by half its width and height"
+
+
+class FeatureNetwork(Protocol):
+    """What turns a picture into features."""
+
+    @property
+    def name(self) -> str:
+        """What the score is reported under."""
+
+    def features(self, rgb: NDArray[np.uint8]) -> Float32:
+        """Features of a picture.
+
+        Args:
+            rgb: (H, W, 3) uint8.
+
+        Returns:
+            (C, h, w) float32; the h x w cells cover the picture evenly.
+        """
+
+
+@dataclass(frozen=True)
+class FeatureConsistency:
+    """Agreement of the features of two views. Figures that no place stands behind are None.
+
+    Attributes:
+        first: name of the view whose places were compared.
+        second: name of the view whose features were carried there.
+        network: name of the feature network.
+        status: "measured", "empty: ..." where nothing could be compared, or "degenerate: ..." where
+            the network tells no content from any other.
+        score: mean of 1 - cosine over the compared places: 0 is equal, lower is better.
+        overlap: share of the first view's places (cells of its feature map) that were compared.
+        places: how many.
+        undefined: co-visible places left out because both features are zero there.
+        same_image: the score of the first view with itself: 0 up to rounding.
+        unrelated: the score with the same geometry and the features of unrelated content.
+        unrelated_source: what that content is.
+    """
+
+    first: str
+    second: str
+    network: str
+    status: str
+    score: float | None
+    overlap: float
+    places: int
+    undefined: int
+    same_image: float | None
+    unrelated: float | None
+    unrelated_source: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the score means something."""
+        return self.status == "measured"
+
+
+@dataclass(frozen=True)
+class Met3rScore:
+    """What the original MEt3R says of two pictures.
+
+    Attributes:
+        first: name of a view.
+        second: name of the other.
+        status: "measured"; "unavailable: ..." with what is lacking and how to get it; or "empty:
+            ..." where MEt3R finds no overlap.
+        score: MEt3R, lower is better; None unless measured.
+        overlap: share of the first picture that MEt3R compares; None unless it ran.
+    """
+
+    first: str
+    second: str
+    status: str
+    score: float | None
+    overlap: float | None
+
+
+def feature_consistency(
+    first: PosedPicture,
+    second: PosedPicture,
+    *,
+    network: FeatureNetwork | None = None,
+    unrelated: PosedPicture | None = None,
+    occlusion: float = 0.05,
+) -> FeatureConsistency:
+    """Compare second's features, carried into first by depth and cameras, with first's.
+
+    Args:
+        first: the view that is looked at, with depth.
+        second: the view that is carried into it, with depth for the occlusion test.
+        network: what makes the features; None is `DenseGradient`, which needs no weights.
+        unrelated: a picture of something else, for the reference value; it is laid over second and
+            its camera and depth play no part. None rolls second's features by half the picture to
+            the right and half downwards: the same colours and structures in the wrong places.
+        occlusion: largest relative depth difference at which both see one surface.
+
+    Raises:
+        OptionError: an occlusion outside 0 to 1.
+        ShapeError: the network's features are not (C, h, w), not finite, or differ in C.
+    """
+    network = network or DenseGradient()
+    ours, theirs = _features(network, first), _features(network, second)
+    if unrelated is None:
+        others, source = np.roll(theirs, [n // 2 for n in theirs.shape[1:]], (1, 2)), ROLLED
+    else:
+        others, source = _features(network, unrelated), unrelated.name
+    if not len(ours) == len(theirs) == len(others):
+        raise ShapeError(
+            f"{network.name}: {len(ours)}, {len(theirs)} and {len(others)} feature channels; "
+            "expected one number for all pictures"
+        )
+    where = _places(first, ours)
+    here, there = _common(first, second, where, occlusion)
+    score, undefined = _dissimilarity(_sample(ours, here), _sample(theirs, there))
+    reference, _ = _dissimilarity(_sample(ours, here), _sample(others, there))
+    itself, back = _common(first, first, where, occlusion)
+    same, _ = _dissimilarity(_sample(ours, itself), _sample(ours, back))
+    compared = len(here) - undefined
+    status = "measured"
+    if score is None:
+        status = (
+            f"empty: {first.name} and {second.name} have no co-visible place with features"
+            if first.depth is not None and second.depth is not None
+            else f"empty: {first.name if first.depth is None else second.name} has no depth"
+        )
+    elif reference is not None and same is not None and reference - same < LEAST_SCALE:
+        status = (
+            f"degenerate: {network.name} gives unrelated content {reference:.3g} and the same "
+            f"picture {same:.3g}; it tells nothing apart here"
+        )
+    return FeatureConsistency(
+        first=first.name,
+        second=second.name,
+        network=network.name,
+        status=status,
+        score=score if status == "measured" else None,
+        overlap=compared / int(where.sum()),
+        places=compared,
+        undefined=undefined,
+        same_image=same,
+        unrelated=reference,
+        unrelated_source=source,
+    )
+
+
+def met3r_score(
+    first: PosedPicture,
+    second: PosedPicture,
+    *,
+    metric: Callable[..., Any] | None = None,
+    size: int = 256,
+) -> Met3rScore:
+    """The original MEt3R of two pictures, if the package ``met3r`` is installed.
+
+    The largest centred square of each picture, resampled to ``size``, goes in; cameras, depth and
+    masks do not. MEt3R gives 0 (its best) where the pictures do not overlap; here that is None.
+
+    Args:
+        first: the view that MEt3R compares in.
+        second: the view that it carries there.
+        metric: a ``met3r.MEt3R`` module made for ``size``, to use for many pairs; None makes one
+            with its own defaults, on the GPU if there is one. Making one fetches its weights.
+        size: pixels, a multiple of 16.
+    """
+
+    def without(status: str, overlap: float | None = None) -> Met3rScore:
+        return Met3rScore(first.name, second.name, status, None, overlap)
+
+    import torch
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if metric is None:
+        try:
+            from met3r import MEt3R
+
+            metric = MEt3R(img_size=size).to(device).eval()
+        except ImportError as error:
+            return without(
+                f"unavailable: {error}; MEt3R needs PyTorch3D, FeatUp and "
+                "`pip install git+https://github.com/mohammadasim98/met3r`"
+            )
+        except (OSError, RuntimeError) as error:
+            return without(f"unavailable: MEt3R could not be made ({error}); check its weights")
+    elif isinstance(metric, torch.nn.Module):
+        device = next((weight.device for weight in metric.parameters()), device)
+    pair = torch.from_numpy(np.stack([_square(first.rgb, size), _square(second.rgb, size)])[None])
+    with torch.no_grad():
+        score, mask, *_ = metric(
+            images=pair.to(device),
+            return_overlap_mask=True,
+            return_score_map=False,
+            return_projections=False,
+        )
+    overlap = float(mask.float().mean())
+    if overlap == 0:
+        return without("empty: MEt3R finds no overlap", overlap)
+    return Met3rScore(first.name, second.name, "measured", float(score.mean()), overlap)
+
+
+def _features(network: FeatureNetwork, picture: PosedPicture) -> Float32:
+    features = np.asarray(network.features(picture.rgb))
+    if features.ndim != 3 or not features.size or not np.isfinite(features).all():
+        raise ShapeError(
+            f"{network.name}: features of {picture.name} have shape {features.shape}"
+            f"{'' if np.isfinite(features).all() else ' and are not finite'}; expected finite "
+            "(C, h, w)"
+        )
+    return features
+
+
+def _places(picture: PosedPicture, features: Float32) -> NDArray[np.bool_]:
+    """(H, W) bool: the pixel in the middle of each cell of the feature map."""
+    size, cells = picture.rgb.shape[:2], features.shape[1:]
+    middle = [
+        ((np.arange(count) + 0.5) * length / count).astype(np.int64)
+        for length, count in zip(size, cells, strict=True)
+    ]
+    where = np.zeros(size, np.bool_)
+    where[np.ix_(*middle)] = True
+    return where
+
+
+def _common(
+    first: PosedPicture, second: PosedPicture, where: NDArray[np.bool_], occlusion: float
+) -> tuple[Float64, Float64]:
+    """Co-visible places in both views, (N, 2) each, as shares of width and height."""
+    found = correspond(first, second, occlusion=occlusion, where=where)
+    on = found.seen == Seen.COVISIBLE
+    return (
+        found.start[on] / (first.camera.width[0], first.camera.height[0]),
+        found.xy[on] / (second.camera.width[0], second.camera.height[0]),
+    )
+
+
+def _sample(features: Float32, places: Float64) -> Float64:
+    """(N, C) features at places given as shares of width and height, bilinear, edges repeated."""
+    height, width = features.shape[1:]
+    x = np.clip(places[:, 0] * width - 0.5, 0, width - 1)
+    y = np.clip(places[:, 1] * height - 0.5, 0, height - 1)
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    along_x, along_y = x - left, y - top
+    upper = features[:, top, left] * (1 - along_x) + features[:, top, right] * along_x
+    lower = features[:, bottom, left] * (1 - along_x) + features[:, bottom, right] * along_x
+    return (upper * (1 - along_y) + lower * along_y).T
+
+
+def _dissimilarity(first: Float64, second: Float64) -> tuple[float | None, int]:
+    """Mean of 1 - cosine of (N, C) rows, and how many are left out, both being zero.
+
+    A feature against nothing has cosine 0.
+    """
+    lengths = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
+    defined = (lengths[0] > 0) | (lengths[1] > 0)
+    if not defined.any():
+        return None, int((~defined).sum())
+    product = (lengths[0] * lengths[1])[defined]
+    dot = np.einsum("nc,nc->n", first, second)[defined]
+    cosine = np.divide(dot, product, out=np.zeros_like(dot), where=product > 0)
+    return float(np.mean(1 - np.clip(cosine, -1, 1))), int((~defined).sum())
+
+
+def _square(rgb: NDArray[np.uint8], size: int) -> Float32:
+    """(3, size, size) float32 in [-1, 1]: the largest centred square, resampled."""
+    height, width = rgb.shape[:2]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    square = Image.fromarray(np.ascontiguousarray(rgb[top : top + side, left : left + side]))
+    pixels = np.asarray(square.resize((size, size), Image.Resampling.BICUBIC), np.float32)
+    return np.ascontiguousarray(pixels.transpose(2, 0, 1)) / 127.5 - 1

@@ -1,0 +1,292 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise, permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from consistency_scene import HALF, SLANT, SQUARE, WALL, camera, moved, picture
+
+from gvtools.errors import OptionError, ShapeError
+from gvtools.evaluation.consistency.correspondence import Seen, correspond
+from gvtools.evaluation.consistency.depth_reprojection import (
+    depth_reprojection,
+    depth_reprojection_of_views,
+)
+from gvtools.evaluation.posed_picture import PosedPicture
+from gvtools.scenes.project import open_project
+
+FIGURES = (
+    "mean_pixels",
+    "median_pixels",
+    "mean_relative_depth",
+    "median_relative_depth",
+)
+SHARES = ("covisible_share", "occluded_share", "contradicting_share", "unknown_share")
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[PosedPicture, PosedPicture]:
+    """Two views whose parallax hides and uncovers parts of the wall."""
+    return (
+        picture(camera((-0.3, 0.05, 0), turn=(1, -4, 2)), "left"),
+        picture(camera((0.4, -0.1, 0.2), turn=(-2, 6, -3), width=200, height=140), "right"),
+    )
+
+
+def _flat(depth: float, *, x: float = 0.0, measured: float | None = None) -> PosedPicture:
+    """A wall square to the camera, whose depth is given as another than it is."""
+    at = camera((x, 0, 0))
+    size = int(at.height[0]), int(at.width[0])
+    rgb = np.zeros((*size, 3), np.uint8)
+    return PosedPicture("flat", at, rgb, np.full(size, measured or depth, np.float32))
+
+
+def test_exact_depth_of_a_plane_leaves_no_error() -> None:
+    first = picture(camera((-0.3, 0, 0)), "left", square=False)
+    second = picture(camera((0.4, 0.1, 0.3), turn=(3, 8, -5)), "right", square=False)
+    result = depth_reprojection(first, second)
+    assert result.ok and (result.first, result.second) == ("left", "right")
+    assert result.known == first.rgb[..., 0].size and 0 < result.inside < result.known
+    assert result.covisible == result.inside
+    assert result.mean_pixels is not None and result.mean_pixels < 1e-3
+    assert result.mean_relative_depth is not None and result.mean_relative_depth < 1e-5
+    assert [getattr(result, name) for name in SHARES] == [1, 0, 0, 0]
+
+
+@pytest.mark.parametrize("scale", [0.97, 1.03])
+def test_a_wrong_depth_scale_gives_its_closed_form(scale: float) -> None:
+    distance, baseline = 2.5, 0.4
+    first = _flat(distance)
+    second = _flat(distance, x=baseline, measured=scale * distance)
+    result = depth_reprojection(first, second)
+    focal = first.camera.K[0, 0, 0]
+    # q's ray at depth s Z comes back to f X' / (s Z), X' = b + s (X - b): off by f b (1 - s) / s Z.
+    pixels = focal * baseline * abs(1 - scale) / (scale * distance)
+    assert result.mean_pixels == pytest.approx(pixels, rel=1e-5)
+    assert result.median_pixels == pytest.approx(pixels, rel=1e-5)
+    assert result.mean_relative_depth == pytest.approx(abs(1 / scale - 1), rel=1e-5)
+    assert result.median_relative_depth == pytest.approx(abs(1 / scale - 1), rel=1e-5)
+
+
+def test_a_scale_beyond_the_occlusion_limit_shows_in_the_shares() -> None:
+    near = depth_reprojection(_flat(2.0), _flat(2.0, x=0.1, measured=1.8))
+    far = depth_reprojection(_flat(2.0), _flat(2.0, x=0.1, measured=2.2))
+    assert near.occluded_share == 1 and far.contradicting_share == 1
+    assert all(getattr(result, name) is None for result in (near, far) for name in FIGURES)
+    assert near.status == "empty: flat and flat see no common surface"
+
+
+def test_pixels_are_classified_as_the_scenes_geometry_says(
+    pair: tuple[PosedPicture, PosedPicture],
+) -> None:
+    first, second = pair
+    found = correspond(first, second)
+    assert first.depth is not None
+    rotation, eye = first.camera.cam_from_world[0, :3, :3], first.camera.centers[0]
+    rays = first.camera.rays()[found.rows, found.columns] @ rotation
+    points = eye + first.depth[found.rows, found.columns, None] * rays
+    (xy,), (z,) = second.camera.project(points)
+    inside = ((xy >= 0) & (xy < (200, 140))).all(-1)
+    np.testing.assert_allclose(found.z, z, rtol=1e-9)
+    np.testing.assert_allclose(found.xy[inside], xy[inside], atol=1e-6)
+    assert (found.seen[~inside] == Seen.OUTSIDE).all() and np.isnan(found.xy[~inside]).all()
+
+    # Where the ray from second's centre to the point meets the plane of the square, beyond whose
+    # rim (2 pixels aside) it is plain what is seen.
+    center = second.camera.centers[0]
+    along = (SQUARE - center[2]) / (points[:, 2] - center[2])
+    rim = np.abs((center + along[:, None] * (points - center))[:, :2]).max(-1)
+    on_square = np.abs(points[:, 2] - SQUARE) < 1e-3
+    hidden = inside & ~on_square & (rim < HALF - 0.03)
+    plain = inside & (on_square & (rim < HALF - 0.03) | ~on_square & (rim > HALF + 0.03))
+    assert hidden.sum() > 100 and plain.sum() > 5000
+    assert (found.seen[hidden] == Seen.OCCLUDED).all()
+    assert (found.seen[plain] == Seen.COVISIBLE).all()
+
+
+def test_depth_is_never_a_blend_of_two_surfaces(pair: tuple[PosedPicture, PosedPicture]) -> None:
+    first, second = pair
+    found = correspond(first, second)
+    there = found.depth > 0
+    rotation, center = second.camera.cam_from_world[0, :3, :3], second.camera.centers[0]
+    local = np.insert(found.xy[there], 2, 1, axis=1) @ np.linalg.inv(second.camera.K[0]).T
+    points = center + found.depth[there, None] * (local @ rotation)
+    off_wall = np.abs(points[:, 2] - WALL - SLANT * points[:, 0])
+    off_square = np.abs(points[:, 2] - SQUARE)
+    assert np.minimum(off_wall, off_square).max() < 0.01
+
+
+def test_what_floats_in_front_contradicts(pair: tuple[PosedPicture, PosedPicture]) -> None:
+    first, second = pair
+    assert first.depth is not None
+    depth = first.depth.copy()
+    depth[50:70, 130:150] *= 0.5
+    clean, dirty = (correspond(replace(first, depth=d), second) for d in (first.depth, depth))
+    patch = np.zeros(depth.shape, bool)
+    patch[50:70, 130:150] = True
+    floats = patch[dirty.rows, dirty.columns] & (dirty.seen != Seen.OUTSIDE)
+    assert floats.sum() > 200
+    assert (dirty.seen[floats] == Seen.CONTRADICTING).all()
+    assert (dirty.seen == clean.seen)[~patch[dirty.rows, dirty.columns]].all()
+
+
+@pytest.mark.parametrize("turn", [(0, 2, 0), (2, 0, 0)])
+def test_a_wrong_rotation_raises_the_error(
+    pair: tuple[PosedPicture, PosedPicture], turn: tuple[float, float, float]
+) -> None:
+    first, second = pair
+    steps = [
+        depth_reprojection(first, moved(second, turn=(k * turn[0], k * turn[1], k * turn[2])))
+        for k in (0.0, 0.5, 1.0)
+    ]
+    for better, worse in pairwise(steps):
+        assert all(getattr(better, name) < getattr(worse, name) for name in FIGURES)
+        assert (better.covisible_share or 0) > (worse.covisible_share or 0)
+
+
+def test_a_wrong_place_a_shift_and_noise_raise_the_error(
+    pair: tuple[PosedPicture, PosedPicture],
+) -> None:
+    first, second = pair
+    clean = depth_reprojection(first, second)
+    assert second.depth is not None
+    rng = np.random.default_rng(3)
+    noise = second.depth * (1 + rng.normal(0, 0.01, second.depth.shape)).astype(np.float32)
+    for worse in (
+        moved(second, shift=(0.1, 0, 0)),
+        moved(second, shift=(0, 0, 0.1)),
+        replace(second, depth=np.roll(second.depth, 4, axis=1)),
+        replace(second, depth=noise),
+    ):
+        result = depth_reprojection(first, worse)
+        assert all(getattr(result, name) > 1.5 * getattr(clean, name) for name in FIGURES)
+
+
+def test_the_worlds_frame_does_not_matter(pair: tuple[PosedPicture, PosedPicture]) -> None:
+    elsewhere = moved(pair[0], turn=(20, 130, 50)).camera.cam_from_world[0]
+    elsewhere[:3, 3] = (3e4, -2e4, 5e4)
+    carried = [
+        replace(v, camera=replace(v.camera, cam_from_world=v.camera.cam_from_world @ elsewhere))
+        for v in pair
+    ]
+    here, there = depth_reprojection(*pair), depth_reprojection(carried[0], carried[1])
+    for name in (*FIGURES, *SHARES):
+        assert getattr(there, name) == pytest.approx(getattr(here, name), abs=1e-6)
+
+
+def test_masked_and_missing_depth_is_not_known(pair: tuple[PosedPicture, PosedPicture]) -> None:
+    first, second = pair
+    assert first.depth is not None and second.depth is not None
+    mask = np.zeros(first.depth.shape, bool)
+    mask[10:30, 40:90] = True
+    assert depth_reprojection(replace(first, mask=mask), second).known == 20 * 50
+    bad = first.depth.copy()
+    bad[0, :4] = np.nan, np.inf, -1, 0
+    assert depth_reprojection(replace(first, depth=bad), second).known == bad.size - 4
+
+    whole = depth_reprojection(first, second)
+    hidden = replace(second, mask=np.arange(200)[None, :] < np.full((140, 1), 100))
+    half = depth_reprojection(first, hidden)
+    assert half.inside == whole.inside and 0 < half.covisible < whole.covisible
+    assert sum(getattr(half, name) for name in SHARES) == pytest.approx(1)
+    assert half.unknown_share == pytest.approx(
+        np.mean(correspond(first, second).xy[:, 0] >= 100) * half.known / half.inside
+    )
+
+
+def test_surfaces_behind_the_first_camera_are_not_covisible() -> None:
+    # The first camera stands close to its wall and the second 30 units behind it: within 5 % of
+    # second's depth lies what is behind the first camera.
+    first, second = _flat(1.0), _flat(31.0, measured=29.6)
+    second = moved(second, shift=(0, 0, 30))
+    result = depth_reprojection(first, second)
+    assert result.occluded_share == 1 and result.mean_pixels is None
+
+
+def test_views_without_common_surface_give_no_figure(
+    pair: tuple[PosedPicture, PosedPicture],
+) -> None:
+    first, second = pair
+    away = moved(second, turn=(0, 180, 0))
+    blind = replace(second, depth=None)
+    for result, reason in (
+        (depth_reprojection(first, away), "nothing of left falls inside right"),
+        (depth_reprojection(replace(first, depth=None), second), "left has no pixel with depth"),
+        (depth_reprojection(first, blind), "right has no pixel with depth"),
+    ):
+        assert result.status == f"empty: {reason}" and not result.ok
+        assert result.covisible == 0
+        assert all(getattr(result, name) is None for name in FIGURES)
+    assert depth_reprojection(first, away).covisible_share is None
+    assert depth_reprojection(first, blind).unknown_share == 1
+
+
+def test_many_views_weigh_by_pixels_and_name_the_pairs_without_overlap(
+    pair: tuple[PosedPicture, PosedPicture],
+) -> None:
+    away = replace(moved(pair[1], turn=(0, 180, 0)), name="away")
+    off = replace(moved(pair[1], turn=(0, 2, 0)), name="off")
+    views = depth_reprojection_of_views([*pair, off, away])
+    assert views.status == "measured" and len(views.pairs) == 12
+    assert set(views.without_overlap) == {
+        *((name, "away") for name in ("left", "right", "off")),
+        *(("away", name) for name in ("left", "right", "off")),
+    }
+    found = [p for p in views.pairs if p.ok]
+    assert views.covisible == sum(p.covisible for p in found)
+    for name in ("mean_pixels", "mean_relative_depth"):
+        total = sum(getattr(p, name) * p.covisible for p in found)
+        assert getattr(views, name) == pytest.approx(total / views.covisible)
+    pixels, relative = [], []
+    for first, second in permutations([*pair, off, away], 2):
+        both = correspond(first, second)
+        on = both.seen == Seen.COVISIBLE
+        pixels.append(np.linalg.norm(both.back - both.start, axis=1)[on])
+        relative.append(np.abs(both.z[on] / both.depth[on] - 1))
+    for value, spread in ((views.median_pixels, pixels), (views.median_relative_depth, relative)):
+        assert value is not None and np.mean(np.concatenate(spread) < value) == pytest.approx(
+            0.5, abs=0.005
+        )
+    assert sum(getattr(views, name) for name in SHARES) == pytest.approx(1)
+    assert all(type(getattr(views, name)) is float for name in (*FIGURES, *SHARES))
+
+    chain = depth_reprojection_of_views([*pair, off], pairs="consecutive")
+    assert [(p.first, p.second) for p in chain.pairs] == [("left", "right"), ("right", "off")]
+
+
+def test_too_few_views_give_a_status(pair: tuple[PosedPicture, PosedPicture]) -> None:
+    for views in ([], [pair[0]]):
+        result = depth_reprojection_of_views(views)
+        assert result.status == f"empty: {len(views)} view(s); at least 2 are needed"
+        assert result.mean_pixels is None and result.covisible_share is None
+    apart = depth_reprojection_of_views([pair[0], moved(pair[1], turn=(0, 180, 0))])
+    assert apart.status == "empty: none of the 2 pairs has a co-visible pixel"
+    assert apart.median_pixels is None and len(apart.without_overlap) == 2
+
+
+def test_wrong_options_are_errors(pair: tuple[PosedPicture, PosedPicture]) -> None:
+    for limit in (0, 1, -0.1, float("nan")):
+        with pytest.raises(OptionError, match="occlusion"):
+            depth_reprojection(*pair, occlusion=limit)
+    with pytest.raises(OptionError, match="consecutive"):
+        depth_reprojection_of_views(pair, pairs="some")
+    with pytest.raises(ShapeError, match="pixels to follow"):
+        correspond(*pair, where=np.ones((3, 3), bool))
+
+
+@pytest.mark.data
+def test_a_real_recording_agrees_until_a_pose_is_wrong(shared: Path) -> None:
+    scene = open_project(shared / "data" / "sevenscenes_reg")
+    first, second = (
+        PosedPicture(view.name, view.camera, frame.rgb, frame.depth, frame.mask)
+        for view in scene.views[:3:2]
+        for frame in [view.load()]
+    )
+    good = depth_reprojection(first, second)
+    bad = depth_reprojection(first, moved(second, turn=(0, 2, 0)))
+    assert good.median_relative_depth is not None and good.median_relative_depth < 0.01
+    assert (good.covisible_share or 0) > 0.85
+    assert (bad.median_relative_depth or 0) > 3 * good.median_relative_depth
+    assert (bad.contradicting_share or 0) > 10 * (good.contradicting_share or 1)

@@ -1,0 +1,331 @@
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from consistency_scene import blurred, camera, moved, noisy, picture
+
+from gvtools.errors import OptionError, ShapeError
+from gvtools.evaluation.consistency.dense_gradient import DenseGradient
+from gvtools.evaluation.consistency.feature_consistency import (
+    feature_consistency,
+    met3r_score,
+)
+from gvtools.evaluation.posed_picture import PosedPicture
+from gvtools.scenes.project import open_project
+
+WIDTH, HEIGHT = 240, 180
+
+
+class Network:
+    """Features from a function of the picture."""
+
+    name = "given"
+
+    def __init__(self, function: Callable[[np.ndarray], Any]) -> None:
+        self.function = function
+
+    def features(self, rgb: np.ndarray) -> np.ndarray:
+        return np.asarray(self.function(rgb), np.float32)
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[PosedPicture, PosedPicture]:
+    size = {"width": WIDTH, "height": HEIGHT}
+    return (
+        picture(camera((-0.2, 0, 0), turn=(0, -3, 0), **size), "left"),
+        picture(camera((0.1, 0.05, 0.1), turn=(0, 2, 1), **size), "right"),
+    )
+
+
+def _score(*pair: PosedPicture, **options: Any) -> float:
+    result = feature_consistency(*pair, **options)
+    assert result.ok and result.score is not None
+    return result.score
+
+
+def test_one_scene_is_consistent_and_unrelated_content_is_not(
+    pair: tuple[PosedPicture, PosedPicture],
+) -> None:
+    result = feature_consistency(*pair)
+    assert (result.first, result.second, result.network) == ("left", "right", "dense-gradient")
+    assert result.score is not None and result.unrelated is not None
+    assert result.same_image == pytest.approx(0, abs=1e-6)
+    assert result.score < 0.1 and result.unrelated > 0.6
+    assert result.unrelated_source == "second rolled by half its width and height"
+    assert 0.7 < result.overlap < 1
+    assert result.places == round(result.overlap * 60 * 45) and result.undefined == 0
+
+    other = picture(pair[1].camera, "elsewhere", seed=9)
+    against = feature_consistency(*pair, unrelated=other)
+    assert against.score == result.score and against.unrelated_source == "elsewhere"
+    assert against.unrelated == pytest.approx(_score(pair[0], replace(other, depth=pair[1].depth)))
+    assert against.unrelated is not None and against.unrelated > 0.6
+
+
+def test_a_view_with_itself_scores_nothing(pair: tuple[PosedPicture, PosedPicture]) -> None:
+    result = feature_consistency(pair[0], replace(pair[0], name="twin"))
+    assert result.score == pytest.approx(0, abs=1e-6) and result.overlap == 1
+
+
+@pytest.mark.parametrize("what", ["blur", "noise", "shift", "turn", "place", "depth"])
+def test_inconsistency_raises_the_score(pair: tuple[PosedPicture, PosedPicture], what: str) -> None:
+    first, second = pair
+    assert first.depth is not None and second.depth is not None
+    near, far = first.depth, second.depth
+    scores = [_score(first, second)]
+    for k in (1, 2):
+        changed = {
+            "blur": lambda k=k: (first, blurred(second, 2.0 * k)),
+            "noise": lambda k=k: (first, noisy(second, 20 * k)),
+            "shift": lambda k=k: (first, replace(second, rgb=np.roll(second.rgb, 3 * k, axis=1))),
+            "turn": lambda k=k: (first, moved(second, turn=(k, 0, 0))),
+            "place": lambda k=k: (first, moved(second, shift=(0.03 * k, 0, 0))),
+            "depth": lambda k=k: (
+                replace(first, depth=near * np.float32(1 + 0.1 * k)),
+                replace(second, depth=far * np.float32(1 + 0.1 * k)),
+            ),
+        }[what]()
+        scores.append(_score(*changed))
+    assert scores[0] * 1.1 < scores[1] < scores[2]
+
+
+def test_the_score_is_one_minus_the_cosine_of_what_the_network_gives(
+    pair: tuple[PosedPicture, PosedPicture],
+) -> None:
+    first, second = pair
+    angles = {first.rgb.tobytes(): 0.2, second.rgb.tobytes(): 1.0}
+
+    def constant(rgb: np.ndarray) -> np.ndarray:
+        angle = angles[rgb.tobytes()]
+        # The length is no part of a cosine.
+        return np.full((2, 7, 9), [[[np.cos(angle)]], [[np.sin(angle)]]]) * (1 + angle)
+
+    result = feature_consistency(first, second, network=Network(constant))
+    assert result.score == pytest.approx(1 - np.cos(0.8), abs=1e-6)
+    assert result.same_image == pytest.approx(0, abs=1e-6)
+    assert 0 < result.places <= 7 * 9
+
+
+def test_features_are_taken_from_where_the_geometry_says() -> None:
+    # A step sideways by 20 pixels' parallax before a flat wall: the network tells columns apart by
+    # a phase that turns once in 60 pixels, so that places 20 pixels apart differ by a third of it.
+    at, aside = camera((0, 0, 0)), camera((0.4, 0, 0))
+    depth = np.full((120, 160), 0.4 * at.K[0, 0, 0] / 20, np.float32)
+    column = np.broadcast_to(np.arange(160, dtype=np.uint8)[None, :, None], (120, 160, 3))
+
+    def phase(rgb: np.ndarray) -> np.ndarray:
+        angle = rgb[..., 0] * (2 * np.pi / 60)
+        return np.stack([np.cos(angle), np.sin(angle)])
+
+    first, second = (PosedPicture("wall", c, column, depth) for c in (at, aside))
+    result = feature_consistency(first, second, network=Network(phase))
+    assert result.score == pytest.approx(1 - np.cos(2 * np.pi / 3), abs=1e-4)
+    assert result.overlap == pytest.approx(140 / 160)
+    painted = replace(second, rgb=np.ascontiguousarray(column + np.uint8(20)))
+    right = feature_consistency(first, painted, network=Network(phase))
+    assert right.score == pytest.approx(0, abs=1e-4)
+
+
+def test_places_where_both_features_are_zero_are_left_out_and_counted(
+    pair: tuple[PosedPicture, PosedPicture],
+) -> None:
+    def half(rgb: np.ndarray) -> np.ndarray:
+        features = rgb[::4, ::4].transpose(2, 0, 1).astype(float)
+        return np.where(np.arange(60) < 30, features, 0)
+
+    result = feature_consistency(*pair, network=Network(half))
+    assert result.ok and result.undefined > 500 and result.places > 500
+    empty = feature_consistency(*pair, network=Network(lambda rgb: np.zeros((3, 6, 8))))
+    assert empty.score is None and empty.places == 0 and empty.unrelated is None
+    assert empty.status == "empty: left and right have no co-visible place with features"
+
+
+def test_a_network_that_tells_nothing_apart_is_reported(
+    pair: tuple[PosedPicture, PosedPicture],
+) -> None:
+    blank = [replace(view, rgb=np.full_like(view.rgb, 90)) for view in pair]
+    for result in (
+        feature_consistency(*blank),
+        feature_consistency(*pair, network=Network(lambda rgb: np.ones((4, 10, 10)))),
+    ):
+        assert result.status.startswith("degenerate: ") and "tells nothing apart" in result.status
+        assert result.score is None and result.unrelated == pytest.approx(0, abs=1e-3)
+
+
+def test_views_without_overlap_or_depth_give_a_status(
+    pair: tuple[PosedPicture, PosedPicture],
+) -> None:
+    first, second = pair
+    nothing = "empty: left and right have no co-visible place with features"
+    for views, status in (
+        ((first, moved(second, turn=(0, 180, 0))), nothing),
+        ((first, replace(second, depth=None)), "empty: right has no depth"),
+        ((replace(first, depth=None), second), "empty: left has no depth"),
+        ((first, replace(second, mask=np.zeros((HEIGHT, WIDTH), bool))), nothing),
+    ):
+        result = feature_consistency(*views)
+        assert result.status == status and not result.ok
+        assert result.score is None and result.unrelated is None and result.overlap == 0
+
+
+def test_what_is_not_a_feature_map_is_an_error(pair: tuple[PosedPicture, PosedPicture]) -> None:
+    wrong: list[Callable[[np.ndarray], Any]] = [
+        lambda rgb: np.zeros((3, 4)),
+        lambda rgb: np.zeros((0, 4, 4)),
+        lambda rgb: np.full((1, 4, 4), np.nan),
+    ]
+    for function in wrong:
+        with pytest.raises(ShapeError, match="given: features of left"):
+            feature_consistency(*pair, network=Network(function))
+    with pytest.raises(ShapeError, match="channels"):
+        feature_consistency(*pair, network=Network(lambda rgb: np.ones((1 + rgb[0, 0, 0], 2, 2))))
+    with pytest.raises(OptionError, match="occlusion"):
+        feature_consistency(*pair, occlusion=2)
+
+
+def test_dense_gradients_cover_pictures_of_any_size() -> None:
+    rng = np.random.default_rng(1)
+    for height, width in ((40, 64), (37, 50), (5, 3), (1, 1)):
+        rgb = rng.integers(0, 256, (height, width, 3), np.uint8)
+        features = DenseGradient().features(rgb)
+        assert features.dtype == np.float32
+        assert features.shape == (76, -(-height // 4), -(-width // 4))
+        assert np.isfinite(features).all()
+        assert np.linalg.norm(features[:72], axis=0).max() <= 1 + 1e-6
+        assert np.abs(features[:72].mean(0)).max() < 1e-6
+
+
+def test_dense_gradients_of_a_turned_picture_are_the_turned_features() -> None:
+    rgb = np.random.default_rng(2).integers(0, 256, (48, 64, 3), np.uint8)
+    straight = DenseGradient().features(rgb)
+    turned = DenseGradient().features(np.ascontiguousarray(np.rot90(rgb)))
+    # A quarter turn takes each of the 3 x 3 cells, and each of the 8 orientations, to another.
+    layout = straight[:72].reshape(3, 3, 8, 12, 16)
+    expected = np.rot90(np.rot90(np.roll(layout, -2, axis=2), axes=(0, 1)), axes=(3, 4))
+    np.testing.assert_allclose(turned[:72], expected.reshape(72, 16, 12), atol=1e-5)
+    np.testing.assert_allclose(turned[72:], np.rot90(straight[72:], axes=(1, 2)), atol=1e-5)
+
+
+def test_dense_gradients_tell_edges_and_colours() -> None:
+    rgb = np.full((48, 64, 3), 60, np.uint8)
+    rgb[:, 32:] = (200, 60, 60)
+    features = DenseGradient().features(rgb)
+    middle = features[:72].reshape(9, 8, 12, 16)[4]
+    assert (middle[:, :, 7:9].argmax(0) == 0).all()  # brighter to the right
+    assert np.abs(features[:72, :, 1]).max() < 1e-3  # nothing far from the edge
+    red_green, blue_yellow = features[73:75, 6, 14]
+    assert red_green == pytest.approx(140 / 255, abs=0.01)
+    assert blue_yellow == pytest.approx(70 / 255, abs=0.01)
+
+
+@pytest.mark.data
+def test_a_real_recording_is_consistent_until_a_pose_is_wrong(shared: Path) -> None:
+    scene = open_project(shared / "data" / "sevenscenes_reg")
+    first, second = (
+        PosedPicture(view.name, view.camera, frame.rgb, frame.depth, frame.mask)
+        for view in scene.views[:3:2]
+        for frame in [view.load()]
+    )
+    good = feature_consistency(first, second)
+    bad = feature_consistency(first, moved(second, turn=(0, 2, 0)))
+    assert good.score is not None and good.unrelated is not None and bad.score is not None
+    assert good.score < 0.1 * good.unrelated
+    assert bad.score > 3 * good.score
+
+
+class FakeMet3r(torch.nn.Module):
+    """Stands for met3r.MEt3R: records what it is given."""
+
+    made: list[dict[str, Any]]
+    calls: list[dict[str, Any]]
+    mask = 1.0
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__()
+        type(self).made.append(options)
+
+    def forward(self, **inputs: Any) -> tuple[torch.Tensor, torch.Tensor, None, None]:
+        type(self).calls.append(inputs)
+        size = inputs["images"].shape[-1]
+        mask = torch.zeros(1, size, size)
+        mask[:, : size // 4] = self.mask
+        return torch.tensor([0.125]), mask, None, None
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeMet3r]:
+    module = ModuleType("met3r")
+    monkeypatch.setattr(FakeMet3r, "made", [], raising=False)
+    monkeypatch.setattr(FakeMet3r, "calls", [], raising=False)
+    module.MEt3R = FakeMet3r  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "met3r", module)
+    return FakeMet3r
+
+
+def test_met3r_is_given_square_pairs_from_minus_one_to_one(
+    fake: type[FakeMet3r], pair: tuple[PosedPicture, PosedPicture]
+) -> None:
+    black, white = (np.full((HEIGHT, WIDTH, 3), level, np.uint8) for level in (0, 255))
+    white[:, :30] = white[:, -30:] = 0  # beside the centred square of 180 x 180
+    result = met3r_score(replace(pair[0], rgb=black), replace(pair[1], rgb=white), size=64)
+    assert (result.status, result.score, result.overlap) == ("measured", 0.125, 0.25)
+    assert (result.first, result.second) == ("left", "right")
+    assert fake.made == [{"img_size": 64}]
+    (call,) = fake.calls
+    images = call.pop("images")
+    assert images.shape == (1, 2, 3, 64, 64) and images.dtype == torch.float32
+    assert (images[:, 0] == -1).all() and (images[:, 1] == 1).all()
+    assert call == {
+        "return_overlap_mask": True,
+        "return_score_map": False,
+        "return_projections": False,
+    }
+
+
+def test_a_met3r_that_is_given_is_used(
+    fake: type[FakeMet3r], pair: tuple[PosedPicture, PosedPicture]
+) -> None:
+    metric = fake(img_size=256)
+    assert met3r_score(*pair, metric=metric).score == 0.125
+    assert met3r_score(*pair, metric=metric).score == 0.125
+    assert len(fake.made) == 1 and len(fake.calls) == 2
+    images = fake.calls[0]["images"]
+    assert images.shape == (1, 2, 3, 256, 256)
+    assert -1 <= images.min() < -0.5 and 0.5 < images.max() <= 1
+
+
+def test_met3r_without_overlap_has_no_score(
+    fake: type[FakeMet3r],
+    pair: tuple[PosedPicture, PosedPicture],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(fake, "mask", 0.0)
+    result = met3r_score(*pair)
+    assert (result.status, result.score) == ("empty: MEt3R finds no overlap", None)
+
+
+def test_met3r_that_is_lacking_is_never_replaced(
+    pair: tuple[PosedPicture, PosedPicture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "met3r", None)
+    lacking = met3r_score(*pair)
+    assert lacking.score is None and lacking.overlap is None
+    assert lacking.status.startswith("unavailable: ")
+    assert "pip install git+https://github.com/mohammadasim98/met3r" in lacking.status
+
+    def offline(**options: Any) -> None:
+        raise OSError("no route to host")
+
+    module = ModuleType("met3r")
+    module.MEt3R = offline  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "met3r", module)
+    unmade = met3r_score(*pair)
+    assert unmade.score is None and "no route to host" in unmade.status
