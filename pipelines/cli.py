@@ -19,6 +19,7 @@ COMMANDS = {
     "check": "pipelines.check",
     "reconstruct": "pipelines.reconstruct",
     "render": "pipelines.render",
+    "evaluate": "pipelines.evaluate",
     "trajectory": "pipelines.trajectory",
     "export": "pipelines.export",
     "bench": "pipelines.bench",

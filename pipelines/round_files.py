@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +107,7 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
         with np.load(folder / f"depth_{stem}.npz", allow_pickle=False) as stored:
             depth = stored["completion"]
         scale = entry["scale"]["scale"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, EOFError, BadZipFile, ValueError, KeyError, TypeError) as error:
         raise ProjectError(
             f"{folder}: the target {entry.get('name', '?')} cannot be read ({error!r}); expected a "
             "round of this version; run reconstruct again"

@@ -58,7 +58,7 @@ def resolve_targets(
             raise OptionError(f"targets {spec!r}; expected {name}:N with N >= 1")
         return _path(scene, context, name, int(count))
     path, at, selection = spec.partition("@")
-    if path and Path(path).exists() and spec not in scene.names:
+    if path and _exists(path) and spec not in scene.names:
         if Path(path).is_dir() or Path(path).suffix == ".json":
             targets = _project(Path(path), selection if at else "all")
             if not allow_overlap:
@@ -73,6 +73,13 @@ def resolve_targets(
         check_disjoint(context, chosen)
     views = tuple(scene[name] for name in chosen)
     return Targets(scene.subset(chosen).cameras, views, "hold-out")
+
+
+def _exists(text: str) -> bool:
+    try:
+        return Path(text).exists()
+    except OSError:
+        return False  # A long list of names is longer than any file's.
 
 
 def _path(scene: Scene, context: tuple[str, ...], name: str, count: int) -> Targets:

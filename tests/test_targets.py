@@ -69,6 +69,13 @@ def test_a_second_project_with_the_contexts_pictures_is_refused(scene, tmp_path)
         assert len(resolve_targets(scene, scene.names, spec, allow_overlap=True).cameras) >= 2
 
 
+def test_a_list_longer_than_a_files_name_is_a_selection(tmp_path):
+    wide = open_project(write_scan(tmp_path / "wide", views=14))
+    spec = ",".join(wide.names[2:])
+    assert len(spec) > 255
+    assert len(resolve_targets(wide, wide.names[:2], spec).cameras) == 12
+
+
 def test_a_second_project_with_smaller_copies_of_the_pictures_is_refused(scene, tmp_path):
     """Other files, sizes and intrinsics, but the same shots."""
     from PIL import Image

@@ -1,0 +1,18 @@
+"""The pose probe: where a picture really looks from, found from the picture alone."""
+
+from __future__ import annotations
+
+from gvtools.evaluation.pose_probe.features import FeatureMatcher, Features, SiftMatcher
+from gvtools.evaluation.pose_probe.located import Located, PoseSummary, summarise
+from gvtools.evaluation.pose_probe.probe import PoseProbe, PoseProbeOptions
+
+__all__ = [
+    "FeatureMatcher",
+    "Features",
+    "Located",
+    "PoseProbe",
+    "PoseProbeOptions",
+    "PoseSummary",
+    "SiftMatcher",
+    "summarise",
+]

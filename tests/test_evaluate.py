@@ -1,0 +1,200 @@
+"""``gvtools evaluate`` on real runs of a tiny recording."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from test_cli import refused
+from tiny_scan import write_scan
+
+from gvtools.evaluation.images import psnr
+from gvtools.evaluation.view_figures import FIGURES
+from gvtools.scenes.project import open_project
+from pipelines.cli import main
+from pipelines.finished_run import open_run
+
+RUN = ("--context", "first:3", "--views-per-round", "2", "--quiet")
+
+
+def reconstruct(scan, out, *more: object) -> None:
+    assert main(["reconstruct", str(scan), "--out", str(out), *RUN, *map(str, more)]) == 0
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    return write_scan(tmp_path_factory.mktemp("scan"), views=7)
+
+
+@pytest.fixture(scope="module")
+def finished(scan, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "held-out"
+    reconstruct(scan, out, "--targets", "range:3-6")
+    return out
+
+
+@pytest.fixture(scope="module")
+def measured(finished, tmp_path_factory):
+    out = tmp_path_factory.mktemp("figures")
+    assert main(["evaluate", str(finished), "--out", str(out), "--quiet"]) == 0
+    return out, json.loads((out / "evaluation.json").read_text())
+
+
+def test_the_figures_that_scripts_read_stand_at_the_top(measured):
+    _, figures = measured
+    for name in ("psnr", "ssim", "lpips", "psnr_valid", "psnr_generated", "depth_rel_valid",
+                 "depth_rel_generated", "coverage", "views", "seconds_per_view"):  # fmt: skip
+        assert name in figures
+    assert figures["views"] == 4
+    assert figures["psnr_valid"] > 20
+    assert figures["depth_rel_valid"] < 1e-3
+    assert figures["lpips"] is None
+    assert "vgg16-397923af.pth" in figures["notes"]["lpips"]
+
+
+def test_figures_are_of_the_runs_pictures_by_region(measured, finished):
+    _, figures = measured
+    views = {view["name"]: view for view in figures["runs"][0]["images"]["views"]}
+    for number, entry, target, truth in open_run(finished).targets():
+        assert truth is not None
+        reference = truth.load().rgb
+        view = views[target.name]
+        assert view["round"] == number
+        assert view["psnr"] == pytest.approx(psnr(target.picture, reference))
+        expected = psnr(target.picture, reference, mask=target.observed)
+        assert view["psnr_valid"] == pytest.approx(expected)
+        expected = psnr(target.picture, reference, mask=target.generated)
+        assert view["psnr_generated"] == (None if expected is None else pytest.approx(expected))
+        assert not (target.observed & target.generated).any()
+        assert view["observed"] == pytest.approx(entry["observed"])
+
+
+def test_means_are_over_views_and_rounds_with_intervals(measured):
+    _, figures = measured
+    images = figures["runs"][0]["images"]
+    values = [view["psnr"] for view in images["views"]]
+    mean = images["mean"]["psnr"]
+    assert mean["mean"] == pytest.approx(np.mean(values))
+    assert min(values) <= mean["low"] <= mean["mean"] <= mean["high"] <= max(values)
+    assert mean["n"] == 4
+    assert [part["round"] for part in images["rounds"]] == [1, 2]
+    assert images["rounds"][1]["psnr"]["mean"] == pytest.approx(np.mean(values[2:]))
+    assert set(images["mean"]) == set(FIGURES)
+
+
+def test_consistency_and_poses_have_a_status_and_the_true_pictures_beside(measured):
+    _, figures = measured
+    run = figures["runs"][0]
+    for kind in ("generated", "true_pictures"):
+        part = run["consistency"][kind]
+        assert part["depth_reprojection"]["mean_relative_depth"] < 0.01
+        assert len(part["depth_reprojection"]["pairs"]) == 3
+        assert "status" in part["geometric_verification"]
+        score = part["feature_consistency"]
+        assert score["same_image"] < score["score"]["mean"] < score["unrelated"]
+        assert part["met3r"]["score"]["mean"] is None
+        assert "met3r" in part["met3r"]["status"]
+    poses = run["poses"]
+    if poses["status"] == "measured":
+        assert poses["pictures"] == 4
+        assert len(poses["failures"]) == 4 - poses["located"]
+
+
+def test_what_was_measured_is_written_beside_the_scores(measured, scan):
+    _, figures = measured
+    run = figures["runs"][0]
+    names = open_project(scan).names
+    assert run["split"]["context"] == list(names[:3])
+    assert run["split"]["rounds"] == [list(names[3:5]), list(names[5:])]
+    assert run["seed"] == 0
+    assert run["versions"]["gvtools"]
+    assert run["config"]["completer"] == "inpaint"
+
+
+def test_every_table_is_there_in_every_form(measured):
+    out, _ = measured
+    for table in ("summary", "views", "published_dl3dv", "published_scannetv2"):
+        for suffix in (".csv", ".md", ".tex"):
+            assert (out / f"{table}{suffix}").stat().st_size > 100
+    rows = (out / "published_dl3dv.csv").read_text().splitlines()
+    assert sum("published" in row for row in rows) == 8
+    ours = next(row for row in rows if "measured here" in row)
+    assert ours.startswith("gvtools")
+    assert "data set: a scene of one's own" in (out / "published_dl3dv.md").read_text()
+
+
+def test_targets_without_truth_have_no_image_figures(scan, tmp_path):
+    reconstruct(scan, tmp_path / "run", "--targets", "interpolate:2")
+    assert main(["evaluate", str(tmp_path / "run"), "--quiet", "--parts", "images"]) == 0
+    figures = json.loads((tmp_path / "run/evaluation/evaluation.json").read_text())
+    assert figures["psnr"] is None
+    assert figures["notes"]["psnr"] == "no target has a true picture"
+    assert figures["views"] == 2
+
+
+def test_several_runs_are_scenes(finished, scan, tmp_path):
+    reconstruct(scan, tmp_path / "other", "--targets", "range:3-4", "--seed", 4)
+    runs = [str(finished), str(tmp_path / "other")]
+    out = tmp_path / "both"
+    assert main(["evaluate", *runs, "--out", str(out), "--parts", "images", "--quiet"]) == 0
+    figures = json.loads((out / "evaluation.json").read_text())
+    means = [run["images"]["mean"]["psnr"]["mean"] for run in figures["runs"]]
+    assert figures["psnr"] == pytest.approx(np.mean(means))
+    assert figures["over_scenes"]["psnr"]["n"] == figures["scenes"] == 2
+    assert (out / "views_001.csv").is_file()
+
+
+def test_the_protocol_splits_runs_and_measures(scan, tmp_path):
+    wide = write_scan(tmp_path / "wide", views=9)
+    out = tmp_path / "out"
+    words = ["evaluate", str(wide), "--protocol", "pass", "--out", str(out), "--quiet"]
+    assert main([*words, "--parts", "images", "--completer", "none"]) == 0
+    split = json.loads((out / "split.json").read_text())
+    assert len(split["context"]) == 2
+    assert [len(names) for names in split["rounds"]] == [6]
+    figures = json.loads((out / "evaluation.json").read_text())
+    assert figures["runs"][0]["split"]["rounds"] == split["rounds"]
+    # Once more: the run is there, and is measured again.
+    assert main([*words, "--parts", "images", "--completer", "none"]) == 0
+
+
+def test_wrong_input_ends_in_one_line(finished, scan, tmp_path, capsys):
+    assert "run.json" in refused(capsys, "evaluate", scan)
+    assert "--parts" in refused(capsys, "evaluate", finished, "--parts", "images,speed")
+    assert "--out" in refused(capsys, "evaluate", finished, finished)
+    assert "did you mean" in refused(capsys, "evaluate", finished, "--against", "scannet")
+    assert "--protocol" in refused(capsys, "evaluate", finished, "--stride", 2)
+    assert "--out" in refused(capsys, "evaluate", scan, "--protocol", "long")
+    line = refused(capsys, "evaluate", finished, "--lpips-weights", tmp_path)
+    assert "vgg16-397923af.pth is absent" in line
+    wide = refused(capsys, "evaluate", scan, "--protocol", "long", "--out", tmp_path / "long")
+    assert "expected at least 20" in wide
+    assert not (finished / "evaluation").exists()
+
+
+def test_a_project_that_changed_or_went_is_said(scan, tmp_path, capsys):
+    copy = tmp_path / "scan"
+    shutil.copytree(scan, copy)
+    reconstruct(copy, tmp_path / "run", "--targets", "range:3-4")
+    pose = copy / "frame-000003.pose.txt"
+    text = pose.read_text()
+    matrix = np.loadtxt(pose)
+    matrix[0, 3] += 0.1
+    np.savetxt(pose, matrix)
+    assert "another one now" in refused(capsys, "evaluate", tmp_path / "run", "--quiet")
+    pose.write_text(text)
+    copy.rename(tmp_path / "moved")
+    assert "no such folder" in refused(capsys, "evaluate", tmp_path / "run", "--quiet")
+    words = ["evaluate", str(tmp_path / "run"), "--project", str(tmp_path / "moved"), "--quiet"]
+    assert main([*words, "--parts", "images"]) == 0
+
+
+def test_damaged_rounds_are_named(scan, tmp_path, capsys):
+    reconstruct(scan, tmp_path / "run", "--targets", "range:3-4")
+    next((tmp_path / "run/round_001").glob("depth_*.npz")).write_bytes(b"")
+    line = refused(capsys, "evaluate", tmp_path / "run", "--quiet")
+    assert "round_001" in line
+    shutil.rmtree(tmp_path / "run/round_001")
+    assert "no round of targets" in refused(capsys, "evaluate", tmp_path / "run")
