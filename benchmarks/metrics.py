@@ -51,10 +51,14 @@ def main() -> None:
         rendering.append(middle - start)
     # The first view compiled or loaded the kernels.
     twice, figures = sum(rendering[1:]), sum(measuring[1:])
-    print(f"{len(rendering) - 1} views of {frame.rgb.shape[1]}x{frame.rgb.shape[0]}, voxel {args.voxel}")
-    print(f"projecting them twice  {twice:.2f} s (median {statistics.median(rendering[1:]):.4f} a view)")
-    print(f"all their figures      {figures:.2f} s (median {statistics.median(measuring[1:]):.4f})")
-    print(f"ratio                  {figures / twice:.2f}")
+    size = f"{frame.rgb.shape[1]}x{frame.rgb.shape[0]}"
+    medians = [statistics.median(times[1:]) for times in (rendering, measuring)]
+    print(f"{len(rendering) - 1} views of {size}, voxel {args.voxel}")
+    print(f"projecting them twice  {twice:.2f} s (median {medians[0]:.4f} a view)")
+    print(f"all their figures      {figures:.2f} s (median {medians[1]:.4f} a view)")
+    print(
+        f"ratio                  {figures / twice:.2f} (of medians {medians[1] / medians[0]:.2f})"
+    )
 
 
 if __name__ == "__main__":
