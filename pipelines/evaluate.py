@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError
+from gvtools.options import check_range
 from pipelines.lpips_arguments import add_lpips_arguments, open_lpips
 from pipelines.scene_arguments import add_scene_arguments
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.ranking import Setting
     from pipelines.console import Console
-    from pipelines.finished_run import FinishedRun
 
 SUMMARY = "measure finished runs: pictures, consistency, poses, beside published figures"
 EXAMPLES = (
@@ -70,6 +67,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--project", type=Path, metavar="DIR", help="where the run's project lies, if it was moved"
     )
+    parser.add_argument(
+        "--features",
+        metavar="MODULE:NAME",
+        help="of feature consistency: a class of your own with name and features(rgb) (default "
+        "dense-gradient)",
+    )
     group = parser.add_argument_group("running the protocol on a project first")
     group.add_argument(
         "--protocol", choices=tuple(PROTOCOLS), help="pass: 2 context and 6 target views; long: "
@@ -93,6 +96,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """
     from gvtools.evaluation.published import benchmark_names, load_benchmark
     from pipelines.console import write_json
+    from pipelines.evaluation_record import described, joined, name_apart, setting_of
     from pipelines.evaluation_tables import (
         comparison,
         measured_row,
@@ -104,6 +108,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from pipelines.run_evaluation import evaluate_run
 
     parts = _parts(args.parts)
+    check_range("--seed", args.seed, least=0)
     names = benchmark_names()
     shown = names if "all" in args.against else tuple(args.against)
     benchmarks = {name: load_benchmark(name) for name in dict.fromkeys((*names, *shown))}
@@ -113,8 +118,12 @@ def run(args: argparse.Namespace, console: Console) -> None:
         raise OptionError("--project: names the project of one run; give one run")
     out = _folder(args)
     lpips, no_lpips = open_lpips(args)
+    network = _network(args.features)
     if args.protocol is not None:
         args.runs = [_run_protocol(args, out, console)]
+    resolved = [path.resolve() for path in args.runs]
+    if len(set(resolved)) < len(resolved):
+        raise OptionError("a run is given twice; expected each once")
     runs = [open_run(path, project=args.project) for path in args.runs]
     evaluations = []
     for finished in runs:
@@ -127,22 +136,25 @@ def run(args: argparse.Namespace, console: Console) -> None:
             lpips=lpips,
             no_lpips=no_lpips,
             matcher=_matcher(args.matcher),
+            network=network,
             control=not args.no_control,
             seed=args.seed,
             console=console,
         )
-        evaluations.append(_described(finished, found.figures))
-    setting = _setting(args, runs, evaluations, lpips is not None)
+        evaluations.append(described(finished, found.figures))
+    name_apart(evaluations)
+    setting = setting_of(args, runs, evaluations, lpips is not None)
     row = measured_row(args.name, evaluations, setting)
     comparisons = {name: comparison(row, benchmark) for name, benchmark in benchmarks.items()}
-    tables = {"summary": summary_table(evaluations, "Evaluation")}
+    figures = joined(evaluations, row.figures, args, parts)
+    over = figures["over_scenes"] if len(evaluations) > 1 else {}
+    tables = {"summary": summary_table(evaluations, "Evaluation", over)}
     for number, evaluation in enumerate(evaluations):
         if "images" in evaluation:
             views = evaluation["images"]["views"]
             key = "views" if len(evaluations) == 1 else f"views_{number:03d}"
             tables[key] = view_table(views, evaluation["name"])
     tables |= {f"published_{name}": table for name, table in comparisons.items()}
-    figures = _joined(evaluations, row.figures, args.seed)
     write_json(out / "evaluation.json", figures)
     write_tables(out, tables)
     if args.json is not None:
@@ -187,8 +199,27 @@ def _matcher(name: str) -> Any:
     return LightGlueMatcher()
 
 
+def _network(spec: str | None) -> Any:
+    """The feature network that the user named, or None for the default."""
+    if spec is None:
+        return None
+    from importlib import import_module
+
+    module, _, name = spec.partition(":")
+    try:
+        network = getattr(import_module(module), name)()
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise OptionError(
+            f"--features {spec!r}: cannot be made ({error}); expected MODULE:NAME of a class "
+            "without required arguments"
+        ) from None
+    if not hasattr(network, "features") or not hasattr(network, "name"):
+        raise OptionError(f"--features {spec!r}: expected name and features(rgb) of it")
+    return network
+
+
 def _run_protocol(args: argparse.Namespace, out: Path, console: Console) -> Path:
-    """Split the project, write the split beside the scores, and run it; the run's folder."""
+    """Split the project, run it, and write the split beside the scores; the run's folder."""
     from gvtools.evaluation.protocol import protocol_split
     from pipelines import config as settings
     from pipelines.console import write_json
@@ -215,99 +246,19 @@ def _run_protocol(args: argparse.Namespace, out: Path, console: Console) -> Path
     }
     for key, value in chosen.items():
         config = settings.with_setting(config, key, value)
+    for text in args.set:
+        key = text.partition("=")[0].strip()
+        if key in chosen:
+            raise OptionError(f"--set {key}: decided by --protocol; leave it out")
     config = settings.with_settings(config, args.set)
     folder = out / "run"
     resume = (folder / "run.json").is_file()
     RunDirectory(folder).refuse_foreign()
-    write_json(out / "split.json", {"protocol": args.protocol, **split.to_dict()})
-    return reconstruct(
+    done = reconstruct(
         scene, config, folder, console=console, resume=resume, reading=reading_of(args)
     )
-
-
-def _described(finished: FinishedRun, figures: dict[str, Any]) -> dict[str, Any]:
-    """The figures with what they were measured on."""
-    record = finished.record
-    schedule = [[record["targets"][row] for row in rows] for rows in record["schedule"]]
-    reports = finished.reports[1:]
-    passes = [report["seconds"]["total"] for report in reports]
-    return {
-        "name": finished.path.resolve().name,
-        "run": str(finished.path),
-        "project": record["project"],
-        "split": {"context": record["context"], "rounds": schedule},
-        "seed": record["config"]["seed"],
-        "config": record["config"],
-        "versions": record["versions"],
-        "seconds_per_pass": sum(passes) / len(passes),
-        **figures,
-    }
-
-
-def _setting(
-    args: argparse.Namespace,
-    runs: Sequence[FinishedRun],
-    evaluations: Sequence[Mapping[str, Any]],
-    lpips: bool,
-) -> Setting:
-    from gvtools.evaluation.ranking import Setting
-
-    sizes = {
-        (entry["camera"]["width"], entry["camera"]["height"])
-        for finished in runs
-        for report in finished.reports[1:]
-        for entry in report["views"]
-    }
-    per_round = {len(report["views"]) for finished in runs for report in finished.reports[1:]}
-    met3r = [e.get("consistency", {}).get("generated", {}).get("met3r") for e in evaluations]
-    return Setting(
-        data_set=args.data_set,
-        # Mixed sizes and numbers are none of the published ones.
-        resolution=sizes.pop() if len(sizes) == 1 else (0, 0),
-        context=_common([len(finished.record["context"]) for finished in runs]),
-        targets=per_round.pop() if len(per_round) == 1 else 0,
-        rounds=_common([len(finished.reports) - 1 for finished in runs]),
-        scenes=len(runs),
-        lpips_net=args.lpips_net if lpips else None,
-        poses_from=f"pose probe ({args.matcher})",
-        pose_unit="scene units",
-        reprojection=None,
-        met3r="original" if all(m and m["status"] == "measured" for m in met3r) else None,
-        hardware=f"{os.cpu_count()} CPU cores",
-    )
-
-
-def _common(numbers: Sequence[int]) -> int:
-    return numbers[0] if len(set(numbers)) == 1 else 0
-
-
-def _joined(
-    evaluations: Sequence[Mapping[str, Any]], row: Mapping[str, float | None], seed: int
-) -> dict[str, Any]:
-    """One JSON object: figures over all runs at the top, then each run's."""
-    from dataclasses import asdict
-
-    from gvtools.evaluation.intervals import mean_interval
-    from gvtools.evaluation.view_figures import FIGURES
-
-    means = {
-        name: [e.get("images", {}).get("mean", {}).get(name, {}).get("mean") for e in evaluations]
-        for name in FIGURES
-    }
-    over = {name: mean_interval(values, seed=seed) for name, values in means.items()}
-    notes = {key: text for e in evaluations for key, text in e.get("images", {})
-             .get("notes", {}).items()}  # fmt: skip
-    return {
-        **{name: interval.mean for name, interval in over.items()},
-        "coverage": mean_interval([e["coverage"] for e in evaluations]).mean,
-        "views": sum(e["views"] for e in evaluations),
-        "seconds_per_view": mean_interval([e["seconds_per_view"] for e in evaluations]).mean,
-        "scenes": len(evaluations),
-        "over_scenes": {name: asdict(interval) for name, interval in over.items()},
-        "protocol_row": dict(row),
-        "runs": list(evaluations),
-        "notes": notes,
-    }
+    write_json(out / "split.json", {"protocol": args.protocol, **split.to_dict()})
+    return done
 
 
 def _print(table: Any, console: Console) -> None:
@@ -315,9 +266,15 @@ def _print(table: Any, console: Console) -> None:
 
     if table.caption:
         console.line(table.caption)
-    rows = [
-        [value.value if isinstance(value, Cell) else value for value in row] for row in table.rows
-    ]
+
+    def shown(value: Any) -> Any:
+        if not isinstance(value, Cell):
+            return value
+        if value.value is None or value.rank is None:
+            return value.value
+        return f"{value.value:.4g} #{value.rank}"
+
+    rows = [[shown(value) for value in row] for row in table.rows]
     console.table([column.heading for column in table.columns], rows)
     for note in table.notes:
         console.line(f"  {note}")

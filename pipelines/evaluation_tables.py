@@ -28,8 +28,18 @@ def view_table(views: Sequence[Mapping[str, Any]], caption: str) -> Table:
     return Table(tuple(columns), tuple(rows), caption)
 
 
-def summary_table(evaluations: Sequence[Mapping[str, Any]], caption: str) -> Table:
-    """One row a figure and run: mean, its interval, each round, and the true pictures' figure."""
+def summary_table(
+    evaluations: Sequence[Mapping[str, Any]],
+    caption: str,
+    over_scenes: Mapping[str, Mapping[str, Any]],
+) -> Table:
+    """One row a figure and run: mean, its interval, each round, and the true pictures' figure.
+
+    Args:
+        evaluations: one a run.
+        caption: above the table.
+        over_scenes: means of the runs' means, for a block of their own; empty for a single run.
+    """
     rounds = max(evaluation["rounds"] for evaluation in evaluations)
     columns = [Column("run"), Column("figure"), Column("mean", digits=4)]
     columns += [Column(end, digits=4) for end in ("low", "high")]
@@ -51,6 +61,16 @@ def summary_table(evaluations: Sequence[Mapping[str, Any]], caption: str) -> Tab
         for figure, mean, low, high, n, true in scalars(evaluation):
             rows.append((name, figure, mean, low, high, n, *[None] * rounds, true))
         notes += [f"{name}: {key}: {text}" for key, text in images["notes"].items()]
+        notes += [f"{name}: {text}" for text in _without_figures(evaluation)]
+    for figure, interval in over_scenes.items():
+        ends = interval["mean"], interval["low"], interval["high"], interval["n"]
+        rows.append(("all scenes", figure, *ends, *[None] * rounds, None))
+    if any(evaluation.get("poses", {}).get("located") for evaluation in evaluations):
+        notes.append(
+            "pose figures are over the located pictures; a completed picture repeats what the "
+            "context shows, and is located more exactly than a photograph at recorded poses: read "
+            "them beside the true pictures"
+        )
     return Table(tuple(columns), tuple(rows), caption, tuple(notes))
 
 
@@ -78,6 +98,28 @@ def scalars(evaluation: Mapping[str, Any]) -> list[Scalar]:
     return out
 
 
+def _without_figures(evaluation: Mapping[str, Any]) -> list[str]:
+    """Why parts have no figure."""
+    out = []
+    for kind, part in evaluation.get("consistency", {}).items():
+        label = "" if kind == "generated" else "true pictures: "
+        for name in ("depth_reprojection", "geometric_verification", "met3r"):
+            status = part.get(name, {}).get("status", "")
+            if status.startswith(("empty", "unavailable")):
+                out.append(f"{label}{name.replace('_', ' ')}: {status}")
+        if not part["feature_consistency"]["pairs"]:
+            out.append(f"{label}feature consistency: empty: a single view has no pairs")
+    poses = evaluation.get("poses", {})
+    for label, part in (("", poses), ("true pictures: ", poses.get("true_pictures") or {})):
+        if str(part.get("status", "")).startswith("degenerate"):
+            out.append(f"{label}poses: {part['status']}")
+        for key in ("ate_sim3", "rpe_sim3"):
+            status = part.get(key, {}).get("status", "")
+            if status.startswith("degenerate"):
+                out.append(f"{label}{key.split('_')[0].upper()}: {status}")
+    return list(dict.fromkeys(out))
+
+
 Quad = tuple[float | None, float | None, float | None, int | None]
 
 
@@ -97,7 +139,8 @@ def _consistency_figures(part: Mapping[str, Any] | None) -> list[tuple[str, Quad
         ("reprojection at given poses, pixels", geometry["mean_reprojection"], geometry["points"]),
         ("epipolar distance, pixels", geometry["epipolar"], None),
     )
-    label = f"feature consistency ({features['network']})"
+    network = features["network"]
+    label = f"feature consistency ({network})" if network else "feature consistency"
     return [(name, (value, None, None, n)) for name, value, n in plain] + [
         (label, (score["mean"], score["low"], score["high"], score["n"]))
     ]
@@ -117,8 +160,16 @@ def _pose_figures(part: Mapping[str, Any] | None) -> dict[str, tuple[float | Non
         out[label] = (found["median"], found["n"]) if found else (None, 0)
     for key in ("ate_sim3", "rpe_sim3"):
         if key in part:
-            label = f"{key.split('_')[0].upper()} (Sim(3)), rmse, scene units"
-            out[label] = (part[key]["rmse"], part[key]["n"])
+            label = f"{key.split('_')[0].upper()} (Sim(3)), rmse"
+            figures = part[key]
+            out[f"{label}, scene units"] = (figures["rmse"], figures["n"])
+            out[f"{label}, share of extent"] = (figures["translation_share"]["rmse"], figures["n"])
+            if key == "rpe_sim3":
+                out[f"{label}, degrees"] = (figures["rotation_deg"]["rmse"], figures["n"])
+    auc = part.get("auc")
+    if auc:
+        out["pose AUC at 3 degrees, failures as wrong"] = (auc["3"], part["pictures"])
+        out["pose AUC at 30 degrees, failures as wrong"] = (auc["30"], part["pictures"])
     return out
 
 
@@ -130,7 +181,10 @@ def comparison(row: MeasuredRow, benchmark: Benchmark) -> Table:
 def measured_row(
     name: str, evaluations: Sequence[Mapping[str, Any]], setting: Setting
 ) -> MeasuredRow:
-    """The protocol's figures: means over scenes of what each scene's views come to."""
+    """The protocol's figures: means over scenes of what each scene's views come to.
+
+    The time is that of all rounds, as published.
+    """
 
     def mean(values: Sequence[float | None]) -> float | None:
         known = [value for value in values if value is not None]
@@ -159,7 +213,7 @@ def measured_row(
         "rpe_t": pose("rpe_sim3", "rmse"),
         "reproj": None,
         "met3r": mean([m["score"]["mean"] if m else None for m in met3r]),
-        "time": mean([e["seconds_per_pass"] for e in evaluations]),
+        "time": mean([e["seconds_of_rounds"] for e in evaluations]),
     }
     return MeasuredRow(name, figures, setting)
 

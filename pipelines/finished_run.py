@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,10 @@ from pipelines.scene_arguments import reopen_scene
 if TYPE_CHECKING:
     from gvtools.evaluation.posed_picture import PosedPicture
     from gvtools.scenes.scene import Scene, View
+
+
+_RECORDED = ("schedule", "context", "targets", "config", "versions")
+_OF_A_VIEW = ("name", "coverage", "coverage_after", "camera", "stem", "scale")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,22 +66,17 @@ class FinishedRun:
                 yield number, entry, target, truth
 
     def context(self) -> list[PosedPicture]:
-        """The given views; the depth of those that have none is the memory's of round 0."""
+        """The given views, with the depth of the memory's observed points as each sees them."""
         from gvtools.evaluation.posed_picture import PosedPicture
+        from pipelines.memory_source import open_memory
 
-        memory = None
+        memory = open_memory(self.path, up_to=0)
         out = []
         for name in self.record["context"]:
             view = self.scene[name]
             frame = view.load()
-            depth = frame.depth
-            if depth is None:
-                if memory is None:
-                    from pipelines.memory_source import open_memory
-
-                    memory = open_memory(self.path, up_to=0)
-                depth = memory.project(view.camera).depth[0]
-            out.append(PosedPicture(name, view.camera, frame.rgb, depth, frame.mask))
+            known = memory.project(view.camera)
+            out.append(PosedPicture(name, view.camera, frame.rgb, known.depth[0], frame.mask))
         return out
 
 
@@ -98,11 +97,15 @@ def open_run(path: Path, *, project: Path | None = None) -> FinishedRun:
         record = json.loads(file.read_text(encoding="utf-8"))
         root, reading = Path(record["project"]), record["reading"]
         other, kind = record["targets_project"], record["targets_kind"]
+        lacking = [key for key in _RECORDED if key not in record]
+        if lacking:
+            raise KeyError(", ".join(lacking))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ProjectError(
             f"{file}: no record of a run of this version ({error!r}); run reconstruct again"
         ) from None
     reports = tuple(RunDirectory(path).reports())
+    _check_reports(path, reports)
     if len(reports) < 2:
         raise ProjectError(f"{path}: no round of targets is done; expected one; add --resume to it")
     scene = reopen_scene(project or root, reading)
@@ -112,6 +115,17 @@ def open_run(path: Path, *, project: Path | None = None) -> FinishedRun:
 
         truths = open_project(Path(other))
     return FinishedRun(path, record, scene, truths, reports)
+
+
+def _check_reports(path: Path, reports: Sequence[Mapping[str, Any]]) -> None:
+    for number, report in enumerate(reports):
+        views = report.get("views")
+        whole = isinstance(views, list) and "seconds" in report
+        if not whole or any(key not in view for view in views or () for key in _OF_A_VIEW):
+            raise ProjectError(
+                f"{RunDirectory(path).round_path(number)}/report.json: no report of this version; "
+                "run reconstruct again"
+            )
 
 
 def _same_camera(view: View, target: TargetFiles) -> bool:

@@ -172,7 +172,13 @@ class RunDirectory:
             path = self.round_path(len(out)) / "report.json"
             if not path.exists():
                 return out
-            out.append(json.loads(path.read_text(encoding="utf-8")))
+            try:
+                out.append(json.loads(path.read_text(encoding="utf-8")))
+            except (OSError, ValueError) as error:
+                raise ProjectError(
+                    f"{path}: no readable report ({error}); remove this round's folder and add "
+                    "--resume to the run"
+                ) from None
 
     def round_path(self, number: int) -> Path:
         """Where round ``number`` stands."""

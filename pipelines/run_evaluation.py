@@ -17,6 +17,7 @@ from gvtools.evaluation.view_figures import FIGURES, view_figures
 from pipelines.finished_run import FinishedRun
 
 if TYPE_CHECKING:
+    from gvtools.evaluation.consistency.feature_consistency import FeatureNetwork
     from gvtools.evaluation.lpips_distance import Lpips
     from gvtools.evaluation.pose_probe.features import FeatureMatcher
     from gvtools.scenes.scene import Frame
@@ -70,6 +71,7 @@ def evaluate_run(
     lpips: Lpips | None,
     no_lpips: str | None,
     matcher: FeatureMatcher | None = None,
+    network: FeatureNetwork | None = None,
     control: bool = True,
     seed: int = 0,
     console: Console,
@@ -82,6 +84,7 @@ def evaluate_run(
         lpips: the network, or None.
         no_lpips: why there is none.
         matcher: of the pose probe; None is SIFT.
+        network: of the feature consistency; None is "dense-gradient".
         control: measure the true pictures of the targets as well, to read the figures by.
         seed: of resampling, matching and robust estimates.
         console: for progress.
@@ -108,7 +111,7 @@ def evaluate_run(
             out.figures["images"] = _images(targets, lpips, no_lpips, seed, console)
     if "consistency" in parts:
         with out.timed("consistency"):
-            out.figures["consistency"] = _consistency(targets, control, seed, console)
+            out.figures["consistency"] = _consistency(targets, network, control, seed, console)
     if "poses" in parts:
         with out.timed("poses"):
             out.figures["poses"] = _poses(run, targets, matcher, control, seed, console)
@@ -148,6 +151,11 @@ def _images(
         notes["lpips"] = no_lpips
     if not any(target.truth for target in targets):
         notes["psnr"] = "no target has a true picture"
+    if any(view["psnr"] == float("inf") for view in views):
+        notes["psnr"] = "infinite, and null in JSON, where pictures are equal"
+    masked = [
+        1 - float(t.truth.mask.mean()) for t in targets if t.truth and t.truth.mask is not None
+    ]
     numbers = sorted({view["round"] for view in views})
     return {
         "mean": {name: _interval([view[name] for view in views], seed) for name in FIGURES},
@@ -166,19 +174,25 @@ def _images(
             "psnr": "peak 1, mean over pixels and channels",
             "ssim": "Gaussian window 11x11, sigma 1.5, population covariances, data range 1",
             "lpips": f"lpips package, network {lpips.net}" if lpips else None,
+            "masked_share": max(masked, default=0.0),
         },
         "notes": notes,
     }
 
 
 def _consistency(
-    targets: Sequence[_Target], control: bool, seed: int, console: Console
+    targets: Sequence[_Target],
+    network: FeatureNetwork | None,
+    control: bool,
+    seed: int,
+    console: Console,
 ) -> dict[str, Any]:
     pictures = [target.picture for target in targets]
-    out = {"generated": _consistent(pictures, seed, console, "consistency")}
+    out = {"generated": _consistent(pictures, network, seed, console, "consistency")}
     true = _true_pictures(targets)
     if control and len(true) > 1:
-        out["true_pictures"] = _consistent(true, seed, console, "consistency of the true pictures")
+        label = "consistency of the true pictures"
+        out["true_pictures"] = _consistent(true, network, seed, console, label)
     return out
 
 
@@ -197,16 +211,24 @@ def _true_pictures(targets: Sequence[_Target]) -> list[PosedPicture]:
 
 
 def _consistent(
-    pictures: Sequence[PosedPicture], seed: int, console: Console, label: str
+    pictures: Sequence[PosedPicture],
+    network: FeatureNetwork | None,
+    seed: int,
+    console: Console,
+    label: str,
 ) -> dict[str, Any]:
     """The three measures of one set of pictures; pairs are consecutive ones."""
     from gvtools.evaluation.consistency.depth_reprojection import depth_reprojection_of_views
-    from gvtools.evaluation.consistency.feature_consistency import feature_consistency, met3r_score
+    from gvtools.evaluation.consistency.feature_consistency import (
+        feature_consistency,
+        load_met3r,
+        met3r_score,
+    )
     from gvtools.evaluation.consistency.geometric_verification import verify_geometry
 
     depth = asdict(depth_reprojection_of_views(pictures, pairs="consecutive"))
     features = [
-        feature_consistency(first, second)
+        feature_consistency(first, second, network=network)
         for first, second in console.track(list(pairwise(pictures)), f"{label}: pairs")
     ]
     matched = _sampled(pictures, MOST_MATCHED)
@@ -225,15 +247,17 @@ def _consistent(
             "pairs": [asdict(pair) for pair in features],
         },
     }
-    if len(pictures) > 1:
-        first = met3r_score(pictures[0], pictures[1])
-        scores = [first]
-        if first.status == "measured":
-            scores += [met3r_score(a, b) for a, b in pairwise(pictures[1:])]
-        out["met3r"] = {
-            "status": first.status,
-            "score": _interval([pair.score for pair in scores], seed),
-        }
+    metric, status = load_met3r()
+    scores = []
+    if metric is not None:
+        scores = [met3r_score(a, b, metric=metric) for a, b in pairwise(pictures)]
+        measured = sum(pair.score is not None for pair in scores)
+        status = "measured" if measured else "empty: no pair with overlap"
+    out["met3r"] = {
+        "status": status,
+        "score": _interval([pair.score for pair in scores], seed),
+        "pairs": [asdict(pair) for pair in scores],
+    }
     return out
 
 
@@ -300,10 +324,27 @@ def _pose_figures(found: Sequence[Any], pictures: Sequence[PosedPicture] | None)
     requested = np.array([pictures[i].camera.world_from_cam[0] for i in rows]).reshape(-1, 4, 4)
     estimated = np.array([np.linalg.inv(found[i].cam_from_world) for i in rows]).reshape(-1, 4, 4)
     out["rpe_pairs"] = "consecutive located views"
+    out["auc"] = _auc(found, pictures)
     for align in ("none", "sim3"):
         out[f"ate_{align}"] = to_dict(absolute_errors(requested, estimated, align=align))
         out[f"rpe_{align}"] = to_dict(relative_errors(requested, estimated, align=align))
     return out
+
+
+def _auc(found: Sequence[Any], pictures: Sequence[PosedPicture]) -> dict[str, float | None]:
+    """Pose AUC over all pairs of the pictures; a pair with a failure counts as wrong."""
+    from gvtools.evaluation.trajectories import AUC_THRESHOLDS, pose_auc
+
+    rows = [i for i, one in enumerate(found) if one.ok]
+    pairs = len(found) * (len(found) - 1) // 2
+    keys = [f"{threshold:g}" for threshold in AUC_THRESHOLDS]
+    if len(rows) < 2:
+        return dict.fromkeys(keys, 0.0 if pairs else None)
+    requested = np.array([pictures[i].camera.world_from_cam[0] for i in rows])
+    estimated = np.array([np.linalg.inv(found[i].cam_from_world) for i in rows])
+    auc = pose_auc(requested, estimated)
+    share = auc.pairs / pairs
+    return {key: share * (value or 0.0) for key, value in zip(keys, auc.auc.values(), strict=True)}
 
 
 def _sampled(pictures: Sequence[PosedPicture], most: int) -> list[PosedPicture]:

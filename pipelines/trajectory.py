@@ -172,5 +172,7 @@ def _print(figures: dict[str, Any], errors: PoseErrors, console: Console) -> Non
     ]
     console.table(["error", *FIGURES, "n"], rows)
     if figures.get("auc"):
-        shares = ", ".join(f"@{key} {value:.4f}" for key, value in figures["auc"].items() if value)
+        shares = ", ".join(
+            f"@{key} {value:.4f}" for key, value in figures["auc"].items() if value is not None
+        )
         console.line(f"pose AUC over {figures['auc_pairs']} pairs, degrees: {shares or '-'}")

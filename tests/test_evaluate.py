@@ -198,3 +198,85 @@ def test_damaged_rounds_are_named(scan, tmp_path, capsys):
     assert "round_001" in line
     shutil.rmtree(tmp_path / "run/round_001")
     assert "no round of targets" in refused(capsys, "evaluate", tmp_path / "run")
+
+
+def test_what_is_beside_published_rows_says_what_it_stands_on(scan, tmp_path):
+    """Masked pictures, few located views and one project twice are no ranking on a data set."""
+    from PIL import Image
+
+    masked = write_scan(tmp_path / "masked", views=7)
+    for path in masked.glob("*.color.png"):
+        with Image.open(path) as image:
+            rgba = image.convert("RGBA")
+        rgba.putalpha(Image.fromarray((np.arange(96)[None] > 20).repeat(72, 0).astype("u1") * 255))
+        rgba.save(path)
+    runs = [tmp_path / "a" / "run", tmp_path / "b" / "run"]
+    for seed, run in enumerate(runs):
+        reconstruct(masked, run, "--targets", "range:3-4", "--seed", seed)
+    out = tmp_path / "out"
+    words = ["evaluate", *map(str, runs), "--out", str(out), "--data-set", "dl3dv", "--seed", "7"]
+    assert main([*words, "--against", "dl3dv", "--quiet"]) == 0
+    text = (out / "published_dl3dv.md").read_text()
+    assert "compared pixels: inside masks here" in text
+    assert "scenes: a single one here" in text
+    figures = json.loads((out / "evaluation.json").read_text())
+    assert [run["name"] for run in figures["runs"]] == ["a/run", "b/run"]
+    assert figures["evaluation"]["seed"] == 7
+    assert figures["evaluation"]["bootstrap"] == {"level": 0.95, "resamples": 2000}
+    assert figures["protocol_row"]["probed"] == 4
+    assert figures["runs"][0]["images"]["settings"]["masked_share"] == pytest.approx(21 / 96)
+    summary = (out / "summary.csv").read_text()
+    assert "all scenes,psnr" in summary
+
+
+def test_a_feature_network_of_ones_own(finished, tmp_path, monkeypatch, capsys):
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np\n"
+        "class Means:\n"
+        "    name = 'means'\n"
+        "    def features(self, rgb):\n"
+        "        h, w = rgb.shape[0] // 8, rgb.shape[1] // 8\n"
+        "        cells = rgb[: h * 8, : w * 8].reshape(h, 8, w, 8, 3).mean(axis=(1, 3))\n"
+        "        return (cells.transpose(2, 0, 1) / 255 - 0.5).astype(np.float32)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    out = tmp_path / "out"
+    words = ["evaluate", str(finished), "--out", str(out), "--parts", "consistency", "--quiet"]
+    assert main([*words, "--features", "mine:Means"]) == 0
+    figures = json.loads((out / "evaluation.json").read_text())
+    part = figures["runs"][0]["consistency"]["generated"]["feature_consistency"]
+    assert part["network"] == "means"
+    assert "cannot be made" in refused(capsys, *words, "--features", "mine:Medians")
+    assert "expected name and features" in refused(capsys, *words, "--features", "json:JSONEncoder")
+
+
+@pytest.mark.parametrize("damage", ["seed", "report", "record", "view", "twice", "decided"])
+def test_damage_and_contradictions_end_in_one_line(damage, finished, scan, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    report = run / "round_002" / "report.json"
+    words: list[object] = ["evaluate", run]
+    if damage == "seed":
+        words += ["--seed", "-1"]
+    elif damage == "report":
+        report.write_text(report.read_text()[:100])
+    elif damage == "record":
+        record = json.loads((run / "run.json").read_text())
+        record.pop("schedule")
+        (run / "run.json").write_text(json.dumps(record))
+    elif damage == "view":
+        data = json.loads(report.read_text())
+        data["views"][0].pop("coverage")
+        report.write_text(json.dumps(data))
+    elif damage == "twice":
+        words += [run, "--out", tmp_path / "out"]
+    else:
+        words = ["evaluate", scan, "--protocol", "pass", "--out", tmp_path / "p"]
+        words += ["--set", "rounds=1"]
+    told = {"seed": "at least 0", "report": "no readable report", "record": "schedule",
+            "view": "no report of this version", "twice": "given twice",
+            "decided": "decided by --protocol"}  # fmt: skip
+    if damage == "decided":
+        words[1] = write_scan(tmp_path / "wide", views=9)
+    assert told[damage] in refused(capsys, *words)
+    assert not (tmp_path / "p" / "split.json").exists()

@@ -152,7 +152,7 @@ def distance(
             f"{SMALLEST}x{SMALLEST} pixels"
         )
     pair = [
-        torch.from_numpy(np.ascontiguousarray(x)).permute(2, 0, 1)[None].float() / 127.5 - 1
+        torch.from_numpy(x.copy()).permute(2, 0, 1)[None].float() / 127.5 - 1
         for x in (image, truth)
     ]
     with torch.inference_mode():

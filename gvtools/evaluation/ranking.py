@@ -34,7 +34,7 @@ class Setting:
     Attributes:
         data_set: a benchmark's name; None is a scene of the user's own.
         resolution: width and height, pixels.
-        context: context views of a round.
+        context: context views of a round; None, here and below, when the runs differ.
         targets: target views of a round.
         rounds: how many rounds.
         scenes: how many scenes the figures are averages over.
@@ -48,10 +48,10 @@ class Setting:
     """
 
     data_set: str | None
-    resolution: tuple[int, int]
-    context: int
-    targets: int
-    rounds: int = 1
+    resolution: tuple[int, int] | None
+    context: int | None
+    targets: int | None
+    rounds: int | None = 1
     scenes: int = 1
     pixels: str = "all"
     lpips_net: str | None = None
@@ -105,20 +105,24 @@ def reasons_not_to_rank(setting: Setting, benchmark: Benchmark, figure: str) -> 
     elif setting.scenes < 2:
         reasons = ["scenes: a single one here, the published figures are of a data set"]
     compared = {
-        "resolution": (f"{x.resolution[0]}x{x.resolution[1]}" for x in (setting, benchmark)),
+        "resolution": (_size(setting.resolution), _size(benchmark.resolution)),
         "context views a round": (setting.context, benchmark.context),
         "target views a round": (setting.targets, benchmark.targets),
         "rounds": (setting.rounds, benchmark.rounds),
     }
     for what, (here, there) in compared.items():
         if here != there:
-            reasons.append(f"{what}: {here} here, {there} published")
+            reasons.append(f"{what}: {here or 'mixed'} here, {there} published")
     for aspect, there in benchmark.figures[figure].definition.items():
         here = getattr(setting, aspect)
         if there is None or here is None or name_key(here) != name_key(there):
             stated = "not stated by the source" if there is None else f"{there} published"
             reasons.append(f"{ASPECTS[aspect]}: {here or 'not recorded'} here, {stated}")
     return tuple(reasons)
+
+
+def _size(resolution: tuple[int, int] | None) -> str | None:
+    return f"{resolution[0]}x{resolution[1]}" if resolution else None
 
 
 def side_by_side(

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from gvtools.scenes.scene import Frame
 
 # Of each: the whole picture, what stands on observations, what a completer made.
+SMALLEST = 32  # pixels a side, of a picture that LPIPS can be taken of
 REGIONS = {"": "whole", "_valid": "observed", "_generated": "generated"}
 FIGURES = (
     *(f"{figure}{region}" for region in REGIONS for figure in ("psnr", "ssim", "lpips")),
@@ -43,7 +44,8 @@ def view_figures(
         generated: (H, W) bool, pixels that a completer made; never observed ones.
         depth: (H, W) z-depth of the picture, scene units, 0 = none.
         lpips: the network; None leaves LPIPS out. On a region it is the mean of the distance's
-            map, which has no meaning for regions much smaller than the network's view.
+            map, which has no meaning for regions much smaller than the network's view. Pictures
+            below 32 x 32 pixels have none.
         sample_covariance: see gvtools.evaluation.images.ssim.
 
     Returns:
@@ -62,7 +64,7 @@ def view_figures(
     found = image_figures(picture, truth.rgb, regions, sample_covariance=sample_covariance)
     for region, figures in found.items():
         out |= {f"{name}{region}": value for name, value in figures.items()}
-    if lpips is not None:
+    if lpips is not None and min(shape) >= SMALLEST:
         if picture.dtype != np.uint8:
             picture = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
         whole, spread = lpips.distance(picture, truth.rgb)

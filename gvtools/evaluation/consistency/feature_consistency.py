@@ -179,6 +179,32 @@ def feature_consistency(
     )
 
 
+def load_met3r(size: int = 256) -> tuple[Callable[..., Any] | None, str]:
+    """The original ``met3r.MEt3R`` with its own defaults, made once for many pairs.
+
+    Args:
+        size: pixels, a multiple of 16.
+
+    Returns:
+        The module, on the GPU if there is one, and "ready"; or None and "unavailable: ..." with
+        what is lacking. Making it fetches its weights.
+    """
+    import torch
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        from met3r import MEt3R
+
+        return MEt3R(img_size=size).to(device).eval(), "ready"
+    except ImportError as error:
+        return None, (
+            f"unavailable: {error}; MEt3R needs PyTorch3D, FeatUp and "
+            "`pip install git+https://github.com/mohammadasim98/met3r`"
+        )
+    except (OSError, RuntimeError) as error:
+        return None, f"unavailable: MEt3R could not be made ({error}); check its weights"
+
+
 def met3r_score(
     first: PosedPicture,
     second: PosedPicture,
@@ -206,18 +232,10 @@ def met3r_score(
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if metric is None:
-        try:
-            from met3r import MEt3R
-
-            metric = MEt3R(img_size=size).to(device).eval()
-        except ImportError as error:
-            return without(
-                f"unavailable: {error}; MEt3R needs PyTorch3D, FeatUp and "
-                "`pip install git+https://github.com/mohammadasim98/met3r`"
-            )
-        except (OSError, RuntimeError) as error:
-            return without(f"unavailable: MEt3R could not be made ({error}); check its weights")
-    elif isinstance(metric, torch.nn.Module):
+        metric, status = load_met3r(size)
+        if metric is None:
+            return without(status)
+    if isinstance(metric, torch.nn.Module):
         device = next((weight.device for weight in metric.parameters()), device)
     pair = torch.from_numpy(np.stack([_square(first.rgb, size), _square(second.rgb, size)])[None])
     with torch.no_grad():
