@@ -10,11 +10,13 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from gvtools.depth.stereo.options import StereoOptions
 from gvtools.errors import OptionError
 from gvtools.memory.back_projection import BackProjectionOptions
 from gvtools.memory.spatial_memory import MemoryOptions
 from gvtools.memory.splat import DEVICES, SplatOptions
 from gvtools.options import check_range
+from gvtools.scenes.reduced import SMALLEST
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +54,8 @@ class RunConfig:
             file, or another project).
         views_per_round: targets a round takes at most.
         rounds: how many rounds; None takes as many as the targets need.
-        depth: where the context's depth comes from.
+        max_side: longer side, pixels, that larger pictures are reduced to; None keeps all.
+        depth: where the context's depth comes from, see gvtools.depth.choice.
         completer: by registered name.
         profile: fast, balanced or accurate.
         voxel: voxel edge, scene units; None derives it from the pixel footprints.
@@ -61,6 +64,7 @@ class RunConfig:
         allow_overlap: whether a view may be context and target.
         back_projection: see BackProjectionOptions.
         memory: see MemoryOptions.
+        stereo: see StereoOptions; of depth from photographs.
         splat: see SplatOptions.
         fusion: see FusionOptions.
         completer_options: options of the completer by name.
@@ -70,6 +74,7 @@ class RunConfig:
     targets: str = "interpolate:12"
     views_per_round: int = 6
     rounds: int | None = None
+    max_side: int | None = 1600
     depth: str = "auto"
     completer: str = "inpaint"
     profile: str = "balanced"
@@ -79,6 +84,7 @@ class RunConfig:
     allow_overlap: bool = False
     back_projection: BackProjectionOptions = field(default_factory=BackProjectionOptions)
     memory: MemoryOptions = field(default_factory=MemoryOptions)
+    stereo: StereoOptions = field(default_factory=StereoOptions)
     splat: SplatOptions = field(default_factory=SplatOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
     completer_options: Mapping[str, Any] = field(default_factory=dict)
@@ -86,6 +92,7 @@ class RunConfig:
     def __post_init__(self) -> None:
         check_range("views_per_round", self.views_per_round, least=1)
         check_range("rounds", self.rounds, least=0)
+        check_range("max_side", self.max_side, least=SMALLEST)
         check_range("voxel", self.voxel, above=0)
         check_range("seed", self.seed, least=0)
         if self.device not in DEVICES:

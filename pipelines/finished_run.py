@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvtools.errors import ProjectError
+from gvtools.scenes.reduced import reduced
 from pipelines.round_files import TargetFiles, read_target
 from pipelines.run_directory import RunDirectory
 from pipelines.scene_arguments import reopen_scene
@@ -108,12 +109,13 @@ def open_run(path: Path, *, project: Path | None = None) -> FinishedRun:
     _check_reports(path, reports)
     if len(reports) < 2:
         raise ProjectError(f"{path}: no round of targets is done; expected one; add --resume to it")
-    scene = reopen_scene(project or root, reading)
+    max_side = record["config"].get("max_side")
+    scene = reduced(reopen_scene(project or root, reading), max_side)
     truths = {"hold-out": scene}.get(kind)
     if other is not None:
         from gvtools.scenes.project import open_project
 
-        truths = open_project(Path(other))
+        truths = reduced(open_project(Path(other)), max_side)
     return FinishedRun(path, record, scene, truths, reports)
 
 

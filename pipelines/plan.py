@@ -30,6 +30,7 @@ class Plan:
         targets: the cameras to complete.
         schedule: per round (from 1) the rows of the targets.
         source: where depth comes from.
+        source_reason: why from there, in words.
     """
 
     scene: Scene
@@ -38,13 +39,15 @@ class Plan:
     targets: Targets
     schedule: tuple[tuple[int, ...], ...]
     source: DepthSource
+    source_reason: str
 
 
 def make_plan(scene: Scene, config: RunConfig) -> Plan:
     """Resolve selections, depth source, voxel edge and schedule."""
     from gvtools.completers.base import create
-    from gvtools.depth.source import choose_source
+    from gvtools.depth.choice import choose_source
     from gvtools.errors import ProjectError
+    from gvtools.scenes.reduced import reduced
     from gvtools.scenes.selection import select
     from pipelines.targets import resolve_targets
 
@@ -55,17 +58,26 @@ def make_plan(scene: Scene, config: RunConfig) -> Plan:
             + (f" (and {len(errors) - 1} more; see 'gvtools check')" if len(errors) > 1 else "")
         )
     config = _on_device(config)
+    scene = reduced(scene, config.max_side)
     create(config.completer, **config.completer_options)
     context = select(scene.names, config.context)
-    targets = resolve_targets(scene, context, config.targets, allow_overlap=config.allow_overlap)
-    source = choose_source(scene, context, config.depth)
+    targets = resolve_targets(
+        scene,
+        context,
+        config.targets,
+        allow_overlap=config.allow_overlap,
+        max_side=config.max_side,
+    )
+    chosen = choose_source(scene, context, config.depth, stereo=config.stereo)
     if config.voxel is None:
-        edge = automatic_voxel(scene, context, source, percentile=config.fusion.voxel_percentile)
+        edge = automatic_voxel(
+            scene, context, chosen.source, percentile=config.fusion.voxel_percentile
+        )
         edge *= config.fusion.voxel_scale
         config = replace(config, voxel=float(f"{edge:.3g}"))
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = replace(config, rounds=len(schedule))
-    return Plan(scene, config, context, targets, schedule, source)
+    return Plan(scene, config, context, targets, schedule, chosen.source, chosen.reason)
 
 
 def _on_device(config: RunConfig) -> RunConfig:
@@ -118,14 +130,23 @@ def make_schedule(
 def automatic_voxel(
     scene: Scene, context: Sequence[str], source: DepthSource, *, percentile: float
 ) -> float:
-    """A percentile of the pixel footprints z / f of the context's depth, scene units."""
+    """A percentile of the pixel footprints z / f of the context's depth, scene units.
+
+    Of a view whose depth has yet to be computed, the sparse points' depth serves.
+    """
     import numpy as np
 
     footprints = []
-    for name in sampled([name for name in context if scene[name].has_depth]):
+    for name in sampled([name for name in context if source.covers(scene[name])]):
         view = scene[name]
-        depth = source.depth(scene, view, view.load()).depth
-        known = depth[depth > 0]
+        known = np.zeros(0, np.float32)
+        if not view.has_depth and scene.points is not None:
+            row = scene.points.view_index == scene.names.index(name)
+            _, z = view.camera.project(scene.points.positions[scene.points.point_index[row]])
+            known = z[0][z[0] > 0].astype(np.float32)
+        if not known.size:
+            depth = source.depth(scene, view, view.load()).depth
+            known = depth[depth > 0]
         if known.size:
             focal = float(np.sqrt(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
             footprints.append(float(np.percentile(known, percentile)) / focal)
@@ -148,7 +169,8 @@ def describe(plan: Plan, console: Console) -> None:
         f"{', '.join(f'{w}x{h}' for w, h in sizes)})"
     )
     console.line(
-        f"depth {plan.source.name}, voxel {config.voxel:g}, completer {config.completer}, "
+        f"depth {plan.source.name} ({plan.source_reason}), voxel {config.voxel:g}, completer "
+        f"{config.completer}, "
         f"{len(plan.schedule)} rounds of at most {config.views_per_round} targets, seed "
         f"{config.seed}"
     )

@@ -47,7 +47,10 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
     )
     parser.add_argument("--views-per-round", type=int, metavar="N", help="at most (default 6)")
     parser.add_argument("--rounds", type=int, metavar="N", help="default: as the targets need")
-    parser.add_argument("--depth", metavar="SOURCE", help="auto, sensor or colmap (default auto)")
+    parser.add_argument("--depth", metavar="SOURCE", help="auto, sensor, colmap or plane-sweep")
+    parser.add_argument(
+        "--max-side", metavar="PIXELS", help="reduce larger pictures to it, or none (default 1600)"
+    )
     parser.add_argument("--completer", metavar="NAME", help="default inpaint")
     parser.add_argument("--profile", metavar="NAME", help="fast, balanced or accurate")
     parser.add_argument("--voxel", metavar="EDGE", help="auto, or scene units")
@@ -102,8 +105,8 @@ def config_from(args: argparse.Namespace) -> RunConfig:
         config = settings.with_file(config, args.config)
     if args.profile:
         config = settings.with_profile(config, args.profile)
-    names = ("context", "targets", "views_per_round", "rounds", "depth", "completer", "voxel",
-             "device", "seed")  # fmt: skip
+    names = ("context", "targets", "views_per_round", "rounds", "max_side", "depth", "completer",
+             "voxel", "device", "seed")  # fmt: skip
     for name in names:
         value = getattr(args, name)
         if value is not None:
@@ -177,9 +180,11 @@ def _run_rounds(plan: Plan, directory: RunDirectory, done: int, console: Console
     context: list[ContextView] | None = None
     for number in range(done, len(plan.schedule) + 1):
         if number and context is None:
+            from pipelines.context_depth import KeptDepth
             from pipelines.rounds import load_context
 
-            context = load_context(plan.scene, plan.context, plan.source)
+            kept_depth = KeptDepth(plan.scene, plan.context, plan.source, directory.round_path(0))
+            context = load_context(plan.scene, plan.context, kept_depth)
         with directory.writing_round(number) as folder:
             report = _round(plan, memory, number, context or [], folder, console)
             memory.save(folder / "memory.npz")
@@ -210,6 +215,7 @@ def _round(
 ) -> dict[str, Any]:
     from gvtools.completers.base import create
     from pipelines import rounds
+    from pipelines.context_depth import KeptDepth
     from pipelines.round_files import camera_entry, target_stems, write_target
 
     clock = rounds.Clock()
@@ -218,11 +224,14 @@ def _round(
     views: list[dict[str, Any]] = []
     before = after = None
     dropped: dict[str, int] = {}
+    depth: list[dict[str, Any]] = []
     if number == 0:
-        total, dropped = rounds.observe_context(
-            plan.scene, plan.context, source=plan.source, memory=memory, config=plan.config,
-            clock=clock, progress=console.track,
+        total, dropped, depth = rounds.observe_context(
+            plan.scene, plan.context,
+            source=KeptDepth(plan.scene, plan.context, plan.source, folder),
+            memory=memory, config=plan.config, clock=clock, progress=console.track,
         )  # fmt: skip
+        _warn_of_scale(depth, console)
     else:
         cameras = plan.targets.cameras[list(plan.schedule[number - 1])]
         with clock.stage("project"):
@@ -264,12 +273,24 @@ def _round(
         "rejected": total.rejected,
         "fuse": asdict(total),
         "dropped": dropped,
+        "depth": depth,
         "coverage_before": before,
         "coverage_after": after,
         "seconds": {**clock.seconds, "total": time.perf_counter() - start},
         "bytes": memory.nbytes,
         "views": views,
     }
+
+
+def _warn_of_scale(reports: list[dict[str, Any]], console: Console) -> None:
+    odd = [report for report in reports if report["scale"] and report["scale"]["disagrees"]]
+    if odd:
+        first = odd[0]["scale"]
+        console.warn(
+            f"the depth of {len(odd)} of {len(reports)} views disagrees with the sparse points, "
+            f"first {odd[0]['view']}: {first['status']}, scale {first['scale']:.3g}; look at its "
+            "unit and at the poses"
+        )
 
 
 def _mean(values: list[float]) -> float | None:

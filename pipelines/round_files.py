@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -15,7 +15,9 @@ from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance
 from pipelines.render_files import file_stems
-from pipelines.rounds import TargetResult
+
+if TYPE_CHECKING:
+    from pipelines.rounds import TargetResult
 
 # Grey levels of valid_NAME.png.
 SUPPORT_OBSERVED = 255

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completer, Completion, ContextView
-from gvtools.depth.source import DepthSource
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance
 from gvtools.memory.back_projection import back_project
@@ -21,6 +20,7 @@ from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.scenes.scene import Scene
 from gvtools.similarity import align_depth_scale
 from pipelines.config import RunConfig
+from pipelines.context_depth import KeptDepth, depth_report
 
 STAGES = ("depth", "fuse", "project", "complete", "align")
 
@@ -63,23 +63,29 @@ def observe_context(
     scene: Scene,
     names: Sequence[str],
     *,
-    source: DepthSource,
+    source: KeptDepth,
     memory: SpatialMemory,
     config: RunConfig,
     clock: Clock,
     progress: Any,
-) -> tuple[FuseReport, dict[str, int]]:
-    """Round 0: lift the context views and fuse them; returns the sum and pixels dropped."""
+) -> tuple[FuseReport, dict[str, int], list[dict[str, Any]]]:
+    """Round 0: lift the context views and fuse them.
+
+    Returns:
+        The sum of what was fused, the pixels dropped by reason, and a report of each view's depth.
+    """
     total = FuseReport()
     dropped: dict[str, int] = {}
+    reports = []
     for name in progress(names, "context views"):
         view = scene[name]
-        if not view.has_depth:
+        if not source.covers(view):
             dropped["views without depth"] = dropped.get("views without depth", 0) + 1
             continue
         with clock.stage("depth"):
             frame = view.load()
-            depth_map = source.depth(scene, view, frame)
+            depth_map = source.depth(view, frame)
+            reports.append(depth_report(scene, name, depth_map))
         with clock.stage("fuse"):
             points = back_project(
                 frame.rgb,
@@ -104,16 +110,16 @@ def observe_context(
             f"{scene.root}: the context's depth gave no point; look at 'gvtools check' and at the "
             "depth's unit"
         )
-    return total, dropped
+    return total, dropped, reports
 
 
-def load_context(scene: Scene, names: Sequence[str], source: DepthSource) -> list[ContextView]:
+def load_context(scene: Scene, names: Sequence[str], source: KeptDepth) -> list[ContextView]:
     """The context as completers see it."""
     out = []
     for name in names:
         view = scene[name]
         frame = view.load()
-        depth = source.depth(scene, view, frame) if frame.depth is not None else None
+        depth = source.depth(view, frame) if source.covers(view) else None
         out.append(
             ContextView(
                 name,

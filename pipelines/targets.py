@@ -44,9 +44,21 @@ class Targets:
 
 
 def resolve_targets(
-    scene: Scene, context: tuple[str, ...], spec: str, *, allow_overlap: bool = False
+    scene: Scene,
+    context: tuple[str, ...],
+    spec: str,
+    *,
+    allow_overlap: bool = False,
+    max_side: int | None = None,
 ) -> Targets:
     """The target cameras that ``spec`` means.
+
+    Args:
+        scene: the project, already of the size that the run works in.
+        context: names of the given views.
+        spec: one of FORMS.
+        allow_overlap: let views be context and target.
+        max_side: another project's pictures are reduced to it, pixels.
 
     Raises:
         OptionError: an unknown form, an empty selection, or hold-outs that overlap the context.
@@ -60,7 +72,7 @@ def resolve_targets(
     path, at, selection = spec.partition("@")
     if path and _exists(path) and spec not in scene.names:
         if Path(path).is_dir() or Path(path).suffix == ".json":
-            targets = _project(Path(path), selection if at else "all")
+            targets = _project(Path(path), selection if at else "all", max_side)
             if not allow_overlap:
                 _check_pictures(scene, context, targets)
             return targets
@@ -117,10 +129,11 @@ def _file(path: Path, known: Cameras) -> Targets:
     return Targets(cameras, (None,) * len(cameras), "trajectory", (path,))
 
 
-def _project(path: Path, selection: str) -> Targets:
+def _project(path: Path, selection: str, max_side: int | None) -> Targets:
     from gvtools.scenes.project import open_project
+    from gvtools.scenes.reduced import reduced
 
-    other = open_project(path)
+    other = reduced(open_project(path), max_side)
     chosen = select(other.names, selection)
     views = tuple(other[name] for name in chosen)
     files = tuple(file for view in views for file in view.files)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes_workspace import HEIGHT, WIDTH, depth_picture, save, sevenscenes, workspace
 
-from gvtools.depth.source import choose_source
+from gvtools.depth.choice import choose_source
 from gvtools.errors import ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.inspection import inspect, reprojection_errors
@@ -94,37 +94,21 @@ def depth_findings(scene):
     ]
 
 
-@pytest.mark.parametrize(
-    ("kind", "advice"),
-    [("colmap", "patch_match_stereo"), ("transforms", "depth_file_path"), ("rgbd", "depth maps")],
-)
-def test_no_depth_is_a_warning_that_says_what_to_add(tmp_path, kind, advice):
-    scene = read_sevenscenes(sevenscenes(tmp_path))
-    bare = tuple(replace(view, has_depth=False) for view in scene)
-    ((level, message),) = depth_findings(replace(scene, kind=kind, views=bare))
-    assert level == "warning"
-    assert message.startswith("none of the 3 views has depth")
-    assert advice in message
-    assert inspect(replace(scene, kind=kind, views=bare), read_pixels=False).ok
-
-
-def test_choosing_the_depth_of_such_a_scene_fails_as_the_warning_says(tmp_path):
-    workspace(tmp_path)
-    scene = read_colmap(tmp_path)
-    ((_, message),) = depth_findings(scene)
-    with pytest.raises(ProjectError) as refusal:
-        choose_source(scene, scene.names, "auto")
-    for words in ("patch_match_stereo", "undistorted workspace", "stereo/depth_maps"):
-        assert words in message
-        assert words in str(refusal.value)
-
-
-def test_some_depth_is_a_warning_with_numbers_and_all_depth_none(tmp_path):
+def test_depth_that_a_run_computes_is_told(tmp_path):
     scene = read_sevenscenes(sevenscenes(tmp_path))
     assert not depth_findings(scene)
-    views = (replace(scene.views[0], has_depth=False), *scene.views[1:])
-    message = "1 of 3 views have no depth; a run takes no points from them"
-    assert depth_findings(replace(scene, views=views)) == [("warning", message)]
+    bare = tuple(replace(view, has_depth=False) for view in scene)
+    ((level, message),) = depth_findings(replace(scene, views=bare))
+    assert level == "info"
+    assert message.startswith("none of the 3 views has recorded depth; a run computes")
+    ((level, message),) = depth_findings(replace(scene, views=(bare[0], *scene.views[1:])))
+    assert level == "info"
+    assert message.startswith("2 of the 3 views has recorded depth")
+    ((level, message),) = depth_findings(replace(scene, views=bare[:1]))
+    assert level == "warning"
+    assert "one photograph" in message
+    with pytest.raises(ProjectError, match="at least 2 views"):
+        choose_source(replace(scene, views=bare[:1]), scene.names[:1], "auto")
 
 
 def test_scene_without_views_is_not_ok(tmp_path):

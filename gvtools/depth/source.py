@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Frame, Scene, View
 
 
@@ -32,8 +32,16 @@ class DepthSource(Protocol):
 
     name: str
 
+    def covers(self, view: View) -> bool:
+        """Whether the source has, or can find, the depth of ``view``."""
+        ...
+
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
-        """The depth of ``view``, whose pixels are ``frame``."""
+        """The depth of ``view``, whose pixels are ``frame``.
+
+        Raises:
+            ProjectError: the source does not cover the view.
+        """
         ...
 
 
@@ -45,6 +53,10 @@ class RecordedDepth:
     """
 
     name = "recorded"
+
+    def covers(self, view: View) -> bool:
+        """Views with a depth map."""
+        return view.has_depth
 
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
         """The depth that was loaded with the picture.
@@ -65,32 +77,23 @@ class RecordedDepth:
         return DepthMap(depth, np.where(depth > 0, confidence, np.float32(1)), self.name)
 
 
-CHOICES = ("auto", "sensor", "colmap")
-
-
-def choose_source(scene: Scene, views: tuple[str, ...], choice: str) -> DepthSource:
-    """The source for the views that a run lifts.
+class MixedDepth:
+    """Recorded depth where a view has it, another source's elsewhere.
 
     Args:
-        scene: the project.
-        views: names of the context views.
-        choice: one of CHOICES; ``sensor`` wants RGB-D, ``colmap`` COLMAP's stereo maps.
-
-    Raises:
-        OptionError: unknown choice, or one that the project cannot give.
-        ProjectError: no view has depth.
+        recorded: comes first.
+        computed: for the views that the first does not cover.
     """
-    if choice not in CHOICES:
-        raise OptionError(f"depth {choice!r}; expected one of {', '.join(CHOICES)}")
-    if (choice == "sensor" and scene.kind == "colmap") or (
-        choice == "colmap" and scene.kind != "colmap"
-    ):
-        raise OptionError(f"depth {choice!r}: {scene.root} is a {scene.kind} project; use auto")
-    with_depth = sum(scene[name].has_depth for name in views)
-    if not with_depth:
-        raise ProjectError(
-            f"{scene.root}: none of the {len(views)} context views has depth; run COLMAP's "
-            "patch_match_stereo on an undistorted workspace (stereo/depth_maps is then read), or "
-            "use a posed RGB-D recording"
-        )
-    return RecordedDepth()
+
+    def __init__(self, recorded: DepthSource, computed: DepthSource) -> None:
+        self.recorded, self.computed = recorded, computed
+        self.name = f"{recorded.name} + {computed.name}"
+
+    def covers(self, view: View) -> bool:
+        """Views of either source."""
+        return self.recorded.covers(view) or self.computed.covers(view)
+
+    def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
+        """Of the first source that covers the view; see ``DepthSource.depth``."""
+        source = self.recorded if self.recorded.covers(view) else self.computed
+        return source.depth(scene, view, frame)

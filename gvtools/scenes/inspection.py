@@ -11,13 +11,6 @@ import numpy as np
 from gvtools.errors import GvError
 from gvtools.scenes.scene import Finding, Scene, SparsePoints, View
 
-# What to add to a project of each kind that has no depth.
-ADD_DEPTH = {
-    "colmap": "run COLMAP's patch_match_stereo on an undistorted workspace and give that folder "
-    "(stereo/depth_maps is then read)",
-    "transforms": "name each frame's depth map in its depth_file_path",
-    "rgbd": "add the depth maps of the recording",
-}
 # Focal lengths of usual lenses, over the image's sides.
 FOCAL = (0.1, 50.0)
 # Mean reprojection error, pixels, above which a model is no good one.
@@ -196,12 +189,15 @@ def _views_without_depth(scene: Scene) -> list[Finding]:
     without = sum(not view.has_depth for view in scene.views)
     if not without:
         return []
-    if without < len(scene):
-        message = f"{without} of {len(scene)} views have no depth; a run takes no points from them"
+    if len(scene) < 2:
+        message = "the only view has no depth, and one photograph is none to compute it from"
         return [Finding("warning", message)]
-    advice = ADD_DEPTH.get(scene.kind, "add depth maps")
-    message = f"none of the {without} views has depth, which a run needs; {advice}"
-    return [Finding("warning", message)]
+    which = "none" if without == len(scene) else f"{len(scene) - without}"
+    message = (
+        f"{which} of the {len(scene)} views has recorded depth; a run computes the others' from "
+        "the photographs (plane-sweep stereo)"
+    )
+    return [Finding("info", message)]
 
 
 def _doubtful_cameras(scene: Scene, errors: np.ndarray) -> list[Finding]:

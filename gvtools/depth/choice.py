@@ -1,0 +1,116 @@
+"""Which depth source a run takes: the best that the scene and the machine allow, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gvtools.depth.colmap_patch_match import ColmapPatchMatch, has_patch_match
+from gvtools.depth.source import DepthSource, MixedDepth, RecordedDepth
+from gvtools.depth.stereo.options import StereoOptions
+from gvtools.errors import CheckpointError, OptionError, ProjectError
+from gvtools.scenes.scene import Scene
+
+CHOICES = ("auto", "sensor", "colmap", "plane-sweep", "da3")
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenSource:
+    """A source and why it was taken.
+
+    Attributes:
+        source: gives the depth.
+        reason: in words, for the user.
+    """
+
+    source: DepthSource
+    reason: str
+
+
+def choose_source(
+    scene: Scene, views: Sequence[str], choice: str, *, stereo: StereoOptions | None = None
+) -> ChosenSource:
+    """The source for the views that a run lifts.
+
+    "auto" takes recorded depth where there is some and computes the rest: by COLMAP's PatchMatch
+    where pycolmap has CUDA, otherwise by plane-sweep stereo. Nothing but ``views`` is looked at.
+
+    Args:
+        scene: the project.
+        views: names of the context views.
+        choice: one of CHOICES; ``sensor`` wants RGB-D, ``colmap`` COLMAP's stereo maps, on disk or
+            computed now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights.
+        stereo: options of the plane sweep.
+
+    Raises:
+        OptionError: unknown choice, or one that the project cannot give.
+        ProjectError: no view has depth, and none can be computed.
+        CheckpointError: a network's weights are needed.
+    """
+    if choice not in CHOICES:
+        raise OptionError(f"depth {choice!r}; expected one of {', '.join(CHOICES)}")
+    recorded = sum(scene[name].has_depth for name in views)
+    if choice == "da3":
+        raise CheckpointError(
+            "depth da3: needs the weights of Depth Anything 3, which this version does not read; "
+            "use auto, or plane-sweep for photographs"
+        )
+    if choice == "sensor":
+        if scene.kind == "colmap":
+            raise OptionError(f"depth 'sensor': {scene.root} is a colmap project; use auto")
+        if not recorded:
+            raise ProjectError(
+                f"{scene.root}: none of the {len(views)} context views has depth; add depth maps, "
+                "or use auto"
+            )
+        return ChosenSource(RecordedDepth(), f"asked for; {recorded} of {len(views)} views have it")
+    if choice == "colmap":
+        if scene.kind != "colmap":
+            raise OptionError(f"depth 'colmap': {scene.root} is a {scene.kind} project; use auto")
+        if recorded:
+            return ChosenSource(
+                RecordedDepth(), f"asked for; {recorded} of {len(views)} views have stereo maps"
+            )
+        if not has_patch_match():
+            raise ProjectError(
+                f"{scene.root}: none of the {len(views)} context views has depth, and pycolmap has "
+                "no CUDA here; run COLMAP's patch_match_stereo on an undistorted workspace "
+                "(stereo/depth_maps is then read), or use plane-sweep"
+            )
+        return ChosenSource(ColmapPatchMatch(scene, views), "asked for; computed now with CUDA")
+    if choice == "plane-sweep":
+        return ChosenSource(_stereo(scene, views, stereo), "asked for")
+    if recorded == len(views):
+        return ChosenSource(RecordedDepth(), "every context view has recorded depth")
+    computed: DepthSource
+    if len(views) < 2:
+        if recorded:
+            return ChosenSource(RecordedDepth(), "a single view leaves nothing to compute from")
+        raise ProjectError(
+            f"{scene.root}: one context view without depth; expected depth, or at least 2 views to "
+            "compute it from"
+        )
+    if has_patch_match():
+        computed, how = ColmapPatchMatch(scene, views), "COLMAP's PatchMatch, as there is CUDA"
+    else:
+        computed, how = _stereo(scene, views, stereo), "plane-sweep stereo of the photographs"
+    if not recorded:
+        return ChosenSource(computed, f"no context view has recorded depth; {how}")
+    return ChosenSource(
+        MixedDepth(RecordedDepth(), computed),
+        f"{recorded} of {len(views)} views have recorded depth; the others {how}",
+    )
+
+
+def _stereo(scene: Scene, views: Sequence[str], options: StereoOptions | None) -> DepthSource:
+    if len(views) < 2:
+        raise ProjectError(
+            f"{scene.root}: stereo of {len(views)} context view(s); expected at least 2"
+        )
+    from gvtools.depth.rectified_pair import RectifiedPair, is_rectifiable
+
+    if len(views) == 2 and is_rectifiable(scene.subset(views).cameras):
+        return RectifiedPair(scene, views)
+    from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+
+    return PlaneSweepStereo(scene, options=options or StereoOptions(), views=tuple(views))

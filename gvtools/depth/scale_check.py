@@ -1,0 +1,46 @@
+"""Whether a view's depth has the scale of the sparse points that it sees."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.scenes.scene import Scene
+from gvtools.similarity import ScaleFit, align_depth_scale
+
+# Sparse points that have to fall on known depth.
+MIN_POINTS = 20
+# A scale farther from 1 than this is of other poses or another unit.
+SUSPECT = 0.05
+
+
+def scale_to_points(scene: Scene, name: str, depth: NDArray[np.float32]) -> ScaleFit | None:
+    """The robust scale between a view's depth and its sparse points.
+
+    Args:
+        scene: the project; its points are in its own unit.
+        name: of the view.
+        depth: (H, W) z-depth, scene units, 0 = none.
+
+    Returns:
+        The fit of points = scale x depth: 1 is agreement; None in a scene without sparse points.
+    """
+    points = scene.points
+    if points is None:
+        return None
+    row = scene.names.index(name)
+    mine = points.view_index == row
+    _, z = scene.views[row].camera.project(points.positions[points.point_index[mine]])
+    height, width = depth.shape
+    column = np.floor(points.xy[mine, 0]).astype(np.int64)
+    line = np.floor(points.xy[mine, 1]).astype(np.int64)
+    inside = (column >= 0) & (column < width) & (line >= 0) & (line < height) & (z[0] > 0)
+    measured = depth[line[inside], column[inside]]
+    return align_depth_scale(measured, z[0][inside], valid=measured > 0, min_support=MIN_POINTS)
+
+
+def disagrees(fit: ScaleFit | None) -> bool:
+    """Whether a fit contradicts the depth: another scale, or points that fit no scale."""
+    if fit is None or fit.support < MIN_POINTS:
+        return False
+    return not fit.ok or abs(fit.scale - 1) > SUSPECT

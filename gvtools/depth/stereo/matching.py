@@ -1,0 +1,171 @@
+"""Matching on one level of the pyramid: the pictures, and the back ends that compare them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from gvtools.depth.stereo import matching_torch
+from gvtools.depth.stereo.options import StereoOptions
+from gvtools.errors import OptionError
+
+# Semi-global aggregation (Hirschmueller, TPAMI 2008, equation 13): the penalties of a change by
+# one plane and by more, in units of the cost, and the contrast that halves the second.
+SMALL, LARGE, CONTRAST = 0.06, 0.5, 0.06
+DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level of the pyramid of a reference view and its sources.
+
+    Attributes:
+        reference: (H, W) float32 luminance in [0, 1].
+        sources: (S, H', W') float32, padded to the largest source.
+        sizes: (S, 2) int32, width and height of each source, pixels.
+        matrix: (S, 3, 3) float32, see gvtools.depth.stereo.warps.Warps.
+        offset: (S, 3) float32.
+        taps: (T, 2) int32, dx and dy of the compared pixels of a window.
+        weights: (H, W, T) float32, how much each counts; they sum to 1 at each pixel.
+    """
+
+    reference: torch.Tensor
+    sources: torch.Tensor
+    sizes: torch.Tensor
+    matrix: torch.Tensor
+    offset: torch.Tensor
+    taps: torch.Tensor
+    weights: torch.Tensor
+
+
+class Matcher(Protocol):
+    """A back end of the stages that cost time. Costs are 0 for a perfect match, 1 for none."""
+
+    def sweep(self, level: Level, inverse_depths: torch.Tensor) -> torch.Tensor:
+        """Photometric cost of planes parallel to the reference's image.
+
+        The cost is 1 - ZNCC over a square window, mean of the best sources. Both variances are
+        raised by the noise's, so that windows without texture match nothing.
+
+        Args:
+            level: the pictures.
+            inverse_depths: (D,) float32.
+
+        Returns:
+            (H, W, D) float32 in [0, 1].
+        """
+
+    def aggregate(self, volume: torch.Tensor, guide: torch.Tensor) -> torch.Tensor:
+        """Semi-global aggregation along eight paths.
+
+        Args:
+            volume: (H, W, D) float32 costs.
+            guide: (H, W) float32 luminance; across its edges a jump is cheaper.
+
+        Returns:
+            (H, W, D) float32, mean of the paths' costs.
+        """
+
+    def score(self, level: Level, planes: torch.Tensor) -> torch.Tensor:
+        """Photometric cost of one slanted plane for each pixel.
+
+        Args:
+            level: the pictures; the window's pixels are ``level.taps``, weighted.
+            planes: (3, H, W) float32: inverse depth at the pixel, and its change per pixel in x
+                and y.
+
+        Returns:
+            (H, W) float32 in [0, 1].
+        """
+
+
+class TorchMatcher:
+    """Matching by torch; see Matcher."""
+
+    def __init__(self, options: StereoOptions) -> None:
+        self.options = options
+
+    def sweep(self, level: Level, inverse_depths: torch.Tensor) -> torch.Tensor:
+        """See Matcher.sweep."""
+        options = self.options
+        return matching_torch.sweep(
+            level.reference, level.sources, level.sizes, level.matrix, level.offset,
+            inverse_depths, options.window, min(options.best, len(level.sources)), options.noise,
+        )  # fmt: skip
+
+    def aggregate(self, volume: torch.Tensor, guide: torch.Tensor) -> torch.Tensor:
+        """See Matcher.aggregate."""
+        directions = torch.tensor(DIRECTIONS)
+        return matching_torch.aggregate(volume, guide, directions, SMALL, LARGE, CONTRAST)
+
+    def score(self, level: Level, planes: torch.Tensor) -> torch.Tensor:
+        """See Matcher.score."""
+        options = self.options
+        return matching_torch.score(
+            level.reference, level.sources, level.sizes, level.matrix, level.offset,
+            planes, level.weights, level.taps,
+            min(options.best, len(level.sources)), options.noise,
+        )  # fmt: skip
+
+
+class CpuMatcher:
+    """Matching by compiled kernels; see Matcher."""
+
+    def __init__(self, options: StereoOptions) -> None:
+        self.options = options
+
+    def sweep(self, level: Level, inverse_depths: torch.Tensor) -> torch.Tensor:
+        """See Matcher.sweep."""
+        from gvtools.depth.stereo import matching_cpu
+
+        options = self.options
+        volume = np.empty((*level.reference.shape, len(inverse_depths)), np.float32)
+        matching_cpu.sweep(
+            level.reference.numpy(), level.sources.numpy(), level.sizes.numpy(),
+            level.matrix.numpy(), level.offset.numpy(), inverse_depths.numpy(),
+            options.window, min(options.best, len(level.sources)), options.noise, volume,
+        )  # fmt: skip
+        return torch.from_numpy(volume)
+
+    def aggregate(self, volume: torch.Tensor, guide: torch.Tensor) -> torch.Tensor:
+        """See Matcher.aggregate."""
+        from gvtools.depth.stereo import matching_cpu
+
+        directions = np.array(DIRECTIONS)
+        paths = np.empty((len(directions), *volume.shape), np.float32)
+        matching_cpu.aggregate(
+            volume.numpy(), guide.numpy(), directions, SMALL, LARGE, CONTRAST, paths
+        )
+        return torch.from_numpy(paths).mean(0)
+
+    def score(self, level: Level, planes: torch.Tensor) -> torch.Tensor:
+        """See Matcher.score."""
+        from gvtools.depth.stereo import matching_cpu
+
+        options = self.options
+        cost = np.empty(tuple(level.reference.shape), np.float32)
+        matching_cpu.score(
+            level.reference.numpy(), level.sources.numpy(), level.sizes.numpy(),
+            level.matrix.numpy(), level.offset.numpy(), planes.contiguous().numpy(),
+            level.weights.numpy(), level.taps.numpy(),
+            min(options.best, len(level.sources)), options.noise, cost,
+        )  # fmt: skip
+        return torch.from_numpy(cost)
+
+
+def make_matcher(options: StereoOptions) -> tuple[Matcher, torch.device]:
+    """The back end of the options, and where its tensors live.
+
+    Raises:
+        OptionError: CUDA is asked for and torch sees none.
+    """
+    if options.backend == "cpu":
+        return CpuMatcher(options), torch.device("cpu")
+    there = torch.cuda.is_available()
+    if options.device == "cuda" and not there:
+        raise OptionError("stereo device 'cuda': torch sees no CUDA device; choose 'auto' or 'cpu'")
+    cuda = options.device == "cuda" or (options.device == "auto" and there)
+    return TorchMatcher(options), torch.device("cuda" if cuda else "cpu")

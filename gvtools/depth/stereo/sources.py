@@ -1,0 +1,127 @@
+"""Which views a reference view is compared with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.depth.stereo.depth_range import DepthRange, seen_points
+from gvtools.depth.stereo.warps import pixel_grid
+from gvtools.scenes.scene import Scene
+
+Float64 = NDArray[np.float64]
+
+# Parallax at which matching still works and depth is well determined, degrees; the fall towards
+# less (depth unsure) and towards more (appearance differs). MVSNet (arXiv:1804.02505, section 4.1)
+# weighs sparse points likewise, with 5, 1 and 10.
+BEST_ANGLE, BELOW, ABOVE = 7.0, 3.0, 8.0
+# Sources that stand closer together than this share of their baseline show much the same.
+APART = 0.4
+# A view that shares less than this share of the reference's points is no source.
+LEAST_OVERLAP = 0.15
+SAMPLES_ACROSS = 10
+SAMPLE_DEPTHS = 4
+
+
+@dataclass(frozen=True)
+class SourceView:
+    """A source of a reference view.
+
+    Attributes:
+        name: of the view.
+        overlap: share of the reference's points that it sees too.
+        angle: median parallax of these, degrees.
+    """
+
+    name: str
+    overlap: float
+    angle: float
+
+
+def choose_sources(
+    scene: Scene, name: str, candidates: tuple[str, ...], *, count: int, depths: DepthRange
+) -> tuple[SourceView, ...]:
+    """The best source views for a reference view, best first.
+
+    Each candidate is rated by the points of the reference that it sees too, each weighted by its
+    parallax: sparse points with their tracks when the reference has enough of them, else points
+    spread over its frustum inside the depth range. Candidates close to a chosen one count less.
+
+    Args:
+        scene: the project.
+        name: the reference view.
+        candidates: views that may be looked at; the reference itself is left out.
+        count: how many at most.
+        depths: the reference's depth range.
+    """
+    others = tuple(candidate for candidate in candidates if candidate != name)
+    if not others:
+        return ()
+    views = {view_name: i for i, view_name in enumerate(scene.names)}
+    rows = [views[other] for other in others]
+    cameras = scene.cameras
+    reference, sources = cameras[views[name]], cameras[rows]
+    tracks = seen_points(scene, name)
+    points = _frustum_points(reference, depths) if tracks is None else tracks.positions
+    shared = _inside(sources, points)
+    if tracks is not None:
+        tracked = tracks.seen_by(rows)
+        # A track that misses a view may just be short; enough tracks are taken at their word.
+        enough = tracked.sum(1) >= 20
+        shared[enough] = tracked[enough]
+    angle = parallax(reference.centers[0], sources.centers, points)
+    spread = np.where(angle < BEST_ANGLE, BELOW, ABOVE)
+    weight = np.exp(-((angle - BEST_ANGLE) ** 2) / (2 * spread**2)) * shared
+    turned = reference.cam_from_world[0, 2, :3] @ sources.cam_from_world[:, 2, :3].T
+    overlap = shared.mean(1)
+    score = weight.mean(1) * (turned > np.cos(np.deg2rad(60))) * (overlap >= LEAST_OVERLAP)
+    chosen = _spread_out(score, reference.centers[0], sources.centers, count)
+    return tuple(
+        SourceView(others[i], float(overlap[i]), float(np.median(angle[i][shared[i]])))
+        for i in chosen
+    )
+
+
+def parallax(center: Float64, others: Float64, points: Float64) -> Float64:
+    """(S, N) degrees between the rays from ``center`` and from each of ``others`` to the points."""
+    one = points - center
+    two = points[None] - others[:, None]
+    cosine = np.einsum("nj,snj->sn", one, two)
+    cosine /= np.linalg.norm(one, axis=-1) * np.linalg.norm(two, axis=-1) + 1e-300
+    return np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def _spread_out(score: Float64, center: Float64, centers: Float64, count: int) -> list[int]:
+    """Rows of the best scores, each lowered by how near it stands to those already taken."""
+    chosen: list[int] = []
+    baseline = np.linalg.norm(centers - center, axis=-1) + 1e-300
+    score = score.copy()
+    while len(chosen) < count and score.max() > 0:
+        best = int(np.argmax(score))
+        chosen.append(best)
+        gap = np.linalg.norm(centers - centers[best], axis=-1) / baseline
+        score *= 1 - np.exp(-0.5 * (gap / APART) ** 2)
+        score[best] = 0
+    return chosen
+
+
+def _frustum_points(camera: Cameras, depths: DepthRange) -> Float64:
+    """(N, 3) world points over the camera's frustum, between the quartiles of its depths."""
+    xy = pixel_grid(camera, SAMPLES_ACROSS)
+    low, high = depths.lower, depths.upper
+    inverse = np.linspace(1 / low, 1 / high, SAMPLE_DEPTHS)
+    rays = np.concatenate([xy, np.ones_like(xy[:, :1])], axis=1) @ np.linalg.inv(camera.K[0]).T
+    local = (rays[None] / inverse[:, None, None]).reshape(-1, 3)
+    pose = camera.world_from_cam[0]
+    return local @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _inside(cameras: Cameras, points: Float64) -> NDArray[np.bool_]:
+    """(S, N) whether each point projects into each camera's image."""
+    xy, z = cameras.project(points)
+    size = np.stack([cameras.width, cameras.height], axis=-1)[:, None]
+    with np.errstate(invalid="ignore"):
+        return (z > 0) & (xy > 0).all(-1) & (xy < size).all(-1)

@@ -1,0 +1,77 @@
+"""A scene with its pictures reduced to a size that a run can hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.options import check_range
+from gvtools.scenes.scene import Finding, Frame, Scene, View
+
+# Below this, nothing of a picture is left to work with.
+SMALLEST = 64
+
+
+def reduced(scene: Scene, max_side: int | None) -> Scene:
+    """The scene with no picture's longer side above ``max_side``.
+
+    Colours are averaged over what they stand for; depth and masks take the nearest pixel, so that
+    no depth lies between two surfaces. Cameras and detections of sparse points follow.
+
+    Args:
+        scene: left as it is.
+        max_side: pixels; None keeps every size.
+
+    Raises:
+        OptionError: below 64 pixels.
+    """
+    check_range("max_side", max_side, least=SMALLEST)
+    sizes = np.array([(view.camera.width[0], view.camera.height[0]) for view in scene.views])
+    if max_side is None or not len(sizes) or sizes.max() <= max_side:
+        return scene
+    factor = np.minimum(max_side / sizes.max(axis=1), 1.0)
+    targets = np.maximum(np.rint(sizes * factor[:, None]), 1).astype(int)
+    views = tuple(
+        view if (size == target).all() else _reduced_view(view, int(target[0]), int(target[1]))
+        for view, size, target in zip(scene.views, sizes, targets, strict=True)
+    )
+    points = scene.points
+    if points is not None:
+        share = targets / sizes
+        points = replace(points, xy=points.xy * share[points.view_index])
+    count = int((sizes.max(axis=1) > max_side).sum())
+    largest = sizes[sizes.max(axis=1).argmax()]
+    message = (
+        f"{count} pictures are reduced to {max_side} pixels on their longer side (the largest is "
+        f"{largest[0]}x{largest[1]}); max_side says how far"
+    )
+    findings = (*scene.findings, Finding("info", message))
+    return replace(scene, views=views, points=points, findings=findings)
+
+
+def _reduced_view(view: View, width: int, height: int) -> View:
+    def load() -> Frame:
+        return _reduced_frame(view.load(), width, height)
+
+    return replace(view, camera=view.camera.resized(width, height), load=load)
+
+
+def _reduced_frame(frame: Frame, width: int, height: int) -> Frame:
+    from PIL import Image
+
+    picture = Image.fromarray(frame.rgb).resize((width, height), Image.Resampling.BOX)
+    rows = _nearest(frame.rgb.shape[0], height)
+    columns = _nearest(frame.rgb.shape[1], width)
+    cut = np.ix_(rows, columns)
+    return Frame(
+        np.asarray(picture),
+        None if frame.depth is None else np.ascontiguousarray(frame.depth[cut]),
+        None if frame.mask is None else np.ascontiguousarray(frame.mask[cut]),
+    )
+
+
+def _nearest(old: int, new: int) -> NDArray[np.int64]:
+    """For each new pixel, the old one that its centre lies in."""
+    return np.minimum(((np.arange(new) + 0.5) * old / new).astype(np.int64), old - 1)

@@ -1,0 +1,99 @@
+"""Computed depth of the context: kept by round 0, read on resuming, checked against the points."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_scan import render, world_from_cam, write_scan
+
+from gvtools.depth import choice
+from gvtools.depth.source import DepthMap
+from gvtools.scenes.scene import Frame, Scene, View
+from pipelines.cli import main
+from pipelines.context_depth import colored
+
+RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3", "--quiet")
+
+
+class Exact:
+    """The recording's true depth, as if it had been computed; counts how often it was asked."""
+
+    name = "exact"
+    asked = 0
+
+    def covers(self, view: View) -> bool:
+        return True
+
+    def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
+        Exact.asked += 1
+        index = int(view.name.split("-")[1].split(".")[0])
+        depth = render(world_from_cam(index))[1].astype(np.float32)
+        return DepthMap(depth, np.full_like(depth, 0.5), self.name)
+
+
+@pytest.fixture
+def scan(tmp_path, monkeypatch):
+    """A recording whose context views have lost their depth maps; the source knows the depth."""
+    folder = write_scan(tmp_path / "scan")
+    for index in (0, 2):
+        Image.fromarray(np.zeros((72, 96), np.uint16)).save(folder / f"frame-{index:06d}.depth.png")
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Exact())
+    Exact.asked = 0
+    return folder
+
+
+def reconstruct(scan, out, *more: object) -> int:
+    words = ["reconstruct", scan, "--out", out, *RUN, "--depth", "plane-sweep", *more]
+    return main([str(word) for word in words])
+
+
+def test_computed_depth_is_kept_and_asked_for_once(scan, tmp_path):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out, "--voxel", "0.03") == 0
+    # Once a view, although round 0 lifts it and the completer looks at it in every round.
+    assert Exact.asked == 3
+    kept = sorted((out / "round_000").glob("context_depth_*.npz"))
+    assert len(kept) == 3
+    with np.load(kept[0]) as stored:
+        np.testing.assert_array_equal(
+            stored["depth"], render(world_from_cam(0))[1].astype(np.float32)
+        )
+        assert str(stored["source"]) == "exact"
+    assert kept[0].with_suffix(".png").is_file()
+    report = json.loads((out / "round_000" / "report.json").read_text())
+    assert [entry["source"] for entry in report["depth"]] == ["exact"] * 3
+    assert report["depth"][0]["known"] == 1
+    assert report["depth"][0]["scale"] is None
+
+
+def test_a_resumed_run_reads_it_again(scan, tmp_path):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out, "--voxel", "0.03") == 0
+    whole = (out / "memory.npz").read_bytes()
+    shutil.rmtree(out / "round_002")
+    Exact.asked = 0
+    assert reconstruct(scan, out, "--voxel", "0.03", "--resume") == 0
+    assert Exact.asked == 0
+    assert (out / "memory.npz").read_bytes() == whole
+    shutil.rmtree(out / "round_002")
+    next((out / "round_000").glob("context_depth_*.npz")).write_bytes(b"half")
+    assert reconstruct(scan, out, "--voxel", "0.03", "--resume") == 2
+
+
+def test_the_automatic_voxel_asks_the_source_where_nothing_else_tells(scan, tmp_path):
+    assert reconstruct(scan, tmp_path / "run") == 0
+    config = json.loads((tmp_path / "run" / "run.json").read_text())["config"]
+    assert config["voxel"] == pytest.approx(3 / 90, rel=0.05)
+
+
+def test_depth_is_drawn_from_near_red_to_far_blue():
+    depth = np.array([[0, 1, 4]], np.float32)
+    picture = colored(depth)
+    assert picture[0, 0].tolist() == [0, 0, 0]
+    assert picture[0, 1, 0] > picture[0, 1, 2]
+    assert picture[0, 2, 2] > picture[0, 2, 0]
+    assert not colored(np.zeros((2, 2), np.float32)).any()

@@ -1,0 +1,204 @@
+"""Which depth source a run takes, and whether its scale is that of the sparse points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes_workspace import workspace
+from tiny_scan import write_scan
+
+from gvtools.depth import choice, colmap_patch_match
+from gvtools.depth.choice import choose_source
+from gvtools.depth.colmap_patch_match import ColmapPatchMatch, write_workspace
+from gvtools.depth.scale_check import disagrees, scale_to_points
+from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth
+from gvtools.errors import CheckpointError, OptionError, ProjectError
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.colmap_depth import write_depth_map
+from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
+from gvtools.scenes.sevenscenes import read_sevenscenes
+
+
+class Computed:
+    """A source that always has 2."""
+
+    name = "computed"
+
+    def covers(self, view: View) -> bool:
+        return True
+
+    def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
+        depth = np.full(frame.rgb.shape[:2], 2, np.float32)
+        return DepthMap(depth, np.ones_like(depth), self.name)
+
+
+@pytest.fixture
+def scan(tmp_path) -> Scene:
+    return read_sevenscenes(write_scan(tmp_path / "scan"))
+
+
+def without_depth(scene: Scene, *rows: int) -> Scene:
+    """The scene with some views' depth taken away."""
+
+    def bare(view: View) -> View:
+        return replace(view, load=lambda: replace(view.load(), depth=None), has_depth=False)
+
+    views = tuple(bare(view) if i in rows else view for i, view in enumerate(scene.views))
+    return replace(scene, views=views)
+
+
+def test_auto_takes_recorded_depth_where_all_have_it(scan):
+    chosen = choose_source(scan, scan.names, "auto")
+    assert isinstance(chosen.source, RecordedDepth)
+    assert "every context view" in chosen.reason
+
+
+def test_auto_mixes_view_by_view(scan, monkeypatch):
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
+    partly = without_depth(scan, 1, 3)
+    chosen = choose_source(partly, partly.names, "auto")
+    assert isinstance(chosen.source, MixedDepth)
+    assert chosen.reason.startswith("4 of 6 views have recorded depth")
+    for i, view in enumerate(partly):
+        found = chosen.source.depth(partly, view, view.load())
+        assert found.source == ("computed" if i in (1, 3) else "recorded")
+        assert chosen.source.covers(view)
+
+
+def test_auto_computes_where_there_is_none(scan, monkeypatch):
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
+    bare = without_depth(scan, *range(6))
+    chosen = choose_source(bare, bare.names, "auto")
+    assert chosen.source.name == "computed"
+    assert "plane-sweep" in chosen.reason
+
+
+def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):
+    workspace(tmp_path)
+    scene = read_colmap(tmp_path)
+    monkeypatch.setattr(choice, "has_patch_match", lambda: True)
+    for asked in ("auto", "colmap"):
+        assert isinstance(choose_source(scene, scene.names, asked).source, ColmapPatchMatch)
+
+
+def test_a_single_view_leaves_nothing_to_compute_from(scan):
+    bare = without_depth(scan, *range(6))
+    with pytest.raises(ProjectError, match="at least 2 views"):
+        choose_source(bare, bare.names[:1], "auto")
+    with pytest.raises(ProjectError, match="at least 2"):
+        choose_source(bare, bare.names[:1], "plane-sweep")
+
+
+def test_what_a_project_cannot_give_is_refused(scan, tmp_path):
+    with pytest.raises(OptionError, match="rgbd"):
+        choose_source(scan, scan.names, "colmap")
+    with pytest.raises(OptionError, match="plane-sweep"):
+        choose_source(scan, scan.names, "guess")
+    with pytest.raises(CheckpointError, match="needs the weights"):
+        choose_source(scan, scan.names, "da3")
+    bare = without_depth(scan, *range(6))
+    with pytest.raises(ProjectError, match="add depth maps"):
+        choose_source(bare, bare.names, "sensor")
+    workspace(tmp_path / "colmap")
+    scene = read_colmap(tmp_path / "colmap")
+    with pytest.raises(OptionError, match="colmap project"):
+        choose_source(scene, scene.names, "sensor")
+    with pytest.raises(ProjectError, match=r"no CUDA.*patch_match_stereo"):
+        choose_source(scene, scene.names, "colmap")
+
+
+def test_patch_match_gets_a_workspace_of_the_given_views_alone(tmp_path, monkeypatch):
+    """The workspace is a real one, that pycolmap reads; its maps come back as depth."""
+    import pycolmap
+
+    workspace(tmp_path / "project")
+    scene = read_colmap(tmp_path / "project")
+    given = scene.names[:3]
+    seen: list[Path] = []
+
+    def fake(folder, **_):
+        folder = Path(folder)
+        seen.append(folder)
+        model = pycolmap.Reconstruction(folder / "sparse")
+        assert {image.name for image in model.images.values()} == set(given)
+        assert scene.points is not None
+        assert len(model.points3D) == len(scene.points.positions)
+        lines = (folder / "stereo" / "patch-match.cfg").read_text().split("\n")
+        assert lines[:2] == [given[0], "__auto__, 20"]
+        assert sorted(p.name for p in (folder / "images").rglob("*.*")) == sorted(
+            Path(name).name for name in given
+        )
+        for view in scene.views[:2]:
+            size = int(view.camera.height[0]), int(view.camera.width[0])
+            write_depth_map(
+                folder / "stereo/depth_maps" / f"{view.name}.geometric.bin", np.full(size, 3.0)
+            )
+
+    monkeypatch.setattr(pycolmap, "patch_match_stereo", fake)
+    source = ColmapPatchMatch(scene, given)
+    view = scene.views[0]
+    for _ in range(2):
+        found = source.depth(scene, view, view.load())
+    assert len(seen) == 1
+    assert not seen[0].exists()
+    assert (found.depth == 3).all()
+    assert found.source == "colmap-patch-match"
+    assert not source.covers(scene.views[3])
+    with pytest.raises(ProjectError, match="gave no depth"):
+        source.depth(scene, scene.views[2], scene.views[2].load())
+
+
+def test_patch_match_that_fails_is_said(tmp_path, monkeypatch):
+    import pycolmap
+
+    def fails(*_, **__):
+        raise RuntimeError("out of memory")
+
+    workspace(tmp_path / "project")
+    scene = read_colmap(tmp_path / "project")
+    monkeypatch.setattr(pycolmap, "patch_match_stereo", fails)
+    with pytest.raises(ProjectError, match="out of memory"):
+        ColmapPatchMatch(scene, scene.names).depth(scene, scene.views[0], scene.views[0].load())
+    with pytest.raises(ProjectError, match="sparse points"):
+        ColmapPatchMatch(replace(scene, points=None), scene.names)
+    assert colmap_patch_match.has_patch_match() in (True, False)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.3])
+def test_the_scale_of_depth_is_that_of_the_sparse_points(scan, factor):
+    view = scan.views[0]
+    frame = view.load()
+    assert frame.depth is not None
+    rng = np.random.default_rng(0)
+    xy = np.stack([rng.uniform(1, 95, 60), rng.uniform(1, 71, 60)], axis=1)
+    z = frame.depth[xy[:, 1].astype(int), xy[:, 0].astype(int)].astype(float)
+    rays = np.column_stack([xy, np.ones(60)]) @ np.linalg.inv(view.camera.K[0]).T
+    world = np.column_stack([rays * z[:, None], np.ones(60)]) @ view.camera.world_from_cam[0].T
+    points = SparsePoints(
+        world[:, :3], np.zeros((60, 3), np.uint8), np.zeros(60, np.float32),
+        np.arange(60, dtype=np.int32), np.zeros(60, np.int32), xy,
+    )  # fmt: skip
+    scene = replace(scan, points=points)
+    fit = scale_to_points(scene, view.name, frame.depth / np.float32(factor))
+    assert fit is not None
+    assert fit.scale == pytest.approx(factor, rel=1e-3)
+    assert disagrees(fit) == (factor != 1)
+    few = scale_to_points(scene, scan.names[1], frame.depth)
+    assert few is not None
+    assert not few.ok
+    assert not disagrees(few)
+    assert scale_to_points(scan, view.name, frame.depth) is None
+
+
+def test_the_workspace_keeps_positions_and_tracks(tmp_path):
+    import pycolmap
+
+    workspace(tmp_path / "project")
+    scene = read_colmap(tmp_path / "project")
+    write_workspace(tmp_path / "dense", scene, scene.names[1:3])
+    model = pycolmap.Reconstruction(tmp_path / "dense" / "sparse")
+    assert model.compute_mean_reprojection_error() < 0.5
+    assert all(len(point.track.elements) == 2 for point in model.points3D.values())

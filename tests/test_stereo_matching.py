@@ -1,0 +1,208 @@
+"""Warps, hypotheses and matching: known geometry, and the compiled back end against torch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from stereo_scenes import plane_depth, plane_scene
+
+from gvtools.cameras import concatenate
+from gvtools.depth.stereo.depth_range import DepthRange
+from gvtools.depth.stereo.hypotheses import best_plane, parabola, plane_hypotheses
+from gvtools.depth.stereo.matching import CpuMatcher, Level, TorchMatcher, make_matcher
+from gvtools.depth.stereo.options import StereoOptions
+from gvtools.depth.stereo.pyramid import build_pyramid, level_of, window_taps, window_weights
+from gvtools.depth.stereo.refinement import fitted, refined, upsampled
+from gvtools.depth.stereo.warps import disparity_rate, relative_warps
+from gvtools.errors import OptionError
+
+OPTIONS = StereoOptions(sources=2, best=1)
+
+
+@pytest.fixture(scope="module")
+def slanted():
+    """A slanted plane: the middle view's level with two sources, and the exact planes."""
+    made = plane_scene(slope=(0.25, -0.15))
+    scene = made.scene
+    pyramids = [
+        build_pyramid(view.load().rgb, view.camera, max_side=640, levels=1) for view in scene
+    ]
+    level = level_of(
+        pyramids[2], [pyramids[0], pyramids[4]], 0, window=7, device=torch.device("cpu")
+    )
+    inverse = 1 / made.depths[2]
+    planes = np.stack([inverse, np.gradient(inverse, axis=1), np.gradient(inverse, axis=0)])
+    return made, level, torch.from_numpy(planes.astype(np.float32))
+
+
+def test_warps_agree_with_projection(slanted):
+    made, _, _ = slanted
+    cameras = made.scene.cameras
+    warps = relative_warps(cameras[2], cameras[[0, 4]])
+    xy = np.array([[10.5, 20.5], [80.5, 60.5], [150.5, 100.5]])
+    depth = made.depths[2][(xy[:, 1]).astype(int), xy[:, 0].astype(int)]
+    rays = cameras[2].rays()[xy[:, 1].astype(int), xy[:, 0].astype(int)]
+    local = np.concatenate([rays * depth[:, None], np.ones((3, 1))], axis=1)
+    points = (local @ cameras.world_from_cam[2].T)[:, :3]
+    expected, _ = cameras[[0, 4]].project(points)
+    found, ratio = warps.project(xy, 1 / depth)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert (ratio > 0).all()
+
+
+def test_disparity_rate_of_a_sidestep_is_focal_times_baseline():
+    scene = plane_scene(count=2, turns=False).scene
+    cameras = scene.cameras
+    pose = cameras.cam_from_world.copy()
+    pose[1] = pose[0]
+    pose[1, 0, 3] -= 0.1
+    rate = disparity_rate(cameras[0], replace(cameras, cam_from_world=pose)[1], 1.0, 10.0)
+    assert rate[0] == pytest.approx(0.1 * cameras.K[0, 0, 0])
+
+
+def test_planes_are_one_pixel_apart_in_the_widest_source():
+    cameras = plane_scene(turns=False).scene.cameras
+    depths = DepthRange(1.0, 5.0, 1.5, 2.5, "points")
+    planes = plane_hypotheses(cameras[2], cameras[[0, 1]], depths, planes=None)
+    rate = disparity_rate(cameras[2], cameras[[0, 1]], 1.0, 5.0).max()
+    assert 0.9 < planes.step * rate <= 1.0
+    assert float(planes.inverse_depths[0]) == pytest.approx(0.2)
+    assert float(planes.inverse_depths[-1]) == pytest.approx(1.0)
+    assert len(plane_hypotheses(cameras[2], cameras[[0]], depths, planes=33).inverse_depths) == 33
+
+
+def test_parabola_finds_the_vertex():
+    x = torch.tensor([-1.0, 0.0, 1.0]) - 0.3
+    left, middle, right = 2 * x**2 + 0.1
+    assert float(parabola(left, middle, right)) == pytest.approx(0.3, abs=1e-5)
+    flat = torch.tensor(0.5)
+    assert float(parabola(flat, flat, flat)) == 0
+
+
+@pytest.mark.parametrize("matcher", [CpuMatcher(OPTIONS), TorchMatcher(OPTIONS)])
+def test_score_is_near_zero_on_the_true_plane_and_high_off_it(slanted, matcher):
+    _, level, planes = slanted
+    inner = (slice(8, -8), slice(8, -8))
+    right = matcher.score(level, planes)[inner]
+    off = planes.clone()
+    off[0] *= 1.1
+    wrong = matcher.score(level, off)[inner]
+    assert float(right.median()) < 0.02
+    assert float(wrong.median()) > 0.1
+
+
+def test_slopes_matter(slanted):
+    _, level, planes = slanted
+    flat = planes.clone()
+    flat[1:] *= -8
+    matcher = CpuMatcher(OPTIONS)
+    inner = (slice(8, -8), slice(8, -8))
+    assert float((matcher.score(level, flat) - matcher.score(level, planes))[inner].mean()) > 0.002
+
+
+def test_compiled_score_equals_torch(slanted):
+    _, level, planes = slanted
+    rng = torch.Generator().manual_seed(0)
+    shaken = planes * (1 + 0.05 * torch.randn(planes.shape, generator=rng))
+    one, two = CpuMatcher(OPTIONS).score(level, shaken), TorchMatcher(OPTIONS).score(level, shaken)
+    assert float(((one - two).abs() > 1e-3).float().mean()) < 1e-3
+    assert float((one - two).abs().mean()) < 2e-5
+
+
+@pytest.mark.parametrize("best", [1, 2])
+def test_compiled_sweep_equals_torch(slanted, best):
+    _, level, _ = slanted
+    options = StereoOptions(sources=2, best=best)
+    inverse = torch.linspace(0.2, 1.0, 9)
+    one = CpuMatcher(options).sweep(level, inverse)
+    two = TorchMatcher(options).sweep(level, inverse)
+    assert one.shape == (*level.reference.shape, 9)
+    assert float((one - two).abs().mean()) < 1e-4
+    assert float(((one - two).abs() > 5e-3).float().mean()) < 5e-3
+
+
+def test_compiled_aggregation_equals_torch():
+    rng = torch.Generator().manual_seed(1)
+    volume = torch.rand((20, 31, 12), generator=rng)
+    guide = torch.rand((20, 31), generator=rng)
+    one = CpuMatcher(OPTIONS).aggregate(volume, guide)
+    two = TorchMatcher(OPTIONS).aggregate(volume, guide)
+    torch.testing.assert_close(one, two, atol=1e-5, rtol=1e-5)
+
+
+def test_aggregation_fills_an_ambiguous_strip_from_its_sides():
+    volume = torch.ones((9, 30, 8))
+    volume[..., 3] = 0.2
+    volume[:, 12:18] = 0.5  # nothing to tell the planes apart
+    total = CpuMatcher(OPTIONS).aggregate(volume, torch.full((9, 30), 0.5))
+    assert (total.argmin(-1) == 3).all()
+
+
+def test_sweep_and_parabola_find_the_plane(slanted):
+    made, level, _ = slanted
+    cameras = made.scene.cameras
+    depths = DepthRange(1.0, 5.0, 1.5, 2.5, "points")
+    planes = plane_hypotheses(cameras[2], cameras[[0, 4]], depths, planes=None)
+    matcher = CpuMatcher(OPTIONS)
+    volume = matcher.aggregate(matcher.sweep(level, planes.inverse_depths), level.reference)
+    inverse, _ = best_plane(volume, planes)
+    error = (inverse.numpy() * made.depths[2] - 1)[10:-10, 10:-10]
+    assert np.median(np.abs(error)) < 0.01
+
+
+def test_refinement_reaches_sub_percent_depth_from_a_rough_start(slanted):
+    made, level, planes = slanted
+    rate = disparity_rate(made.scene.cameras[2], made.scene.cameras[[0, 4]], 1.0, 5.0).max()
+    start = planes.clone()
+    start[0] += 0.4 / rate * torch.sign(torch.sin(torch.arange(start.shape[2]) * 0.3))
+    start[1:] = 0
+    found, cost = refined(
+        start, level, CpuMatcher(OPTIONS), step=1 / rate, bounds=(0.2, 1.0), iterations=2
+    )
+    error = (found[0].numpy() * made.depths[2] - 1)[10:-10, 10:-10]
+    assert np.median(np.abs(error)) < 0.003
+    assert float(cost[10:-10, 10:-10].median()) < 0.03
+
+
+def test_fitted_and_upsampled_are_exact_on_a_plane():
+    y, x = torch.meshgrid(torch.arange(12.0) + 0.5, torch.arange(16.0) + 0.5, indexing="ij")
+    w = 0.4 + 0.01 * x - 0.02 * y
+    planes = fitted(w, torch.ones_like(w))
+    inner = (slice(4, -4), slice(4, -4))
+    assert float((planes[0] - w)[inner].abs().max()) < 1e-4
+    assert float((planes[1] - 0.01)[inner].abs().max()) < 2e-4
+    exact = torch.stack([w, torch.full_like(w, 0.01), torch.full_like(w, -0.02)])
+    fine = upsampled(exact, 24, 32)
+    y, x = torch.meshgrid(torch.arange(24.0) + 0.5, torch.arange(32.0) + 0.5, indexing="ij")
+    torch.testing.assert_close(fine[0], 0.4 + 0.005 * x - 0.01 * y)
+    torch.testing.assert_close(fine[1], torch.full((24, 32), 0.005))
+
+
+def test_window_weights_sum_to_one_and_stop_at_edges():
+    image = torch.zeros((10, 10))
+    image[:, 5:] = 1
+    taps = window_taps(5)
+    weights = window_weights(image, taps)
+    torch.testing.assert_close(weights.sum(-1), torch.ones((10, 10)))
+    across = (taps[:, 0] > 0) & (taps[:, 1] == 0)
+    assert float(weights[5, 4, across].sum()) < 1e-3
+
+
+def test_cuda_without_a_device_is_refused():
+    if torch.cuda.is_available():
+        pytest.skip("this machine has CUDA")
+    with pytest.raises(OptionError, match="no CUDA device"):
+        make_matcher(StereoOptions(backend="torch", device="cuda"))
+
+
+def test_plane_depth_of_the_fixture_is_exact(slanted):
+    made, level, _ = slanted
+    assert isinstance(level, Level)
+    cameras = concatenate([view.camera for view in made.scene])
+    depth = plane_depth(cameras[0], np.array([-0.25, 0.15, 1.0]), 2.0)
+    rays = cameras[0].rays()[7, 9]
+    point = cameras.world_from_cam[0] @ np.array([*(rays * depth[7, 9]), 1])
+    assert point[2] == pytest.approx(2 + 0.25 * point[0] - 0.15 * point[1])
