@@ -6,16 +6,18 @@ confidence; ``context_depth_NAME.png`` shows it, near red, far blue, none black.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap, DepthSource, RecordedDepth
-from gvtools.errors import ProjectError
+from gvtools.errors import DegenerateError, ProjectError
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.round_files import target_stems, write_png
 
@@ -34,6 +36,8 @@ class KeptDepth:
         self, scene: Scene, names: Sequence[str], source: DepthSource, folder: Path
     ) -> None:
         self.scene, self.source, self.folder = scene, source, folder
+        # Views that no depth was found for, with the reason.
+        self.failed: dict[str, str] = {}
         self._stem = dict(zip(names, target_stems(names), strict=True))
 
     def covers(self, view: View) -> bool:
@@ -48,14 +52,23 @@ class KeptDepth:
         """
         path = self.folder / f"context_depth_{self._stem[view.name]}.npz"
         if not path.exists():
-            found = self.source.depth(self.scene, view, frame)
+            try:
+                found = self.source.depth(self.scene, view, frame)
+            except DegenerateError as error:
+                # The view stays without depth; the others carry the run.
+                self.failed[view.name] = str(error)
+                empty = np.zeros(frame.rgb.shape[:2], np.float32)
+                found = DepthMap(empty, np.ones_like(empty), self.source.name)
             if found.source != RecordedDepth.name:
                 self._keep(path, found)
             return found
         try:
             with np.load(path, allow_pickle=False) as stored:
-                return DepthMap(stored["depth"], stored["confidence"], str(stored["source"]))
-        except (OSError, EOFError, ValueError, KeyError) as error:
+                kept = DepthMap(stored["depth"], stored["confidence"], str(stored["source"]))
+            if kept.depth.shape != frame.rgb.shape[:2]:
+                raise ValueError(f"depth of {kept.depth.shape}, picture of {frame.rgb.shape[:2]}")
+            return kept
+        except (OSError, EOFError, ValueError, KeyError, BadZipFile, zlib.error) as error:
             raise ProjectError(
                 f"{path}: unreadable ({error!r}); expected depth of the context; start the run "
                 "again with another --out"

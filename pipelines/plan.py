@@ -136,6 +136,8 @@ def automatic_voxel(
     """
     import numpy as np
 
+    from gvtools.errors import DegenerateError
+
     footprints = []
     for name in sampled([name for name in context if source.covers(scene[name])]):
         view = scene[name]
@@ -145,7 +147,10 @@ def automatic_voxel(
             _, z = view.camera.project(scene.points.positions[scene.points.point_index[row]])
             known = z[0][z[0] > 0].astype(np.float32)
         if not known.size:
-            depth = source.depth(scene, view, view.load()).depth
+            try:
+                depth = source.depth(scene, view, view.load()).depth
+            except DegenerateError:
+                continue
             known = depth[depth > 0]
         if known.size:
             focal = float(np.sqrt(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))

@@ -47,7 +47,7 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
     )
     parser.add_argument("--views-per-round", type=int, metavar="N", help="at most (default 6)")
     parser.add_argument("--rounds", type=int, metavar="N", help="default: as the targets need")
-    parser.add_argument("--depth", metavar="SOURCE", help="auto, sensor, colmap or plane-sweep")
+    parser.add_argument("--depth", metavar="SOURCE", help="auto, sensor, colmap, plane-sweep, da3")
     parser.add_argument(
         "--max-side", metavar="PIXELS", help="reduce larger pictures to it, or none (default 1600)"
     )
@@ -231,7 +231,7 @@ def _round(
             source=KeptDepth(plan.scene, plan.context, plan.source, folder),
             memory=memory, config=plan.config, clock=clock, progress=console.track,
         )  # fmt: skip
-        _warn_of_scale(depth, console)
+        _warn_of_depth(depth, console)
     else:
         cameras = plan.targets.cameras[list(plan.schedule[number - 1])]
         with clock.stage("project"):
@@ -282,7 +282,13 @@ def _round(
     }
 
 
-def _warn_of_scale(reports: list[dict[str, Any]], console: Console) -> None:
+def _warn_of_depth(reports: list[dict[str, Any]], console: Console) -> None:
+    failed = [report for report in reports if report["failed"]]
+    if failed:
+        console.warn(
+            f"{len(failed)} of {len(reports)} views have no depth and give no points, first: "
+            f"{failed[0]['failed']}"
+        )
     odd = [report for report in reports if report["scale"] and report["scale"]["disagrees"]]
     if odd:
         first = odd[0]["scale"]

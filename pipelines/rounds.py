@@ -99,6 +99,10 @@ def observe_context(
             total += memory.fuse(points, round=0)
         for reason, count in points.dropped.items():
             dropped[reason] = dropped.get(reason, 0) + count
+    for entry in reports:
+        entry["failed"] = source.failed.get(entry["view"])
+    if not len(memory) and source.failed:
+        raise ProjectError(next(iter(source.failed.values())))
     if not len(memory) and total.out_of_reach:
         raise ProjectError(
             f"{scene.root}: all {total.out_of_reach} points of the context lie beyond the "

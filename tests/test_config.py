@@ -87,3 +87,10 @@ def test_profiles_only_hold_known_settings():
 def test_a_section_cannot_be_set_as_a_whole():
     with pytest.raises(OptionError):
         with_setting(RunConfig(), "splat", "1")
+
+
+def test_settings_that_depend_on_each_other_may_come_in_any_order():
+    for texts in (["stereo.sources=1", "stereo.best=1"], ["stereo.best=1", "stereo.sources=1"]):
+        config = with_settings(RunConfig(), texts)
+        assert (config.stereo.sources, config.stereo.best) == (1, 1)
+    assert with_settings(RunConfig(), ["stereo.sources=1"]).stereo.sources == 1

@@ -12,6 +12,7 @@ from tiny_scan import render, world_from_cam, write_scan
 
 from gvtools.depth import choice
 from gvtools.depth.source import DepthMap
+from gvtools.errors import DegenerateError
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.cli import main
 from pipelines.context_depth import colored
@@ -79,9 +80,34 @@ def test_a_resumed_run_reads_it_again(scan, tmp_path):
     assert reconstruct(scan, out, "--voxel", "0.03", "--resume") == 0
     assert Exact.asked == 0
     assert (out / "memory.npz").read_bytes() == whole
-    shutil.rmtree(out / "round_002")
-    next((out / "round_000").glob("context_depth_*.npz")).write_bytes(b"half")
-    assert reconstruct(scan, out, "--voxel", "0.03", "--resume") == 2
+    kept = next((out / "round_000").glob("context_depth_*.npz"))
+    data = kept.read_bytes()
+    middle = len(data) // 2
+    for damaged in (b"half", data[:middle], data[:middle] + b"\0" * 99 + data[middle + 99 :]):
+        shutil.rmtree(out / "round_002", ignore_errors=True)
+        kept.write_bytes(damaged)
+        assert reconstruct(scan, out, "--voxel", "0.03", "--resume") == 2
+
+
+def test_a_view_without_depth_does_not_stop_the_others(scan, tmp_path, monkeypatch, capsys):
+    class Lacking(Exact):
+        def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
+            if view.name.startswith("frame-000001") or Lacking.none:
+                raise DegenerateError(f"none shows what {view.name} does")
+            return super().depth(scene, view, frame)
+
+        none = False
+
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Lacking())
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    assert "1 of 3 views have no depth" in capsys.readouterr().err
+    report = json.loads((out / "round_000" / "report.json").read_text())
+    assert [entry["known"] for entry in report["depth"]] == [1, 0, 1]
+    assert "frame-000001" in report["depth"][1]["failed"]
+    Lacking.none = True
+    assert reconstruct(scan, tmp_path / "none", "--voxel", "0.03") == 2
+    assert "none shows what" in capsys.readouterr().err
 
 
 def test_the_automatic_voxel_asks_the_source_where_nothing_else_tells(scan, tmp_path):

@@ -15,7 +15,7 @@ from gvtools.depth.choice import choose_source
 from gvtools.depth.colmap_patch_match import ColmapPatchMatch, write_workspace
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth
-from gvtools.errors import CheckpointError, OptionError, ProjectError
+from gvtools.errors import CheckpointError, DegenerateError, OptionError, ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.colmap_depth import write_depth_map
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
@@ -82,6 +82,10 @@ def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):
     monkeypatch.setattr(choice, "has_patch_match", lambda: True)
     for asked in ("auto", "colmap"):
         assert isinstance(choose_source(scene, scene.names, asked).source, ColmapPatchMatch)
+    # Without sparse points, it could not run.
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
+    bare = replace(scene, points=None)
+    assert choose_source(bare, bare.names, "auto").source.name == "computed"
 
 
 def test_a_single_view_leaves_nothing_to_compute_from(scan):
@@ -147,7 +151,7 @@ def test_patch_match_gets_a_workspace_of_the_given_views_alone(tmp_path, monkeyp
     assert (found.depth == 3).all()
     assert found.source == "colmap-patch-match"
     assert not source.covers(scene.views[3])
-    with pytest.raises(ProjectError, match="gave no depth"):
+    with pytest.raises(DegenerateError, match="gave no depth"):
         source.depth(scene, scene.views[2], scene.views[2].load())
 
 

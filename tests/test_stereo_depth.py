@@ -124,7 +124,7 @@ def test_errors_name_what_is_wrong(slanted):
     with pytest.raises(ProjectError, match="nothing"):
         PlaneSweepStereo(slanted.scene, views=("v0", "nothing"))
     for wrong in (
-        {"sources": 0}, {"best": 5}, {"window": 4}, {"max_side": 8}, {"tolerance": 0},
+        {"sources": 0}, {"best": 9}, {"window": 4}, {"max_side": 8}, {"tolerance": 0},
         {"planes": 2}, {"noise": 0}, {"cost": 2}, {"backend": "gpu"}, {"device": "tpu"},
     ):  # fmt: skip
         with pytest.raises(OptionError, match="stereo"):

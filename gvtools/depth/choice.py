@@ -90,7 +90,7 @@ def choose_source(
             f"{scene.root}: one context view without depth; expected depth, or at least 2 views to "
             "compute it from"
         )
-    if has_patch_match():
+    if has_patch_match() and scene.points is not None:
         computed, how = ColmapPatchMatch(scene, views), "COLMAP's PatchMatch, as there is CUDA"
     else:
         computed, how = _stereo(scene, views, stereo), "plane-sweep stereo of the photographs"

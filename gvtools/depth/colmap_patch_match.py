@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.depth.source import DepthMap, RecordedDepth
-from gvtools.errors import ProjectError
+from gvtools.errors import DegenerateError, ProjectError
 from gvtools.scenes.colmap_depth import depth_map_path, read_depth_map
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.scene import Frame, Scene, View
@@ -61,13 +61,14 @@ class ColmapPatchMatch:
         """The view's geometric depth map, trusted as recorded ones are.
 
         Raises:
-            ProjectError: PatchMatch failed, or left no map of the view.
+            ProjectError: PatchMatch failed.
+            DegenerateError: it left no map of the view.
         """
         if self._depth is None:
             with tempfile.TemporaryDirectory() as folder:
                 self._depth = self._run(Path(folder))
         if view.name not in self._depth:
-            raise ProjectError(f"{scene.root}: PatchMatch gave no depth of view {view.name}")
+            raise DegenerateError(f"{scene.root}: PatchMatch gave no depth of view {view.name}")
         found = Frame(frame.rgb, self._depth[view.name], frame.mask)
         trusted = RecordedDepth().depth(scene, view, found)
         return DepthMap(trusted.depth, trusted.confidence, self.name)

@@ -41,6 +41,7 @@ class DepthSource(Protocol):
 
         Raises:
             ProjectError: the source does not cover the view.
+            DegenerateError: no depth can be found for it; other views may have some.
         """
         ...
 

@@ -66,7 +66,7 @@ def _reduced_frame(frame: Frame, width: int, height: int) -> Frame:
     columns = _nearest(frame.rgb.shape[1], width)
     cut = np.ix_(rows, columns)
     return Frame(
-        np.asarray(picture),
+        np.array(picture),
         None if frame.depth is None else np.ascontiguousarray(frame.depth[cut]),
         None if frame.mask is None else np.ascontiguousarray(frame.mask[cut]),
     )

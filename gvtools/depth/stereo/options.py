@@ -18,7 +18,7 @@ class StereoOptions:
     Attributes:
         sources: source views of a reference view, at most 8.
         best: how many of the sources, the best at each pixel, make the photometric cost; the others
-            may be occluded there.
+            may be occluded there. More than there are means all.
         max_side: longer side of the pictures that are compared, pixels; larger ones are reduced.
         planes: inverse-depth hypotheses of the coarsest level; None takes as many as the largest
             baseline resolves, one per pixel of disparity.
@@ -27,7 +27,7 @@ class StereoOptions:
         iterations: rounds of propagation on each level finer than the coarsest.
         noise: standard deviation of the pictures' noise, 0 to 1 for black to white; what varies
             less than this counts as without texture.
-        views: source views whose own depth must confirm a pixel's.
+        views: source views whose own depth must confirm a pixel's, at most ``sources``.
         tolerance: relative depth difference up to which another view confirms.
         cost: highest photometric cost that is kept, 0 for a perfect match to 1 for none.
         align: adjust the poses to the pictures first; None does so for scenes without sparse
@@ -55,14 +55,14 @@ class StereoOptions:
 
     def __post_init__(self) -> None:
         check_range("stereo.sources", self.sources, least=1, most=8)
-        check_range("stereo.best", self.best, least=1, most=self.sources)
+        check_range("stereo.best", self.best, least=1, most=8)
         check_range("stereo.max_side", self.max_side, least=64)
         check_range("stereo.planes", self.planes, least=8, most=512)
         check_range("stereo.levels", self.levels, least=1, most=6)
         check_range("stereo.window", self.window, least=3, most=15)
         check_range("stereo.iterations", self.iterations, least=0)
         check_range("stereo.noise", self.noise, above=0, most=1)
-        check_range("stereo.views", self.views, least=0, most=self.sources)
+        check_range("stereo.views", self.views, least=0, most=8)
         check_range("stereo.tolerance", self.tolerance, above=0, below=1)
         check_range("stereo.cost", self.cost, above=0, most=1)
         check_range("stereo.speckle", self.speckle, least=0)

@@ -100,7 +100,7 @@ class PlaneSweepStereo:
             [(other.inverse_depth, other.camera) for other in others],
             tolerance=options.tolerance,
         )  # fmt: skip
-        kept = (compared.views >= options.views) & (raw.cost <= options.cost)
+        kept = (compared.views >= min(options.views, options.sources)) & (raw.cost <= options.cost)
         kept &= raw.contrast > options.noise
         confidence = confidence_of(raw.cost, compared.views, compared.spread)
         depth = torch.where(kept, 1 / compared.inverse_depth.clamp(min=1e-9), 0).float()
