@@ -19,6 +19,8 @@ Float64 = NDArray[np.float64]
 # A rotation read from a file may be this far from orthonormal (largest entry of R Rᵀ − I) and is
 # then replaced by the nearest rotation; beyond it, the matrix holds a scale, a shear or a mirror.
 ROTATION_TOLERANCE = 5e-3
+# A rotation nearer to orthonormal than this is as good as text with few digits can be.
+ROTATION_ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, eq=False)

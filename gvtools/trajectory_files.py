@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, invert_rigid, rigid_transform
+from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.files import write_text
 
@@ -21,8 +21,6 @@ Float64 = NDArray[np.float64]
 
 # A quaternion written with few digits may be this far from unit length; farther, it is none.
 QUATERNION_TOLERANCE = 1e-2
-# A rotation nearer to orthonormal than this is as good as text with few digits can be.
-ROUNDING = 1e-5
 # Numbers of a line that are read.
 _COUNTS = {"tum": 8, "kitti": 12, "euroc": 8}
 
@@ -90,7 +88,7 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
             nearest, defect = rigid_transform(poses[i], what=where)
         except ShapeError as error:
             raise ProjectError(str(error)) from None
-        if defect > ROUNDING:
+        if defect > ROTATION_ROUNDING:
             poses[i] = nearest
     return Trajectory(poses, (), None if layout == "kitti" else stamps)
 

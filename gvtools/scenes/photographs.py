@@ -10,15 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import ROTATION_ROUNDING, Cameras
 from gvtools.errors import ProjectError
 from gvtools.scenes.images import check_size, fit_depth, read_header, read_image, read_mask
 from gvtools.scenes.scene import Finding, Frame, View
 from gvtools.scenes.undistort import Undistortion
 
 Depth = NDArray[np.float32]
-# A rotation nearer to orthonormal than this is as good as text with few digits can be.
-ROUNDING = 1e-5
 NAMED_AT_MOST = 3  # a finding names this many files and counts the rest
 
 
@@ -184,7 +182,7 @@ def lens_findings(lenses: Sequence[Undistortion]) -> list[Finding]:
 
 def rotation_findings(defects: Sequence[float]) -> list[Finding]:
     """One line when rotations had to be made orthonormal."""
-    mended = sum(defect > ROUNDING for defect in defects)
+    mended = sum(defect > ROTATION_ROUNDING for defect in defects)
     if not mended:
         return []
     return [
