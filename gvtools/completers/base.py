@@ -107,6 +107,7 @@ _FACTORIES: dict[str, Callable[..., Completer] | str] = {
     "none": "gvtools.completers.none:NoneCompleter",
     "inpaint": "gvtools.completers.inpaint:InpaintCompleter",
     "exemplar": "gvtools.completers.exemplar:ExemplarCompleter",
+    "geoverse": "gvtools.completers.geoverse.completer:GeoVerseCompleter",
 }
 
 

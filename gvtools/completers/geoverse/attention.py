@@ -1,0 +1,43 @@
+"""Scaled dot-product attention without the matrix of scores."""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from gvtools.errors import ShapeError
+
+# CUDA's fused kernels ask for heads of a multiple of this size; others would get N x M scores.
+FUSED_MULTIPLE = 8
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """softmax(q kᵀ / sqrt(d)) v, in torch's fused kernels, whose memory is linear in N and M.
+
+    On a CPU the fused kernel is also the faster one: in float32 it takes a third to four fifths of
+    the time of the two products around a softmax from about 100 tokens on, and never longer by
+    more than a fraction of a millisecond; in bfloat16 the products may win, but round the scores.
+
+    Args:
+        q: (B, heads, N, d).
+        k: (B, heads, M, d).
+        v: (B, heads, M, d), the dtype of ``q`` and ``k``.
+
+    Returns:
+        (B, heads, N, d).
+
+    Raises:
+        ShapeError: not four dimensions, or dimensions that do not match.
+    """
+    if not (q.ndim == 4 and k.shape == v.shape == (*q.shape[:2], *k.shape[2:3], q.shape[3])):
+        raise ShapeError(
+            f"attention: q {tuple(q.shape)}, k {tuple(k.shape)}, v {tuple(v.shape)}; expected "
+            "(B, heads, N, d), (B, heads, M, d) and (B, heads, M, d)"
+        )
+    size = q.shape[-1]
+    lacking = -size % FUSED_MULTIPLE
+    if not lacking or q.device.type != "cuda":
+        return F.scaled_dot_product_attention(q, k, v)
+    # Zeros add nothing to the scores; the scale stays that of the true head.
+    q, k, v = (F.pad(tensor, (0, lacking)) for tensor in (q, k, v))
+    return F.scaled_dot_product_attention(q, k, v, scale=size**-0.5)[..., :size]

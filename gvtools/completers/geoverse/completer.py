@@ -1,0 +1,304 @@
+"""GeoVerse as a completer: what the memory does not know, generated for several views at once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gvtools.cameras import Cameras
+from gvtools.completers.base import Completion, ContextView
+from gvtools.completers.geoverse.depth_scale import ALIGNMENTS, centre_scale, scaled_depth
+from gvtools.completers.geoverse.flow import interval_bounds
+from gvtools.completers.geoverse.model import Generated, GeoVerse
+from gvtools.completers.geoverse.model_views import enlarged, model_size, view_batch
+from gvtools.completers.geoverse.published import CONFIG_FILE, WHOLE_FILE
+from gvtools.completers.geoverse.weights_folder import config_of, from_pretrained
+from gvtools.errors import OptionError
+from gvtools.guidance import Guidance
+from gvtools.options import check_range
+
+PRECISIONS = ("auto", "float32", "bfloat16")
+DEVICES = ("auto", "cpu", "cuda")
+# Confidence of a generated pixel at most: below what was observed.
+GENERATED = 0.9
+
+
+@dataclass(frozen=True)
+class GeoVerseCompleter:
+    """The generative core (see ``model.py``), with the memory's pixels kept as they are.
+
+    Attributes:
+        weights: folder of a GeoVerse model; see ``gvtools weights list``.
+        steps: level-1 steps; None for the model's own interval bounds.
+        cascade_steps: level-0 steps; None for the model's own.
+        guidance: classifier-free guidance scale; None for the model's own.
+        context_views: most photographs in a pass; None for the model's own.
+        views: most views in a pass, photographs and targets; None for the model's own.
+        alignment: how depth gets the memory's scale, see ``depth_scale``; None for the model's own.
+        precision: "auto" is bfloat16 on a GPU and float32 on a CPU.
+        device: "auto" takes a GPU where there is one.
+    """
+
+    name: ClassVar[str] = "geoverse"
+    joint: ClassVar[bool] = True
+
+    weights: str | None = None
+    steps: int | None = None
+    cascade_steps: int | None = None
+    guidance: float | None = None
+    context_views: int | None = None
+    views: int | None = None
+    alignment: str | None = None
+    precision: str = "auto"
+    device: str = "auto"
+
+    def __post_init__(self) -> None:
+        check_range("completer.steps", self.steps, least=1)
+        check_range("completer.cascade_steps", self.cascade_steps, least=1)
+        check_range("completer.guidance", self.guidance, least=0)
+        check_range("completer.context_views", self.context_views, least=1)
+        check_range("completer.views", self.views, least=2)
+        for name, value, known in (
+            ("precision", self.precision, PRECISIONS),
+            ("device", self.device, DEVICES),
+            ("alignment", self.alignment or ALIGNMENTS[0], ALIGNMENTS),
+        ):
+            if value not in known:
+                raise OptionError(
+                    f"completer.{name} = {value!r}; expected one of {', '.join(known)}"
+                )
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise OptionError("completer.device = 'cuda', and torch sees no CUDA device here")
+        if self.weights is None:
+            raise OptionError(
+                "completer geoverse needs weights; give --set completer.weights=DIR, a folder as "
+                "'gvtools weights list' describes it"
+            )
+        # A folder that cannot be a model is refused before anything is computed.
+        config_of(Path(self.weights))
+
+    def complete(
+        self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
+    ) -> Completion:
+        """Complete all target views, several in a pass; see ``Completer.complete``."""
+        start = time.perf_counter()
+        if not context:
+            raise OptionError("completer geoverse needs at least one context view, and got none")
+        device = self._device()
+        model = _loaded(*_identity(self.weights or "", device))
+        canvas = _Canvas(guidance)
+        holes = [index for index in range(len(guidance)) if not guidance.valid[index].all()]
+        most = self.context_views or model.config.context
+        room = max(1, (self.views or model.config.views) - min(most, len(context)))
+        passes = 0
+        for first in range(0, len(holes), room):
+            rows = holes[first : first + room]
+            part = _rows(guidance, rows)
+            chosen = nearest_views(context, part.cameras, most)
+            canvas.put(rows, self._pass(model, device, chosen, part, seed), part)
+            passes += 1
+        spent = {
+            "seconds": time.perf_counter() - start,
+            "passes": float(passes),
+            "steps": float(len(self._bounds(model)) - 1),
+        }
+        return canvas.completion(spent)
+
+    def _pass(
+        self,
+        model: GeoVerse,
+        device: torch.device,
+        context: Sequence[ContextView],
+        part: Guidance,
+        seed: int,
+    ) -> _Made:
+        """One pass of the model over context views and a few targets."""
+        full = part.depth.shape[1:]
+        size = model_size(*full, longest=model.config.image_size, patch=model.config.patch)
+        batch, cameras = view_batch(context, part, size)
+        batch = batch.to(device)
+        with self._precision(device):
+            made = model.generate(
+                batch,
+                seed=seed,
+                names=[list(cameras.names)],
+                bounds=self._bounds(model),
+                cascade_bounds=self._cascade_bounds(model),
+                guidance=self.guidance,
+            )
+        return _brought_back(
+            made, part, cameras, full, len(context), self.alignment or model.config.alignment
+        )
+
+    def _bounds(self, model: GeoVerse) -> tuple[float, ...]:
+        flow = model.config.flow
+        if self.steps is None or self.steps == len(flow.level1) - 1:
+            return flow.level1
+        return interval_bounds(self.steps, shift=flow.shift)
+
+    def _cascade_bounds(self, model: GeoVerse) -> tuple[float, ...]:
+        flow = model.config.flow
+        if self.cascade_steps is None:
+            return flow.cascade
+        return interval_bounds(self.cascade_steps, shift=flow.shift)
+
+    def _device(self) -> torch.device:
+        if self.device == "auto":
+            return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        return torch.device(self.device)
+
+    def _precision(self, device: torch.device):  # type: ignore[no-untyped-def]
+        half = self.precision == "bfloat16" or (self.precision == "auto" and device.type == "cuda")
+        return torch.autocast(device.type, dtype=torch.bfloat16) if half else nullcontext()
+
+
+@dataclass(frozen=True)
+class _Made:
+    """A pass's result at the targets' size and in scene units."""
+
+    rgb: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    rays: NDArray[np.float32]
+    centre_scale: float
+    scales: NDArray[np.float64]
+
+
+class _Canvas:
+    """The completion, begun from what the memory knows."""
+
+    def __init__(self, guidance: Guidance) -> None:
+        valid = guidance.valid
+        self.valid = valid
+        self.rgb = np.where(valid[..., None], guidance.rgb, np.float32(0))
+        self.depth = np.where(valid, guidance.depth, np.float32(0))
+        known = np.where(valid, np.minimum(guidance.confidence, 1), 0)
+        self.confidence = known.astype(np.float32)
+        self.rays = np.stack(
+            [guidance.cameras.plucker(index) for index in range(len(guidance))]
+        ).astype(np.float32)
+        self.spent = {"holes": float((~valid).sum()), "unfilled": 0.0, "views_without_scale": 0.0}
+
+    def put(self, rows: Sequence[int], made: _Made, part: Guidance) -> None:
+        """Fill the holes of some views."""
+        for position, row in enumerate(rows):
+            hole = ~self.valid[row]
+            self.rgb[row][hole] = made.rgb[position][hole]
+            self.depth[row][hole] = made.depth[position][hole]
+            self.confidence[row][hole] = made.confidence[position][hole]
+            self.rays[row] = made.rays[position]
+            self.spent["unfilled"] += float((made.depth[position][hole] <= 0).sum())
+            self.spent["views_without_scale"] += float(not np.isfinite(made.scales[position]))
+        self.spent["centre_scale"] = made.centre_scale
+
+    def completion(self, spent: dict[str, float]) -> Completion:
+        """The result."""
+        return Completion(
+            self.rgb, self.depth, self.confidence, self.rays, spent={**self.spent, **spent}
+        )
+
+
+def nearest_views(
+    context: Sequence[ContextView], targets: Cameras, count: int
+) -> list[ContextView]:
+    """The context views that stand and look most like the targets, the very best first.
+
+    Distances are in units of the scene's extent between cameras; a right angle between viewing
+    directions weighs as much as that extent.
+    """
+    if len(context) <= 1:
+        return list(context)
+    centres = np.concatenate([view.camera.centers for view in context])
+    forward = np.concatenate([view.camera.world_from_cam[:, :3, 2] for view in context])
+    target_centres, target_forward = targets.centers, targets.world_from_cam[:, :3, 2]
+    everything = np.concatenate((centres, target_centres))
+    extent = max(float(np.linalg.norm(np.ptp(everything, axis=0))), 1e-12)
+    apart = np.linalg.norm(centres[:, None] - target_centres[None], axis=-1) / extent
+    turned = 1 - np.clip(forward @ target_forward.T, -1, 1)
+    cost = apart + turned
+    # The best for any target first, then those that are best for the targets served worst.
+    chosen: list[int] = [int(cost.mean(1).argmin())]
+    while len(chosen) < min(count, len(context)):
+        served = cost[chosen].min(0)
+        gain = np.maximum(served[None] - cost, 0).sum(1)
+        gain[chosen] = -1
+        best = int(gain.argmax())
+        if gain[best] <= 0:
+            rest = [index for index in np.argsort(cost.min(1), kind="stable")]
+            best = next(int(index) for index in rest if int(index) not in chosen)
+        chosen.append(best)
+    return [context[index] for index in chosen]
+
+
+def _brought_back(
+    made: Generated,
+    part: Guidance,
+    cameras: Cameras,
+    full: tuple[int, int],
+    context: int,
+    alignment: str,
+) -> _Made:
+    """Pictures, depth, confidence and rays of the targets at their own size, in scene units."""
+    geometry = made.decoded.geometry
+    rgb = enlarged(made.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
+    depth = enlarged(geometry.depth[0, context:, None].float().cpu(), full)[:, 0]
+    certain = enlarged(geometry.depth_confidence[0, context:, None].float().cpu(), full)[:, 0]
+    world_from_cam = cameras.world_from_cam
+    scale, _ = centre_scale(geometry, world_from_cam)
+    scaled = scaled_depth(depth, part.depth, part.valid, centres=scale, alignment=alignment)
+    confidence = (GENERATED * (1 - 1 / certain.clamp_min(1))).numpy().astype(np.float32)
+    confidence[scaled.depth <= 0] = 0
+    unit = scale if np.isfinite(scale) else float(np.nanmedian(scaled.scale, axis=0))
+    rays = _plucker(geometry.ray[0, context:], world_from_cam[0], unit, full)
+    return _Made(
+        rgb.permute(0, 2, 3, 1).numpy(), scaled.depth, confidence, rays, scale, scaled.scale
+    )
+
+
+def _plucker(
+    ray: Tensor, world_from_first: NDArray[np.float64], unit: float, full: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Predicted (T, h, w, 6) rays of the first view's frame as (T, H, W, 6) world Plücker rays."""
+    maps = enlarged(ray.float().cpu().permute(0, 3, 1, 2), full).permute(0, 2, 3, 1).double()
+    rotation = torch.from_numpy(world_from_first[:3, :3].copy())
+    direction = torch.nn.functional.normalize(maps[..., :3] @ rotation.T, dim=-1)
+    origin = maps[..., 3:] * (unit if np.isfinite(unit) else 1.0) @ rotation.T
+    origin = origin + torch.from_numpy(world_from_first[:3, 3].copy())
+    moment = torch.linalg.cross(origin, direction)
+    return torch.cat((direction, moment), -1).numpy().astype(np.float32)
+
+
+def _rows(guidance: Guidance, rows: Sequence[int]) -> Guidance:
+    """Some views of a guidance."""
+    index = list(rows)
+    return Guidance(
+        guidance.cameras[index],
+        guidance.rgb[index],
+        guidance.depth[index],
+        guidance.valid[index],
+        guidance.confidence[index],
+        guidance.generated[index],
+    )
+
+
+def _identity(weights: str, device: torch.device) -> tuple[str, str, tuple[float, ...]]:
+    """What a loaded model is kept by: its folder, device, and its files' times."""
+    folder = Path(weights).resolve()
+    files = [folder / name for name in (CONFIG_FILE, WHOLE_FILE)]
+    return str(folder), str(device), tuple(f.stat().st_mtime for f in files if f.exists())
+
+
+@lru_cache(maxsize=1)
+def _loaded(folder: str, device: str, times: tuple[float, ...]) -> GeoVerse:
+    """The model of a folder; kept, since every round asks for it."""
+    return from_pretrained(folder, device=device)

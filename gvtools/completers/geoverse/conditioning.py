@@ -1,0 +1,278 @@
+"""From pictures, projections and cameras to what the denoisers are conditioned on.
+
+The hint features are Eq. 1 of the paper: context pictures and projections are encoded jointly and
+masked by the validity at feature resolution. The mask is applied to *normalised* features, so that
+a target without a valid pixel has exactly GLD's zero padding; such a view is also left out of the
+joint encoding, since it has nothing to tell and its black picture would disturb the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gvtools.completers.geoverse.depth_anything import DepthAnything3, relative_cameras
+from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
+from gvtools.completers.geoverse.statistics import LatentStatistics
+from gvtools.errors import OptionError, ShapeError
+
+LOG_DEPTH_LIMIT = 6.0
+
+
+@dataclass(frozen=True)
+class HintConfig:
+    """How projections become features; the defaults are the paper's form.
+
+    Attributes:
+        fill: "none": holes are black; "push-pull": they are filled before encoding.
+        encode: "jointly": context and projections in one pass (Eq. 1); "alone": the context views
+            by themselves, as GLD does, and the projections with them in a second pass.
+        mask: features of a token count where at least this share of its pixels is valid; 0: the
+            features are not masked (of use with filled holes).
+        cameras: known cameras go into the encoder's camera tokens.
+        cascade_context: level-0 features of the context come from the context "alone" (as GLD
+            trains its cascade) or from the "jointly" encoded sequence.
+        token: token 0 of generated features: "first-context" encoded alone and shared by all views
+            (GLD), or each view's "own" of the joint encoding.
+    """
+
+    fill: str = "none"
+    encode: str = "jointly"
+    mask: float = 0.5
+    cameras: bool = False
+    cascade_context: str = "alone"
+    token: str = "first-context"
+
+    def __post_init__(self) -> None:
+        for name, known in (
+            ("fill", ("none", "push-pull")),
+            ("encode", ("jointly", "alone")),
+            ("cascade_context", ("alone", "jointly")),
+            ("token", ("first-context", "own")),
+        ):
+            if getattr(self, name) not in known:
+                raise OptionError(
+                    f"hints.{name} = {getattr(self, name)!r}; expected one of {', '.join(known)}"
+                )
+        if not 0 <= self.mask <= 1:
+            raise OptionError(f"hints.mask = {self.mask}; expected a share from 0 to 1")
+
+
+@dataclass(frozen=True)
+class ViewBatch:
+    """Context views, then target views, all of one size.
+
+    Attributes:
+        images: (B, V, 3, H, W) in [0, 1]: context pictures; projections on targets, holes at 0.
+        depth: (B, V, 1, H, W) z-depth, any one unit for the batch's sample; 0 = none.
+        valid: (B, V, 1, H, W) bool: True on context; True where the projection knows a target.
+        cam_from_world: (B, V, 4, 4).
+        K: (B, V, 3, 3), px of ``images``, pixel centres at + 0.5.
+        context: number of context views, at least one.
+    """
+
+    images: Tensor
+    depth: Tensor
+    valid: Tensor
+    cam_from_world: Tensor
+    K: Tensor
+    context: int
+
+    def __post_init__(self) -> None:
+        batch, views, channels, height, width = self.images.shape
+        if channels != 3 or not 1 <= self.context <= views:
+            raise ShapeError(
+                f"images {tuple(self.images.shape)} with {self.context} context view(s); expected "
+                "(B, V, 3, H, W) and 1 to V context views"
+            )
+        for what, value, shape in (
+            ("depth", self.depth, (batch, views, 1, height, width)),
+            ("valid", self.valid, (batch, views, 1, height, width)),
+            ("cam_from_world", self.cam_from_world, (batch, views, 4, 4)),
+            ("K", self.K, (batch, views, 3, 3)),
+        ):
+            if tuple(value.shape) != shape:
+                raise ShapeError(f"{what} {tuple(value.shape)}; expected {shape}")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.images.shape[-2], self.images.shape[-1]
+
+    def to(self, device: torch.device | str) -> ViewBatch:
+        """On another device."""
+        tensors = (self.images, self.depth, self.valid, self.cam_from_world, self.K)
+        return ViewBatch(*(tensor.to(device) for tensor in tensors), self.context)
+
+    def samples(self, index: Tensor) -> ViewBatch:
+        """Some samples of the batch."""
+        tensors = (self.images, self.depth, self.valid, self.cam_from_world, self.K)
+        return ViewBatch(*(tensor[index] for tensor in tensors), self.context)
+
+
+@dataclass(frozen=True)
+class Hints:
+    """Features of context and projections.
+
+    Attributes:
+        level1: (B, V, C, h, w) normalised and masked: what the denoiser is conditioned on.
+        unmasked: (B, V, C, h, w) normalised: where a hint skip starts from.
+        level0: (B, V, C, h, w) normalised on context views, zeros on targets.
+        token: (B, V, C) raw token 0 of level 1, for ``Backbone.propagate``.
+        mask: (B, V, 1, h, w) in {0, 1}.
+    """
+
+    level1: Tensor
+    unmasked: Tensor
+    level0: Tensor
+    token: Tensor
+    mask: Tensor
+
+
+def feature_mask(valid: Tensor, grid: tuple[int, int], share: float) -> Tensor:
+    """(B, V, 1, H, W) validity to (B, V, 1, h, w) in {0, 1}: enough of a token's pixels are valid.
+
+    A ``share`` of 0 counts every token.
+    """
+    patch = (valid.shape[-2] // grid[0], valid.shape[-1] // grid[1])
+    covered = F.avg_pool2d(valid.float().flatten(0, 1), patch).unflatten(0, valid.shape[:2])
+    # The mean of a patch is rounded; half of an even number of pixels must still count as half.
+    return (covered >= share - 1e-6).to(torch.float32)
+
+
+def depth_condition(depth: Tensor, valid: Tensor, scale: Tensor) -> Tensor:
+    """(B, V, 2, H, W): log of the depth in the cameras' unit where valid, and the validity.
+
+    Args:
+        depth: (B, V, 1, H, W) scene units.
+        valid: (B, V, 1, H, W).
+        scale: (B,) of the camera condition: normalised units a scene unit.
+    """
+    known = (valid > 0) & (depth > 0) & torch.isfinite(depth)
+    unit = torch.where(known, depth, torch.ones_like(depth)) * scale[:, None, None, None, None]
+    log = unit.clamp_min(torch.finfo(unit.dtype).tiny).log()
+    log = log.clamp(-LOG_DEPTH_LIMIT, LOG_DEPTH_LIMIT) * known
+    return torch.cat((log, known.to(log.dtype)), dim=2)
+
+
+def filled(batch: ViewBatch, config: HintConfig) -> ViewBatch:
+    """The batch with its holes filled as ``config.fill`` says."""
+    if config.fill == "none":
+        return batch
+    flat = batch.valid.flatten(0, 1)
+    shape = batch.images.shape[:2]
+    images = push_pull(batch.images.flatten(0, 1), flat).unflatten(0, shape)
+    depth = push_pull_depth(batch.depth.flatten(0, 1), flat).unflatten(0, shape)
+    return ViewBatch(images, depth, batch.valid, batch.cam_from_world, batch.K, batch.context)
+
+
+@torch.no_grad()
+def encode_hints(
+    network: DepthAnything3,
+    level0: LatentStatistics,
+    level1: LatentStatistics,
+    batch: ViewBatch,
+    config: HintConfig,
+) -> Hints:
+    """Eq. 1 for every sample of a batch (see the module).
+
+    Args:
+        network: the frozen encoder.
+        level0: statistics of level 0.
+        level1: statistics of level 1.
+        batch: its holes filled already where they should be (``filled``).
+        config: see ``HintConfig``.
+    """
+    grid = network.encoder.grid(*batch.size)
+    mask = feature_mask(batch.valid, grid, config.mask)
+    mask[:, : batch.context] = 1
+    told = batch.valid.flatten(2).any(2)
+    told[:, : batch.context] = True
+    context = batch.context
+    alone = _encode(network, batch, slice(0, context), config)
+    shape = (*batch.images.shape[:2], 1 + grid[0] * grid[1], network.config.encoder.channels)
+    joint = [alone[0].new_zeros(shape) for _ in range(2)]
+    for pattern in torch.unique(told, dim=0):
+        samples = (told == pattern).all(1).nonzero()[:, 0]
+        if not bool(pattern[context:].any()):
+            for level, features in zip(joint, alone, strict=True):
+                level[samples, :context] = features[samples]
+            continue
+        views = pattern.nonzero()[:, 0]
+        part = _encode(network, batch.samples(samples), views, config)
+        for level, features in zip(joint, part, strict=True):
+            level[samples[:, None], views] = features
+    if config.encode == "alone":
+        for level, features in zip(joint, alone, strict=True):
+            level[:, :context] = features
+    if config.token == "own":
+        token = joint[1][:, :, 0].clone()
+        silent = ~told
+        if bool(silent.any()):
+            token[silent] = _silent_tokens(token, context)[silent]
+    else:
+        first = alone if context == 1 else _encode(network, batch, slice(0, 1), config)
+        token = first[1][:, :, 0].expand(-1, shape[1], -1)
+
+    features = level1.normalise(_maps(joint[1], grid))
+    features = features * told[:, :, None, None, None]
+    source = alone[0] if config.cascade_context == "alone" else joint[0][:, :context]
+    shallow = torch.zeros_like(features)
+    shallow[:, :context] = level0.normalise(_maps(source, grid))
+    return Hints(
+        level1=features * mask.to(features.dtype),
+        unmasked=features,
+        level0=shallow,
+        token=token,
+        mask=mask,
+    )
+
+
+@torch.no_grad()
+def encode_latents(
+    network: DepthAnything3,
+    level0: LatentStatistics,
+    level1: LatentStatistics,
+    batch: ViewBatch,
+    *,
+    cameras: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Clean level-0 and level-1 latents of true pictures of all views, encoded jointly.
+
+    Args:
+        network: the frozen encoder.
+        level0: statistics of level 0.
+        level1: statistics of level 1.
+        batch: true pictures on all views.
+        cameras: see ``HintConfig.cameras``.
+
+    Returns:
+        Two (B, V, C, h, w) tensors, normalised.
+    """
+    grid = network.encoder.grid(*batch.size)
+    both = _encode(network, batch, slice(None), HintConfig(cameras=cameras))
+    return level0.normalise(_maps(both[0], grid)), level1.normalise(_maps(both[1], grid))
+
+
+def _encode(
+    network: DepthAnything3, batch: ViewBatch, views: slice | Tensor, config: HintConfig
+) -> list[Tensor]:
+    """Raw levels 0 and 1 of some views; with known cameras relative to the batch's first view."""
+    images = batch.images[:, views]
+    if not config.cameras:
+        return network.encode(images, levels=2)
+    cameras, _ = relative_cameras(batch.cam_from_world)
+    return network.encode(images, levels=2, cam_from_world=cameras[:, views], K=batch.K[:, views])
+
+
+def _silent_tokens(token: Tensor, context: int) -> Tensor:
+    """Stand-ins for views that were not encoded: the mean over the context views."""
+    return token[:, :context].mean(1, keepdim=True).expand_as(token)
+
+
+def _maps(level: Tensor, grid: tuple[int, int]) -> Tensor:
+    """(B, V, 1 + N, C) tokens to (B, V, C, h, w) maps, without token 0."""
+    return level[:, :, 1:].transpose(2, 3).unflatten(3, grid)

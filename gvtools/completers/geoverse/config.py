@@ -1,0 +1,188 @@
+"""The whole model's configuration: ``base`` (the paper's), ``tiny`` (trainable on a CPU)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+from gvtools.completers.geoverse.conditioning import HintConfig
+from gvtools.completers.geoverse.config_json import from_json, to_json
+from gvtools.completers.geoverse.control import ControlConfig
+from gvtools.completers.geoverse.denoiser import DenoiserConfig
+from gvtools.completers.geoverse.depth_anything import DepthAnythingConfig
+from gvtools.completers.geoverse.flow import check_bounds
+from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
+from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
+from gvtools.completers.geoverse.video_prior import VideoPriorConfig
+from gvtools.errors import CheckpointError, OptionError
+
+NAMES = ("base", "tiny")
+
+
+@dataclass(frozen=True)
+class FlowConfig:
+    """How latents are sampled.
+
+    Attributes:
+        prediction: what the level-1 denoiser is trained to return: "velocity" (the paper) or
+            "clean" latents, from which the velocity follows.
+        skip: with "clean": the denoiser returns the difference from the hints' features.
+        least_time: t below which a clean prediction's velocity is not divided further.
+        level1: interval bounds of level 1, from 1 to 0; one denoiser evaluation an interval.
+        cascade: interval bounds of level 0.
+        shift: of the training times, t' = s t / (1 + (s - 1) t); 1 for none (the paper).
+        guidance: classifier-free guidance scale over the cameras; 1 for none (the paper).
+    """
+
+    prediction: str = "velocity"
+    skip: bool = False
+    least_time: float = 0.05
+    level1: tuple[float, ...] = (1.0, 2 / 3, 1 / 3, 0.0)
+    cascade: tuple[float, ...] = (1.0, 0.0)
+    shift: float = 1.0
+    guidance: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.prediction not in ("velocity", "clean"):
+            raise OptionError(
+                f"flow.prediction = {self.prediction!r}; expected 'velocity' or 'clean'"
+            )
+        if self.skip and self.prediction != "clean":
+            raise OptionError("flow.skip needs flow.prediction = 'clean'")
+        check_bounds(self.level1)
+        check_bounds(self.cascade)
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """Camera conventions of the denoisers.
+
+    Attributes:
+        pixel_offset: what is added to a pixel's column and row before it becomes a ray. GLD's
+            checkpoints were trained with (-0.5, 0.5); (0.5, 0.5) is the centre of the pixel.
+        reference: the view whose frame the Plücker rays are given in; GLD's is the last.
+    """
+
+    pixel_offset: tuple[float, float] = (-0.5, 0.5)
+    reference: int = -1
+
+
+@dataclass(frozen=True)
+class GeoVerseConfig:
+    """Everything that is needed to build the model; the defaults are ``base``.
+
+    Attributes:
+        name: of the configuration.
+        image_size: longest side of the model's pictures, px, a multiple of the patch.
+        views: views of a pass, context and targets.
+        context: most context views of a pass.
+        geometry: the frozen encoder and geometry head.
+        rgb: the RGB head.
+        level1: the level-1 denoiser.
+        cascade: the level-0 denoiser; None: level 0 is left at its mean.
+        hints: how projections become features.
+        flow: how latents are sampled.
+        camera: camera conventions.
+        alignment: how generated depth gets the memory's scale, see ``depth_scale``: "centres" (the
+            paper), "hint" or "field".
+        video: the video prior; None for a model without one.
+        injection: how video features enter: "control", "shared" (MoT) or "none".
+        control: of the control branch.
+        shared: of the MoT variant.
+    """
+
+    name: str = "base"
+    image_size: int = 504
+    views: int = 8
+    context: int = 4
+    geometry: DepthAnythingConfig = field(default_factory=DepthAnythingConfig)
+    rgb: RGBHeadConfig = field(default_factory=RGBHeadConfig)
+    level1: DenoiserConfig = field(default_factory=lambda: DenoiserConfig(depth_condition=True))
+    cascade: DenoiserConfig | None = field(
+        default_factory=lambda: DenoiserConfig(
+            head_depth=2, source=True, separate_embedders=False, projective_size=504
+        )
+    )
+    hints: HintConfig = field(default_factory=HintConfig)
+    flow: FlowConfig = field(default_factory=FlowConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    alignment: str = "centres"
+    video: VideoPriorConfig | None = field(default_factory=VideoPriorConfig)
+    injection: str = "control"
+    control: ControlConfig = field(default_factory=ControlConfig)
+    shared: SharedAttentionConfig = field(default_factory=SharedAttentionConfig)
+
+    def __post_init__(self) -> None:
+        encoder = self.geometry.encoder
+        channels = encoder.channels
+        levels = len(encoder.taps)
+        if self.injection not in ("control", "shared", "none"):
+            raise OptionError(
+                f"injection = {self.injection!r}; expected 'control', 'shared' or 'none'"
+            )
+        if self.alignment not in ("centres", "hint", "field"):
+            raise OptionError(
+                f"alignment = {self.alignment!r}; expected 'centres', 'hint' or 'field'"
+            )
+        if (self.injection == "none") != (self.video is None):
+            raise OptionError(
+                "a video prior needs injection = 'control' or 'shared', and 'none' goes without one"
+            )
+        if self.image_size % encoder.patch:
+            raise OptionError(
+                f"image_size = {self.image_size}; expected a multiple of the patch {encoder.patch}"
+            )
+        expected = {
+            "geometry.head.channels": (self.geometry.head.channels, channels),
+            "geometry.head.patch": (self.geometry.head.patch, encoder.patch),
+            "level1.channels": (self.level1.channels, channels),
+            "level1.camera_patch": (self.level1.camera_patch, encoder.patch),
+            "rgb.in_channels": (self.rgb.in_channels, levels * channels),
+            "rgb.patch": (self.rgb.patch, encoder.patch),
+        }
+        if self.cascade is not None:
+            expected["cascade.channels"] = (self.cascade.channels, channels)
+            expected["cascade.camera_patch"] = (self.cascade.camera_patch, encoder.patch)
+        for name, (found, wanted) in expected.items():
+            if found != wanted:
+                raise OptionError(f"{name} = {found}; the encoder's dimensions ask for {wanted}")
+
+    @property
+    def patch(self) -> int:
+        """Pixels of a token's edge."""
+        return self.geometry.encoder.patch
+
+
+def named(name: str) -> GeoVerseConfig:
+    """One of the configurations that ship with the package.
+
+    Raises:
+        OptionError: an unknown name.
+    """
+    if name not in NAMES:
+        raise OptionError(f"no configuration {name!r}; known: {', '.join(NAMES)}")
+    text = resources.files(__package__).joinpath("configs", f"{name}.json").read_text("utf-8")
+    return from_json(GeoVerseConfig, json.loads(text))
+
+
+def read(path: Path) -> GeoVerseConfig:
+    """A configuration from its JSON file.
+
+    Raises:
+        CheckpointError: no such file, no JSON, or not a configuration of this model.
+    """
+    try:
+        return from_json(GeoVerseConfig, json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"no {path}; expected the config.json of a GeoVerse folder (gvtools weights list)"
+        ) from None
+    except (OSError, ValueError, OptionError) as error:
+        raise CheckpointError(f"{path}: {error}; expected a GeoVerse configuration") from None
+
+
+def write(config: GeoVerseConfig, path: Path) -> None:
+    """The configuration as JSON, every field written out."""
+    path.write_text(json.dumps(to_json(config), indent=2) + "\n", encoding="utf-8")

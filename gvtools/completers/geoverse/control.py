@@ -1,0 +1,111 @@
+"""The ControlNet-style branch: video features become residuals of the denoiser's encoder.
+
+For each video level l, with the denoiser's token stream h and the control stream c (Eqs. 5, 6)::
+
+    c[l+1] = B_ctrl[l](c[l] + A[l](F_W[l]); t, cameras),   c[0] = the tokens that enter the encoder
+    h      = B(h; t, cameras) + Z[l](c[l+1])
+
+B_ctrl starts as a copy of the denoiser's blocks, Z at zero: a fresh branch changes nothing, and on
+the first step only Z receives a gradient.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
+
+
+@dataclass(frozen=True)
+class ControlConfig:
+    """Where the control branch enters.
+
+    Attributes:
+        layers: encoder blocks of the denoiser after which a residual is added, one for each video
+            level. The paper does not name them: spread over GLD's 28 by default.
+    """
+
+    layers: tuple[int, ...] = (0, 7, 14, 21)
+
+
+class FeatureAdapter(nn.Module):
+    """A[l]: video features at the tokens' resolution and width."""
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        self.reduce = nn.Conv2d(channels, width, 1)
+        self.mix = nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, feature: Tensor, grid: tuple[int, int]) -> Tensor:
+        """(B, V, C, h', w') to (B, V, N, width)."""
+        batch_views = feature.shape[:2]
+        x = self.reduce(feature.flatten(0, 1).to(self.reduce.weight.dtype))
+        if tuple(x.shape[-2:]) != grid:
+            x = F.interpolate(x, size=grid, mode="bilinear", align_corners=False)
+        x = self.mix(F.silu(x))
+        return x.flatten(2).transpose(1, 2).unflatten(0, batch_views)
+
+
+class ControlBranch(nn.Module):
+    """See the module.
+
+    Args:
+        config: see ``ControlConfig``.
+        denoiser: its blocks at the control layers are copied.
+        video_channels: channels of the video features.
+    """
+
+    def __init__(self, config: ControlConfig, denoiser: Denoiser, *, video_channels: int) -> None:
+        super().__init__()
+        self.config = config
+        width = denoiser.config.width
+        self.adapters = nn.ModuleList(FeatureAdapter(video_channels, width) for _ in config.layers)
+        self.blocks = nn.ModuleList(copy.deepcopy(denoiser.blocks[i]) for i in config.layers)
+        self.outputs = nn.ModuleList(nn.Linear(width, width) for _ in config.layers)
+        for output in self.outputs:
+            nn.init.zeros_(output.weight)
+            nn.init.zeros_(output.bias)
+
+    def copy_from(self, denoiser: Denoiser) -> None:
+        """Start the branch's blocks from the denoiser's, after that has loaded its weights."""
+        for block, layer in zip(self.blocks, self.config.layers, strict=True):
+            block.load_state_dict(denoiser.blocks[layer].state_dict())
+
+    def adapted(self, features: Sequence[Tensor], grid: tuple[int, int]) -> list[Tensor]:
+        """A[l](F_W[l]) of all levels; does not depend on the step, so compute it once."""
+        return [
+            adapter(feature, grid) for adapter, feature in zip(self.adapters, features, strict=True)
+        ]
+
+    def forward(
+        self,
+        denoiser: Denoiser,
+        noisy: Tensor,
+        t: Tensor,
+        conditions: Conditions,
+        *,
+        adapted: Sequence[Tensor],
+        positions: Positions,
+    ) -> dict[int, Tensor]:
+        """The residuals of this step, (B, V, N, width) by encoder block.
+
+        Args:
+            denoiser: whose embedders and time embedding the branch shares.
+            noisy: (B, V, C, h, w).
+            t: (B,) or (B, V).
+            conditions: as the denoiser gets them.
+            adapted: from ``adapted``.
+            positions: as the denoiser gets them.
+        """
+        stream, _ = denoiser.embed(noisy, conditions)
+        c = F.silu(denoiser.time(t, noisy.shape[1]).to(stream.dtype))
+        residuals = {}
+        for index, layer in enumerate(self.config.layers):
+            stream = self.blocks[index](stream + adapted[index], c, positions.encoder)
+            residuals[layer] = self.outputs[index](stream)
+        return residuals

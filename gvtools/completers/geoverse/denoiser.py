@@ -1,0 +1,343 @@
+"""The multi-view denoiser: a diffusion transformer with a wide head, over all tokens of all views.
+
+A narrow, deep *encoder* reads the conditions and writes one conditioning vector a token; a wide,
+shallow *head* denoises under it (Zheng et al. 2025, RAE; Geometric Latent Diffusion). Every block
+attends over all views at once; position comes only from the cameras (``projective.py``).
+
+The same class is level 1 (separate embedders for context and target views, both streams read
+[condition | noisy]) and the level-0 cascade (``source``: the encoder reads [condition | level 1]).
+Parameter names are those of GLD's checkpoints. What GeoVerse adds (``depth_condition``) starts at
+zero: a fresh extension returns the pretrained output bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gvtools.completers.geoverse.attention import attend
+from gvtools.completers.geoverse.plucker import CameraCondition
+from gvtools.completers.geoverse.projective import Projective
+from gvtools.completers.geoverse.shared_attention import VideoKeys
+from gvtools.errors import ShapeError
+
+CAMERA_CHANNELS = 7
+DEPTH_CHANNELS = 2
+
+
+@dataclass(frozen=True)
+class DenoiserConfig:
+    """Dimensions of a denoiser; the defaults are GLD's level 1.
+
+    Attributes:
+        channels: of the latents.
+        width: channels of the encoder's tokens.
+        depth: blocks of the encoder.
+        heads: attention heads of the encoder.
+        head_width: channels of the head's tokens.
+        head_depth: blocks of the head.
+        head_heads: attention heads of the head.
+        mlp_ratio: hidden width of a block's MLP over 1.5 times its width (SwiGLU).
+        frequencies: of the time embedding.
+        camera_patch: pixels of the camera map a token.
+        source: the encoder's second input is a source latent (the cascade), not the noisy one.
+        separate_embedders: context and target views have their own embedders.
+        projective_size: K is normalised by this square, px; by the image's size where None. The
+            released cascade has a fixed square.
+        invert_K: keys and values carry K's inverse, as the projective encoding is published; GLD's
+            checkpoints were trained with K itself in its place.
+        depth_condition: projected depth and validity enter through a zero-initialised embedder.
+    """
+
+    channels: int = 1536
+    width: int = 768
+    depth: int = 28
+    heads: int = 16
+    head_width: int = 2048
+    head_depth: int = 6
+    head_heads: int = 16
+    mlp_ratio: float = 4.0
+    frequencies: int = 256
+    camera_patch: int = 14
+    source: bool = False
+    separate_embedders: bool = True
+    projective_size: int | None = None
+    invert_K: bool = False
+    depth_condition: bool = False
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a denoiser knows, constant over the steps.
+
+    Attributes:
+        latents: (B, V, C, h, w) normalised: clean context, hints or zeros on targets.
+        camera: Plücker map, cameras and image size.
+        source: (B, V, C, h, w) normalised level-1 latents, for the cascade.
+        depth: (B, V, 2, H, W) from ``conditioning.depth_condition``, or None.
+    """
+
+    latents: Tensor
+    camera: CameraCondition
+    source: Tensor | None = None
+    depth: Tensor | None = None
+
+
+class Positions:
+    """Projective transforms of one pass for the two head widths."""
+
+    def __init__(self, config: DenoiserConfig, camera: CameraCondition, grid: tuple[int, int]):
+        square = config.projective_size
+        size = camera.size if square is None else (square, square)
+        self.encoder, self.head = (
+            Projective(
+                camera.cam_from_world, camera.K, size, grid, head_dim, invert_K=config.invert_K
+            )
+            for head_dim in (
+                config.width // config.heads,
+                config.head_width // config.head_heads,
+            )
+        )
+
+
+class PixelEmbed(nn.Module):
+    """(B, C, H, W) to tokens (B, N, width) by patches."""
+
+    def __init__(self, channels: int, width: int, patch: int = 1) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(channels, width, kernel_size=patch, stride=patch)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Tokens, row-major."""
+        return self.proj(x).flatten(2).transpose(1, 2)
+
+
+class TimeEmbed(nn.Module):
+    """t in [0, 1] to a vector, by frozen Gaussian Fourier features."""
+
+    W: Tensor
+
+    def __init__(self, width: int, frequencies: int) -> None:
+        super().__init__()
+        self.W = nn.Parameter(torch.randn(frequencies), requires_grad=False)
+        self.mlp = nn.Sequential(
+            nn.Linear(2 * frequencies, width), nn.SiLU(), nn.Linear(width, width)
+        )
+
+    def forward(self, t: Tensor) -> Tensor:
+        """(...,) to (..., width); the angles are computed in float32."""
+        angle = t[..., None].float() * self.W.float() * (2 * math.pi)
+        return self.mlp(torch.cat((angle.sin(), angle.cos()), -1).to(self.mlp[0].weight.dtype))
+
+
+class SwiGLU(nn.Module):
+    """Gated MLP: w3(silu(a) * b) with [a, b] = w12(x)."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.w12 = nn.Linear(width, 2 * hidden)
+        self.w3 = nn.Linear(hidden, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., width) to the same."""
+        gate, value = self.w12(x).chunk(2, dim=-1)
+        return self.w3(nn.functional.silu(gate) * value)
+
+
+class CameraAttention(nn.Module):
+    """Self-attention over all tokens of all views, with projective positions."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(width, 3 * width)
+        self.proj = nn.Linear(width, width)
+
+    def forward(self, x: Tensor, positions: Projective, video: VideoKeys | None = None) -> Tensor:
+        """(B, T, width) to the same; ``video`` holds further keys and values (MoT variant)."""
+        q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        q, k, v = positions.query(q), positions.key(k), positions.value(v)
+        out = attend(q, k, v) if video is None else video.attend(q, k, v)
+        return self.proj(positions.output(out).transpose(1, 2).flatten(2))
+
+
+class DenoiserBlock(nn.Module):
+    """Attention and MLP, each shifted, scaled and gated by the conditioning vector."""
+
+    def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
+        super().__init__()
+        self.norm1 = nn.RMSNorm(width, eps=1e-6)
+        self.attn = CameraAttention(width, heads)
+        self.norm2 = nn.RMSNorm(width, eps=1e-6)
+        self.mlp = SwiGLU(width, int(2 / 3 * int(width * mlp_ratio)))
+        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 6 * width))
+
+    def forward(
+        self, x: Tensor, c: Tensor, positions: Projective, video: VideoKeys | None = None
+    ) -> Tensor:
+        """Tokens under their conditioning.
+
+        Args:
+            x: (B, V, N, width).
+            c: (B, V, 1 or N, width).
+            positions: of the V * N tokens.
+            video: see ``CameraAttention``.
+        """
+        shift1, scale1, gate1, shift2, scale2, gate2 = self.adaLN_modulation(c).chunk(6, dim=-1)
+        inner = modulated(self.norm1(x), shift1, scale1).flatten(1, 2)
+        x = x + gate1 * self.attn(inner, positions, video).view_as(x)
+        return x + gate2 * self.mlp(modulated(self.norm2(x), shift2, scale2))
+
+
+class FinalLayer(nn.Module):
+    """Tokens to latent channels."""
+
+    def __init__(self, width: int, channels: int) -> None:
+        super().__init__()
+        self.norm_final = nn.RMSNorm(width, eps=1e-6)
+        self.linear = nn.Linear(width, channels)
+        self.adaLN_modulation = nn.Sequential(nn.SiLU(), nn.Linear(width, 2 * width))
+
+    def forward(self, x: Tensor, c: Tensor) -> Tensor:
+        """(B, V, N, width) under (B, V, N, width) to (B, V, N, channels)."""
+        shift, scale = self.adaLN_modulation(c).chunk(2, dim=-1)
+        return self.linear(modulated(self.norm_final(x), shift, scale))
+
+
+class Denoiser(nn.Module):
+    """See the module.
+
+    ``forward`` returns the velocity of the linear path, or clean latents where the model's
+    configuration says so (``FlowConfig.prediction``).
+    """
+
+    def __init__(self, config: DenoiserConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, head_width, pair = config.width, config.head_width, 2 * config.channels
+        for stream, out in (("x", head_width), ("s", width)):
+            for suffix in ("_ref", "_tgt") if config.separate_embedders else ("",):
+                self.add_module(f"{stream}_embedder{suffix}", PixelEmbed(pair, out))
+        self.s_projector = nn.Linear(width, head_width)
+        self.t_embedder = TimeEmbed(width, config.frequencies)
+        self.camera_embedder = PixelEmbed(CAMERA_CHANNELS, width, config.camera_patch)
+        self.blocks = nn.ModuleList(
+            DenoiserBlock(width, config.heads, config.mlp_ratio)
+            if index < config.depth
+            else DenoiserBlock(head_width, config.head_heads, config.mlp_ratio)
+            for index in range(config.depth + config.head_depth)
+        )
+        self.final_layer = FinalLayer(head_width, config.channels)
+        if config.depth_condition:
+            self.depth_embedder = PixelEmbed(DEPTH_CHANNELS, width, config.camera_patch)
+        self._initialise()
+
+    def _initialise(self) -> None:
+        """Gates, the output and the added condition start at zero."""
+        zero = [block.adaLN_modulation[1] for block in self.blocks]
+        zero += [self.final_layer.adaLN_modulation[1], self.final_layer.linear]
+        if self.config.depth_condition:
+            zero.append(self.depth_embedder.proj)
+        for layer in zero:
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def embed(self, noisy: Tensor, conditions: Conditions) -> tuple[Tensor, Tensor]:
+        """Tokens that enter the encoder, (B, V, N, width), and the head, (B, V, N, head_width)."""
+        second = noisy
+        if self.config.source:
+            if conditions.source is None:
+                raise ShapeError("the cascade got no source latents; give the level-1 latents")
+            second = conditions.source
+        context = conditions.camera.context
+        s = self._split("s", torch.cat((conditions.latents, second), dim=2), context)
+        s = s + _tokens(self.camera_embedder, conditions.camera.map.to(s.dtype))
+        if self.config.depth_condition and conditions.depth is not None:
+            s = s + _tokens(self.depth_embedder, conditions.depth.to(s.dtype))
+        x = self._split("x", torch.cat((conditions.latents, noisy), dim=2), context)
+        # Under autocast the streams stay in full precision; only the products are rounded.
+        stream = self.t_embedder.W.dtype
+        return s.to(stream), x.to(stream)
+
+    def time(self, t: Tensor, views: int) -> Tensor:
+        """(B,) or (B, V) to the encoder's (B, V, 1, width) time embedding."""
+        embedded = self.t_embedder(t)
+        if t.ndim == 1:
+            embedded = embedded[:, None].expand(-1, views, -1)
+        return embedded[:, :, None]
+
+    def forward(
+        self,
+        noisy: Tensor,
+        t: Tensor,
+        conditions: Conditions,
+        *,
+        residuals: Mapping[int, Tensor] | None = None,
+        video: Mapping[int, VideoKeys] | None = None,
+        positions: Positions | None = None,
+    ) -> Tensor:
+        """The velocity of every view.
+
+        Args:
+            noisy: (B, V, C, h, w).
+            t: (B,) or (B, V) in [0, 1]; 1 is noise.
+            conditions: see ``Conditions``; its context views come first.
+            residuals: what is added after an encoder block, (B, V, N, width), by its index.
+            video: further keys and values of an encoder block, by its index.
+            positions: of this grid and cameras, when the caller has them already.
+
+        Returns:
+            (B, V, C, h, w).
+        """
+        grid = (noisy.shape[-2], noisy.shape[-1])
+        self._check(noisy, conditions)
+        positions = positions or Positions(self.config, conditions.camera, grid)
+        s, x = self.embed(noisy, conditions)
+        time = self.time(t, noisy.shape[1]).to(s.dtype)
+        c = nn.functional.silu(time)
+        for index in range(self.config.depth):
+            extra = None if video is None else video.get(index)
+            s = self.blocks[index](s, c, positions.encoder, extra)
+            if residuals is not None and index in residuals:
+                s = s + residuals[index]
+        s = self.s_projector(nn.functional.silu(time + s))
+        for block in self.blocks[self.config.depth :]:
+            x = block(x, s, positions.head)
+        return self.final_layer(x, s).transpose(2, 3).unflatten(3, grid)
+
+    def _split(self, stream: str, x: Tensor, context: int) -> Tensor:
+        """Embeds (B, V, 2C, h, w), context views by their own layer where there is one."""
+        if not self.config.separate_embedders:
+            return _tokens(getattr(self, f"{stream}_embedder"), x)
+        reference = _tokens(getattr(self, f"{stream}_embedder_ref"), x[:, :context])
+        target = _tokens(getattr(self, f"{stream}_embedder_tgt"), x[:, context:])
+        return torch.cat((reference, target), dim=1)
+
+    def _check(self, noisy: Tensor, conditions: Conditions) -> None:
+        expected = tuple(conditions.latents.shape)
+        height, width = conditions.camera.size
+        patch, (rows, columns) = self.config.camera_patch, noisy.shape[-2:]
+        if tuple(noisy.shape) != expected or noisy.shape[2] != self.config.channels:
+            raise ShapeError(
+                f"latents {tuple(noisy.shape)} with conditions {expected}; expected equal shapes "
+                f"(B, V, {self.config.channels}, h, w)"
+            )
+        if (rows * patch, columns * patch) != (height, width):
+            raise ShapeError(
+                f"latents of {columns}x{rows} tokens with cameras of {width}x{height} pixels; "
+                f"expected {patch} pixels a token"
+            )
+
+
+def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    """``x`` (1 + scale) + shift."""
+    return x * (1 + scale) + shift
+
+
+def _tokens(embed: nn.Module, x: Tensor) -> Tensor:
+    """(B, V, C, H, W) through a per-view embedder to (B, V, N, width)."""
+    return embed(x.flatten(0, 1)).unflatten(0, x.shape[:2])

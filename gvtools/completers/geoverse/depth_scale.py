@@ -1,0 +1,118 @@
+"""The model's depth in the memory's scale.
+
+Three ways, the first the paper's: one scale a pass from camera centres (Eq. "scale-aligned"), one
+robust scale a view from the projected memory, or a smooth field of log ratios to it. Each is
+refused where nothing supports it, and then the next one is asked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gvtools.completers.geoverse.fill import push_pull
+from gvtools.completers.geoverse.geometry_head import Geometry
+from gvtools.completers.geoverse.rays import camera_centres
+from gvtools.completers.geoverse.similarity_scale import center_similarity
+from gvtools.errors import OptionError
+from gvtools.similarity import align_depth_scale
+
+ALIGNMENTS = ("centres", "hint", "field")
+# Centres that fit the cameras worse than this say nothing of the scale.
+MIN_CORRELATION = 0.9
+# A log-ratio field that asks for more than this factor about its median is no scale error.
+MAX_FIELD = 1.5
+
+
+@dataclass(frozen=True)
+class ScaledDepth:
+    """Depth in scene units, and how it got there.
+
+    Attributes:
+        depth: (T, H, W) z-depth; 0 for views without a supported scale.
+        scale: (T,) factor, the field's median; NaN where refused.
+        method: for each view, what was used: one of ``ALIGNMENTS`` or "none".
+    """
+
+    depth: NDArray[np.float32]
+    scale: NDArray[np.float64]
+    method: tuple[str, ...]
+
+
+def centre_scale(geometry: Geometry, world_from_cam: NDArray[np.float64]) -> tuple[float, str]:
+    """s* between the predicted centres of all views and the requested ones, or NaN with a reason.
+
+    Args:
+        geometry: (1, V, ...) of a pass.
+        world_from_cam: (V, 4, 4), scene units.
+    """
+    predicted = camera_centres(geometry.ray.float(), geometry.ray_confidence.float()).cpu()
+    reference = torch.from_numpy(np.ascontiguousarray(world_from_cam[None, :, :3, 3]))
+    fitted = center_similarity(predicted.double(), reference)
+    if not bool(fitted.ok[0]):
+        return float("nan"), fitted.status[0]
+    correlation = float(fitted.correlation[0])
+    if correlation < MIN_CORRELATION:
+        return float("nan"), f"centres correlate by {correlation:.2f}, below {MIN_CORRELATION}"
+    return float(fitted.scale[0]), "aligned"
+
+
+def scaled_depth(
+    depth: Tensor,
+    hint: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    *,
+    centres: float,
+    alignment: str,
+) -> ScaledDepth:
+    """Depth of target views in scene units.
+
+    Args:
+        depth: (T, H, W) of the model, at the hint's resolution.
+        hint: (T, H, W) the memory's depth, scene units.
+        valid: (T, H, W) where it is known.
+        centres: scale from ``centre_scale``; NaN when refused.
+        alignment: one of ``ALIGNMENTS``.
+
+    Raises:
+        OptionError: another alignment.
+    """
+    if alignment not in ALIGNMENTS:
+        raise OptionError(f"alignment {alignment!r}; expected one of {', '.join(ALIGNMENTS)}")
+    made = depth.float().cpu().numpy().astype(np.float32)
+    result = np.zeros_like(made)
+    scale = np.full(len(made), np.nan)
+    methods = []
+    for index, view in enumerate(made):
+        fitted = align_depth_scale(view, hint[index], valid=valid[index], max_residual=0.5)
+        order = {
+            "centres": ("centres", "hint"),
+            "hint": ("hint", "centres"),
+            "field": ("field", "hint", "centres"),
+        }[alignment]
+        known = {"centres": centres, "hint": fitted.scale, "field": fitted.scale}
+        method = next((name for name in order if np.isfinite(known[name])), "none")
+        methods.append(method)
+        if method == "none":
+            continue
+        scale[index] = known[method]
+        result[index] = view * np.float32(scale[index])
+        if method == "field":
+            result[index] *= _field(result[index], hint[index], valid[index])
+    return ScaledDepth(result, scale, tuple(methods))
+
+
+def _field(
+    depth: NDArray[np.float32], hint: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Exponential of the push-pull of log(hint / depth) over valid pixels, within ``MAX_FIELD``."""
+    known = valid & (hint > 0) & (depth > 0)
+    limit = np.log(MAX_FIELD)
+    ratio = np.zeros_like(depth)
+    ratio[known] = np.clip(np.log(hint[known] / depth[known]), -limit, limit)
+    filled = push_pull(torch.from_numpy(ratio)[None, None], torch.from_numpy(known)[None, None])
+    return np.exp(filled[0, 0].numpy())

@@ -1,0 +1,57 @@
+"""Push-pull filling of holes, in torch: averages of the known pixels, coarse to fine.
+
+Of use where a network should see a plausible picture instead of black holes. (Gortler et al. 1996,
+The Lumigraph.)
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def push_pull(values: Tensor, valid: Tensor) -> Tensor:
+    """Holes filled from averages over growing windows; known pixels stay as they are.
+
+    Args:
+        values: (B, C, H, W); what stands in the holes is ignored, NaN included.
+        valid: (B, 1, H, W), > 0 where known.
+
+    Returns:
+        (B, C, H, W); zeros for an image without a known pixel.
+    """
+    weight = (valid > 0).to(values.dtype)
+    known = torch.where(weight > 0, values, values.new_zeros(()))
+    pyramid = [(known, weight)]
+    while max(known.shape[-2:]) > 1:
+        total, weight = _halved(known * weight), _halved(weight)
+        known = total / weight.clamp_min(torch.finfo(values.dtype).tiny)
+        # An average counts by its share of known pixels, wholly from a quarter on.
+        weight = (4 * weight).clamp_max(1)
+        pyramid.append((known, weight))
+    filled, _ = pyramid.pop()
+    while pyramid:
+        known, weight = pyramid.pop()
+        size = (known.shape[-2], known.shape[-1])
+        coarse = F.interpolate(filled, size=size, mode="bilinear", align_corners=False)
+        filled = torch.lerp(coarse, known, weight)
+    return filled
+
+
+def push_pull_depth(depth: Tensor, valid: Tensor) -> Tensor:
+    """Depth filled in its logarithm; see ``push_pull``. Zeros for an image without known depth.
+
+    Args:
+        depth: (B, 1, H, W) > 0 where valid.
+        valid: (B, 1, H, W).
+    """
+    known = (valid > 0) & (depth > 0)
+    log = torch.where(known, depth, torch.ones_like(depth)).log()
+    filled = push_pull(log, known).exp()
+    return torch.where(known.flatten(1).any(1)[:, None, None, None], filled, 0.0)
+
+
+def _halved(x: Tensor) -> Tensor:
+    """Means of 2x2 windows; the odd last row and column stand for themselves and count in full."""
+    return F.avg_pool2d(x, 2, ceil_mode=True, count_include_pad=False)

@@ -1,0 +1,250 @@
+"""Flow matching on a straight path: clean at t = 0, noise at t = 1, and Euler steps between them.
+
+x_t = (1 - t) clean + t noise, velocity u = dx/dt = noise - clean. A time shift s spends more of the
+steps near the noise, t' = s t / (1 + (s - 1) t). Shapes: states (B, ...), usually latents
+(B, V, C, h, w); one t a sample, shared by its views.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from gvtools.errors import OptionError, ShapeError
+from gvtools.options import check_range
+
+Time = TypeVar("Time", float, Tensor)
+Velocity = Callable[[Tensor, Tensor], Tensor]
+
+# Geometric Latent Diffusion stops here, before its shift.
+GLD_END = 0.001
+
+
+def shift_time(t: Time, shift: float) -> Time:
+    """Uniform time to shifted time; 0 and 1 stay, ``shift`` 1 changes nothing."""
+    check_range("time shift", shift, above=0, below=math.inf)
+    return shift * t / (1 + (shift - 1) * t)
+
+
+def unshift_time(t: Time, shift: float) -> Time:
+    """The inverse of ``shift_time``."""
+    check_range("time shift", shift, above=0, below=math.inf)
+    return shift_time(t, 1 / shift)
+
+
+def latent_shift(values: int, *, base: int = 4096) -> float:
+    """Geometric Latent Diffusion's shift sqrt(values / base), of values = C h w V a sample."""
+    check_range("latent values", values, least=1)
+    return math.sqrt(values / base)
+
+
+def time_grid(
+    steps: int, *, shift: float = 1.0, start: float = 1.0, end: float = 0.0
+) -> tuple[float, ...]:
+    """``steps`` + 1 falling times, equally spaced before the shift.
+
+    Args:
+        steps: network evaluations of an Euler run over the grid.
+        shift: see ``shift_time``.
+        start: first and
+        end: last time, both after the shift.
+    """
+    check_range("steps", steps, least=1)
+    check_range("time grid's start", start, above=0, most=1)
+    check_range("time grid's end", end, least=0, below=start)
+    first, last = unshift_time(start, shift), unshift_time(end, shift)
+    inner = (first + (last - first) * k / steps for k in range(1, steps))
+    return (start, *(shift_time(u, shift) for u in inner), end)
+
+
+def gld_time_grid(points: int, *, shift: float) -> tuple[float, ...]:
+    """The grid of Geometric Latent Diffusion: ``points`` times, one network evaluation less.
+
+    It ends above 0, at shift_time(GLD_END): some noise stays in the result.
+    """
+    return time_grid(points - 1, shift=shift, end=shift_time(GLD_END, shift))
+
+
+def interval_bounds(intervals: int | Sequence[float], *, shift: float = 1.0) -> tuple[float, ...]:
+    """Bounds 1 = tau_0 > ... > tau_K = 0 of K intervals, or an explicit list, checked.
+
+    K intervals are equally long before the shift; an explicit list is not shifted.
+    """
+    if isinstance(intervals, int):
+        return time_grid(intervals, shift=shift)
+    return check_bounds(intervals)
+
+
+def check_bounds(bounds: Sequence[float]) -> tuple[float, ...]:
+    """The bounds as floats.
+
+    Raises:
+        OptionError: not 1 = tau_0 > tau_1 > ... > tau_K >= 0 with K >= 1.
+    """
+    tau = tuple(float(bound) for bound in bounds)
+    wanted = "expected 1 = tau_0 > tau_1 > ... > tau_K >= 0"
+    if len(tau) < 2:
+        raise OptionError(f"interval bounds {list(tau)}: {len(tau)} value(s); {wanted}")
+    if tau[0] != 1:
+        raise OptionError(f"interval bounds {list(tau)} begin at {tau[0]:g}; {wanted}")
+    for index in range(1, len(tau)):
+        if not tau[index] < tau[index - 1]:
+            raise OptionError(
+                f"interval bounds {list(tau)}: tau_{index} = {tau[index]:g} is not below "
+                f"tau_{index - 1} = {tau[index - 1]:g}; {wanted}"
+            )
+    if tau[-1] < 0:
+        raise OptionError(f"interval bounds {list(tau)} end at {tau[-1]:g}; {wanted}")
+    return tau
+
+
+def sample_times(
+    batch: int,
+    *,
+    shift: float = 1.0,
+    most: float = 0.999,
+    generator: torch.Generator | None = None,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """Training times (B,) float32: uniform on [0, ``most``), then shifted.
+
+    The paper's t ~ U(0, 1) is ``most`` 1, ``shift`` 1; Geometric Latent Diffusion has 0.999 and
+    ``latent_shift``. Drawn where ``generator`` lives, on the CPU without one.
+    """
+    check_range("largest training time", most, above=0, most=1)
+    home = "cpu" if generator is None else generator.device
+    uniform = torch.rand(batch, generator=generator, device=home) * most
+    return shift_time(uniform, shift).to(device=device)
+
+
+def over_state(t: float | Tensor, state: Tensor) -> float | Tensor:
+    """A time (B,) in the shape that multiplies ``state`` (B, ...); a number stays a number."""
+    if not isinstance(t, Tensor):
+        return t
+    if t.shape != state.shape[: t.ndim]:
+        raise ShapeError(
+            f"time {tuple(t.shape)} for a state {tuple(state.shape)}; expected one a sample"
+        )
+    return t.reshape(t.shape + (1,) * (state.ndim - t.ndim))
+
+
+def interpolate(clean: Tensor, noise: Tensor, t: float | Tensor) -> Tensor:
+    """x_t (B, ...) in the dtype of ``clean``, at t, a number or (B,)."""
+    t = over_state(t, clean)
+    return ((1 - t) * clean + t * noise).to(clean.dtype)
+
+
+def velocity_target(clean: Tensor, noise: Tensor) -> Tensor:
+    """The path's velocity noise - clean (B, ...), the same at every t."""
+    return noise - clean
+
+
+def clean_from_velocity(velocity: Tensor, state: Tensor, t: float | Tensor) -> Tensor:
+    """The clean state x_t - t u (B, ...) that a predicted velocity points back to."""
+    return (state - over_state(t, state) * velocity).to(state.dtype)
+
+
+def velocity_from_clean(
+    clean: Tensor, state: Tensor, t: float | Tensor, *, least: float = 0.05
+) -> Tensor:
+    """The velocity (x_t - clean) / max(t, least) (B, ...) of a prediction of the clean state.
+
+    As t falls to 0, ``least`` keeps the prediction's errors from growing beyond 1 / least.
+    """
+    check_range("least time", least, above=0, most=1)
+    time = over_state(t, state)
+    time = time.clamp(min=least) if isinstance(time, Tensor) else max(time, least)
+    return ((state - clean) / time).to(state.dtype)
+
+
+def guided(velocity: Velocity, unconditional: Velocity | None, scale: float) -> Velocity:
+    """Classifier-free guidance: u = unconditional + scale (conditional - unconditional).
+
+    ``scale`` 1 returns ``velocity`` itself: the unconditional branch is not evaluated.
+
+    Raises:
+        OptionError: a scale other than 1 without an unconditional branch.
+    """
+    check_range("guidance scale", scale, least=0, below=math.inf)
+    if scale == 1:
+        return velocity
+    if unconditional is None:
+        raise OptionError(f"guidance scale {scale:g} needs an unconditional velocity; set it to 1")
+    without = unconditional
+
+    def combined(state: Tensor, t: Tensor) -> Tensor:
+        base = without(state, t)
+        return base + scale * (velocity(state, t) - base)
+
+    return combined
+
+
+def integrate(
+    velocity: Velocity,
+    state: Tensor,
+    times: Sequence[float] | Tensor,
+    *,
+    callback: Callable[[int, Tensor, Tensor], None] | None = None,
+) -> Tensor:
+    """Euler steps of dx/dt = velocity(x, t) along ``times``.
+
+    The state is carried in float32 at least, so that small steps do not vanish in bfloat16; the
+    network receives it in its own dtype. Gradients flow unless the caller turns them off.
+
+    Args:
+        velocity: of (B, ...) and t (B,), returns (B, ...).
+        state: (B, ...) at the first time.
+        times: (S + 1,), or (S + 1, B) for times of each sample's own.
+        callback: receives the number of steps made, their time (B,) and the state (B, ...).
+
+    Returns:
+        The state at the last time, dtype of ``state``.
+    """
+    wide = torch.promote_types(state.dtype, torch.float32)
+    grid = torch.as_tensor(times, dtype=torch.float64, device="cpu")
+    if grid.ndim not in (1, 2) or (grid.ndim == 2 and grid.shape[1] != len(state)):
+        raise ShapeError(
+            f"times {tuple(grid.shape)}; expected (S + 1,) or (S + 1, {len(state)}), one a sample"
+        )
+    grid = grid.reshape(len(grid), -1).expand(-1, len(state))
+    strides = grid.diff(dim=0).to(wide).to(state.device)
+    at = grid.to(wide).to(state.device)
+    current = state.to(wide)
+    for step in range(len(strides)):
+        u = velocity(current.to(state.dtype), at[step])
+        if u.shape != state.shape:
+            raise ShapeError(f"velocity {tuple(u.shape)} of a state {tuple(state.shape)}")
+        current = current + over_state(strides[step], current) * u.to(wide)
+        if callback is not None:
+            callback(step + 1, at[step + 1], current)
+    return current.to(state.dtype)
+
+
+def sample(
+    velocity: Velocity,
+    noise: Tensor,
+    bounds: Sequence[float],
+    *,
+    unconditional: Velocity | None = None,
+    guidance: float = 1.0,
+    callback: Callable[[int, Tensor, Tensor], None] | None = None,
+) -> Tensor:
+    """From noise to clean with one Euler step an interval.
+
+    Args:
+        velocity: see ``integrate``.
+        noise: (B, ...), the state at t = 1.
+        bounds: K + 1 times, see ``check_bounds``; the last is 0 in GeoVerse.
+        unconditional: the network without the condition that ``guidance`` is to strengthen.
+        guidance: scale, 1 = none, see ``guided``.
+        callback: see ``integrate``.
+
+    Returns:
+        The state (B, ...) at the last bound.
+    """
+    step = guided(velocity, unconditional, guidance)
+    return integrate(step, noise, check_bounds(bounds), callback=callback)

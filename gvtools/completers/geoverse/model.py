@@ -1,0 +1,391 @@
+"""GeoVerse: the whole model, from views and projections to target pictures, depth and rays.
+
+Data flow of one pass (tensor shapes in ``docs``; equations are the paper's)::
+
+    pictures, projections --filled--> encode_hints (Eq. 1) --> hints
+    hints, cameras, depth --> Conditions;  video prior --> control residuals | shared keys (once)
+    noise --level-1 denoiser, K Euler steps--> level 1 --cascade, 1 step--> level 0
+    level 1 --frozen blocks--> levels 2, 3;  all four --heads--> pictures, depth, rays
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gvtools.completers.geoverse.conditioning import (
+    Hints,
+    ViewBatch,
+    depth_condition,
+    encode_hints,
+    filled,
+)
+from gvtools.completers.geoverse.config import GeoVerseConfig
+from gvtools.completers.geoverse.control import ControlBranch
+from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
+from gvtools.completers.geoverse.depth_anything import DepthAnything3
+from gvtools.completers.geoverse.flow import sample, velocity_from_clean
+from gvtools.completers.geoverse.geometry_head import Geometry
+from gvtools.completers.geoverse.noise import seeded_noise, view_seed
+from gvtools.completers.geoverse.plucker import camera_condition
+from gvtools.completers.geoverse.projective import Projective
+from gvtools.completers.geoverse.rgb_head import RGBHead
+from gvtools.completers.geoverse.shared_attention import SharedAttention, VideoKeys
+from gvtools.completers.geoverse.stages import DECODE, HINTS, LEVEL0, LEVEL1, VIDEO, Clock, no_clock
+from gvtools.completers.geoverse.statistics import LatentStatistics
+from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior
+from gvtools.errors import CheckpointError
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What stays constant over the denoising steps of a pass.
+
+    Attributes:
+        batch: the views, holes filled where the configuration says so.
+        hints: features of context and projections.
+        level1: conditions of the level-1 denoiser.
+        positions: its projective transforms.
+        adapted: video features at the control branch's width.
+        keys: video keys and values of the coupled blocks.
+    """
+
+    batch: ViewBatch
+    hints: Hints
+    level1: Conditions
+    positions: Positions
+    adapted: list[Tensor] | None = None
+    keys: dict[int, VideoKeys] | None = None
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Pictures and geometry of generated features.
+
+    Attributes:
+        rgb: (B, T, 3, H, W) of the target views, not clipped to [0, 1].
+        geometry: of all V views, in the frame of the first view and the model's unit.
+    """
+
+    rgb: Tensor
+    geometry: Geometry
+
+
+@dataclass(frozen=True)
+class Generated:
+    """The result of a pass.
+
+    Attributes:
+        level1: (B, V, C, h, w) normalised latents.
+        level0: (B, V, C, h, w) normalised latents.
+        decoded: pictures and geometry.
+    """
+
+    level1: Tensor
+    level0: Tensor
+    decoded: Decoded
+
+
+class GeoVerse(nn.Module):
+    """See the module. The encoder, its heads and the video prior are frozen.
+
+    Args:
+        config: see ``GeoVerseConfig``; ``config.named("tiny")`` for the small one.
+    """
+
+    def __init__(self, config: GeoVerseConfig) -> None:
+        super().__init__()
+        self.config = config
+        channels = config.geometry.encoder.channels
+        self.geometry = DepthAnything3(config.geometry)
+        self.rgb_head = RGBHead(config.rgb)
+        self.level1 = Denoiser(config.level1)
+        self.cascade = None if config.cascade is None else Denoiser(config.cascade)
+        self.statistics = nn.ModuleList(LatentStatistics(channels) for _ in range(2))
+        self.control: ControlBranch | None = None
+        self.shared: SharedAttention | None = None
+        if config.video is not None and config.injection == "control":
+            self.control = ControlBranch(
+                config.control, self.level1, video_channels=config.video.channels
+            )
+        if config.video is not None and config.injection == "shared":
+            self.shared = SharedAttention(
+                config.shared,
+                width=config.level1.width,
+                heads=config.level1.heads,
+                video_channels=config.video.channels,
+            )
+        # Not a submodule: its weights live in a folder of their own and are never trained.
+        self._video: list[VideoPrior] = []
+        self.freeze()
+
+    @classmethod
+    def from_pretrained(cls, folder: Path | str, **options: Any) -> GeoVerse:
+        """The model of a weights folder; see ``weights_folder.from_pretrained``."""
+        from gvtools.completers.geoverse.weights_folder import from_pretrained
+
+        return from_pretrained(folder, **options)
+
+    def save_pretrained(self, folder: Path | str, **options: Any) -> Path:
+        """Write a weights folder; see ``weights_folder.save_pretrained``."""
+        from gvtools.completers.geoverse.weights_folder import save_pretrained
+
+        return save_pretrained(self, folder, **options)
+
+    def freeze(self) -> None:
+        """Turn off gradients of the encoder and both heads; they still pass gradients through."""
+        self.geometry.requires_grad_(False)
+        self.rgb_head.requires_grad_(False)
+
+    @property
+    def video(self) -> VideoPrior | None:
+        """The video prior, when one has been attached."""
+        return self._video[0] if self._video else None
+
+    def attach_video(self, prior: VideoPrior) -> None:
+        """Use this video prior for the features that the configuration asks for."""
+        self._video = [prior]
+
+    def prepare(
+        self,
+        batch: ViewBatch,
+        *,
+        seed: int | Sequence[Sequence[int]] = 0,
+        video: VideoFeatures | None = None,
+        clock: Clock = no_clock,
+    ) -> Prepared:
+        """Everything that the denoising steps share, computed once.
+
+        Args:
+            batch: context views, then targets.
+            seed: of the video prior's noise; one number, or B rows of V.
+            video: features computed before, for the same views; taken from the attached prior
+                when None.
+            clock: receives the stages' names.
+
+        Raises:
+            CheckpointError: the configuration has a video prior and none is attached.
+        """
+        config = self.config
+        with clock(HINTS):
+            source = batch
+            batch = filled(batch, config.hints)
+            camera = camera_condition(
+                torch.linalg.inv(batch.cam_from_world),
+                batch.K,
+                batch.size,
+                context=batch.context,
+                reference=config.camera.reference,
+                pixel_offset=config.camera.pixel_offset,
+            )
+            level0, level1 = self.statistics
+            hints = encode_hints(self.geometry, level0, level1, batch, config.hints)
+            depth = None
+            if config.level1.depth_condition:
+                # Filled depth keeps the true validity beside it.
+                depth = depth_condition(batch.depth, batch.depth > 0, camera.scale)
+                depth = torch.cat((depth[:, :, :1], source.valid.to(depth.dtype)), dim=2)
+            conditions = Conditions(hints.level1, camera, depth=depth)
+            grid = (hints.level1.shape[-2], hints.level1.shape[-1])
+            positions = Positions(config.level1, camera, grid)
+            prepared = Prepared(batch, hints, conditions, positions)
+        if config.injection == "none":
+            return prepared
+        with clock(VIDEO):
+            features = self._video_features(source, seed) if video is None else video
+            return self.with_video(prepared, features)
+
+    def with_video(self, prepared: Prepared, features: VideoFeatures) -> Prepared:
+        """``prepared`` with video features; gradients reach the adapters."""
+        latents = prepared.hints.level1
+        grid = (latents.shape[-2], latents.shape[-1])
+        if self.control is not None:
+            return replace(prepared, adapted=self.control.adapted(features.tensors, grid))
+        if self.shared is None:
+            return prepared
+        camera = prepared.level1.camera
+        heads = self.config.level1.width // self.config.level1.heads
+        positions = [
+            Projective(
+                camera.cam_from_world,
+                camera.K,
+                camera.size,
+                (level.shape[-2], level.shape[-1]),
+                heads,
+                position_scale=(grid[0] / level.shape[-2], grid[1] / level.shape[-1]),
+                invert_K=self.config.level1.invert_K,
+            )
+            for level in features.tensors
+        ]
+        return replace(prepared, keys=self.shared(features.tensors, positions))
+
+    def _video_features(
+        self, batch: ViewBatch, seeds: int | Sequence[Sequence[int]]
+    ) -> VideoFeatures:
+        if self.video is None:
+            raise CheckpointError(
+                "this GeoVerse configuration needs the video prior and none was loaded; put the "
+                "truncated Wan2.2-VACE folder at video/ (gvtools weights list), or use a "
+                "configuration with injection = 'none'"
+            )
+        return self.video.features(batch.images, batch.valid, batch.context, seed=seeds)
+
+    def velocity1(self, prepared: Prepared, state: Tensor, t: Tensor) -> Tensor:
+        """The level-1 velocity at (B, V, C, h, w) ``state`` and (B,) or (B, V) ``t`` (Eq. 2)."""
+        residuals = None
+        if self.control is not None and prepared.adapted is not None:
+            residuals = self.control(
+                self.level1,
+                state,
+                t,
+                prepared.level1,
+                adapted=prepared.adapted,
+                positions=prepared.positions,
+            )
+        out = self.level1(
+            state,
+            t,
+            prepared.level1,
+            residuals=residuals,
+            video=prepared.keys,
+            positions=prepared.positions,
+        )
+        flow = self.config.flow
+        if flow.prediction == "velocity":
+            return out
+        clean = out + prepared.hints.unmasked if flow.skip else out
+        return velocity_from_clean(clean, state, t, least=flow.least_time)
+
+    def cascade_conditions(self, prepared: Prepared, level1: Tensor) -> Conditions:
+        """What the cascade knows: clean context level 0, level 1 of all views, cameras (Eq. 3)."""
+        return replace(prepared.level1, latents=prepared.hints.level0, source=level1, depth=None)
+
+    def sample1(
+        self,
+        prepared: Prepared,
+        noise: Tensor,
+        *,
+        bounds: Sequence[float] | None = None,
+        guidance: float | None = None,
+        clock: Clock = no_clock,
+    ) -> Tensor:
+        """Level-1 latents from (B, V, C, h, w) noise, one Euler step an interval."""
+        flow = self.config.flow
+        scale = flow.guidance if guidance is None else guidance
+        without = self._unconditional(prepared) if scale != 1 else None
+
+        def velocity(state: Tensor, t: Tensor) -> Tensor:
+            with clock(LEVEL1):
+                return self.velocity1(prepared, state, t)
+
+        def unconditional(state: Tensor, t: Tensor) -> Tensor:
+            with clock(LEVEL1):
+                return self.velocity1(without or prepared, state, t)
+
+        return sample(
+            velocity, noise, bounds or flow.level1, unconditional=unconditional, guidance=scale
+        )
+
+    def sample0(
+        self,
+        prepared: Prepared,
+        level1: Tensor,
+        noise: Tensor,
+        *,
+        bounds: Sequence[float] | None = None,
+        clock: Clock = no_clock,
+    ) -> Tensor:
+        """Level-0 latents of (B, V, C, h, w) level-1 latents; the mean without a cascade."""
+        if self.cascade is None:
+            return torch.zeros_like(level1)
+        cascade = self.cascade
+        conditions = self.cascade_conditions(prepared, level1)
+        grid = (level1.shape[-2], level1.shape[-1])
+        positions = Positions(cascade.config, conditions.camera, grid)
+
+        def velocity(state: Tensor, t: Tensor) -> Tensor:
+            with clock(LEVEL0):
+                return cascade(state, t, conditions, positions=positions)
+
+        return sample(velocity, noise, bounds or self.config.flow.cascade)
+
+    def decode(self, prepared: Prepared, level0: Tensor, level1: Tensor) -> Decoded:
+        """Pictures of the targets and geometry of all views; gradients reach the latents."""
+        grid = (level1.shape[-2], level1.shape[-1])
+        encoder = self.geometry.encoder
+        pyramid = self.pyramid(level0, level1, prepared.hints.token)
+        normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
+        geometry = self.geometry.head(normed, grid)
+        context = prepared.batch.context
+        features = torch.cat([level[:, context:] for level in normed], dim=-1)
+        shape = features.shape[:2]
+        rgb = self.rgb_head(features.flatten(0, 1), grid).unflatten(0, shape)
+        return Decoded(rgb, geometry)
+
+    def pyramid(self, level0: Tensor, level1: Tensor, token: Tensor) -> list[Tensor]:
+        """Four raw (B, V, 1 + N, C) levels of two (B, V, C, h, w) latents and token 0 (B, V, C)."""
+        grid = (level1.shape[-2], level1.shape[-1])
+        raw = []
+        for statistics, latent in zip(self.statistics, (level0, level1), strict=True):
+            tokens = statistics.denormalise(latent).flatten(3).transpose(2, 3)
+            raw.append(torch.cat((token[:, :, None].to(tokens.dtype), tokens), dim=2))
+        return [*raw, *self.geometry.encoder.propagate(raw[1], grid)]
+
+    @torch.no_grad()
+    def generate(
+        self,
+        batch: ViewBatch,
+        *,
+        seed: int = 0,
+        names: Sequence[Sequence[int | str]] | None = None,
+        bounds: Sequence[float] | None = None,
+        cascade_bounds: Sequence[float] | None = None,
+        guidance: float | None = None,
+        video: VideoFeatures | None = None,
+        clock: Clock = no_clock,
+    ) -> Generated:
+        """One pass: prepare, sample level 1 and level 0, decode.
+
+        Args:
+            batch: context views, then targets.
+            seed: of all noise.
+            names: B rows of V names; a view's noise depends on the seed and its name alone. Its
+                index by default.
+            bounds: level-1 interval bounds; the configuration's by default.
+            cascade_bounds: level-0 interval bounds; the configuration's by default.
+            guidance: scale; the configuration's by default.
+            video: features computed before, for the same views.
+            clock: receives the stages' names.
+        """
+        rows = names or [list(range(batch.images.shape[1]))] * len(batch.images)
+
+        def seeds(draw: str) -> list[list[int]]:
+            return [[view_seed(seed, draw, name) for name in row] for row in rows]
+
+        prepared = self.prepare(batch, seed=seeds("video"), video=video, clock=clock)
+        like = prepared.hints.level1
+
+        def noise(level: str) -> Tensor:
+            return seeded_noise(like.shape, seeds(level), device=like.device)
+
+        level1 = self.sample1(
+            prepared, noise("level1"), bounds=bounds, guidance=guidance, clock=clock
+        )
+        level0 = self.sample0(prepared, level1, noise("level0"), bounds=cascade_bounds, clock=clock)
+        with clock(DECODE):
+            return Generated(level1, level0, self.decode(prepared, level0, level1))
+
+    def _unconditional(self, prepared: Prepared) -> Prepared:
+        """Without cameras, as GLD's guidance has it: latents and hints are kept."""
+        camera = prepared.level1.camera.unconditional()
+        grid = (prepared.hints.level1.shape[-2], prepared.hints.level1.shape[-1])
+        return replace(
+            prepared,
+            level1=replace(prepared.level1, camera=camera),
+            positions=Positions(self.config.level1, camera, grid),
+        )

@@ -1,0 +1,174 @@
+"""Projective positional encoding: attention that sees cameras only relative to each other.
+
+Source: PRoPE (Li et al., "Cameras as Relative Positional Encoding", 2025). A camera's matrix is
+P = lift(K) · cam_from_world, 4x4, with K in shares of the image about its centre. The first half of
+a head's channels is cut into groups of four, and each group of a token is multiplied by its view's
+matrix: queries by Pᵀ, keys and values by P⁻¹, the result by P. A score then holds P_i P_j⁻¹ alone,
+whatever the world frame. The second half carries rotary positions within the image: a quarter for
+x, a quarter for y, pairs formed by the two halves of a quarter.
+
+The recorded outputs of Geometric Latent Diffusion do not hold P⁻¹ but cam_from_world⁻¹ · lift(K),
+with K itself in the place of K⁻¹ (``invert_K=False``). That is relative to the world frame's choice
+as well, but a token no longer meets its own view's tokens through the identity.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gvtools.errors import ShapeError
+
+GROUP = 4
+# Half of the channels in groups of four, and two rotary quarters of pairs.
+HEAD_MULTIPLE = 8
+
+
+class Projective:
+    """The encoding of V cameras over one token grid, built once for all layers of a pass.
+
+    It holds tensors and no parameters. Matrices and angles are float32 (float64 for float64
+    cameras) whatever the tokens are; the tokens' dtype is that of the result.
+
+    Args:
+        cam_from_world: (B, V, 4, 4) rigid, OpenCV; any scale, the same for all views of a sample.
+        K: (B, V, 3, 3) pixels of an image of ``size``; skew is not used.
+        size: (H, W), pixels, by which K is normalised.
+        grid: (h, w) tokens of a view, row-major.
+        head_dim: channels of an attention head, a multiple of 8.
+        base: of the rotary frequencies.
+        position_scale: (y, x) tokens of another grid per token of this one: keys that lie on a
+            coarser grid get the positions of their centres on the queries' grid.
+        invert_K: False for keys and values as in GLD's recorded outputs; see the module.
+
+    Attributes:
+        matrix: (B, V, 4, 4), P.
+        key_matrix: (B, V, 4, 4), by which keys and values are multiplied.
+
+    Raises:
+        ShapeError: shapes that do not match, or a ``head_dim`` that cannot be divided.
+    """
+
+    def __init__(
+        self,
+        cam_from_world: Tensor,
+        K: Tensor,
+        size: tuple[int, int],
+        grid: tuple[int, int],
+        head_dim: int,
+        *,
+        base: float = 100.0,
+        position_scale: tuple[float, float] = (1.0, 1.0),
+        invert_K: bool = True,
+    ) -> None:
+        if not (
+            cam_from_world.ndim == K.ndim == 4
+            and cam_from_world.shape[-2:] == (4, 4)
+            and K.shape == (*cam_from_world.shape[:2], 3, 3)
+        ):
+            raise ShapeError(
+                f"projective encoding: cam_from_world {tuple(cam_from_world.shape)} and K "
+                f"{tuple(K.shape)}; expected (B, V, 4, 4) and (B, V, 3, 3)"
+            )
+        if head_dim % HEAD_MULTIPLE:
+            raise ShapeError(
+                f"projective encoding: heads of {head_dim} channels; expected a multiple of "
+                f"{HEAD_MULTIPLE}"
+            )
+        dtype = torch.promote_types(cam_from_world.dtype, torch.float32)
+        self.grid = grid
+        self.views = cam_from_world.shape[1]
+        self.head_dim = head_dim
+        self.matrix, self.key_matrix = projection_matrices(
+            cam_from_world.to(dtype), K, size=size, invert_K=invert_K
+        )
+        self.cos, self.sin = _angles(
+            grid, head_dim // 8, base, position_scale, self.matrix.new_empty(0)
+        )
+
+    def query(self, q: Tensor) -> Tensor:
+        """(B, heads, V*h*w, head_dim) queries, encoded."""
+        return self._apply(q, self.matrix, forward=True)
+
+    def key(self, k: Tensor) -> Tensor:
+        """(B, heads, V*h*w, head_dim) keys, encoded."""
+        return self._apply(k, self.key_matrix.mT, forward=True)
+
+    def value(self, v: Tensor) -> Tensor:
+        """(B, heads, V*h*w, head_dim) values, encoded."""
+        return self._apply(v, self.key_matrix.mT, forward=True)
+
+    def output(self, o: Tensor) -> Tensor:
+        """(B, heads, V*h*w, head_dim) results of attention, taken back to each token's frame."""
+        return self._apply(o, self.matrix.mT, forward=False)
+
+    def _apply(self, x: Tensor, right: Tensor, *, forward: bool) -> Tensor:
+        """Rows of four times ``right`` (B, V, 4, 4), and the rotation or its inverse."""
+        tokens = self.grid[0] * self.grid[1]
+        if x.ndim != 4 or x.shape[2:] != (self.views * tokens, self.head_dim):
+            raise ShapeError(
+                f"projective encoding: tokens {tuple(x.shape)}; expected (B, heads, "
+                f"{self.views * tokens}, {self.head_dim}) for {self.views} views of {self.grid}"
+            )
+        dtype = torch.promote_types(x.dtype, right.dtype)
+        projected, turned = x.unflatten(2, (self.views, tokens)).chunk(2, dim=-1)
+        # Under autocast the product would be rounded to half precision, and P P⁻¹ with it.
+        with torch.autocast(x.device.type, enabled=False):
+            rows = projected.to(dtype).unflatten(-1, (-1, GROUP)).flatten(3, 4)
+            projected = (rows @ right.to(dtype)[:, None]).reshape(projected.shape)
+        a, b = turned.unflatten(-1, (2, 2, -1)).unbind(-2)
+        sin = self.sin if forward else -self.sin
+        turned = torch.stack((self.cos * a + sin * b, self.cos * b - sin * a), dim=-2)
+        return torch.cat((projected.to(x.dtype), turned.flatten(-3).to(x.dtype)), -1).flatten(2, 3)
+
+
+def projection_matrices(
+    cam_from_world: Tensor, K: Tensor, *, size: tuple[int, int], invert_K: bool = True
+) -> tuple[Tensor, Tensor]:
+    """P = lift(K) · cam_from_world and its inverse, with K in shares of the image.
+
+    fx / W, fy / H, cx / W - 0.5, cy / H - 0.5. Written out row by row: no matrix product whose
+    precision a backend may lower, no general inversion.
+
+    Args:
+        cam_from_world: (..., 4, 4) rigid; its dtype is the results'.
+        K: (..., 3, 3) pixels of an image of ``size``.
+        size: (H, W), pixels.
+        invert_K: False leaves K as it is in the second matrix.
+
+    Returns:
+        Two (..., 4, 4).
+    """
+    K = K.to(cam_from_world.dtype)
+    height, width = size
+    fx, fy = K[..., 0, 0, None] / width, K[..., 1, 1, None] / height
+    cx, cy = K[..., 0, 2, None] / width - 0.5, K[..., 1, 2, None] / height - 0.5
+    x, y, z, last = cam_from_world.unbind(-2)
+    matrix = torch.stack((fx * x + cx * z, fy * y + cy * z, z, last), dim=-2)
+
+    rotation, translation = cam_from_world[..., :3, :3], cam_from_world[..., :3, 3]
+    centre = -(rotation * translation[..., None]).sum(-2)
+    x, y, z = torch.nn.functional.pad(rotation, (0, 1)).unbind(-2)  # columns of the inverse
+    if invert_K:
+        fx, fy, cx, cy = 1 / fx, 1 / fy, -cx / fx, -cy / fy
+    last = torch.cat((centre, torch.ones_like(centre[..., :1])), -1)
+    columns = (fx * x, fy * y, cx * x + cy * y + z, last)
+    return matrix, torch.stack(columns, dim=-1)
+
+
+def _angles(
+    grid: tuple[int, int],
+    frequencies: int,
+    base: float,
+    scale: tuple[float, float],
+    like: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Cosines and sines (h*w, 2, frequencies): axis x, then axis y, of the tokens' positions."""
+    rows, columns = (
+        (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * factor - 0.5
+        for count, factor in zip(grid, scale, strict=True)
+    )
+    position = torch.stack((columns.repeat(grid[0]), rows.repeat_interleave(grid[1])), dim=-1)
+    exponent = torch.arange(frequencies, dtype=like.dtype, device=like.device) / frequencies
+    angle = position[..., None] * base**-exponent
+    return angle.cos(), angle.sin()

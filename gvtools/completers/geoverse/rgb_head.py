@@ -1,0 +1,213 @@
+"""The RGB head: features of the four levels to a picture, each view by itself.
+
+Geometric Latent Diffusion's decoder: a linear layer on the concatenated levels, a class token, a
+fixed 2-D sine table, pre-norm transformer layers, and a linear layer to the pixels of a patch.
+Parameter names are those of the published checkpoint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from gvtools.completers.geoverse.attention import attend
+from gvtools.completers.geoverse.encoder import IMAGENET_MEAN, IMAGENET_STD
+from gvtools.errors import ShapeError
+
+SINE_BASE = 10000.0
+
+
+@dataclass(frozen=True)
+class RGBHeadConfig:
+    """Dimensions; the defaults are the published decoder for Depth Anything 3 Base.
+
+    Attributes:
+        in_channels: of a token: the four levels of 2 x 768, one after the other.
+        width: channels of the transformer.
+        depth: its layers.
+        heads: its attention heads.
+        mlp: hidden width of its MLPs.
+        patch: patch edge, px.
+        base_grid: (h, w) of the position table, patches; other grids are interpolated.
+        eps: of the LayerNorms.
+    """
+
+    in_channels: int = 6144
+    width: int = 1152
+    depth: int = 28
+    heads: int = 16
+    mlp: int = 4096
+    patch: int = 14
+    base_grid: tuple[int, int] = (36, 36)
+    eps: float = 1e-12
+
+
+class RGBHead(nn.Module):
+    """The decoder; ``forward`` gives pictures, ``logits`` what they are made of."""
+
+    decoder_pos_embed: Tensor
+
+    def __init__(self, config: RGBHeadConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.width
+        self.register_buffer("decoder_pos_embed", sine_table(width, config.base_grid)[None])
+        self.trainable_cls_token = nn.Parameter(torch.zeros(1, 1, width))
+        self.decoder_embed = nn.Linear(config.in_channels, width)
+        self.decoder_layers = nn.ModuleList(_Layer(config) for _ in range(config.depth))
+        self.decoder_norm = nn.LayerNorm(width, eps=config.eps)
+        self.decoder_pred = nn.Linear(width, config.patch**2 * 3)
+
+    def forward(
+        self,
+        features: Tensor,
+        grid: tuple[int, int],
+        *,
+        chunk: int | None = None,
+        recompute: bool = False,
+    ) -> Tensor:
+        """Pictures, not clipped.
+
+        Args:
+            features: (B', N, in_channels), N = h * w tokens row-major, levels 0 to 3 concatenated.
+            grid: (h, w) in patches.
+            chunk: views at a time, which bounds the memory; None for all. The result is the same.
+            recompute: keep no activations of a chunk for the backward pass, compute them again.
+
+        Returns:
+            (B', 3, h * patch, w * patch) RGB, in [0, 1] but for overshoot.
+
+        Raises:
+            ShapeError: features that do not fit the grid or the configuration.
+        """
+        logits = self.logits(features, grid, chunk=chunk, recompute=recompute)
+        return self.image(logits, grid)
+
+    def logits(
+        self,
+        features: Tensor,
+        grid: tuple[int, int],
+        *,
+        chunk: int | None = None,
+        recompute: bool = False,
+    ) -> Tensor:
+        """(B', N, patch² · 3) pixels of the patches, ImageNet-normalised RGB; see ``forward``."""
+        tokens = grid[0] * grid[1]
+        if features.ndim != 3 or features.shape[1:] != (tokens, self.config.in_channels):
+            raise ShapeError(
+                f"RGB head: features {tuple(features.shape)}; expected (B', {tokens}, "
+                f"{self.config.in_channels}) for a grid of {grid}"
+            )
+        position = self.positions(grid)
+        if not recompute or not torch.is_grad_enabled():
+            parts = [self._views(part, position) for part in _chunks(features, chunk)]
+        else:
+            parts = [
+                checkpoint(self._views, part, position, use_reentrant=False)
+                for part in _chunks(features, chunk)
+            ]
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+    def image(self, logits: Tensor, grid: tuple[int, int]) -> Tensor:
+        """(B', h·w, patch² · 3) logits as (B', 3, h * patch, w * patch) RGB, not clipped."""
+        patch = self.config.patch
+        pixels = logits.unflatten(2, (patch, patch, 3)).unflatten(1, grid)
+        pixels = pixels.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
+        mean, std = (pixels.new_tensor(c).view(3, 1, 1) for c in (IMAGENET_MEAN, IMAGENET_STD))
+        return pixels * std + mean
+
+    def positions(self, grid: tuple[int, int]) -> Tensor:
+        """(1, 1 + h * w, width): the table, bicubic on grids other than its own."""
+        table = self.decoder_pos_embed
+        if tuple(grid) == tuple(self.config.base_grid):
+            return table
+        plane = table[:, 1:].mT.unflatten(2, self.config.base_grid)
+        dtype = torch.promote_types(plane.dtype, torch.float32)
+        plane = F.interpolate(plane.to(dtype), size=grid, mode="bicubic", align_corners=False)
+        return torch.cat((table[:, :1], plane.flatten(2).mT.to(table.dtype)), dim=1)
+
+    def _views(self, features: Tensor, position: Tensor) -> Tensor:
+        x = self.decoder_embed(features)
+        x = torch.cat((self.trainable_cls_token.to(x.dtype).expand(len(x), -1, -1), x), dim=1)
+        x = x + position.to(x.dtype)
+        for layer in self.decoder_layers:
+            x = layer(x)
+        return self.decoder_pred(self.decoder_norm(x)[:, 1:])
+
+
+class _Layer(nn.Module):
+    """Pre-norm attention and MLP."""
+
+    def __init__(self, config: RGBHeadConfig) -> None:
+        super().__init__()
+        self.attention = _Attention(config)
+        self.intermediate = _Dense(config.width, config.mlp)
+        self.output = _Dense(config.mlp, config.width)
+        self.layernorm_before = nn.LayerNorm(config.width, eps=config.eps)
+        self.layernorm_after = nn.LayerNorm(config.width, eps=config.eps)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = x + self.attention(self.layernorm_before(x))
+        hidden = F.gelu(self.intermediate(self.layernorm_after(x)))
+        return x + self.output(hidden)
+
+
+class _Attention(nn.Module):
+    """Self-attention within a view, under the names of the published layers."""
+
+    def __init__(self, config: RGBHeadConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.heads = config.heads
+        self.attention = nn.ModuleDict(
+            {name: nn.Linear(width, width) for name in ("query", "key", "value")}
+        )
+        self.output = _Dense(width, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        q, k, v = (
+            self.attention[name](x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+            for name in ("query", "key", "value")
+        )
+        return self.output(attend(q, k, v).transpose(1, 2).flatten(2))
+
+
+class _Dense(nn.Module):
+    """A linear layer, one name deeper."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.dense = nn.Linear(inputs, outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.dense(x)
+
+
+def _chunks(features: Tensor, chunk: int | None) -> tuple[Tensor, ...]:
+    return (features,) if chunk is None else features.split(max(chunk, 1))
+
+
+def sine_table(width: int, grid: tuple[int, int]) -> Tensor:
+    """(1 + h * w, width) fixed positions: a row of zeros for the class token, then the patches.
+
+    The first half of the channels encodes the column, the second the row; each is the sines of
+    width / 4 frequencies, then their cosines.
+
+    Raises:
+        ShapeError: a width that is no multiple of 4.
+    """
+    if width % 4:
+        raise ShapeError(f"position table of {width} channels; expected a multiple of 4")
+    count = width // 4
+    frequency = SINE_BASE ** -(torch.arange(count, dtype=torch.float64) / count)
+    rows, columns = (torch.arange(edge, dtype=torch.float64) for edge in grid)
+    halves = []
+    for position in (columns.repeat(grid[0]), rows.repeat_interleave(grid[1])):
+        angle = position[:, None] * frequency
+        halves.append(torch.cat((angle.sin(), angle.cos()), dim=-1))
+    table = torch.cat(halves, dim=-1)
+    return torch.cat((table.new_zeros(1, width), table)).float()

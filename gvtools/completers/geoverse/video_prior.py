@@ -1,0 +1,207 @@
+"""Features of a frozen video model, computed once for all denoising steps.
+
+Eq. 4 and the appendix on Wan VACE: projections are noised slightly and encoded by the video VAE
+(z_proxy); x_t = (1 - sigma) z_proxy + sigma eps enters the backbone and [z_proxy, V] its VACE
+branch; what four blocks give in that one forward is F^W. Nothing is sampled or decoded.
+
+Where the paper leaves a choice, ``VideoPriorConfig`` says which one is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gvtools.completers.geoverse.noise import seeded_noise, view_seed
+from gvtools.completers.geoverse.video_config import VideoPriorConfig
+from gvtools.completers.geoverse.video_layouts import (
+    ViewLayout,
+    packed_mask,
+    view_layout,
+)
+from gvtools.completers.geoverse.video_views import check_views, resized, seed_rows
+from gvtools.completers.geoverse.wan_folder import load_network, read_empty_prompt
+from gvtools.completers.geoverse.wan_networks import STRIDE, WanNetworks
+from gvtools.errors import CheckpointError
+
+__all__ = ["VideoFeatures", "VideoPrior", "VideoPriorConfig"]
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFeatures:
+    """F^W, to be handed to every denoising step.
+
+    Attributes:
+        tensors: one (B, V, C, h, w) for each tap.
+        latent_of_view: which of the video model's latents each view's features come from; views
+            with the same number have the same features.
+    """
+
+    tensors: tuple[Tensor, ...]
+    latent_of_view: tuple[int, ...]
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of tokens."""
+        return self.tensors[0].shape[-2], self.tensors[0].shape[-1]
+
+    def to(
+        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> VideoFeatures:
+        """On another device, in another dtype."""
+        return replace(self, tensors=tuple(t.to(device=device, dtype=dtype) for t in self.tensors))
+
+
+class VideoPrior:
+    """The frozen video model. Not an ``nn.Module``: it is no part of a model's state.
+
+    Args:
+        transformer: diffusers' WanVACETransformer3DModel.
+        vae: diffusers' AutoencoderKLWan.
+        prompt: (tokens, channels) embedding of the empty prompt; None with ``prompt="zeros"``.
+        config: see there.
+
+    Raises:
+        CheckpointError: the three and the configuration do not fit each other.
+    """
+
+    def __init__(
+        self,
+        transformer: Any,
+        vae: Any,
+        prompt: Tensor | None = None,
+        *,
+        config: VideoPriorConfig | None = None,
+    ) -> None:
+        self.config = config or VideoPriorConfig()
+        zeros = self.config.prompt == "zeros"
+        if prompt is None and not zeros:
+            raise CheckpointError(
+                "video prior: no embedding of the empty prompt; expected wan_folder."
+                "read_empty_prompt, or video.prompt = 'zeros' where no trained network is used"
+            )
+        self.networks = WanNetworks(
+            transformer,
+            vae,
+            prompt=None if zeros else prompt,
+            prompt_rows=self.config.prompt_rows,
+        )
+        self._zero_latents: dict[tuple[int, ...], Tensor] = {}
+        found = (self.networks.channels, self.networks.blocks)
+        if found[0] != self.config.channels or found[1] <= self.config.taps[-1]:
+            raise CheckpointError(
+                f"video prior: {found[1]} blocks of {found[0]} channels; expected "
+                f"{self.config.channels} channels and blocks {self.config.taps}"
+            )
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        folder: Path | str,
+        *,
+        config: VideoPriorConfig | None = None,
+        device: torch.device | str = "cpu",
+    ) -> VideoPrior:
+        """From a folder that ``wan_checkpoint.truncate`` made, strictly.
+
+        Raises:
+            CheckpointError: diffusers, a file or a tensor is absent or does not fit.
+        """
+        config = config or VideoPriorConfig()
+        prompt = read_empty_prompt(Path(folder)) if config.prompt == "empty" else None
+        dtype = getattr(torch, config.dtype) if config.dtype else None
+        transformer = load_network(Path(folder), "transformer", dtype=dtype, device=str(device))
+        vae = load_network(Path(folder), "vae", device=str(device))
+        return cls(transformer, vae, prompt, config=config)
+
+    def to(self, device: torch.device | str) -> VideoPrior:
+        """Move the weights; their dtype stays, since some are float32 on purpose."""
+        self.networks.to(device)
+        self._zero_latents.clear()
+        return self
+
+    @torch.no_grad()
+    def features(
+        self,
+        images: Tensor,
+        valid: Tensor,
+        context: int,
+        *,
+        seed: int | Sequence[Sequence[int]] = 0,
+    ) -> VideoFeatures:
+        """One forward of the video model.
+
+        Args:
+            images: (B, V, 3, H, W) in [0, 1]; what is not valid is not looked at.
+            valid: (B, V, 1, H, W), bool or 1 = valid.
+            context: how many views, the first ones, are photographs: they get no noise.
+            seed: one number, or B rows of V of them (see ``noise.view_seed``): a view's noise
+                depends on its own alone.
+
+        Raises:
+            ShapeError: shapes that do not fit.
+        """
+        check_views(images, valid, context)
+        seeds = seed_rows(seed, *images.shape[:2])
+        layout = view_layout(self.config.layout, images.shape[1])
+        device = self.networks.device
+        with torch.autocast(device.type, enabled=False):
+            proxy, shown = self._proxy(images.to(device), valid.to(device), context, seeds=seeds)
+            z_proxy = self._encoded(proxy, layout)
+            outputs = self.networks.block_outputs(
+                self._noised(z_proxy, layout, seeds),
+                self._condition(z_proxy, shown, layout),
+                timestep=self.config.timestep,
+                blocks=self.config.taps,
+            )
+        where = torch.tensor(layout.latent_of_view, device=device)
+        tensors = (x.index_select(1, where).movedim(-1, 2).contiguous() for x in outputs)
+        return VideoFeatures(tuple(tensors), layout.latent_of_view)
+
+    def _proxy(
+        self, images: Tensor, valid: Tensor, context: int, *, seeds: list[list[int]]
+    ) -> tuple[Tensor, Tensor]:
+        """Views (B, V, 3, H', W') in [-1, 1], 0 where not shown, and shown (B, V, 1, H', W')."""
+        size = self.config.size(images.shape[-2], images.shape[-1])
+        seen, shown = resized(images, valid, size)
+        noise = self._noise("rgb", seeds, (3, *size))
+        noise[:, :context] = 0
+        return (2 * seen - 1 + self.config.proxy_noise * noise) * shown, shown
+
+    def _encoded(self, images: Tensor, layout: ViewLayout) -> Tensor:
+        """Normalised latents (B, 16, F, h, w) of views (B, V, 3, H, W)."""
+        clips = torch.stack([images[:, list(clip)] for clip in layout.clips], dim=1)
+        latents = self.networks.encode(clips.flatten(0, 1).transpose(1, 2))
+        return latents.unflatten(0, clips.shape[:2]).transpose(1, 2).flatten(2, 3)
+
+    def _noised(self, z_proxy: Tensor, layout: ViewLayout, seeds: list[list[int]]) -> Tensor:
+        """x_t; a latent of several views takes the first one's noise."""
+        sigma = self.config.timestep / 1000 if self.config.sigma is None else self.config.sigma
+        first = [[row[held[0]] for held in layout.views_of_latent] for row in seeds]
+        eps = self._noise("latent", first, (z_proxy.shape[1], *z_proxy.shape[-2:]))
+        return (1 - sigma) * z_proxy + sigma * eps.transpose(1, 2)
+
+    def _condition(self, z_proxy: Tensor, shown: Tensor, layout: ViewLayout) -> Tensor:
+        """VACE's inactive and reactive latents and its mask m = 1 - V, (B, 96, F, h, w).
+
+        Pixels without content are 0, so the inactive picture I (1 - m) is the proxy itself, and
+        the reactive one I m is 0 everywhere.
+        """
+        key = (len(layout.clips[0]), *shown.shape[-2:])
+        if key not in self._zero_latents:
+            zero = torch.zeros(1, 3, *key, device=shown.device)
+            self._zero_latents[key] = self.networks.encode(zero)
+        reactive = self._zero_latents[key].repeat(1, 1, len(layout.clips), 1, 1)
+        mask = packed_mask(1 - shown, layout, stride=STRIDE)
+        return torch.cat([z_proxy, reactive.expand_as(z_proxy), mask], dim=1)
+
+    def _noise(self, draw: str, seeds: list[list[int]], shape: tuple[int, ...]) -> Tensor:
+        """Standard normal (B, views, *shape), each view's of its own seed."""
+        rows = [[view_seed(value, "video", draw) for value in row] for row in seeds]
+        device = self.networks.device
+        return seeded_noise((len(rows), len(rows[0]), *shape), rows, device=device)

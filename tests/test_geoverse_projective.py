@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from gvtools.completers.geoverse.attention import attend
+from gvtools.completers.geoverse.projective import Projective, projection_matrices
+from gvtools.errors import ShapeError
+
+SIZE = (84, 112)
+GRID = (3, 4)
+
+
+def rigid(count: int, *, seed: int = 0, reach: float = 1.0) -> torch.Tensor:
+    rng = np.random.default_rng(seed)
+    pose = np.tile(np.eye(4), (count, 1, 1))
+    pose[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
+    pose[:, :3, 3] = rng.uniform(-reach, reach, (count, 3))
+    return torch.from_numpy(pose)
+
+
+def cameras(batch: int = 2, views: int = 3, dtype=torch.float64):
+    pose = rigid(batch * views, seed=5).unflatten(0, (batch, views))
+    rng = np.random.default_rng(6)
+    K = np.tile(np.eye(3), (batch, views, 1, 1))
+    K[..., 0, 0], K[..., 1, 1] = rng.uniform(70, 130, (2, batch, views))
+    K[..., 0, 2], K[..., 1, 2] = 56 + rng.uniform(-5, 5, (2, batch, views))
+    return pose.to(dtype), torch.from_numpy(K).to(dtype)
+
+
+def tokens(head_dim: int, *, batch=2, views=3, heads=2, seed=0, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    shape = (batch, heads, views * GRID[0] * GRID[1], head_dim)
+    return torch.randn(shape, generator=generator, dtype=torch.float64).to(dtype)
+
+
+def lifted(pose, K, size=SIZE):
+    """K in shares of the image, and the 4x4 it becomes, element by element."""
+    shares = torch.zeros_like(pose)
+    shares[..., 0, 0], shares[..., 1, 1] = K[..., 0, 0] / size[1], K[..., 1, 1] / size[0]
+    shares[..., 0, 2] = K[..., 0, 2] / size[1] - 0.5
+    shares[..., 1, 2] = K[..., 1, 2] / size[0] - 0.5
+    shares[..., 2, 2] = shares[..., 3, 3] = 1
+    return shares
+
+
+def dense(matrix: np.ndarray, y: int, x: int, head_dim: int, *, base: float = 100.0) -> np.ndarray:
+    """The whole head_dim x head_dim transform of one token."""
+    groups = head_dim // 8
+    out = np.zeros((head_dim, head_dim))
+    for group in range(groups):
+        out[4 * group : 4 * group + 4, 4 * group : 4 * group + 4] = matrix
+    start = head_dim // 2
+    for position in (x, y):
+        for i in range(groups):
+            angle = position * base ** (-i / groups)
+            a, b = start + i, start + groups + i
+            out[a, a] = out[b, b] = np.cos(angle)
+            out[a, b], out[b, a] = np.sin(angle), -np.sin(angle)
+        start += head_dim // 4
+    return out
+
+
+@pytest.mark.parametrize("head_dim", [8, 24])
+def test_every_token_is_transformed_as_the_definition_says(head_dim):
+    pose, K = cameras()
+    encoding = Projective(pose, K, SIZE, GRID, head_dim)
+    P = (lifted(pose, K) @ pose).numpy()
+    x = tokens(head_dim)
+    found = [f(x).numpy() for f in (encoding.query, encoding.key, encoding.value, encoding.output)]
+    count = GRID[0] * GRID[1]
+    for b, view, row, column in np.ndindex(2, 3, *GRID):
+        token = view * count + row * GRID[1] + column
+        inverse = np.linalg.inv(P[b, view])
+        forward = [dense(m, row, column, head_dim) for m in (P[b, view].T, inverse, inverse)]
+        # The result's rotation is the inverse of the others'.
+        backward = dense(P[b, view], -row, -column, head_dim)
+        for ours, transform in zip(found, [*forward, backward], strict=True):
+            np.testing.assert_allclose(
+                ours[b, :, token], x[b, :, token].numpy() @ transform.T, rtol=1e-9, atol=1e-9
+            )
+
+
+def test_matrices_and_their_inverse():
+    pose, K = cameras()
+    P, inverse = projection_matrices(pose, K, size=SIZE)
+    torch.testing.assert_close(P, lifted(pose, K) @ pose)
+    torch.testing.assert_close(P @ inverse, torch.eye(4).double().expand_as(P))
+    same, kept = projection_matrices(pose, K, size=SIZE, invert_K=False)
+    torch.testing.assert_close(same, P)
+    torch.testing.assert_close(kept, torch.linalg.inv(pose) @ lifted(pose, K))
+
+
+@pytest.mark.parametrize("invert_K", [True, False])
+def test_the_world_frame_does_not_matter(invert_K):
+    pose, K = cameras()
+    q, k, v = (tokens(24, seed=seed) for seed in range(3))
+    results = []
+    for moved in (pose, pose @ rigid(1, seed=9, reach=3.0)[0]):
+        e = Projective(moved, K, SIZE, GRID, 24, invert_K=invert_K)
+        results.append(e.output(attend(e.query(q), e.key(k), e.value(v))))
+    torch.testing.assert_close(*results, rtol=1e-9, atol=1e-9)
+
+
+def test_a_moved_camera_does_matter():
+    pose, K = cameras()
+    q, k, v = (tokens(24, seed=seed) for seed in range(3))
+    other = pose.clone()
+    other[:, 1, 0, 3] += 0.5
+    results = []
+    for moved in (pose, other):
+        e = Projective(moved, K, SIZE, GRID, 24)
+        results.append(e.output(attend(e.query(q), e.key(k), e.value(v))))
+    assert (results[0] - results[1]).abs().max() > 1e-2
+
+
+def test_a_value_that_comes_back_to_its_token_is_unchanged():
+    pose, K = cameras()
+    encoding = Projective(pose, K, SIZE, GRID, 16)
+    x = tokens(16)
+    torch.testing.assert_close(encoding.output(encoding.value(x)), x)
+
+
+def test_within_a_view_scores_depend_on_the_distance_alone():
+    pose, K = cameras(1, 1)
+    encoding = Projective(pose, K, SIZE, GRID, 16)
+    same = tokens(16, batch=1, views=1)[:, :, :1].expand(-1, -1, 12, -1)
+    scores = (encoding.query(same) @ encoding.key(same).mT)[0, 0]
+    scores = scores.unflatten(0, GRID).unflatten(2, GRID)
+    torch.testing.assert_close(scores[0, 0, 1, 2], scores[1, 1, 2, 3])
+    torch.testing.assert_close(scores[0, 3, 1, 1], scores[1, 2, 2, 0])
+    assert (scores[0, 0, 0, 1] - scores[0, 0, 1, 0]).abs() > 1e-6
+
+
+def test_keys_of_a_coarser_grid_lie_at_the_centres_of_their_tokens():
+    pose, K = cameras(1, 1)
+    coarse = Projective(pose, K, SIZE, (1, 2), 8, position_scale=(3.0, 2.0))
+    # Columns 0, 1 have their middle at 0.5, columns 2, 3 at 2.5; rows 0 to 2 at 1.
+    x, y = torch.tensor([0.5, 2.5]).double(), torch.ones(2).double()
+    torch.testing.assert_close(coarse.cos[:, :, 0], torch.stack((x, y), -1).cos())
+    torch.testing.assert_close(coarse.sin[:, :, 0], torch.stack((x, y), -1).sin())
+    fine = Projective(pose, K, SIZE, GRID, 8)
+    torch.testing.assert_close(coarse.key_matrix, fine.key_matrix)
+
+
+def test_half_precision_rounds_the_result_only():
+    pose, K = cameras(dtype=torch.float32)
+    encoding = Projective(pose, K, SIZE, GRID, 24)
+    assert encoding.matrix.dtype == encoding.cos.dtype == torch.float32
+    x = tokens(24, dtype=torch.bfloat16)
+    for method in (encoding.query, encoding.key, encoding.value, encoding.output):
+        low = method(x)
+        assert low.dtype == torch.bfloat16
+        torch.testing.assert_close(low, method(x.float()).bfloat16(), rtol=0, atol=0)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            under = method(x.float())
+        torch.testing.assert_close(under, method(x.float()), rtol=0, atol=0)
+
+
+def test_cameras_of_half_precision_are_raised_to_single():
+    pose, K = cameras(dtype=torch.bfloat16)
+    assert Projective(pose, K, SIZE, GRID, 8).matrix.dtype == torch.float32
+
+
+def test_gradients():
+    pose, K = cameras(1, 2)
+    x = tokens(8, batch=1, views=2, heads=1).requires_grad_()
+
+    def through(x, pose, K):
+        e = Projective(pose, K, SIZE, GRID, 8)
+        return e.output(e.value(x) * e.query(x)) + e.key(x)
+
+    inputs = (x, pose.requires_grad_(), K.requires_grad_())
+    assert torch.autograd.gradcheck(through, inputs, fast_mode=True)
+
+
+@pytest.mark.slow
+def test_it_compiles_to_one_graph():
+    pose, K = cameras(dtype=torch.float32)
+    encoding = Projective(pose, K, SIZE, GRID, 24)
+    x = tokens(24, dtype=torch.float32)
+
+    def layer(x, encoding):
+        return encoding.output(attend(encoding.query(x), encoding.key(x), encoding.value(x)))
+
+    compiled = torch.compile(layer, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(x, encoding), layer(x, encoding))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_cuda_agrees(dtype):
+    pose, K = cameras(dtype=torch.float32)
+    x = tokens(24, dtype=dtype)
+    here = Projective(pose, K, SIZE, GRID, 24)
+    there = Projective(pose.cuda(), K.cuda(), SIZE, GRID, 24)
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-2
+    for name in ("query", "key", "value", "output"):
+        torch.testing.assert_close(
+            getattr(there, name)(x.cuda()).cpu(), getattr(here, name)(x),
+            rtol=tolerance, atol=tolerance,
+        )  # fmt: skip
+
+
+def test_shapes_that_do_not_match():
+    pose, K = cameras()
+    with pytest.raises(ShapeError, match=r"expected \(B, V, 4, 4\)"):
+        Projective(pose, K[:, :2], SIZE, GRID, 8)
+    with pytest.raises(ShapeError, match="multiple of 8"):
+        Projective(pose, K, SIZE, GRID, 12)
+    with pytest.raises(ShapeError, match="3 views"):
+        Projective(pose, K, SIZE, GRID, 8).query(tokens(8, views=2))

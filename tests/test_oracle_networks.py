@@ -1,0 +1,152 @@
+"""Networks, cameras and sampling against the reference values of the official implementations.
+
+Driven by the fixtures' own JSON (configurations, cases, salt): any folder of the same layout, named
+by GVTOOLS_ORACLE, is tried as well. Which check a fixture gets follows from its name's beginning.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+
+import oracle_denoiser_cases
+import oracle_depth_anything_cases
+import oracle_flow_cases
+import oracle_geometry_cases
+import pytest
+import torch
+from oracle import ABSENT, ORACLE
+from oracle_networks import Fixture
+
+from gvtools.completers.geoverse.checkpoints import shapes
+from gvtools.completers.geoverse.config import named
+from gvtools.completers.geoverse.denoiser import Denoiser, DenoiserConfig
+from gvtools.completers.geoverse.depth_anything import DepthAnything3, DepthAnythingConfig
+from gvtools.completers.geoverse.rgb_head import RGBHead
+
+NAMES = sorted(path.stem for path in ORACLE.glob("*.json")) if ORACLE.is_dir() else []
+pytestmark = pytest.mark.skipif(not NAMES, reason=ABSENT)
+
+
+def cases(*starts: str, key: str = "cases") -> list[tuple[str, int]]:
+    """Fixture and case number of every case of the fixtures with such names."""
+    found = []
+    for name in NAMES:
+        if name.startswith(starts):
+            data = json.loads((ORACLE / f"{name}.json").read_text(encoding="utf-8"))
+            found += [(name, index) for index in range(len(data.get(key, [])))]
+    return found
+
+
+@functools.lru_cache(maxsize=1)
+def depth_anything(name: str) -> tuple[Fixture, DepthAnything3]:
+    """A fixture and its network, kept for its other cases."""
+    fixture = Fixture(ORACLE / name)
+    return fixture, oracle_depth_anything_cases.network(fixture)
+
+
+@functools.lru_cache(maxsize=1)
+def fixture_of(name: str) -> Fixture:
+    """A fixture, kept for its other cases."""
+    return Fixture(ORACLE / name)
+
+
+@pytest.fixture(autouse=True)
+def _free_networks(request: pytest.FixtureRequest):  # type: ignore[no-untyped-def]
+    yield
+    if "keys" in request.node.name:
+        depth_anything.cache_clear()
+
+
+@pytest.mark.parametrize(("name", "case"), cases("da3_"))
+def test_depth_anything(name: str, case: int) -> None:
+    oracle_depth_anything_cases.check_case(*depth_anything(name), case)
+
+
+@pytest.mark.parametrize(("name", "case"), cases("gld_propagation"))
+def test_levels_propagated_from_generated_latents(name: str, case: int) -> None:
+    oracle_depth_anything_cases.check_propagation(*depth_anything(name), case)
+
+
+@pytest.mark.parametrize(("name", "case"), cases("gld_level1", "gld_cascade"))
+def test_denoiser_and_its_guidance(name: str, case: int) -> None:
+    oracle_denoiser_cases.check_case(fixture_of(name), case)
+
+
+@pytest.mark.parametrize(("name", "case"), cases("gld_sampler"))
+def test_whole_sampling_run(name: str, case: int) -> None:
+    oracle_denoiser_cases.check_sampler(fixture_of(name), case)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("gld_sampler")])
+def test_training_loss_at_a_fixed_time(name: str) -> None:
+    fixture = fixture_of(name)
+    losses = sorted({key.split(".")[0] for key in fixture.arrays.files if key.startswith("loss")})
+    assert losses
+    for loss in losses:
+        oracle_denoiser_cases.check_loss(fixture, loss)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("gld_time")])
+def test_time_grids_and_path(name: str) -> None:
+    fixture = fixture_of(name)
+    oracle_flow_cases.check_shifts(fixture)
+    oracle_flow_cases.check_grids(fixture)
+    oracle_flow_cases.check_training_shift(fixture)
+    oracle_flow_cases.check_path(fixture)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("gld_sampler")])
+def test_time_grids_and_losses_of_the_sampler(name: str) -> None:
+    oracle_flow_cases.check_sampler_grids(fixture_of(name))
+    oracle_flow_cases.check_losses(fixture_of(name))
+
+
+@pytest.mark.parametrize(("name", "case"), cases("gld_camera"))
+def test_camera_maps_and_projective_encoding(name: str, case: int) -> None:
+    oracle_geometry_cases.check_camera(fixture_of(name), case)
+
+
+@pytest.mark.parametrize(("name", "case"), cases("gld_rgb_decoder"))
+def test_rgb_head(name: str, case: int) -> None:
+    oracle_geometry_cases.check_rgb_decoder(fixture_of(name), case)
+
+
+@pytest.mark.parametrize(("name", "case"), cases("ray_pose"))
+def test_poses_from_rays(name: str, case: int) -> None:
+    oracle_geometry_cases.check_ray_pose(fixture_of(name), case)
+
+
+def key_list(path: Path) -> dict[str, tuple[int, ...]]:
+    """Name and shape of every line of a key list."""
+    found = {}
+    for line in path.read_text(encoding="utf-8").splitlines():
+        name, shape = line.split("\t")[:2]
+        found[name] = tuple(int(side) for side in shape.strip("()").split(",") if side.strip())
+    return found
+
+
+def small() -> DepthAnythingConfig:
+    """Depth Anything 3 Small."""
+    return DepthAnythingConfig(*oracle_depth_anything_cases.SIZES["small"])
+
+
+@pytest.mark.parametrize(
+    ("name", "prefix", "build"),
+    [
+        ("da3_small", "model.", lambda: DepthAnything3(small())),
+        ("da3_base", "model.", lambda: DepthAnything3(named("base").geometry)),
+        ("gld_da3_level1", "", lambda: Denoiser(DenoiserConfig())),
+        ("gld_da3_cascade", "", lambda: Denoiser(named("base").cascade or DenoiserConfig())),
+        ("gld_rgb_decoder", "", lambda: RGBHead(named("base").rgb)),
+    ],
+)
+def test_keys_and_shapes_of_the_published_files(name: str, prefix: str, build) -> None:  # type: ignore[no-untyped-def]
+    path = ORACLE / "keys" / f"{name}.txt"
+    if not path.is_file():
+        pytest.skip(f"no key list {path}")
+    with torch.device("meta"):
+        module = build()
+    found = {prefix + key: shape for key, shape in shapes(module.state_dict()).items()}
+    assert found == key_list(path)
