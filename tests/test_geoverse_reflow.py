@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvtools.completers.geoverse.flow import (
+    integrate,
+    interpolate,
+    sample,
+    unshift_time,
+    velocity_from_clean,
+)
+from gvtools.completers.geoverse.losses import flow_matching_loss
+from gvtools.completers.geoverse.reflow import (
+    fast_loss,
+    interval_ends,
+    interval_of,
+    interval_share,
+    reflow_pair,
+    sample_interval_times,
+    straight_state,
+    straight_velocity,
+    teacher_times,
+)
+from gvtools.errors import OptionError
+
+BOUNDS = (1.0, 0.75, 0.25, 0.0)
+SHAPE = (3, 2, 4, 2, 2)
+
+
+def _pair(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    clean, noise = torch.randn(2, *SHAPE, generator=generator, dtype=torch.float64)
+    return clean, noise
+
+
+def test_a_time_lies_in_the_interval_that_begins_at_or_above_it():
+    t = torch.tensor([1.0, 0.9, 0.75, 0.7499, 0.25, 0.2, 0.0])
+    assert interval_of(t, BOUNDS).tolist() == [0, 0, 1, 1, 2, 2, 2]
+    with pytest.raises(OptionError, match="expected within"):
+        interval_of(torch.tensor([0.1, 1.1]), BOUNDS)
+    with pytest.raises(OptionError, match="expected within"):
+        interval_of(torch.tensor([0.1]), (1.0, 0.5, 0.2))
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.floats(0.01, 0.99), min_size=1, max_size=5, unique_by=lambda x: round(x, 4)),
+    st.integers(0, 2**32),
+)
+def test_drawn_times_lie_in_their_intervals(inner, seed):
+    bounds = (1.0, *sorted(inner, reverse=True), 0.0)
+    generator = torch.Generator().manual_seed(seed)
+    intervals, t = sample_interval_times(64, bounds, generator=generator)
+    upper, lower = interval_ends(intervals, bounds)
+    assert bool(((t <= upper.float()) & (t >= lower.float())).all())
+    eta = interval_share(t.double(), upper=upper, lower=lower)
+    assert bool(((eta >= -1e-4) & (eta <= 1 + 1e-4)).all())
+
+
+def test_intervals_are_drawn_equally_often_and_times_uniformly():
+    intervals, t = sample_interval_times(30000, BOUNDS, generator=torch.Generator().manual_seed(0))
+    share = torch.bincount(intervals, minlength=3) / 30000
+    assert float((share - 1 / 3).abs().max()) < 5 * math.sqrt(2 / 9 / 30000)
+    upper, lower = interval_ends(intervals, BOUNDS)
+    eta = interval_share(t.double(), upper=upper, lower=lower).sort().values
+    assert float((eta - torch.arange(1, 30001) / 30000).abs().max()) < 1.63 / math.sqrt(30000)
+
+
+@given(st.floats(0, 1), st.integers(0, 2))
+def test_the_line_has_its_ends_and_its_velocity(eta, interval):
+    start, end = _pair()
+    upper, lower = BOUNDS[interval], BOUNDS[interval + 1]
+    torch.testing.assert_close(straight_state(start, end, 1.0), start)
+    torch.testing.assert_close(straight_state(start, end, 0.0), end)
+    u = straight_velocity(start, end, upper=upper, lower=lower)
+    # from any state of the line, the velocity leads to the interval's lower end
+    t = lower + eta * (upper - lower)
+    torch.testing.assert_close(straight_state(start, end, eta) - (t - lower) * u, end)
+
+
+def test_the_teachers_times_run_from_end_to_end_and_are_even_before_the_shift():
+    upper, lower = interval_ends(torch.tensor([0, 2, 1]), BOUNDS)
+    times = teacher_times(upper, lower, steps=5, shift=7.0)
+    assert torch.equal(times[0], upper) and torch.equal(times[-1], lower)
+    before = unshift_time(times, 7.0)
+    np.testing.assert_allclose(np.diff(before.numpy(), n=2, axis=0), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_a_teacher_of_straight_paths_gives_the_flow_matching_target(steps):
+    # A teacher that knows the one clean state moves along straight lines: X- lies on the path, and
+    # the reflow velocity is noise - clean at x_t itself.
+    clean, noise = _pair()
+    intervals, t = torch.tensor([0, 1, 2]), torch.tensor([0.8, 0.6, 0.125])
+    pair = reflow_pair(
+        lambda x, t: velocity_from_clean(clean, x, t, least=1e-9),
+        clean,
+        noise,
+        intervals=intervals,
+        t=t,
+        bounds=BOUNDS,
+        steps=steps,
+        shift=3.0,
+    )
+    torch.testing.assert_close(pair.velocity, noise - clean)
+    torch.testing.assert_close(pair.state, interpolate(clean, noise, t.double()), atol=1e-6, rtol=0)
+    assert torch.equal(pair.t, t.double())
+
+
+def test_the_pair_is_that_of_the_formulas_for_a_curved_teacher():
+    clean, noise = _pair(1)
+    matrix = torch.randn(4, 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+
+    def teacher(x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        return torch.einsum("bvchw,cd->bvdhw", x, matrix) * (1 + t.reshape(-1, 1, 1, 1, 1))
+
+    intervals, t = torch.tensor([2, 0, 1]), torch.tensor([0.1, 0.8, 0.5], dtype=torch.float64)
+    pair = reflow_pair(
+        teacher, clean, noise, intervals=intervals, t=t, bounds=BOUNDS, steps=6, shift=2.0
+    )
+    assert not pair.velocity.requires_grad
+    for b, a in enumerate(intervals.tolist()):
+        upper, lower = BOUNDS[a], BOUNDS[a + 1]
+        start = (1 - upper) * clean[b] + upper * noise[b]
+        u = np.linspace(upper / (2 - upper), lower / (2 - lower), 7)  # before the shift of 2
+        x = start
+        for now, after in pairwise(u):
+            now, after = 2 * now / (1 + now), 2 * after / (1 + after)
+            x = x + (after - now) * teacher(x[None], torch.tensor([now]))[0]
+        eta = (float(t[b]) - lower) / (upper - lower)
+        torch.testing.assert_close(pair.velocity[b], (start - x) / (upper - lower))
+        torch.testing.assert_close(pair.state[b], eta * start + (1 - eta) * x)
+
+
+def test_a_student_that_learnt_it_needs_one_step_an_interval():
+    # The linear teacher's displacement over an interval is linear in its start: a student can know
+    # it. Chained over the intervals it ends where the teacher's many steps end.
+    noise = _pair(3)[1]
+
+    def teacher(x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        return 0.8 * x + t.reshape(-1, 1, 1, 1, 1)
+
+    def student(x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        upper, lower = interval_ends(interval_of(t, BOUNDS), BOUNDS)
+        times = teacher_times(upper, lower, steps=50)
+        return straight_velocity(x, integrate(teacher, x, times), upper=upper, lower=lower)
+
+    many = noise
+    for a in range(3):
+        upper, lower = torch.full((2, 3), BOUNDS[a]), torch.full((2, 3), BOUNDS[a + 1])
+        many = integrate(teacher, many, teacher_times(upper[0], lower[0], steps=50))
+    torch.testing.assert_close(sample(student, noise, BOUNDS), many, atol=1e-6, rtol=1e-6)
+
+
+def test_a_time_outside_its_interval_is_refused():
+    clean, noise = _pair()
+    with pytest.raises(OptionError, match="outside their intervals"):
+        reflow_pair(
+            lambda x, t: x,
+            clean,
+            noise,
+            intervals=torch.tensor([0, 1, 2]),
+            t=torch.tensor([0.8, 0.8, 0.1]),
+            bounds=BOUNDS,
+            steps=2,
+        )
+    with pytest.raises(OptionError, match="expected 0 to 2"):
+        interval_ends(torch.tensor([3]), BOUNDS)
+
+
+def test_the_two_objectives_are_blended():
+    clean, noise = _pair()
+    reflow = flow_matching_loss(clean, noise, context=1)
+    flow = flow_matching_loss(noise, 2 * clean, context=1)
+    torch.testing.assert_close(fast_loss(reflow, flow, rho=0.3), 0.3 * reflow + 0.7 * flow)
+    with pytest.raises(OptionError, match="rho"):
+        fast_loss(reflow, flow, rho=1.5)

@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvtools.completers.geoverse.similarity_scale import DEFECTS, center_similarity
+from gvtools.errors import ShapeError
+from gvtools.similarity import fit_similarity
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def _rotation(rng: np.random.Generator) -> np.ndarray:
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+def _fit(predicted, reference, **options):
+    return center_similarity(
+        torch.as_tensor(np.asarray(predicted))[None],
+        torch.as_tensor(np.asarray(reference))[None],
+        **options,
+    )
+
+
+@settings(deadline=None)
+@given(SEEDS, st.integers(2, 8), st.floats(0.01, 100))
+def test_a_similarity_is_recovered_from_two_centres_on(seed, count, scale):
+    rng = np.random.default_rng(seed)
+    points, q, b = rng.normal(size=(count, 3)), _rotation(rng), rng.normal(size=3)
+    fit = _fit(points, scale * points @ q.T + b)
+    assert fit.status == ("aligned",)
+    assert float(fit.scale) == pytest.approx(scale, rel=1e-9)
+    assert float(fit.correlation) == pytest.approx(1)
+    if count >= 4:
+        np.testing.assert_allclose(fit.rotation[0], q, atol=1e-6)
+        np.testing.assert_allclose(fit.translation[0], b, atol=1e-6 * (1 + scale))
+    assert float(torch.linalg.det(fit.rotation)) == pytest.approx(1)
+
+
+@settings(deadline=None)
+@given(SEEDS, st.integers(3, 8), st.floats(0, 2))
+def test_noisy_centres_give_the_scale_of_the_numpy_fit(seed, count, noise):
+    rng = np.random.default_rng(seed)
+    predicted = rng.normal(size=(count, 3))
+    reference = 3 * predicted @ _rotation(rng).T + noise * rng.normal(size=(count, 3)) + 5
+    expected = fit_similarity(predicted, reference)
+    fit = _fit(predicted, reference)
+    if expected.ok:
+        assert float(fit.scale) == pytest.approx(expected.scale, rel=1e-9)
+        np.testing.assert_allclose(fit.rotation[0], expected.rotation, atol=1e-6)
+        np.testing.assert_allclose(fit.translation[0], expected.translation, atol=1e-6)
+        spread = reference - reference.mean(axis=0)
+        left = (expected.residuals**2).sum() / (spread**2).sum()
+        assert 1 - float(fit.correlation) ** 2 == pytest.approx(left, abs=1e-9)
+
+
+@settings(deadline=None)
+@given(SEEDS)
+def test_no_other_similarity_fits_better(seed):
+    rng = np.random.default_rng(seed)
+    predicted, reference = rng.normal(size=(2, 5, 3))
+    fit = _fit(predicted, reference)
+
+    def cost(scale: float, rotation: np.ndarray) -> float:
+        moved = scale * predicted @ rotation.T
+        moved = moved + (reference - moved).mean(axis=0)
+        return float(((moved - reference) ** 2).sum())
+
+    best = cost(float(fit.scale), fit.rotation[0].numpy())
+    for _ in range(50):
+        angle = rng.normal(size=3) * rng.choice([0.01, 1.0])
+        turn = torch.linalg.matrix_exp(
+            torch.tensor(
+                [[0, -angle[2], angle[1]], [angle[2], 0, -angle[0]], [-angle[1], angle[0], 0]]
+            )
+        ).numpy()
+        scale = float(fit.scale) * math.exp(rng.normal() * 0.1)
+        assert cost(scale, turn @ fit.rotation[0].numpy()) >= best - 1e-12
+
+
+@settings(deadline=None)
+@given(SEEDS)
+def test_mirrored_centres_are_not_matched_by_a_reflection(seed):
+    rng = np.random.default_rng(seed)
+    predicted = rng.normal(size=(6, 3))
+    reference = 2 * predicted * np.array([-1.0, 1, 1])
+    fit = _fit(predicted, reference)
+    assert float(torch.linalg.det(fit.rotation)) == pytest.approx(1)
+    singular = np.linalg.svd((predicted - predicted.mean(0)).T @ (predicted - predicted.mean(0)))[1]
+    expected = 2 * (singular[0] + singular[1] - singular[2]) / singular.sum()
+    assert float(fit.scale) == pytest.approx(expected, rel=1e-9)
+    assert 0 < float(fit.scale) < 2
+
+
+def test_centres_on_a_line_give_a_scale_where_the_numpy_fit_refuses():
+    line = np.linspace(0, 1, 5)[:, None] * np.array([[1.0, 2.0, -1.0]]) + 3
+    reference = 4 * line @ _rotation(np.random.default_rng(0)).T
+    assert not fit_similarity(line, reference).ok
+    fit = _fit(line, reference)
+    assert fit.status == ("aligned",) and float(fit.scale) == pytest.approx(4)
+
+
+def test_samples_are_fitted_one_by_one_from_their_valid_centres():
+    rng = np.random.default_rng(1)
+    predicted = rng.normal(size=(3, 6, 3))
+    reference = np.array([2.0, 3.0, 5.0])[:, None, None] * predicted + rng.normal(size=(3, 1, 3))
+    valid = np.ones((3, 6), bool)
+    valid[0, 4:] = valid[1, 0] = False
+    spoilt = reference.copy()
+    spoilt[0, 4:], spoilt[1, 0], predicted[2, 3] = 99, np.nan, np.inf
+    fit = center_similarity(
+        torch.tensor(predicted), torch.tensor(spoilt), valid=torch.tensor(valid)
+    )
+    np.testing.assert_allclose(fit.scale, [2, 3, 5])
+    assert fit.used.tolist() == [4, 5, 5]
+
+
+@pytest.mark.parametrize(
+    ("predicted", "reference", "valid", "defect"),
+    [
+        (np.eye(3), np.eye(3), [True, False, False], 1),
+        (np.full((3, 3), np.nan), np.eye(3), [True] * 3, 1),
+        (np.full((3, 3), 0.1), np.eye(3), [True] * 3, 2),
+        (np.zeros((3, 3)), np.eye(3), [True] * 3, 2),
+        (np.eye(3), np.full((3, 3), 1e6 / 3), [True] * 3, 3),
+        (np.eye(3), np.full((3, 3), np.nan), [True] * 3, 1),
+        (
+            np.array([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0], [0, 0, 0]]),
+            np.array([[0.0, 0, 0], [0, 0, 0], [0, 1, 0], [0, -1, 0]]),
+            [True] * 4,
+            4,
+        ),
+    ],
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_what_leaves_the_scale_open_is_said(predicted, reference, valid, defect, dtype):
+    given_ = torch.tensor(predicted, dtype=dtype)[None].requires_grad_()
+    fit = center_similarity(
+        given_, torch.tensor(reference, dtype=dtype)[None], valid=torch.tensor([valid])
+    )
+    assert fit.status == (DEFECTS[defect],)
+    assert not bool(fit.ok) and bool(fit.scale.isnan()) and bool(fit.rotation.isnan().all())
+    # whoever replaces the NaN, as the depth loss does, keeps a graph without NaN
+    torch.where(fit.ok, fit.scale, 1.0).sum().backward()
+    assert given_.grad is not None and not bool(given_.grad.any())
+
+
+def test_small_baselines_far_out_are_geometry_as_long_as_the_dtype_resolves_them():
+    rng = np.random.default_rng(0)
+    predicted = rng.normal(size=(4, 3)) * 1e-3 + 100
+    fine = _fit(predicted, 2 * predicted)
+    assert float(fine.scale) == pytest.approx(2, rel=1e-6)
+    coarse = _fit(predicted.astype(np.float32) + np.float32(1e5), predicted)
+    assert coarse.status == ("coincident predicted centres",)
+
+
+@pytest.mark.parametrize("count", [2, 3, 6])
+def test_the_gradient_of_the_scale_is_exact(count):
+    generator = torch.Generator().manual_seed(count)
+    predicted, reference = torch.randn(2, 2, count, 3, generator=generator, dtype=torch.float64)
+    predicted = predicted.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: center_similarity(x, reference).scale, predicted)
+    assert torch.autograd.gradcheck(
+        lambda x: center_similarity(x, reference).scale,
+        (predicted.detach() * torch.tensor([-1.0, 1, 1])).requires_grad_(),
+    )
+
+
+def test_the_gradient_holds_where_that_of_the_svd_is_infinite():
+    # equal singular values: a cube's corners
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)[None]
+    predicted = corners.clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: center_similarity(x, corners).scale, predicted)
+
+
+def test_the_reference_receives_no_gradient():
+    predicted, reference = torch.randn(2, 1, 4, 3, generator=torch.Generator().manual_seed(0))
+    predicted, reference = predicted.requires_grad_(), reference.requires_grad_()
+    center_similarity(predicted, reference).scale.sum().backward()
+    assert predicted.grad is not None and reference.grad is None
+
+
+def test_half_precision_and_shapes():
+    points = torch.randn(1, 5, 3, generator=torch.Generator().manual_seed(0))
+    fit = center_similarity(points.to(torch.bfloat16), 3 * points)
+    assert fit.scale.dtype == torch.float32 and float(fit.scale) == pytest.approx(3, rel=0.01)
+    for wrong in (points[0], points[:, :4], points[..., :2]):
+        with pytest.raises(ShapeError, match="camera centres"):
+            center_similarity(wrong, points)
+    with pytest.raises(ShapeError, match="valid centres"):
+        center_similarity(points, points, valid=torch.ones(1, 5))
