@@ -57,7 +57,7 @@ def measure(scene: Scene, pool: tuple[str, ...], views: list[str], options: Ster
         off.append(float((error > 0.1).mean()))
         confidences.append(found.confidence[both])
         right.append(error < WRONG)
-    seconds = (time.perf_counter() - start) / len(stereo._raw)
+    seconds = (time.perf_counter() - start) / len(stereo.computed)
     return {
         "kept": float(np.mean(kept)),
         "median": float(np.mean(medians)),

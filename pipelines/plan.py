@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from pipelines.console import Console
+from pipelines.voxel_edge import automatic_voxel
 
 if TYPE_CHECKING:
     from gvtools.depth.source import DepthSource
     from gvtools.scenes.scene import Scene
     from pipelines.config import RunConfig
     from pipelines.targets import Targets
-
-# Views that are opened to find a voxel edge, and to tell two readings of a project apart.
-SAMPLED_VIEWS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +29,7 @@ class Plan:
         schedule: per round (from 1) the rows of the targets.
         source: where depth comes from.
         source_reason: why from there, in words.
+        ignored: settings of stereo that this source does not look at.
     """
 
     scene: Scene
@@ -40,10 +39,20 @@ class Plan:
     schedule: tuple[tuple[int, ...], ...]
     source: DepthSource
     source_reason: str
+    ignored: tuple[str, ...] = ()
 
 
-def make_plan(scene: Scene, config: RunConfig) -> Plan:
-    """Resolve selections, depth source, voxel edge and schedule."""
+def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | None = None) -> Plan:
+    """Resolve selections, depth source, voxel edge and schedule.
+
+    Args:
+        scene: the project.
+        config: as the user gave it.
+        say: is told what is computed meanwhile.
+
+    Raises:
+        GvError: settings that the project cannot serve.
+    """
     from gvtools.completers.base import create
     from gvtools.depth.choice import choose_source
     from gvtools.errors import ProjectError
@@ -71,13 +80,15 @@ def make_plan(scene: Scene, config: RunConfig) -> Plan:
     chosen = choose_source(scene, context, config.depth, stereo=config.stereo)
     if config.voxel is None:
         edge = automatic_voxel(
-            scene, context, chosen.source, percentile=config.fusion.voxel_percentile
+            scene, context, chosen.source, percentile=config.fusion.voxel_percentile, say=say
         )
         edge *= config.fusion.voxel_scale
         config = replace(config, voxel=float(f"{edge:.3g}"))
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = replace(config, rounds=len(schedule))
-    return Plan(scene, config, context, targets, schedule, chosen.source, chosen.reason)
+    return Plan(
+        scene, config, context, targets, schedule, chosen.source, chosen.reason, chosen.ignored
+    )
 
 
 def _on_device(config: RunConfig) -> RunConfig:
@@ -104,11 +115,6 @@ def _on_device(config: RunConfig) -> RunConfig:
     return replace(config, splat=replace(splat, backend="torch", device="cuda"))
 
 
-def sampled(names: Sequence[str]) -> Sequence[str]:
-    """At most SAMPLED_VIEWS of the names, evenly spread."""
-    return names[:: -(-len(names) // SAMPLED_VIEWS)] if names else names
-
-
 def make_schedule(
     targets: int, views_per_round: int, rounds: int | None
 ) -> tuple[tuple[int, ...], ...]:
@@ -125,41 +131,6 @@ def make_schedule(
     used = min(targets, rounds * views_per_round)
     cuts = [i * used // rounds for i in range(rounds + 1)]
     return tuple(tuple(range(a, b)) for a, b in pairwise(cuts))
-
-
-def automatic_voxel(
-    scene: Scene, context: Sequence[str], source: DepthSource, *, percentile: float
-) -> float:
-    """A percentile of the pixel footprints z / f of the context's depth, scene units.
-
-    Of a view whose depth has yet to be computed, the sparse points' depth serves.
-    """
-    import numpy as np
-
-    from gvtools.errors import DegenerateError
-
-    footprints = []
-    for name in sampled([name for name in context if source.covers(scene[name])]):
-        view = scene[name]
-        known = np.zeros(0, np.float32)
-        if not view.has_depth and scene.points is not None:
-            row = scene.points.view_index == scene.names.index(name)
-            _, z = view.camera.project(scene.points.positions[scene.points.point_index[row]])
-            known = z[0][z[0] > 0].astype(np.float32)
-        if not known.size:
-            try:
-                depth = source.depth(scene, view, view.load()).depth
-            except DegenerateError:
-                continue
-            known = depth[depth > 0]
-        if known.size:
-            focal = float(np.sqrt(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
-            footprints.append(float(np.percentile(known, percentile)) / focal)
-    from gvtools.errors import ProjectError
-
-    if not footprints:
-        raise ProjectError(f"{scene.root}: the context's depth maps are empty; see 'gvtools check'")
-    return float(np.median(footprints))
 
 
 def describe(plan: Plan, console: Console) -> None:
@@ -183,6 +154,11 @@ def describe(plan: Plan, console: Console) -> None:
         console.warn(
             f"{len(targets.cameras) - scheduled} of {len(targets.cameras)} targets are in no "
             "round; raise --rounds or --views-per-round"
+        )
+    if plan.ignored:
+        console.warn(
+            f"{', '.join(plan.ignored)} changes nothing: no plane sweep computes depth here, but "
+            f"{plan.source.name}"
         )
     for finding in plan.scene.findings:
         if finding.level == "warning":

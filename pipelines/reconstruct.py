@@ -141,7 +141,7 @@ def reconstruct(
     Raises:
         GvError: wrong input or options; nothing of an earlier run is lost.
     """
-    plan = make_plan(scene, config)
+    plan = make_plan(scene, config, say=console.line)
     describe(plan, console)
     from pipelines.run_directory import RunDirectory
     from pipelines.run_identity import run_identity
@@ -215,7 +215,7 @@ def _round(
 ) -> dict[str, Any]:
     from gvtools.completers.base import create
     from pipelines import rounds
-    from pipelines.context_depth import KeptDepth
+    from pipelines.context_depth import KeptDepth, warn_of_depth
     from pipelines.round_files import camera_entry, target_stems, write_target
 
     clock = rounds.Clock()
@@ -226,12 +226,17 @@ def _round(
     dropped: dict[str, int] = {}
     depth: list[dict[str, Any]] = []
     if number == 0:
+        source = KeptDepth(plan.scene, plan.context, plan.source, folder, unfinished=True)
+        if source.kept:
+            console.line(
+                f"taking over the depth of {source.kept} of {len(plan.context)} context views, "
+                "which an interrupted attempt at this run had computed"
+            )
         total, dropped, depth = rounds.observe_context(
-            plan.scene, plan.context,
-            source=KeptDepth(plan.scene, plan.context, plan.source, folder),
+            plan.scene, plan.context, source=source,
             memory=memory, config=plan.config, clock=clock, progress=console.track,
         )  # fmt: skip
-        _warn_of_depth(depth, console)
+        warn_of_depth(depth, console)
     else:
         cameras = plan.targets.cameras[list(plan.schedule[number - 1])]
         with clock.stage("project"):
@@ -282,23 +287,6 @@ def _round(
     }
 
 
-def _warn_of_depth(reports: list[dict[str, Any]], console: Console) -> None:
-    failed = [report for report in reports if report["failed"]]
-    if failed:
-        console.warn(
-            f"{len(failed)} of {len(reports)} views have no depth and give no points, first: "
-            f"{failed[0]['failed']}"
-        )
-    odd = [report for report in reports if report["scale"] and report["scale"]["disagrees"]]
-    if odd:
-        first = odd[0]["scale"]
-        console.warn(
-            f"the depth of {len(odd)} of {len(reports)} views disagrees with the sparse points, "
-            f"first {odd[0]['view']}: {first['status']}, scale {first['scale']:.3g}; look at its "
-            "unit and at the poses"
-        )
-
-
 def _mean(values: list[float]) -> float | None:
     return sum(values) / len(values) if values else None
 
@@ -318,6 +306,7 @@ def _finish(plan: Plan, memory: SpatialMemory, directory: RunDirectory, console:
     """The run's end products, all derived from the last round's memory."""
     from gvtools.files import replaced_when_written
     from gvtools.memory.ply import export_memory_ply
+    from pipelines.context_depth import off_scale
     from pipelines.measure import measure_run
     from viz.growth import draw_growth, growth_text
 
@@ -334,4 +323,7 @@ def _finish(plan: Plan, memory: SpatialMemory, directory: RunDirectory, console:
     write_json(out / "metrics.json", metrics)
     last.unlink(missing_ok=True)
     console.line(growth_text(reports))
+    flagged = off_scale(reports[0].get("depth", ()))
+    if flagged:
+        console.warn(f"{flagged}; figures in {directory.round_path(0) / 'report.json'}")
     console.line(f"results in {out}: memory.npz, memory.ply, growth.png, metrics.json, round_*/")

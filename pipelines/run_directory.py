@@ -2,6 +2,8 @@
 
 A round is written under a temporary name and renamed when it is whole, its memory included, so a
 kill at any moment leaves whole rounds only. The next round drops the previous one's memory file.
+Of a round that was not finished, the depth that it had computed is kept for the next attempt, which
+takes it over where it is the same run.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import os
 import platform
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -37,6 +39,8 @@ def versions() -> dict[str, str]:
 
 # What is being written has such a name until it is whole.
 LEFTOVERS = ".*.part"
+# Files of an unfinished round that are whole, and worth more than starting again.
+LASTING = "context_depth_*"
 
 
 class RunDirectory:
@@ -136,11 +140,14 @@ class RunDirectory:
         return True
 
     def _start(self, identity: dict[str, Any], *, resume: bool) -> int:
-        if not self.check(identity, resume=resume):
-            self._drop_leftovers()
-            write_json(self.path / "run.json", {**identity, "versions": versions()})
+        there = self.check(identity, resume=resume)
+        record = {**identity, "versions": versions()}
+        begun = self._is_recorded(record)
+        self._drop_leftovers(but=self._part(0) if begun else None)
+        if not there:
+            if not begun:
+                write_json(self.path / "run.json", record)
             return 0
-        self._drop_leftovers()
         done = len(self.reports())
         # Rounds after a removed one stood on it; they are done anew.
         for later in sorted(self.path.glob("round_[0-9]*")):
@@ -150,6 +157,14 @@ class RunDirectory:
             self._settle(done - 1)
         return done
 
+    def _is_recorded(self, record: dict[str, Any]) -> bool:
+        """Whether a first attempt at the very same run, by the same versions, was begun here."""
+        try:
+            before = json.loads((self.path / "run.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return False
+        return bool(before == json.loads(json.dumps(record)))
+
     def _results(self) -> list[Path]:
         """What the folder holds beside the run's record and what a kill left half-written."""
         return [
@@ -158,8 +173,10 @@ class RunDirectory:
             if path.name != "run.json" and not fnmatch(path.name, LEFTOVERS)
         ]
 
-    def _drop_leftovers(self) -> None:
+    def _drop_leftovers(self, *, but: Path | None) -> None:
         for leftover in self.path.glob(LEFTOVERS):
+            if leftover == but:
+                continue
             if leftover.is_dir():
                 shutil.rmtree(leftover)
             else:
@@ -184,6 +201,10 @@ class RunDirectory:
         """Where round ``number`` stands."""
         return self.path / f"round_{number:03d}"
 
+    def _part(self, number: int) -> Path:
+        """Where round ``number`` is written."""
+        return self.path / f".round_{number:03d}.part"
+
     def round_memory(self, number: int) -> Path:
         """The memory after round ``number``; kept for the last whole round only."""
         return self.round_path(number) / "memory.npz"
@@ -192,18 +213,21 @@ class RunDirectory:
     def writing_round(self, number: int) -> Iterator[Path]:
         """A folder to fill; it becomes the round when the block ends without an error.
 
+        What an earlier attempt at this round left that lasts (LASTING) is in it.
+
         Raises:
             ProjectError: the disk is full or the folder cannot be written; earlier rounds stand.
         """
-        part = self.path / f".round_{number:03d}.part"
+        part = self._part(number)
         try:
-            if part.exists():
-                shutil.rmtree(part)
-            part.mkdir(parents=True)
+            part.mkdir(parents=True, exist_ok=True)
+            _clear(part)
             yield part
             os.replace(part, self.round_path(number))
         except BaseException as error:
-            shutil.rmtree(part, ignore_errors=True)
+            with suppress(OSError):
+                _clear(part)
+                part.rmdir()  # Fails where something lasts.
             # A file that could not be written names itself; the user's concern is the round.
             cause = error.__cause__ if isinstance(error, ProjectError) else error
             if not isinstance(cause, OSError):
@@ -220,3 +244,12 @@ class RunDirectory:
             self.round_memory(number - 1).unlink(missing_ok=True)
         lines = [json.dumps(report) for report in self.reports()]
         write_text(self.path / "rounds.jsonl", "".join(f"{line}\n" for line in lines))
+
+
+def _clear(part: Path) -> None:
+    """Remove what does not last from the folder of an unfinished round."""
+    for path in part.iterdir():
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif not fnmatch(path.name, LASTING):
+            path.unlink()

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipelines.plan import Plan, sampled
+from pipelines.plan import Plan
+from pipelines.sampling import sampled
 
 
 def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
@@ -24,6 +25,7 @@ def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
         "reading": dict(reading),
         "fingerprint": fingerprint([*files, *plan.targets.files]),
         "cameras": _camera_digest(plan),
+        "points": _point_digest(plan),
         "pixels": _pixel_digest(plan),
         "config": plan.config.to_dict(),
         "context": list(plan.context),
@@ -53,6 +55,17 @@ def _camera_digest(plan: Plan) -> str:
     for cameras in (plan.scene.subset(plan.context).cameras, plan.targets.cameras):
         for array in (cameras.K, cameras.cam_from_world, cameras.width, cameras.height):
             digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _point_digest(plan: Plan) -> str | None:
+    """Of the sparse points and their tracks, by which depth is sought and checked."""
+    points = plan.scene.points
+    if points is None:
+        return None
+    digest = hashlib.sha256()
+    for array in (points.positions, points.point_index, points.view_index, points.xy):
+        digest.update(array.tobytes())
     return digest.hexdigest()
 
 

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+# As the command line has it: threads that spin while they wait are slow where others work, too.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 

@@ -8,14 +8,14 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_scan import render, world_from_cam, write_scan
+from tiny_scan import render, world_from_cam, write_colmap_scan, write_scan
 
 from gvtools.depth import choice
 from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.cli import main
-from pipelines.context_depth import colored
+from pipelines.context_depth import colored, off_scale
 
 RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3", "--quiet")
 
@@ -114,6 +114,50 @@ def test_the_automatic_voxel_asks_the_source_where_nothing_else_tells(scan, tmp_
     assert reconstruct(scan, tmp_path / "run") == 0
     config = json.loads((tmp_path / "run" / "run.json").read_text())["config"]
     assert config["voxel"] == pytest.approx(3 / 90, rel=0.05)
+
+
+@pytest.mark.parametrize("wrong", [(), (1, 4)])
+def test_views_off_the_sparse_points_scale_are_reported_and_named(
+    tmp_path, monkeypatch, capsys, wrong
+):
+    class Scaled(Exact):
+        """Depth of some views is by a third too large."""
+
+        def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
+            index = int(view.name[5:-4])
+            depth = render(world_from_cam(index))[1] * (4 / 3 if index in wrong else 1)
+            return DepthMap(depth.astype(np.float32), np.ones(depth.shape, np.float32), "scaled")
+
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Scaled())
+    scan, out = write_colmap_scan(tmp_path / "colmap", views=8), tmp_path / "run"
+    options = ("--context", "not:first:1", "--targets", "first:1", "--completer", "none")
+    words = ["reconstruct", str(scan), "--out", str(out), *options, "--quiet"]
+    assert main(words) == 0
+    for entry in json.loads((out / "round_000" / "report.json").read_text())["depth"]:
+        off, scale = int(entry["view"][5:-4]) in wrong, entry["scale"]
+        assert scale["disagrees"] is off
+        assert scale["scale"] == pytest.approx(0.75 if off else 1, rel=1e-3)
+        assert scale["status"] == "aligned"
+        assert scale["inliers"] > 40
+        assert scale["residual"] < 1e-3
+    last = capsys.readouterr().err.splitlines()[-1:]
+    if wrong:
+        assert "2 of 7 views is off the sparse points' scale: view_1.png, view_4.png;" in last[0]
+        assert str(out / "round_000" / "report.json") in last[0]
+        # A run that is taken up again says it as well.
+        assert main([*words, "--resume"]) == 0
+        assert "view_1.png, view_4.png;" in capsys.readouterr().err
+    else:
+        assert last == []
+
+
+def test_a_long_list_of_views_is_cut():
+    reports = [{"view": f"v{i}", "scale": {"disagrees": True}} for i in range(12)]
+    told = off_scale([*reports, {"view": "good", "scale": None}])
+    assert told is not None
+    assert told.endswith("v9 and 2 more")
+    assert "12 of 13" in told
+    assert off_scale([{"view": "good", "scale": None}]) is None
 
 
 def test_depth_is_drawn_from_near_red_to_far_blue():

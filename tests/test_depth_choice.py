@@ -11,15 +11,19 @@ from scenes_workspace import workspace
 from tiny_scan import write_scan
 
 from gvtools.depth import choice, colmap_patch_match
-from gvtools.depth.choice import choose_source
+from gvtools.depth.choice import choose_source, rough_source
 from gvtools.depth.colmap_patch_match import ColmapPatchMatch, write_workspace
+from gvtools.depth.rectified_pair import RectifiedPair
 from gvtools.depth.scale_check import disagrees, scale_to_points
-from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth
+from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded
+from gvtools.depth.stereo.options import StereoOptions
+from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import CheckpointError, DegenerateError, OptionError, ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.colmap_depth import write_depth_map
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 from gvtools.scenes.sevenscenes import read_sevenscenes
+from pipelines.cli import main
 
 
 class Computed:
@@ -50,6 +54,15 @@ def without_depth(scene: Scene, *rows: int) -> Scene:
     return replace(scene, views=views)
 
 
+def _with_points(scene: Scene) -> Scene:
+    none = np.zeros(0, np.int32)
+    points = SparsePoints(
+        np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), none, none,
+        np.zeros((0, 2)),
+    )  # fmt: skip
+    return replace(scene, points=points)
+
+
 def test_auto_takes_recorded_depth_where_all_have_it(scan):
     chosen = choose_source(scan, scan.names, "auto")
     assert isinstance(chosen.source, RecordedDepth)
@@ -74,6 +87,67 @@ def test_auto_computes_where_there_is_none(scan, monkeypatch):
     chosen = choose_source(bare, bare.names, "auto")
     assert chosen.source.name == "computed"
     assert "plane-sweep" in chosen.reason
+
+
+def test_a_pair_side_by_side_says_so_and_which_settings_it_ignores(scan, tmp_path, capsys):
+    bare = without_depth(scan, *range(6))
+    given = StereoOptions(window=5, planes=64)
+    for asked in ("plane-sweep", "auto"):
+        pair = choose_source(bare, bare.names[:2], asked, stereo=given)
+        assert isinstance(pair.source, RectifiedPair)
+        assert "two views side by side" in pair.reason
+        assert set(pair.ignored) == {"stereo.window=5", "stereo.planes=64"}
+        assert not choose_source(bare, bare.names[:2], asked).ignored
+        assert not choose_source(bare, bare.names[:2], asked, stereo=StereoOptions()).ignored
+        # Three views go to the plane sweep, which takes them.
+        assert not choose_source(bare, bare.names[:3], asked, stereo=given).ignored
+    assert choose_source(scan, scan.names, "auto", stereo=given).ignored
+    words = ["reconstruct", str(scan.root), "--out", str(tmp_path / "run"), "--dry-run"]
+    words += ["--context", "first:2", "--targets", "range:3-4", "--depth", "plane-sweep"]
+    assert main([*words, "--set", "stereo.window=5"]) == 0
+    told = capsys.readouterr()
+    assert "depth rectified-pair (asked for plane-sweep; two views side by side" in told.out
+    assert told.err.splitlines() == [
+        "warning: stereo.window=5 changes nothing: no plane sweep computes depth here, but "
+        "rectified-pair"
+    ]
+    assert main(words) == 0
+    assert not capsys.readouterr().err
+
+
+def test_what_is_recorded_is_told_from_what_is_computed(scan):
+    partly = without_depth(scan, 1)
+    mixed = MixedDepth(RecordedDepth(), Computed())
+    assert [is_recorded(mixed, view) for view in partly][:3] == [True, False, True]
+    assert not is_recorded(RecordedDepth(), partly.views[1])
+    # Asked to compute, a source does not read what lies there.
+    assert not is_recorded(Computed(), scan.views[0])
+
+
+def test_a_rough_source_is_a_small_sweep_without_posing(scan, tmp_path):
+    bare = without_depth(scan, *range(1, 6))
+    given = StereoOptions(window=5, align=True)
+    chosen = choose_source(bare, bare.names, "auto", stereo=given)
+    rough = rough_source(bare, chosen.source)
+    assert isinstance(rough, PlaneSweepStereo)
+    assert (rough.options.window, rough.options.align) == (5, False)
+    assert rough.options.max_side <= 160
+    assert rough.views == bare.names
+    patch_match = rough_source(bare, ColmapPatchMatch(_with_points(bare), bare.names))
+    assert isinstance(patch_match, PlaneSweepStereo)
+    assert patch_match.views == bare.names
+    pair = choose_source(bare, bare.names[1:3], "auto").source
+    assert rough_source(bare, pair) is pair
+
+
+def test_a_sweep_tells_which_views_it_has_computed(scan):
+    """A view needs its sources' own estimates, and nothing is computed before it is asked for."""
+    stereo = PlaneSweepStereo(scan, options=StereoOptions(sources=2, align=False), views=scan.names)
+    assert stereo.computed == ()
+    view = scan.views[0]
+    stereo.depth(scan, view, view.load())
+    assert set(stereo.computed) == {view.name, *stereo.raw(view).sources}
+    assert len(stereo.computed) == 3
 
 
 def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_scan import write_scan
+from tiny_scan import write_colmap_scan, write_scan
 
 from gvtools.errors import ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -70,6 +70,20 @@ def test_a_changed_camera_is_another_run(scan, tmp_path, capsys):
     np.savetxt(pose, matrix)
     assert reconstruct(scan, out, "--resume") == 2
     assert "cameras" in capsys.readouterr().err
+
+
+def test_changed_sparse_points_are_another_run(tmp_path, capsys):
+    """Computed depth stands on them."""
+    project = write_colmap_scan(tmp_path / "colmap")
+    out = tmp_path / "run"
+    words = ("--completer", "none", "--context", "first:3", "--targets", "last:1")
+    assert reconstruct(project, out, *words, "--voxel", "0.03") == 0
+    assert reconstruct(project, out, *words, "--voxel", "0.03", "--resume") == 0
+    other = write_colmap_scan(tmp_path / "other", points=70)
+    shutil.rmtree(project / "sparse")
+    shutil.copytree(other / "sparse", project / "sparse")
+    assert reconstruct(project, out, *words, "--voxel", "0.03", "--resume") == 2
+    assert "(points differ)" in capsys.readouterr().err
 
 
 def test_removing_a_round_forgets_it_and_what_came_after(scan, tmp_path):

@@ -1,4 +1,4 @@
-"""A tiny posed RGB-D recording in the 7-Scenes layout: a textured wall behind a square."""
+"""A tiny posed recording of a textured wall behind a square: RGB-D as 7-Scenes, or COLMAP."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+
+from gvtools.cameras import Cameras
+from gvtools.scenes.colmap_writer import write_colmap
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
 WALL, SQUARE, HALF = 3.0, 1.8, 0.35
@@ -48,4 +51,41 @@ def write_scan(folder: Path, *, views: int = 6) -> Path:
         Image.fromarray(rgb).save(f"{stem}.color.png")
         Image.fromarray(np.rint(depth * 1000).astype(np.uint16)).save(f"{stem}.depth.png")
         np.savetxt(f"{stem}.pose.txt", pose)
+    return folder
+
+
+def write_colmap_scan(folder: Path, *, views: int = 6, points: int = 60) -> Path:
+    """The photographs as a COLMAP project without depth maps; each view sees ``points`` of its own.
+
+    The sparse points are exact. With none, the project has no sparse points.
+    """
+    rng = np.random.default_rng(0)
+    names = tuple(f"view_{i}.png" for i in range(views))
+    (folder / "images").mkdir(parents=True)
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    poses = np.stack([world_from_cam(i) for i in range(views)])
+    positions, pixels = [], []
+    for name, pose in zip(names, poses, strict=True):
+        rgb, depth = render(pose)
+        Image.fromarray(rgb).save(folder / "images" / name)
+        column, line = rng.integers(0, WIDTH, points), rng.integers(0, HEIGHT, points)
+        xy = np.stack([column + 0.5, line + 0.5], axis=1)
+        rays = np.column_stack([xy, np.ones(points)]) @ np.linalg.inv(K).T
+        positions.append(rays * depth[line, column, None] + pose[:3, 3])
+        pixels.append(xy)
+    cameras = Cameras(
+        np.repeat(K[None], views, axis=0),
+        np.linalg.inv(poses),
+        np.full(views, WIDTH),
+        np.full(views, HEIGHT),
+        names,
+    )
+    write_colmap(
+        folder / "sparse" / "0",
+        cameras,
+        points=np.concatenate(positions),
+        point_index=np.arange(views * points),
+        view_index=np.repeat(np.arange(views), points),
+        xy=np.concatenate(pixels),
+    )
     return folder

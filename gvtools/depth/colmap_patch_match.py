@@ -38,6 +38,10 @@ class ColmapPatchMatch:
         scene: with sparse points, from which COLMAP takes depth ranges and sources.
         views: names; no other view is looked at.
 
+    Attributes:
+        name: "colmap-patch-match".
+        views: names of the given views.
+
     Raises:
         ProjectError: a scene without sparse points.
     """
@@ -50,12 +54,12 @@ class ColmapPatchMatch:
                 f"{scene.root}: COLMAP's PatchMatch needs sparse points, and there are none; "
                 "triangulate, or use plane-sweep"
             )
-        self._scene, self._views = scene, tuple(views)
+        self._scene, self.views = scene, tuple(views)
         self._depth: dict[str, NDArray[np.float32]] | None = None
 
     def covers(self, view: View) -> bool:
         """The given views."""
-        return view.name in self._views
+        return view.name in self.views
 
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
         """The view's geometric depth map, trusted as recorded ones are.
@@ -77,8 +81,8 @@ class ColmapPatchMatch:
         import pycolmap
         from PIL import Image
 
-        write_workspace(folder, self._scene, self._views)
-        for name in self._views:
+        write_workspace(folder, self._scene, self.views)
+        for name in self.views:
             path = folder / "images" / name
             path.parent.mkdir(parents=True, exist_ok=True)
             # Without loss, whatever the suffix says.
@@ -90,7 +94,7 @@ class ColmapPatchMatch:
                 f"{self._scene.root}: COLMAP's PatchMatch failed ({error}); use plane-sweep"
             ) from None
         out = {}
-        for name in self._views:
+        for name in self.views:
             found = depth_map_path(folder / "stereo" / "depth_maps", name)
             if found is not None:
                 out[name] = read_depth_map(found[0])

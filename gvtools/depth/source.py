@@ -98,3 +98,10 @@ class MixedDepth:
         """Of the first source that covers the view; see ``DepthSource.depth``."""
         source = self.recorded if self.recorded.covers(view) else self.computed
         return source.depth(scene, view, frame)
+
+
+def is_recorded(source: DepthSource, view: View) -> bool:
+    """Whether the source reads the depth of ``view``, where it would otherwise compute it."""
+    if isinstance(source, MixedDepth):
+        source = source.recorded if source.recorded.covers(view) else source.computed
+    return isinstance(source, RecordedDepth) and source.covers(view)

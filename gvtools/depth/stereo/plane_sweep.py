@@ -130,6 +130,11 @@ class PlaneSweepStereo:
             self._raw[view.name] = raw
         return raw
 
+    @property
+    def computed(self) -> tuple[str, ...]:
+        """Names of the views whose own estimate is kept, in the order in which they were asked."""
+        return tuple(self._raw)
+
     def _confirming(self, name: str) -> RawDepth | None:
         """A source's own estimate; None when no view of the pool shows what it does."""
         try:

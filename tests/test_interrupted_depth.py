@@ -1,0 +1,235 @@
+"""Depth that round 0 had computed when it was interrupted: taken over by the same run, by no other.
+
+The pictures are of the tiny scan and the depth comes from the plane sweep itself.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scan import write_scan
+
+from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+from gvtools.errors import DegenerateError
+from pipelines.cli import main
+
+RUN = ("--context", "every:2", "--targets", "range:1-1", "--completer", "none", "--depth",
+       "plane-sweep", "--voxel", "0.03", "--quiet")  # fmt: skip
+VIEWS = 6
+# What a user would run, on a machine so slow that there is time to kill it.
+SLOW = """
+import sys, time
+from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+from pipelines.cli import main
+
+depth = PlaneSweepStereo.depth
+
+def slowed(self, *args):
+    found = depth(self, *args)
+    time.sleep(0.4)
+    return found
+
+PlaneSweepStereo.depth = slowed
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    return write_scan(tmp_path_factory.mktemp("scan") / "scan", views=2 * VIEWS)
+
+
+@pytest.fixture(scope="module")
+def whole(scan, tmp_path_factory):
+    """An uninterrupted run."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert reconstruct(scan, out) == 0
+    return out
+
+
+def words(scan: Path, out: Path, *more: str) -> list[str]:
+    return ["reconstruct", str(scan), "--out", str(out), *RUN, *more]
+
+
+def reconstruct(scan: Path, out: Path, *more: str) -> int:
+    return main(words(scan, out, *more))
+
+
+def results(out: Path) -> dict[str, bytes]:
+    """Every file of a run, without times."""
+    timed = ("report.json", "rounds.jsonl", "growth.png")
+    return {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.is_file() and path.name not in timed
+    }
+
+
+def first_report(out: Path) -> dict:
+    report = json.loads((out / "round_000" / "report.json").read_text())
+    report.pop("seconds")
+    return report
+
+
+@pytest.fixture
+def asked(monkeypatch) -> list[str]:
+    """Names of the views that the sweep is asked for, in order."""
+    names: list[str] = []
+    depth = PlaneSweepStereo.depth
+
+    def noted(self, scene, view, frame):
+        names.append(view.name)
+        return depth(self, scene, view, frame)
+
+    monkeypatch.setattr(PlaneSweepStereo, "depth", noted)
+    return names
+
+
+def stop_before(monkeypatch, index: int, error: BaseException) -> None:
+    """Let the sweep fail at the view of this index."""
+    depth = PlaneSweepStereo.depth
+
+    def failing(self, scene, view, frame):
+        if view.name.startswith(f"frame-{index:06d}"):
+            raise error
+        return depth(self, scene, view, frame)
+
+    monkeypatch.setattr(PlaneSweepStereo, "depth", failing)
+
+
+@pytest.mark.parametrize("again", [("--resume",), ()])
+def test_a_killed_run_goes_on_with_the_next_view(scan, whole, tmp_path, asked, again):
+    out = tmp_path / "run"
+    process = subprocess.Popen([sys.executable, "-c", SLOW, *words(scan, out)])
+    part = out / ".round_000.part"
+    deadline = time.monotonic() + 120
+    while len(list(part.glob("context_depth_*.npz"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    kept = {path.name: path.stat().st_mtime_ns for path in part.glob("context_depth_*.npz")}
+    assert 2 <= len(kept) < VIEWS
+    assert not (out / "round_000").exists()
+    assert reconstruct(scan, out, *again) == 0
+    assert len(asked) == VIEWS - len(kept)
+    assert not any(path.exists() for path in out.glob(".*.part"))
+    for name, written in kept.items():
+        assert (out / "round_000" / name).stat().st_mtime_ns == written
+    assert results(out) == results(whole)
+    assert first_report(out) == first_report(whole)
+
+
+def test_an_interrupt_keeps_what_is_whole_and_nothing_else(scan, whole, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        stop_before(patch, 6, KeyboardInterrupt())
+        assert reconstruct(scan, out) == 1
+    part = out / ".round_000.part"
+    assert len(list(part.glob("context_depth_*.npz"))) == 3
+    assert {path.name[:14] for path in part.iterdir()} == {"context_depth_"}
+    assert reconstruct(scan, out, "--resume") == 0
+    assert results(out) == results(whole)
+
+
+@pytest.mark.parametrize("other", [("--set", "stereo.window=5"), ("--seed", "3")])
+def test_another_run_computes_its_own(scan, tmp_path, monkeypatch, asked, other):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        stop_before(patch, 6, KeyboardInterrupt())
+        assert reconstruct(scan, out) == 1
+    asked.clear()
+    assert reconstruct(scan, out, *other, "--resume") == 0
+    assert len(asked) == VIEWS
+    alone = tmp_path / "alone"
+    assert reconstruct(scan, alone, *other) == 0
+    assert results(out) == results(alone)
+
+
+def test_changed_pictures_and_versions_compute_anew(scan, tmp_path, monkeypatch, asked):
+    mine, out = write_scan(tmp_path / "scan", views=2 * VIEWS), tmp_path / "run"
+
+    def interrupted() -> None:
+        with monkeypatch.context() as patch:
+            stop_before(patch, 6, KeyboardInterrupt())
+            assert reconstruct(mine, out) == 1
+        asked.clear()
+
+    interrupted()
+    picture = mine / "frame-000002.color.png"
+    picture.write_bytes(picture.read_bytes())
+    with monkeypatch.context() as patch:
+        stop_before(patch, 10, KeyboardInterrupt())
+        assert reconstruct(mine, out) == 1
+    assert len(asked) == 5
+    asked.clear()
+    record = json.loads((out / "run.json").read_text())
+    record["versions"]["numba"] = "0.1"
+    (out / "run.json").write_text(json.dumps(record))
+    assert reconstruct(mine, out) == 0
+    assert len(asked) == VIEWS
+
+
+def test_a_damaged_file_of_an_unfinished_round_is_computed_anew(
+    scan, whole, tmp_path, monkeypatch, asked
+):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        stop_before(patch, 6, KeyboardInterrupt())
+        assert reconstruct(scan, out) == 1
+    asked.clear()
+    kept = sorted((out / ".round_000.part").glob("context_depth_*.npz"))
+    kept[0].write_bytes(kept[0].read_bytes()[:200])
+    np.savez_compressed(kept[1], depth=np.zeros((2, 2)), confidence=0, source="", failed="")
+    (kept[2].parent / f".{kept[2].name}.part").write_bytes(b"half")
+    assert reconstruct(scan, out, "--resume") == 0
+    assert len(asked) == VIEWS - 1
+    assert results(out) == results(whole)
+
+
+def test_why_a_view_has_no_depth_outlasts_the_interrupt(scan, tmp_path, monkeypatch, capsys):
+    out, straight = tmp_path / "run", tmp_path / "straight"
+    with monkeypatch.context() as lacking:
+        stop_before(lacking, 2, DegenerateError("none shows what frame-000002 does"))
+        assert reconstruct(scan, straight) == 0
+        with lacking.context() as patch:
+            stop_before(patch, 6, KeyboardInterrupt())
+            assert reconstruct(scan, out) == 1
+    capsys.readouterr()
+    # The reason comes from the file: the sweep itself would find depth now.
+    assert reconstruct(scan, out, "--resume") == 0
+    assert "1 of 6 views have no depth" in capsys.readouterr().err
+    assert results(out) == results(straight)
+    assert first_report(out) == first_report(straight)
+
+
+def test_what_was_taken_over_is_said(scan, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        stop_before(patch, 6, KeyboardInterrupt())
+        assert reconstruct(scan, out) == 1
+    loud = [word for word in words(scan, out) if word != "--quiet"]
+    assert main(loud) == 0
+    assert "taking over the depth of 3 of 6 context views" in capsys.readouterr().out
+
+
+def test_a_first_round_that_is_done_anew_is_taken_up_too(scan, whole, tmp_path, monkeypatch, asked):
+    """A finished run whose first round was removed, and that was interrupted on its way back."""
+    import shutil
+
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    shutil.rmtree(out / "round_000")
+    with monkeypatch.context() as patch:
+        stop_before(patch, 6, KeyboardInterrupt())
+        assert reconstruct(scan, out, "--resume") == 1
+    asked.clear()
+    assert reconstruct(scan, out, "--resume") == 0
+    assert len(asked) == 3
+    assert results(out) == results(whole)
