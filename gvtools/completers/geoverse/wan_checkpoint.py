@@ -125,7 +125,6 @@ def truncate(
         ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-        found.close()
     report(needed, needed)
 
 
@@ -151,7 +150,6 @@ def _vae_files(folder: Path) -> list[Path]:
     files = TensorFiles.find(folder)
     expected = expected_tensors(read_config(folder), component="vae")
     check_tensors(files, expected, where=folder)
-    files.close()
     return sorted({folder / "config.json", *files.files.values(), *folder.glob(f"*{INDEX}")})
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from gvtools.errors import CheckpointError
 
-# Whole parts between dots. All are looked up at once: norm2 and norm3 change places.
+# Whole parts between dots. diffusers numbers the norms in another order; only this one has weights.
 _PARTS = {
     "self_attn": "attn1",
     "cross_attn": "attn2",
@@ -16,7 +16,6 @@ _PARTS = {
     "k": "to_k",
     "v": "to_v",
     "o": "to_out.0",
-    "norm2": "norm3",
     "norm3": "norm2",
     "modulation": "scale_shift_table",
     "before_proj": "proj_in",

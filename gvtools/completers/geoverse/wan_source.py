@@ -51,10 +51,6 @@ class Source:
         """One tensor, as stored."""
         return self.files.read(self.stored[name])
 
-    def close(self) -> None:
-        """Forget the open files."""
-        self.files.close()
-
 
 def find_source(place: Path, vae: Path | None) -> Source:
     """The low-noise transformer in ``place``, and its VAE.

@@ -1,0 +1,504 @@
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from math import prod
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("diffusers", reason="the extra wan is not installed")
+
+import tiny_wan as tiny
+from safetensors.torch import load_file, save_file
+
+from gvtools.completers.geoverse import wan_checkpoint, wan_files, wan_folder
+from gvtools.completers.geoverse.video_prior import VideoPrior
+from gvtools.completers.geoverse.wan_checkpoint import (
+    expected_tensors,
+    truncate,
+    write_empty_prompt,
+)
+from gvtools.completers.geoverse.wan_files import TensorFiles
+from gvtools.completers.geoverse.wan_folder import EMPTY_PROMPT, check_folder
+from gvtools.completers.geoverse.wan_library import network_class
+from gvtools.completers.geoverse.wan_names import diffusers_name
+from gvtools.errors import CheckpointError, OptionError, ProjectError
+
+# Of a Wan with six blocks and hints at 0, 2 and 4, the first four blocks and two hints.
+LAYERS, HINTS = 6, (0, 2, 4)
+KEPT: dict[str, Any] = {"blocks": 4, "vace_blocks": 2}
+FILE = "diffusion_pytorch_model.safetensors"
+A14B = {
+    "num_layers": 40,
+    "num_attention_heads": 40,
+    "attention_head_dim": 128,
+    "ffn_dim": 13824,
+    "text_dim": 4096,
+    "vace_layers": [0, 5, 10, 15, 20, 25, 30, 35],
+}
+
+
+@pytest.fixture(scope="module")
+def network() -> Any:
+    return tiny.transformer(LAYERS, HINTS)
+
+
+def original_name(name: str) -> str:
+    """Wan's own name of a diffusers tensor, part by part."""
+    top = {
+        "condition_embedder.text_embedder.linear_1": "text_embedding.0",
+        "condition_embedder.text_embedder.linear_2": "text_embedding.2",
+        "condition_embedder.time_embedder.linear_1": "time_embedding.0",
+        "condition_embedder.time_embedder.linear_2": "time_embedding.2",
+        "condition_embedder.time_proj": "time_projection.1",
+    }
+    for new, old in top.items():
+        name = name.replace(new, old)
+    if name == "scale_shift_table":
+        return "head.modulation"
+    if name.startswith("proj_out."):
+        return f"head.head.{name.removeprefix('proj_out.')}"
+    inner = {
+        ".attn1.": ".self_attn.",
+        ".attn2.": ".cross_attn.",
+        ".to_q.": ".q.",
+        ".to_k.": ".k.",
+        ".to_v.": ".v.",
+        ".to_out.0.": ".o.",
+        ".norm2.": ".norm3.",
+        ".ffn.net.0.proj.": ".ffn.0.",
+        ".ffn.net.2.": ".ffn.2.",
+        ".scale_shift_table": ".modulation",
+        ".proj_in.": ".before_proj.",
+        ".proj_out.": ".after_proj.",
+    }
+    for new, old in inner.items():
+        name = name.replace(new, old)
+    return name
+
+
+def save_original(network: Any, folder: Path, *, wrapper: str = "") -> Path:
+    folder.mkdir(parents=True)
+    tensors = {f"{wrapper}{original_name(n)}": t for n, t in network.state_dict().items()}
+    save_file(tensors, folder / FILE)
+    config = {"num_heads": 2, "eps": 1e-6, "vace_layers": list(HINTS), "dim": 48}
+    (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def diffusers_source(network: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As Wan2.2-VACE-Fun lies in diffusers' form: two experts, in several files."""
+    folder = tmp_path_factory.mktemp("source") / "wan"
+    tiny.transformer(LAYERS, HINTS, seed=77).save_pretrained(folder / "transformer")
+    network.save_pretrained(folder / "transformer_2", max_shard_size="120KB")
+    tiny.vae().save_pretrained(folder / "vae")
+    (folder / "model_index.json").write_text('{"boundary_ratio": 0.875}')
+    assert len(list((folder / "transformer_2").glob("*.safetensors"))) > 5
+    return folder
+
+
+@pytest.fixture
+def source(diffusers_source: Path, tmp_path: Path) -> Path:
+    """One to be damaged."""
+    return Path(shutil.copytree(diffusers_source, tmp_path / "wan"))
+
+
+@pytest.fixture(scope="module")
+def truncated(diffusers_source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("made") / "prior"
+    truncate(diffusers_source, out, dtype=torch.float32, **KEPT)
+    save_file({"embedding": tiny.prompt()}, out / EMPTY_PROMPT)
+    return out
+
+
+def features(prior: VideoPrior) -> tuple[Tensor, ...]:
+    return prior.features(*tiny.views(2, size=(16, 32)), 1).tensors
+
+
+def test_names_are_converted_as_diffusers_converts_them(network: Any) -> None:
+    single_file = pytest.importorskip("diffusers.loaders.single_file_utils")
+    names = list(network.state_dict())
+    originals = [original_name(n) for n in names]
+    assert len(set(originals)) == len(names)
+    for name, original in zip(names, originals, strict=True):
+        converted = single_file.convert_wan_transformer_to_diffusers({original: torch.zeros(1)})
+        assert list(converted) == [name]
+        assert diffusers_name(original) == name
+        assert diffusers_name(f"model.diffusion_model.{original}") == name
+
+
+def test_a_truncated_folder_gives_the_features_of_the_whole_network(
+    network: Any, truncated: Path
+) -> None:
+    direct = features(tiny.prior(network))
+    loaded = features(VideoPrior.from_pretrained(truncated, config=tiny.CONFIG))
+    assert all(map(torch.equal, direct, loaded))
+    report = check_folder(truncated)
+    sizes = [p.stat().st_size for p in truncated.rglob(FILE)]
+    assert (report.bytes, len(sizes)) == (sum(sizes), 2)
+    assert "empty prompt: (1, 20)" in report.said
+    assert not list(truncated.parent.glob(".*"))
+
+
+@pytest.mark.parametrize("kind", ["folder", "file", "wrapped", "bare"])
+def test_wans_own_files_give_the_same_tensors(
+    network: Any, truncated: Path, tmp_path: Path, kind: str
+) -> None:
+    wrapper = "model.diffusion_model." if kind == "wrapped" else ""
+    folder = save_original(network, tmp_path / "wan" / "low_noise_model", wrapper=wrapper)
+    tiny.vae().save_pretrained(tmp_path / "wan" / "vae")
+    if kind == "bare":
+        # Without a configuration everything but the width of a head shows in the shapes.
+        (folder / "config.json").write_text('{"num_heads": 2}')
+    place = folder / FILE if kind == "file" else folder.parent
+    truncate(place, tmp_path / "out", dtype=torch.float32, **KEPT)
+    found, wanted = (load_file(p / "transformer" / FILE) for p in (tmp_path / "out", truncated))
+    assert found.keys() == wanted.keys()
+    assert all(torch.equal(found[name], wanted[name]) for name in wanted)
+    network_config, config = (
+        network_class("transformer").load_config(p / "transformer")
+        for p in (truncated, tmp_path / "out")
+    )
+    assert all(config[k] == network_config[k] for k in config if not k.startswith("_"))
+
+
+def test_bfloat16_is_what_diffusers_makes_of_it(diffusers_source: Path, tmp_path: Path) -> None:
+    pytest.importorskip("accelerate")
+    truncate(diffusers_source, tmp_path / "out", **KEPT)
+    wanted = network_class("transformer").from_pretrained(
+        diffusers_source,
+        subfolder="transformer_2",
+        num_layers=4,
+        vace_layers=[0, 2],
+        torch_dtype=torch.bfloat16,
+    )
+    loaded = wan_folder.load_network(tmp_path / "out", "transformer")
+    also = wan_folder.load_network(tmp_path / "out", "transformer", dtype=torch.float32)
+    for name, tensor in wanted.state_dict().items():
+        found = loaded.state_dict()[name]
+        assert found.dtype == tensor.dtype, name
+        assert torch.equal(found, tensor)
+        assert torch.equal(also.state_dict()[name], tensor.float())
+    tables = (dict(n.named_buffers()) for n in (loaded, wanted))
+    for (_, a), (_, b) in zip(*(t.items() for t in tables), strict=True):
+        assert torch.equal(a, b)
+    assert {t.dtype for t in wanted.state_dict().values()} == {torch.bfloat16, torch.float32}
+    prior = VideoPrior(loaded, tiny.vae(), tiny.prompt(), config=tiny.CONFIG)
+    direct = VideoPrior(wanted, tiny.vae(), tiny.prompt(), config=tiny.CONFIG)
+    assert all(map(torch.equal, features(prior), features(direct)))
+    assert features(prior)[0].dtype == torch.bfloat16
+
+
+def test_nothing_is_read_that_is_not_needed(
+    network: Any, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = {**network.config, "num_layers": 4, "vace_layers": [0, 2]}
+    needed = set(expected_tensors(config))
+    shards = source / "transformer_2"
+    index = json.loads(next(shards.glob("*.index.json")).read_text())["weight_map"]
+    unneeded = set(index.values()) - {index[name] for name in needed}
+    assert unneeded
+    for file in unneeded:
+        (shards / file).unlink()
+    reads: list[str] = []
+    read = TensorFiles.read
+
+    def reading(files: TensorFiles, name: str, **options: Any) -> Tensor:
+        reads.append(name)
+        return read(files, name, **options)
+
+    monkeypatch.setattr(TensorFiles, "read", reading)
+    truncate(source, tmp_path / "a", **KEPT)
+    assert sorted(reads) == sorted(needed)
+    reads.clear()
+    tiny.vae().save_pretrained(tmp_path / "vae")
+    own = save_original(network, tmp_path / "own") / FILE
+    content = own.read_bytes()
+    for name in network.state_dict().keys() - needed:
+        key = f'"{original_name(name)}":{{"dtype":"'.encode()
+        assert content.count(key) == 1
+        content = content.replace(key + b"F32", key + b"X32")
+    own.write_bytes(content)
+    with pytest.raises(CheckpointError, match="X32"):
+        TensorFiles.find(own).read("blocks.5.modulation")
+    reads.clear()
+    truncate(own, tmp_path / "b", **KEPT)
+    assert sorted(reads) == sorted(map(original_name, needed))
+
+
+def test_files_are_read_as_the_library_reads_them(tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(0)
+    numbers = torch.randn(3, 4, 2, generator=generator)
+    tensors = {str(d): (numbers * 9).to(d) for d in wan_files._DTYPES.values()}
+    tensors |= {"scalar": torch.tensor(2.5), "empty": torch.zeros(0, 3)}
+    save_file(tensors, tmp_path / "a.safetensors", metadata={"format": "pt"})
+    files = TensorFiles.find(tmp_path)
+    assert files.files.keys() == tensors.keys()
+    for name, tensor in load_file(tmp_path / "a.safetensors").items():
+        found = files.read(name)
+        assert (found.dtype, found.shape) == (tensor.dtype, tensor.shape)
+        assert torch.equal(found, tensor)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"PK\3\4 a zip file", b"\2\0\0\0\0\0\0\0{}more", b"\2\0\0\0\0\0\0\0[]"]
+)
+def test_what_is_no_safetensors_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.safetensors").write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"a\.safetensors: cannot be read"):
+        TensorFiles.find(tmp_path)
+
+
+def test_several_files_are_written_where_one_would_be_large(
+    diffusers_source: Path, truncated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wan_checkpoint, "_PART", 300_000)
+    steps: list[tuple[int, int]] = []
+    out = tmp_path / "out"
+    truncate(
+        diffusers_source, out, dtype=torch.float32, progress=lambda *s: steps.append(s), **KEPT
+    )
+    files = sorted((out / "transformer").glob("*.safetensors"))
+    assert len(files) > 2
+    assert all(f.stat().st_size < 320_000 for f in files)
+    for name in ("load", "diffusers"):
+        if name == "load":
+            network = wan_folder.load_network(out, "transformer")
+        else:
+            network = network_class("transformer").from_pretrained(out / "transformer")
+        wanted = load_file(truncated / "transformer" / FILE)
+        assert network.state_dict().keys() == wanted.keys()
+        assert all(torch.equal(network.state_dict()[n], wanted[n]) for n in wanted)
+    done, totals = zip(*steps, strict=True)
+    assert list(done) == sorted(done)
+    assert {done[-1]} == set(totals)
+    written = sum(f.stat().st_size for f in out.rglob("*") if f.is_file())
+    assert written == pytest.approx(done[-1], rel=0.05)
+
+
+def test_published_sizes() -> None:
+    def numbers(config: Mapping[str, Any]) -> int:
+        return sum(map(prod, expected_tensors(config).values()))
+
+    # The published low-noise file is 34.7 GB in bfloat16.
+    assert 2 * numbers(A14B) / 1e9 == pytest.approx(34.68, abs=0.01)
+    kept = {**A14B, "num_layers": 16, "vace_layers": [0, 5, 10, 15]}
+    assert numbers(kept) / 1e9 == pytest.approx(7.394, abs=0.001)
+    tensors = expected_tensors(kept)
+    assert tensors["blocks.15.attn2.to_out.0.weight"] == (5120, 5120)
+    assert tensors["vace_patch_embedding.weight"] == (5120, 96, 1, 2, 2)
+    assert "vace_blocks.4.proj_out.weight" not in tensors
+    assert sum(map(prod, expected_tensors({}, component="vae").values())) == 126_892_531
+
+
+def damage(path: Path, change: Any) -> None:
+    tensors = load_file(path)
+    change(tensors)
+    save_file(tensors, path)
+
+
+def original_with(network: Any, tmp_path: Path, change: Any) -> Path:
+    folder = save_original(network, tmp_path / "own")
+    tiny.vae().save_pretrained(tmp_path / "vae")
+    damage(folder / FILE, change)
+    return folder
+
+
+def test_the_first_missing_tensor_is_named_and_nothing_is_left(
+    network: Any, tmp_path: Path
+) -> None:
+    place = original_with(
+        network,
+        tmp_path,
+        lambda t: [t.pop("blocks.2.cross_attn.k.weight"), t.pop("blocks.3.ffn.0.bias")],
+    )
+    with pytest.raises(CheckpointError, match=r"blocks\.2\.attn2\.to_k\.weight is absent, and 1"):
+        truncate(place, tmp_path / "out", **KEPT)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["own", "vae"]
+
+
+def test_another_shape_is_refused(network: Any, tmp_path: Path) -> None:
+    place = original_with(
+        network, tmp_path, lambda t: t.update({"blocks.1.ffn.2.bias": torch.zeros(7)})
+    )
+    with pytest.raises(CheckpointError, match=r"blocks\.1\.ffn\.net\.2\.bias is \(7,\); expected"):
+        truncate(place, tmp_path / "out", **KEPT)
+
+
+def test_quantised_weights_are_refused(network: Any, tmp_path: Path) -> None:
+    name = "blocks.1.ffn.2.weight"
+    place = original_with(
+        network, tmp_path, lambda t: t.update({name: t[name].to(torch.float8_e4m3fn)})
+    )
+    with pytest.raises(CheckpointError, match="F8_E4M3"):
+        truncate(place, tmp_path / "out", **KEPT)
+
+
+def test_weights_without_a_vace_branch_are_refused(network: Any, tmp_path: Path) -> None:
+    def drop(tensors: dict[str, Tensor]) -> None:
+        for name in [n for n in tensors if n.startswith("vace")]:
+            del tensors[name]
+
+    with pytest.raises(CheckpointError, match="vace_patch_embedding"):
+        truncate(original_with(network, tmp_path, drop), tmp_path / "out", **KEPT)
+
+
+def test_a_torn_or_absent_file_is_named(source: Path, tmp_path: Path) -> None:
+    file = sorted((source / "transformer_2").glob("*.safetensors"))[0]
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(CheckpointError, match=file.name):
+        truncate(source, tmp_path / "out", **KEPT)
+    file.unlink()
+    with pytest.raises(CheckpointError, match=file.name):
+        truncate(source, tmp_path / "out", **KEPT)
+
+
+def test_what_is_not_the_low_noise_expert_is_not_taken_for_it(source: Path, tmp_path: Path) -> None:
+    shutil.rmtree(source / "transformer_2")
+    with pytest.raises(CheckpointError, match="no transformer_2, the low-noise expert"):
+        truncate(source, tmp_path / "out", **KEPT)
+    # Of a Wan with one expert it is the right one.
+    (source / "model_index.json").write_text("{}")
+    truncate(source, tmp_path / "out", **KEPT)
+
+
+def test_sources_of_another_kind_are_refused(source: Path, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="no Wan VACE weights"):
+        truncate(tmp_path / "nowhere", tmp_path / "out", **KEPT)
+    shutil.rmtree(source / "vae")
+    with pytest.raises(CheckpointError, match="no VAE"):
+        truncate(source, tmp_path / "out", **KEPT)
+    tiny.vae().save_pretrained(tmp_path / "elsewhere")
+    truncate(source, tmp_path / "out", vae=tmp_path / "elsewhere", **KEPT)
+    config = source / "transformer_2" / "config.json"
+    config.write_text(config.read_text().replace("WanVACETransformer3DModel", "FluxModel"))
+    with pytest.raises(CheckpointError, match="a FluxModel; expected a WanVACE"):
+        truncate(source, tmp_path / "other", vae=tmp_path / "elsewhere", **KEPT)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"blocks": 7, "vace_blocks": 3}, "blocks 7; expected 1 to 6"),
+        ({"blocks": 0, "vace_blocks": 0}, "blocks 0; expected 1 to 6"),
+        ({"blocks": 4, "vace_blocks": 1}, r"vace_blocks 1; expected 2.*\[0, 2\]"),
+    ],
+)
+def test_impossible_numbers_of_blocks_are_refused(
+    diffusers_source: Path, tmp_path: Path, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(OptionError, match=message):
+        truncate(diffusers_source, tmp_path / "out", **options)
+
+
+def test_a_full_disk_is_noticed_before_anything_is_written(
+    diffusers_source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000_000))
+    with pytest.raises(ProjectError, match=r"0\.1 GB are needed, 0\.0 GB are free"):
+        truncate(diffusers_source, tmp_path / "deep" / "out", **KEPT)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_fails_half_way_leaves_nothing_and_what_is_there_stays(
+    diffusers_source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / ".out.part").mkdir()  # of an attempt that was killed
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "copyfile", full)
+        with pytest.raises(ProjectError, match="No space left"):
+            truncate(diffusers_source, tmp_path / "out", **KEPT)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "out").mkdir()
+    with pytest.raises(ProjectError, match="is there already"):
+        truncate(diffusers_source, tmp_path / "out", **KEPT)
+
+
+def test_loading_is_strict(truncated: Path, tmp_path: Path) -> None:
+    file = "transformer/" + FILE
+    for change, message in (
+        (lambda t: t.pop("blocks.1.norm2.bias"), r"blocks\.1\.norm2\.bias is absent"),
+        (lambda t: t.update(extra=torch.zeros(1)), "extra is no tensor of the network"),
+        (lambda t: t.update(scale_shift_table=torch.zeros(3)), r"scale_shift_table is \(3,\)"),
+    ):
+        shutil.rmtree(tmp_path / "prior", ignore_errors=True)
+        folder = Path(shutil.copytree(truncated, tmp_path / "prior"))
+        damage(folder / file, change)
+        with pytest.raises(CheckpointError, match=message):
+            VideoPrior.from_pretrained(folder, config=tiny.CONFIG)
+        with pytest.raises(CheckpointError, match=message):
+            check_folder(folder)
+    (folder / "transformer" / "config.json").write_text("{]")
+    with pytest.raises(CheckpointError, match="not JSON"):
+        check_folder(folder)
+    (folder / "transformer" / "config.json").unlink()
+    with pytest.raises(CheckpointError, match=r"config\.json: cannot be read"):
+        check_folder(folder)
+
+
+def test_without_the_empty_prompt_it_says_how_to_make_it(truncated: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(truncated, tmp_path / "prior"))
+    (folder / EMPTY_PROMPT).unlink()
+    with pytest.raises(CheckpointError, match=r"write_empty_prompt\('WAN/text_encoder'"):
+        VideoPrior.from_pretrained(folder, config=tiny.CONFIG)
+    with pytest.raises(CheckpointError, match=EMPTY_PROMPT):
+        check_folder(folder)
+    VideoPrior.from_pretrained(folder, config=replace(tiny.CONFIG, prompt="zeros"))
+    check_folder(folder, prompt=False)
+    save_file({"embedding": torch.zeros(1, 1, 20)}, folder / EMPTY_PROMPT)
+    with pytest.raises(CheckpointError, match=r"expected \(tokens, channels\)"):
+        VideoPrior.from_pretrained(folder, config=tiny.CONFIG)
+
+
+def test_without_diffusers_the_extra_is_named(
+    truncated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "diffusers", None)
+    with pytest.raises(CheckpointError, match=r"pip install 'gvtools\[wan\]'"):
+        VideoPrior.from_pretrained(truncated, config=tiny.CONFIG)
+
+
+def test_without_transformers_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(CheckpointError, match="pip install transformers"):
+        write_empty_prompt(tmp_path, tmp_path / "out")
+
+
+def test_the_empty_prompt_is_the_encoding_of_the_end_token(tmp_path: Path) -> None:
+    transformers = pytest.importorskip("transformers", reason="transformers is not installed")
+    torch.manual_seed(0)
+    sizes = {"vocab_size": 30, "d_model": tiny.TEXT, "d_kv": 4, "d_ff": 16, "num_heads": 2}
+    encoder = transformers.UMT5EncoderModel(transformers.UMT5Config(num_layers=2, **sizes)).eval()
+    encoder.save_pretrained(tmp_path / "text_encoder")
+    write_empty_prompt(tmp_path / "text_encoder", tmp_path)
+    # As Wan's pipelines run it: padded to a fixed length, the mask on the one token.
+    tokens, mask = torch.zeros(1, 12, dtype=torch.long), torch.zeros(1, 12, dtype=torch.long)
+    tokens[0, 0], mask[0, 0] = 1, 1
+    with torch.no_grad():
+        padded = encoder(tokens, attention_mask=mask).last_hidden_state[0, :1]
+    torch.testing.assert_close(wan_folder.read_empty_prompt(tmp_path), padded, rtol=0, atol=1e-5)
+    with pytest.raises(CheckpointError, match="is no folder"):
+        write_empty_prompt(tmp_path / "absent", tmp_path)
+
+
+@pytest.mark.gpu
+def test_a_folder_loaded_onto_the_gpu_gives_the_features_of_the_cpu(truncated: Path) -> None:
+    on_cpu = VideoPrior.from_pretrained(truncated, config=tiny.CONFIG)
+    on_gpu = VideoPrior.from_pretrained(truncated, config=tiny.CONFIG, device="cuda")
+    wanted = features(on_cpu)
+    for prior in (on_gpu, on_cpu.to("cuda")):
+        for found, expected in zip(features(prior), wanted, strict=True):
+            assert found.device.type == "cuda"
+            torch.testing.assert_close(found.cpu(), expected, rtol=1e-2, atol=1e-2)
