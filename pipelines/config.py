@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.errors import OptionError
 from gvtools.memory.back_projection import BackProjectionOptions
@@ -65,6 +66,7 @@ class RunConfig:
         back_projection: see BackProjectionOptions.
         memory: see MemoryOptions.
         stereo: see StereoOptions; of depth from photographs.
+        da3: see FoundationOptions; of depth by Depth Anything 3.
         splat: see SplatOptions.
         fusion: see FusionOptions.
         completer_options: options of the completer by name.
@@ -85,6 +87,7 @@ class RunConfig:
     back_projection: BackProjectionOptions = field(default_factory=BackProjectionOptions)
     memory: MemoryOptions = field(default_factory=MemoryOptions)
     stereo: StereoOptions = field(default_factory=StereoOptions)
+    da3: FoundationOptions = field(default_factory=FoundationOptions)
     splat: SplatOptions = field(default_factory=SplatOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
     completer_options: Mapping[str, Any] = field(default_factory=dict)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.console import Console
@@ -30,6 +31,7 @@ class Plan:
         source: where depth comes from.
         source_reason: why from there, in words.
         ignored: settings of stereo that this source does not look at.
+        weights: files of networks that decide the result.
     """
 
     scene: Scene
@@ -40,6 +42,7 @@ class Plan:
     source: DepthSource
     source_reason: str
     ignored: tuple[str, ...] = ()
+    weights: tuple[Path, ...] = ()
 
 
 def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | None = None) -> Plan:
@@ -68,7 +71,7 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
         )
     config = _on_device(config)
     scene = reduced(scene, config.max_side)
-    create(config.completer, **config.completer_options)
+    completer = create(config.completer, **config.completer_options)
     context = select(scene.names, config.context)
     targets = resolve_targets(
         scene,
@@ -77,7 +80,9 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
         allow_overlap=config.allow_overlap,
         max_side=config.max_side,
     )
-    chosen = choose_source(scene, context, config.depth, stereo=config.stereo)
+    chosen = choose_source(
+        scene, context, config.depth, stereo=config.stereo, foundation=config.da3
+    )
     if config.voxel is None:
         edge = automatic_voxel(
             scene, context, chosen.source, percentile=config.fusion.voxel_percentile, say=say
@@ -86,8 +91,17 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
         config = replace(config, voxel=float(f"{edge:.3g}"))
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = replace(config, rounds=len(schedule))
+    weights = [*getattr(chosen.source, "files", ()), *getattr(completer, "files", ())]
     return Plan(
-        scene, config, context, targets, schedule, chosen.source, chosen.reason, chosen.ignored
+        scene,
+        config,
+        context,
+        targets,
+        schedule,
+        chosen.source,
+        chosen.reason,
+        chosen.ignored,
+        tuple(weights),
     )
 
 

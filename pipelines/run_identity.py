@@ -27,6 +27,7 @@ def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
         "cameras": _camera_digest(plan),
         "points": _point_digest(plan),
         "pixels": _pixel_digest(plan),
+        "weights": fingerprint(plan.weights),
         "config": plan.config.to_dict(),
         "context": list(plan.context),
         "targets": list(plan.targets.cameras.names),

@@ -175,7 +175,7 @@ def test_what_a_project_cannot_give_is_refused(scan, tmp_path):
         choose_source(scan, scan.names, "colmap")
     with pytest.raises(OptionError, match="plane-sweep"):
         choose_source(scan, scan.names, "guess")
-    with pytest.raises(CheckpointError, match="needs the weights"):
+    with pytest.raises(CheckpointError, match="needs weights"):
         choose_source(scan, scan.names, "da3")
     bare = without_depth(scan, *range(6))
     with pytest.raises(ProjectError, match="add depth maps"):

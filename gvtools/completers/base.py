@@ -86,7 +86,11 @@ class Completion:
 
 @runtime_checkable
 class Completer(Protocol):
-    """Fills what memory does not know of the target views."""
+    """Fills what memory does not know of the target views.
+
+    One with ``joint`` = True gets all targets of a round at once. One that reads weights names them
+    in an attribute ``files``: they decide the result.
+    """
 
     name: str
 

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 from gvtools.depth.colmap_patch_match import ColmapPatchMatch, has_patch_match
+from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.source import DepthSource, MixedDepth, RecordedDepth
 from gvtools.depth.stereo.options import StereoOptions
-from gvtools.errors import CheckpointError, OptionError, ProjectError
+from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.scene import Scene
 
 CHOICES = ("auto", "sensor", "colmap", "plane-sweep", "da3")
@@ -36,12 +37,18 @@ class ChosenSource:
 
 
 def choose_source(
-    scene: Scene, views: Sequence[str], choice: str, *, stereo: StereoOptions | None = None
+    scene: Scene,
+    views: Sequence[str],
+    choice: str,
+    *,
+    stereo: StereoOptions | None = None,
+    foundation: FoundationOptions | None = None,
 ) -> ChosenSource:
     """The source for the views that a run lifts.
 
-    "auto" takes recorded depth where there is some and computes the rest: by COLMAP's PatchMatch
-    where pycolmap has CUDA, otherwise by plane-sweep stereo. Two views side by side go to rectified
+    "auto" takes recorded depth where there is some and computes the rest: by Depth Anything 3 where
+    its weights are given, by COLMAP's PatchMatch where pycolmap has CUDA, otherwise by plane-sweep
+    stereo. Two views side by side go to rectified
     stereo instead of the plane sweep. Nothing but ``views`` is looked at.
 
     Args:
@@ -50,13 +57,14 @@ def choose_source(
         choice: one of CHOICES; ``sensor`` wants RGB-D, ``colmap`` COLMAP's stereo maps, on disk or
             computed now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights.
         stereo: options of the plane sweep.
+        foundation: options of Depth Anything 3; ``da3`` needs its ``weights``.
 
     Raises:
         OptionError: unknown choice, or one that the project cannot give.
         ProjectError: no view has depth, and none can be computed.
         CheckpointError: a network's weights are needed.
     """
-    chosen = _chosen(scene, views, choice, stereo)
+    chosen = _chosen(scene, views, choice, stereo, foundation or FoundationOptions())
     return replace(chosen, ignored=_ignored(chosen.source, stereo))
 
 
@@ -70,9 +78,12 @@ def rough_source(scene: Scene, source: DepthSource) -> DepthSource:
     """
     if isinstance(source, MixedDepth):
         return rough_source(scene, source.computed)
+    from gvtools.depth.foundation.source import FoundationDepth
     from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 
-    if not isinstance(source, (PlaneSweepStereo, ColmapPatchMatch)):
+    if not isinstance(source, (PlaneSweepStereo, ColmapPatchMatch, FoundationDepth)):
+        return source
+    if len(source.views) < 2:
         return source
     options = source.options if isinstance(source, PlaneSweepStereo) else StereoOptions()
     side, levels = min(options.max_side, ROUGH_SIDE), min(options.levels, ROUGH_LEVELS)
@@ -81,16 +92,18 @@ def rough_source(scene: Scene, source: DepthSource) -> DepthSource:
 
 
 def _chosen(
-    scene: Scene, views: Sequence[str], choice: str, stereo: StereoOptions | None
+    scene: Scene,
+    views: Sequence[str],
+    choice: str,
+    stereo: StereoOptions | None,
+    foundation: FoundationOptions,
 ) -> ChosenSource:
     if choice not in CHOICES:
         raise OptionError(f"depth {choice!r}; expected one of {', '.join(CHOICES)}")
     recorded = sum(scene[name].has_depth for name in views)
     if choice == "da3":
-        raise CheckpointError(
-            "depth da3: needs the weights of Depth Anything 3, which this version does not read; "
-            "use auto, or plane-sweep for photographs"
-        )
+        source = _foundation(scene, views, foundation)
+        return ChosenSource(source, f"asked for; weights of {foundation.weights}")
     if choice == "sensor":
         if scene.kind == "colmap":
             raise OptionError(f"depth 'sensor': {scene.root} is a colmap project; use auto")
@@ -121,14 +134,19 @@ def _chosen(
     if recorded == len(views):
         return ChosenSource(RecordedDepth(), "every context view has recorded depth")
     computed: DepthSource
-    if len(views) < 2:
+    if len(views) < 2 and foundation.weights is None:
         if recorded:
             return ChosenSource(RecordedDepth(), "a single view leaves nothing to compute from")
         raise ProjectError(
             f"{scene.root}: one context view without depth; expected depth, or at least 2 views to "
             "compute it from"
         )
-    if has_patch_match() and scene.points is not None:
+    if foundation.weights is not None:
+        computed, how = (
+            _foundation(scene, views, foundation),
+            "Depth Anything 3, as weights are given",
+        )
+    elif has_patch_match() and scene.points is not None:
         computed, how = ColmapPatchMatch(scene, views), "COLMAP's PatchMatch, as there is CUDA"
     else:
         computed, how = _stereo(scene, views, stereo), "plane-sweep stereo of the photographs"
@@ -153,6 +171,12 @@ def _stereo(scene: Scene, views: Sequence[str], options: StereoOptions | None) -
     from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 
     return PlaneSweepStereo(scene, options=options or StereoOptions(), views=tuple(views))
+
+
+def _foundation(scene: Scene, views: Sequence[str], options: FoundationOptions) -> DepthSource:
+    from gvtools.depth.foundation.source import FoundationDepth
+
+    return FoundationDepth(scene, views=views, options=options)
 
 
 def _is_pair(source: DepthSource) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -28,7 +29,10 @@ class DepthMap:
 
 
 class DepthSource(Protocol):
-    """Gives the depth of a scene's views."""
+    """Gives the depth of a scene's views.
+
+    A source that reads weights names them in an attribute ``files``: they decide the result.
+    """
 
     name: str
 
@@ -89,6 +93,7 @@ class MixedDepth:
     def __init__(self, recorded: DepthSource, computed: DepthSource) -> None:
         self.recorded, self.computed = recorded, computed
         self.name = f"{recorded.name} + {computed.name}"
+        self.files: tuple[Path, ...] = getattr(computed, "files", ())
 
     def covers(self, view: View) -> bool:
         """Views of either source."""

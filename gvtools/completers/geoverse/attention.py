@@ -14,6 +14,12 @@ FUSED_MULTIPLE = 8
 def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
     """softmax(q kᵀ / sqrt(d)) v, in torch's fused kernels, whose memory is linear in N and M.
 
+    On CUDA, torch takes flash attention in half precision (compute capability 8.0 and later, heads
+    of up to 256 channels) and its memory-efficient kernel otherwise (float32; float16 on older
+    cards), which asks for heads of a multiple of 8 channels, 4 in float32, adjacent in memory. The
+    heads here are of 48 and 128 (denoisers), 64 (encoder) and 72 (RGB head), without a mask, so
+    N x M scores are never built; they would be in float64, and in bfloat16 on older cards.
+
     On a CPU the fused kernel is also the faster one: in float32 it takes a third to four fifths of
     the time of the two products around a softmax from about 100 tokens on, and never longer by
     more than a fraction of a millisecond; in bfloat16 the products may win, but round the scores.

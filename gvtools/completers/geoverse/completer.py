@@ -20,8 +20,9 @@ from gvtools.completers.base import Completion, ContextView
 from gvtools.completers.geoverse.depth_scale import ALIGNMENTS, centre_scale, scaled_depth
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import Generated, GeoVerse
-from gvtools.completers.geoverse.model_views import enlarged, model_size, view_batch
+from gvtools.completers.geoverse.model_views import view_batch
 from gvtools.completers.geoverse.published import CONFIG_FILE, WHOLE_FILE
+from gvtools.completers.geoverse.resampling import model_size, resampled, resampled_depth
 from gvtools.completers.geoverse.weights_folder import config_of, from_pretrained
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
@@ -87,6 +88,12 @@ class GeoVerseCompleter:
         # A folder that cannot be a model is refused before anything is computed.
         config_of(Path(self.weights))
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What decides the result beside the views: everything in the weights folder."""
+        folder = Path(self.weights or "")
+        return tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
+
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:
@@ -127,11 +134,14 @@ class GeoVerseCompleter:
         size = model_size(*full, longest=model.config.image_size, patch=model.config.patch)
         batch, cameras = view_batch(context, part, size)
         batch = batch.to(device)
+        # A photograph and a target of one name must not start from the same noise.
+        names = [f"context {view.name}" for view in context]
+        names += [f"target {name}" for name in part.cameras.names]
         with self._precision(device):
             made = model.generate(
                 batch,
                 seed=seed,
-                names=[list(cameras.names)],
+                names=[names],
                 bounds=self._bounds(model),
                 cascade_bounds=self._cascade_bounds(model),
                 guidance=self.guidance,
@@ -164,12 +174,12 @@ class GeoVerseCompleter:
 
 @dataclass(frozen=True)
 class _Made:
-    """A pass's result at the targets' size and in scene units."""
+    """A pass's result at the targets' size and in scene units; no rays without a scale."""
 
     rgb: NDArray[np.float32]
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
-    rays: NDArray[np.float32]
+    rays: NDArray[np.float32] | None
     centre_scale: float
     scales: NDArray[np.float64]
 
@@ -184,9 +194,9 @@ class _Canvas:
         self.depth = np.where(valid, guidance.depth, np.float32(0))
         known = np.where(valid, np.minimum(guidance.confidence, 1), 0)
         self.confidence = known.astype(np.float32)
-        self.rays = np.stack(
-            [guidance.cameras.plucker(index) for index in range(len(guidance))]
-        ).astype(np.float32)
+        self.rays = np.zeros((*valid.shape, 6), np.float32)
+        for index in range(len(guidance)):
+            self.rays[index] = guidance.cameras.plucker(index)
         self.spent = {"holes": float((~valid).sum()), "unfilled": 0.0, "views_without_scale": 0.0}
 
     def put(self, rows: Sequence[int], made: _Made, part: Guidance) -> None:
@@ -196,7 +206,8 @@ class _Canvas:
             self.rgb[row][hole] = made.rgb[position][hole]
             self.depth[row][hole] = made.depth[position][hole]
             self.confidence[row][hole] = made.confidence[position][hole]
-            self.rays[row] = made.rays[position]
+            if made.rays is not None:
+                self.rays[row] = made.rays[position]
             self.spent["unfilled"] += float((made.depth[position][hole] <= 0).sum())
             self.spent["views_without_scale"] += float(not np.isfinite(made.scales[position]))
         self.spent["centre_scale"] = made.centre_scale
@@ -222,7 +233,9 @@ def nearest_views(
     forward = np.concatenate([view.camera.world_from_cam[:, :3, 2] for view in context])
     target_centres, target_forward = targets.centers, targets.world_from_cam[:, :3, 2]
     everything = np.concatenate((centres, target_centres))
-    extent = max(float(np.linalg.norm(np.ptp(everything, axis=0))), 1e-12)
+    # Centres that differ by their rounding alone are one place.
+    least = 1e-9 * max(float(np.abs(everything).max()), 1e-12)
+    extent = max(float(np.linalg.norm(np.ptp(everything, axis=0))), least)
     apart = np.linalg.norm(centres[:, None] - target_centres[None], axis=-1) / extent
     turned = 1 - np.clip(forward @ target_forward.T, -1, 1)
     cost = apart + turned
@@ -250,29 +263,33 @@ def _brought_back(
 ) -> _Made:
     """Pictures, depth, confidence and rays of the targets at their own size, in scene units."""
     geometry = made.decoded.geometry
-    rgb = enlarged(made.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
-    depth = enlarged(geometry.depth[0, context:, None].float().cpu(), full)[:, 0]
-    certain = enlarged(geometry.depth_confidence[0, context:, None].float().cpu(), full)[:, 0]
+    rgb = resampled(made.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
+    depth = resampled_depth(geometry.depth[0, context:].float().cpu(), full)
+    certain = resampled(geometry.depth_confidence[0, context:, None].float().cpu(), full)[:, 0]
     world_from_cam = cameras.world_from_cam
     scale, _ = centre_scale(geometry, world_from_cam)
+    # A pixel without a colour has no depth either: nothing of it enters the memory.
+    depth = torch.where(rgb.isfinite().all(1), depth, torch.nan)
     scaled = scaled_depth(depth, part.depth, part.valid, centres=scale, alignment=alignment)
     confidence = (GENERATED * (1 - 1 / certain.clamp_min(1))).numpy().astype(np.float32)
-    confidence[scaled.depth <= 0] = 0
-    unit = scale if np.isfinite(scale) else float(np.nanmedian(scaled.scale, axis=0))
-    rays = _plucker(geometry.ray[0, context:], world_from_cam[0], unit, full)
-    return _Made(
-        rgb.permute(0, 2, 3, 1).numpy(), scaled.depth, confidence, rays, scale, scaled.scale
-    )
+    confidence[~((scaled.depth > 0) & np.isfinite(confidence))] = 0
+    found = [value for value in (scale, *scaled.scale) if np.isfinite(value)]
+    rays = None
+    if found:
+        unit = scale if np.isfinite(scale) else float(np.median(found))
+        rays = _plucker(geometry.ray[0, context:], world_from_cam[0], unit, full)
+    picture = rgb.nan_to_num().permute(0, 2, 3, 1).numpy()
+    return _Made(picture, scaled.depth, confidence, rays, scale, scaled.scale)
 
 
 def _plucker(
     ray: Tensor, world_from_first: NDArray[np.float64], unit: float, full: tuple[int, int]
 ) -> NDArray[np.float32]:
     """Predicted (T, h, w, 6) rays of the first view's frame as (T, H, W, 6) world Plücker rays."""
-    maps = enlarged(ray.float().cpu().permute(0, 3, 1, 2), full).permute(0, 2, 3, 1).double()
+    maps = resampled(ray.float().cpu().permute(0, 3, 1, 2), full).permute(0, 2, 3, 1).double()
     rotation = torch.from_numpy(world_from_first[:3, :3].copy())
     direction = torch.nn.functional.normalize(maps[..., :3] @ rotation.T, dim=-1)
-    origin = maps[..., 3:] * (unit if np.isfinite(unit) else 1.0) @ rotation.T
+    origin = maps[..., 3:] * unit @ rotation.T
     origin = origin + torch.from_numpy(world_from_first[:3, 3].copy())
     moment = torch.linalg.cross(origin, direction)
     return torch.cat((direction, moment), -1).numpy().astype(np.float32)

@@ -2,13 +2,15 @@
 
 The hint features are Eq. 1 of the paper: context pictures and projections are encoded jointly and
 masked by the validity at feature resolution. The mask is applied to *normalised* features, so that
-a target without a valid pixel has exactly GLD's zero padding; such a view is also left out of the
+a target without a valid token has exactly GLD's zero padding; such a view is also left out of the
 joint encoding, since it has nothing to tell and its black picture would disturb the others.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from gvtools.completers.geoverse.depth_anything import DepthAnything3, relative_cameras
 from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
+from gvtools.completers.geoverse.plucker import normalised_poses
 from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.errors import OptionError, ShapeError
 
@@ -67,7 +70,7 @@ class ViewBatch:
 
     Attributes:
         images: (B, V, 3, H, W) in [0, 1]: context pictures; projections on targets, holes at 0.
-        depth: (B, V, 1, H, W) z-depth, any one unit for the batch's sample; 0 = none.
+        depth: (B, V, 1, H, W) z-depth in the unit of the sample's cameras; 0 = none.
         valid: (B, V, 1, H, W) bool: True on context; True where the projection knows a target.
         cam_from_world: (B, V, 4, 4).
         K: (B, V, 3, 3), px of ``images``, pixel centres at + 0.5.
@@ -82,12 +85,13 @@ class ViewBatch:
     context: int
 
     def __post_init__(self) -> None:
-        batch, views, channels, height, width = self.images.shape
+        views, channels = self.images.shape[1:3] if self.images.ndim == 5 else (0, 0)
         if channels != 3 or not 1 <= self.context <= views:
             raise ShapeError(
                 f"images {tuple(self.images.shape)} with {self.context} context view(s); expected "
                 "(B, V, 3, H, W) and 1 to V context views"
             )
+        batch, _, _, height, width = self.images.shape
         for what, value, shape in (
             ("depth", self.depth, (batch, views, 1, height, width)),
             ("valid", self.valid, (batch, views, 1, height, width)),
@@ -104,13 +108,16 @@ class ViewBatch:
 
     def to(self, device: torch.device | str) -> ViewBatch:
         """On another device."""
-        tensors = (self.images, self.depth, self.valid, self.cam_from_world, self.K)
-        return ViewBatch(*(tensor.to(device) for tensor in tensors), self.context)
+        return self._each(lambda tensor: tensor.to(device))
 
     def samples(self, index: Tensor) -> ViewBatch:
         """Some samples of the batch."""
+        return self._each(lambda tensor: tensor[index])
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> ViewBatch:
         tensors = (self.images, self.depth, self.valid, self.cam_from_world, self.K)
-        return ViewBatch(*(tensor[index] for tensor in tensors), self.context)
+        images, depth, valid, pose, K = (change(tensor) for tensor in tensors)
+        return ViewBatch(images, depth, valid, pose, K, self.context)
 
 
 @dataclass(frozen=True)
@@ -189,16 +196,19 @@ def encode_hints(
     grid = network.encoder.grid(*batch.size)
     mask = feature_mask(batch.valid, grid, config.mask)
     mask[:, : batch.context] = 1
-    told = batch.valid.flatten(2).any(2)
-    told[:, : batch.context] = True
+    # With a share of 0 all tokens count, but a view without a valid pixel still tells nothing.
+    told = mask.flatten(2).any(2) & batch.valid.flatten(2).any(2)
     context = batch.context
-    alone = _encode(network, batch, slice(0, context), config)
+    told[:, :context] = True
+    # Only where it is asked for: with everything encoded jointly it is not.
+    alone = cache(lambda: _encode(network, batch, slice(0, context), config))
     shape = (*batch.images.shape[:2], 1 + grid[0] * grid[1], network.config.encoder.channels)
-    joint = [alone[0].new_zeros(shape) for _ in range(2)]
+    dtype = network.encoder.cls_token.dtype
+    joint = [batch.images.new_zeros(shape, dtype=dtype) for _ in range(2)]
     for pattern in torch.unique(told, dim=0):
         samples = (told == pattern).all(1).nonzero()[:, 0]
         if not bool(pattern[context:].any()):
-            for level, features in zip(joint, alone, strict=True):
+            for level, features in zip(joint, alone(), strict=True):
                 level[samples, :context] = features[samples]
             continue
         views = pattern.nonzero()[:, 0]
@@ -206,7 +216,7 @@ def encode_hints(
         for level, features in zip(joint, part, strict=True):
             level[samples[:, None], views] = features
     if config.encode == "alone":
-        for level, features in zip(joint, alone, strict=True):
+        for level, features in zip(joint, alone(), strict=True):
             level[:, :context] = features
     if config.token == "own":
         token = joint[1][:, :, 0].clone()
@@ -214,12 +224,12 @@ def encode_hints(
         if bool(silent.any()):
             token[silent] = _silent_tokens(token, context)[silent]
     else:
-        first = alone if context == 1 else _encode(network, batch, slice(0, 1), config)
+        first = alone() if context == 1 else _encode(network, batch, slice(0, 1), config)
         token = first[1][:, :, 0].expand(-1, shape[1], -1)
 
     features = level1.normalise(_maps(joint[1], grid))
     features = features * told[:, :, None, None, None]
-    source = alone[0] if config.cascade_context == "alone" else joint[0][:, :context]
+    source = alone()[0] if config.cascade_context == "alone" else joint[0][:, :context]
     shallow = torch.zeros_like(features)
     shallow[:, :context] = level0.normalise(_maps(source, grid))
     return Hints(
@@ -264,7 +274,10 @@ def _encode(
     images = batch.images[:, views]
     if not config.cameras:
         return network.encode(images, levels=2)
-    cameras, _ = relative_cameras(batch.cam_from_world)
+    # The camera encoder's unit has a floor, a tenth of a scene unit: in shares of the views' extent
+    # it means the same in every scene.
+    poses, _ = normalised_poses(torch.linalg.inv(batch.cam_from_world), reference=0)
+    cameras, _ = relative_cameras(torch.linalg.inv(poses))
     return network.encode(images, levels=2, cam_from_world=cameras[:, views], K=batch.K[:, views])
 
 

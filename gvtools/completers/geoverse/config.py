@@ -17,6 +17,7 @@ from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
 from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
 from gvtools.completers.geoverse.video_prior import VideoPriorConfig
 from gvtools.errors import CheckpointError, OptionError
+from gvtools.options import check_range
 
 NAMES = ("base", "tiny")
 
@@ -130,6 +131,12 @@ class GeoVerseConfig:
             raise OptionError(
                 "a video prior needs injection = 'control' or 'shared', and 'none' goes without one"
             )
+        if self.video is not None:
+            self._check_layers(len(self.video.taps))
+        check_range("geometry.encoder.patch", encoder.patch, least=1)
+        check_range("image_size", self.image_size, least=encoder.patch)
+        check_range("views", self.views, least=2)
+        check_range("context", self.context, least=1)
         if self.image_size % encoder.patch:
             raise OptionError(
                 f"image_size = {self.image_size}; expected a multiple of the patch {encoder.patch}"
@@ -148,6 +155,17 @@ class GeoVerseConfig:
         for name, (found, wanted) in expected.items():
             if found != wanted:
                 raise OptionError(f"{name} = {found}; the encoder's dimensions ask for {wanted}")
+
+    def _check_layers(self, count: int) -> None:
+        """Refuse blocks that the denoiser does not have: they would do nothing, unsaid."""
+        layers = self.control.layers if self.injection == "control" else self.shared.layers
+        ascending = list(layers) == sorted({*layers})
+        inside = all(0 <= layer < self.level1.depth for layer in layers)
+        if len(layers) != count or not ascending or not inside:
+            raise OptionError(
+                f"{self.injection}.layers = {layers}; expected {count} ascending blocks of the "
+                f"level-1 denoiser, 0 to {self.level1.depth - 1}, one for each of video.taps"
+            )
 
     @property
     def patch(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import types
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -29,7 +30,7 @@ def from_json(kind: type[T], data: Any, *, where: str = "config") -> T:
         OptionError: an unknown key (the nearest is named) or a value of the wrong type.
     """
     if not isinstance(data, Mapping):
-        raise OptionError(f"{where} = {data!r}; expected an object with the fields of {kind}")
+        raise OptionError(f"{where} = {data!r}; expected an object of fields ({kind.__name__})")
     hints = get_type_hints(kind)
     names = [entry.name for entry in fields(kind)]  # type: ignore[arg-type]
     for key in data:
@@ -62,4 +63,6 @@ def _value(kind: Any, data: Any, where: str) -> Any:
         return float(data)
     if type(data) is not kind:
         raise OptionError(f"{where} = {data!r}; expected {getattr(kind, '__name__', kind)}")
+    if kind is float and not math.isfinite(data):
+        raise OptionError(f"{where} = {data!r}; expected a finite number")
     return data

@@ -67,9 +67,8 @@ class ControlBranch(nn.Module):
         self.adapters = nn.ModuleList(FeatureAdapter(video_channels, width) for _ in config.layers)
         self.blocks = nn.ModuleList(copy.deepcopy(denoiser.blocks[i]) for i in config.layers)
         self.outputs = nn.ModuleList(nn.Linear(width, width) for _ in config.layers)
-        for output in self.outputs:
-            nn.init.zeros_(output.weight)
-            nn.init.zeros_(output.bias)
+        for parameter in self.outputs.parameters():
+            nn.init.zeros_(parameter)
 
     def copy_from(self, denoiser: Denoiser) -> None:
         """Start the branch's blocks from the denoiser's, after that has loaded its weights."""
@@ -102,7 +101,7 @@ class ControlBranch(nn.Module):
             adapted: from ``adapted``.
             positions: as the denoiser gets them.
         """
-        stream, _ = denoiser.embed(noisy, conditions)
+        stream = denoiser.encoder_tokens(noisy, conditions)
         c = F.silu(denoiser.time(t, noisy.shape[1]).to(stream.dtype))
         residuals = {}
         for index, layer in enumerate(self.config.layers):

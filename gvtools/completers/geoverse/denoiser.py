@@ -131,7 +131,7 @@ class TimeEmbed(nn.Module):
     def forward(self, t: Tensor) -> Tensor:
         """(...,) to (..., width); the angles are computed in float32."""
         angle = t[..., None].float() * self.W.float() * (2 * math.pi)
-        return self.mlp(torch.cat((angle.sin(), angle.cos()), -1).to(self.mlp[0].weight.dtype))
+        return self.mlp(torch.cat((angle.sin(), angle.cos()), -1).to(self.W.dtype))
 
 
 class SwiGLU(nn.Module):
@@ -238,16 +238,24 @@ class Denoiser(nn.Module):
 
     def _initialise(self) -> None:
         """Gates, the output and the added condition start at zero."""
-        zero = [block.adaLN_modulation[1] for block in self.blocks]
-        zero += [self.final_layer.adaLN_modulation[1], self.final_layer.linear]
+        zero: list[nn.Module] = [self.final_layer.linear]
+        zero += [
+            module.adaLN_modulation[1]
+            for module in self.modules()
+            if isinstance(module, (DenoiserBlock, FinalLayer))
+        ]
         if self.config.depth_condition:
             zero.append(self.depth_embedder.proj)
         for layer in zero:
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
+            for parameter in layer.parameters():
+                nn.init.zeros_(parameter)
 
     def embed(self, noisy: Tensor, conditions: Conditions) -> tuple[Tensor, Tensor]:
         """Tokens that enter the encoder, (B, V, N, width), and the head, (B, V, N, head_width)."""
+        return self.encoder_tokens(noisy, conditions), self.head_tokens(noisy, conditions)
+
+    def encoder_tokens(self, noisy: Tensor, conditions: Conditions) -> Tensor:
+        """Tokens that enter the encoder, (B, V, N, width)."""
         second = noisy
         if self.config.source:
             if conditions.source is None:
@@ -258,10 +266,13 @@ class Denoiser(nn.Module):
         s = s + _tokens(self.camera_embedder, conditions.camera.map.to(s.dtype))
         if self.config.depth_condition and conditions.depth is not None:
             s = s + _tokens(self.depth_embedder, conditions.depth.to(s.dtype))
-        x = self._split("x", torch.cat((conditions.latents, noisy), dim=2), context)
         # Under autocast the streams stay in full precision; only the products are rounded.
-        stream = self.t_embedder.W.dtype
-        return s.to(stream), x.to(stream)
+        return s.to(self.t_embedder.W.dtype)
+
+    def head_tokens(self, noisy: Tensor, conditions: Conditions) -> Tensor:
+        """Tokens that enter the head, (B, V, N, head_width)."""
+        pair = torch.cat((conditions.latents, noisy), dim=2)
+        return self._split("x", pair, conditions.camera.context).to(self.t_embedder.W.dtype)
 
     def time(self, t: Tensor, views: int) -> Tensor:
         """(B,) or (B, V) to the encoder's (B, V, 1, width) time embedding."""
@@ -294,7 +305,7 @@ class Denoiser(nn.Module):
             (B, V, C, h, w).
         """
         grid = (noisy.shape[-2], noisy.shape[-1])
-        self._check(noisy, conditions)
+        self._check(noisy, t, conditions)
         positions = positions or Positions(self.config, conditions.camera, grid)
         s, x = self.embed(noisy, conditions)
         time = self.time(t, noisy.shape[1]).to(s.dtype)
@@ -317,20 +328,34 @@ class Denoiser(nn.Module):
         target = _tokens(getattr(self, f"{stream}_embedder_tgt"), x[:, context:])
         return torch.cat((reference, target), dim=1)
 
-    def _check(self, noisy: Tensor, conditions: Conditions) -> None:
-        expected = tuple(conditions.latents.shape)
+    def _check(self, noisy: Tensor, t: Tensor, conditions: Conditions) -> None:
         height, width = conditions.camera.size
         patch, (rows, columns) = self.config.camera_patch, noisy.shape[-2:]
-        if tuple(noisy.shape) != expected or noisy.shape[2] != self.config.channels:
+        if noisy.ndim != 5 or noisy.shape[2] != self.config.channels:
             raise ShapeError(
-                f"latents {tuple(noisy.shape)} with conditions {expected}; expected equal shapes "
-                f"(B, V, {self.config.channels}, h, w)"
+                f"latents {tuple(noisy.shape)}; expected (B, V, {self.config.channels}, h, w)"
             )
         if (rows * patch, columns * patch) != (height, width):
             raise ShapeError(
-                f"latents of {columns}x{rows} tokens with cameras of {width}x{height} pixels; "
-                f"expected {patch} pixels a token"
+                f"latents {tuple(noisy.shape)} of {columns}x{rows} tokens with cameras of "
+                f"{width}x{height} pixels; expected {patch} pixels a token"
             )
+        batch, views = noisy.shape[:2]
+        if tuple(t.shape) not in ((batch,), (batch, views)):
+            raise ShapeError(
+                f"time {tuple(t.shape)}; expected {(batch,)}, or {(batch, views)} for views of "
+                "different times"
+            )
+        whole, pixels = tuple(noisy.shape), conditions.camera.size
+        for what, value, expected in (
+            ("latents of the conditions", conditions.latents, whole),
+            ("source latents", conditions.source, whole),
+            ("depth condition", conditions.depth, (batch, views, DEPTH_CHANNELS, *pixels)),
+            ("camera map", conditions.camera.map, (batch, views, CAMERA_CHANNELS, *pixels)),
+            ("cam_from_world", conditions.camera.cam_from_world, (batch, views, 4, 4)),
+        ):
+            if value is not None and tuple(value.shape) != expected:
+                raise ShapeError(f"{what} {tuple(value.shape)}; expected {expected}")
 
 
 def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:

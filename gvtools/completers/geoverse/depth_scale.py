@@ -18,7 +18,7 @@ from gvtools.completers.geoverse.fill import push_pull
 from gvtools.completers.geoverse.geometry_head import Geometry
 from gvtools.completers.geoverse.rays import camera_centres
 from gvtools.completers.geoverse.similarity_scale import center_similarity
-from gvtools.errors import OptionError
+from gvtools.errors import DegenerateError, OptionError
 from gvtools.similarity import align_depth_scale
 
 ALIGNMENTS = ("centres", "hint", "field")
@@ -33,7 +33,8 @@ class ScaledDepth:
     """Depth in scene units, and how it got there.
 
     Attributes:
-        depth: (T, H, W) z-depth; 0 for views without a supported scale.
+        depth: (T, H, W) z-depth; 0 where the model's is not finite, and for views without a
+            supported scale.
         scale: (T,) factor, the field's median; NaN where refused.
         method: for each view, what was used: one of ``ALIGNMENTS`` or "none".
     """
@@ -50,9 +51,12 @@ def centre_scale(geometry: Geometry, world_from_cam: NDArray[np.float64]) -> tup
         geometry: (1, V, ...) of a pass.
         world_from_cam: (V, 4, 4), scene units.
     """
-    predicted = camera_centres(geometry.ray.float(), geometry.ray_confidence.float()).cpu()
+    try:
+        predicted = camera_centres(geometry.ray.float(), geometry.ray_confidence.float()).cpu()
+    except DegenerateError as error:
+        return float("nan"), str(error)
     reference = torch.from_numpy(np.ascontiguousarray(world_from_cam[None, :, :3, 3]))
-    fitted = center_similarity(predicted.double(), reference)
+    fitted = center_similarity(predicted, reference)
     if not bool(fitted.ok[0]):
         return float("nan"), fitted.status[0]
     correlation = float(fitted.correlation[0])
@@ -103,6 +107,7 @@ def scaled_depth(
         result[index] = view * np.float32(scale[index])
         if method == "field":
             result[index] *= _field(result[index], hint[index], valid[index])
+    result[~np.isfinite(result)] = 0
     return ScaledDepth(result, scale, tuple(methods))
 
 
@@ -110,7 +115,7 @@ def _field(
     depth: NDArray[np.float32], hint: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Exponential of the push-pull of log(hint / depth) over valid pixels, within ``MAX_FIELD``."""
-    known = valid & (hint > 0) & (depth > 0)
+    known = valid & (hint > 0) & (depth > 0) & np.isfinite(hint) & np.isfinite(depth)
     limit = np.log(MAX_FIELD)
     ratio = np.zeros_like(depth)
     ratio[known] = np.clip(np.log(hint[known] / depth[known]), -limit, limit)

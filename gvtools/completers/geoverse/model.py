@@ -11,15 +11,14 @@ Data flow of one pass (tensor shapes in ``docs``; equations are the paper's)::
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse.conditioning import (
-    Hints,
     ViewBatch,
     depth_condition,
     encode_hints,
@@ -29,66 +28,30 @@ from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.control import ControlBranch
 from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
 from gvtools.completers.geoverse.depth_anything import DepthAnything3
-from gvtools.completers.geoverse.flow import sample, velocity_from_clean
-from gvtools.completers.geoverse.geometry_head import Geometry
+from gvtools.completers.geoverse.flow import check_bounds, sample, velocity_from_clean
 from gvtools.completers.geoverse.noise import seeded_noise, view_seed
-from gvtools.completers.geoverse.plucker import camera_condition
+from gvtools.completers.geoverse.passes import Decoded, Generated, Prepared
+from gvtools.completers.geoverse.plucker import CameraCondition, camera_condition
 from gvtools.completers.geoverse.projective import Projective
 from gvtools.completers.geoverse.rgb_head import RGBHead
 from gvtools.completers.geoverse.shared_attention import SharedAttention, VideoKeys
-from gvtools.completers.geoverse.stages import DECODE, HINTS, LEVEL0, LEVEL1, VIDEO, Clock, no_clock
+from gvtools.completers.geoverse.stages import (
+    BLOCKS,
+    DECODE,
+    GEOMETRY,
+    HINTS,
+    LEVEL0,
+    LEVEL1,
+    RGB,
+    VIDEO,
+    Clock,
+    no_clock,
+)
 from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior
-from gvtools.errors import CheckpointError
+from gvtools.errors import CheckpointError, OptionError, ShapeError
 
-
-@dataclass(frozen=True)
-class Prepared:
-    """What stays constant over the denoising steps of a pass.
-
-    Attributes:
-        batch: the views, holes filled where the configuration says so.
-        hints: features of context and projections.
-        level1: conditions of the level-1 denoiser.
-        positions: its projective transforms.
-        adapted: video features at the control branch's width.
-        keys: video keys and values of the coupled blocks.
-    """
-
-    batch: ViewBatch
-    hints: Hints
-    level1: Conditions
-    positions: Positions
-    adapted: list[Tensor] | None = None
-    keys: dict[int, VideoKeys] | None = None
-
-
-@dataclass(frozen=True)
-class Decoded:
-    """Pictures and geometry of generated features.
-
-    Attributes:
-        rgb: (B, T, 3, H, W) of the target views, not clipped to [0, 1].
-        geometry: of all V views, in the frame of the first view and the model's unit.
-    """
-
-    rgb: Tensor
-    geometry: Geometry
-
-
-@dataclass(frozen=True)
-class Generated:
-    """The result of a pass.
-
-    Attributes:
-        level1: (B, V, C, h, w) normalised latents.
-        level0: (B, V, C, h, w) normalised latents.
-        decoded: pictures and geometry.
-    """
-
-    level1: Tensor
-    level0: Tensor
-    decoded: Decoded
+__all__ = ["Decoded", "Generated", "GeoVerse", "Prepared"]
 
 
 class GeoVerse(nn.Module):
@@ -143,6 +106,11 @@ class GeoVerse(nn.Module):
         self.rgb_head.requires_grad_(False)
 
     @property
+    def _levels(self) -> Sequence[LatentStatistics]:
+        """Statistics of level 0 and of level 1."""
+        return cast("Sequence[LatentStatistics]", self.statistics)
+
+    @property
     def video(self) -> VideoPrior | None:
         """The video prior, when one has been attached."""
         return self._video[0] if self._video else None
@@ -183,7 +151,7 @@ class GeoVerse(nn.Module):
                 reference=config.camera.reference,
                 pixel_offset=config.camera.pixel_offset,
             )
-            level0, level1 = self.statistics
+            level0, level1 = self._levels
             hints = encode_hints(self.geometry, level0, level1, batch, config.hints)
             depth = None
             if config.level1.depth_condition:
@@ -201,14 +169,39 @@ class GeoVerse(nn.Module):
             return self.with_video(prepared, features)
 
     def with_video(self, prepared: Prepared, features: VideoFeatures) -> Prepared:
-        """``prepared`` with video features; gradients reach the adapters."""
+        """``prepared`` with video features; gradients reach the adapters.
+
+        Raises:
+            ShapeError: features of other views, channels or taps.
+        """
         latents = prepared.hints.level1
         grid = (latents.shape[-2], latents.shape[-1])
+        self._check_video(features, tuple(latents.shape[:2]))
         if self.control is not None:
             return replace(prepared, adapted=self.control.adapted(features.tensors, grid))
+        keys = self._video_keys(prepared.level1.camera, features, grid)
+        return replace(prepared, video=features, keys=keys)
+
+    def _check_video(self, features: VideoFeatures, views: tuple[int, ...]) -> None:
+        config = self.config.video
+        if config is None:
+            raise OptionError(
+                "video features for a GeoVerse without a video prior; expected none, or a "
+                "configuration with injection = 'control' or 'shared'"
+            )
+        shapes = [tuple(level.shape) for level in features.tensors]
+        wanted = (*views, config.channels)
+        if len(shapes) != len(config.taps) or any(shape[:3] != wanted for shape in shapes):
+            raise ShapeError(
+                f"video features {shapes}; expected {len(config.taps)} of {wanted} and a grid"
+            )
+
+    def _video_keys(
+        self, camera: CameraCondition, features: VideoFeatures, grid: tuple[int, int]
+    ) -> dict[int, VideoKeys] | None:
+        """Keys and values of the coupled blocks, positioned by the given cameras."""
         if self.shared is None:
-            return prepared
-        camera = prepared.level1.camera
+            return None
         heads = self.config.level1.width // self.config.level1.heads
         positions = [
             Projective(
@@ -222,7 +215,7 @@ class GeoVerse(nn.Module):
             )
             for level in features.tensors
         ]
-        return replace(prepared, keys=self.shared(features.tensors, positions))
+        return self.shared(features.tensors, positions)
 
     def _video_features(
         self, batch: ViewBatch, seeds: int | Sequence[Sequence[int]]
@@ -235,8 +228,17 @@ class GeoVerse(nn.Module):
             )
         return self.video.features(batch.images, batch.valid, batch.context, seed=seeds)
 
-    def velocity1(self, prepared: Prepared, state: Tensor, t: Tensor) -> Tensor:
-        """The level-1 velocity at (B, V, C, h, w) ``state`` and (B,) or (B, V) ``t`` (Eq. 2)."""
+    def velocity1(
+        self, prepared: Prepared, state: Tensor, t: Tensor, *, least: float | None = None
+    ) -> Tensor:
+        """The level-1 velocity (Eq. 2).
+
+        Args:
+            prepared: what stays constant.
+            state: (B, V, C, h, w).
+            t: (B,) or (B, V).
+            least: instead of the configuration's ``flow.least_time``.
+        """
         residuals = None
         if self.control is not None and prepared.adapted is not None:
             residuals = self.control(
@@ -259,7 +261,7 @@ class GeoVerse(nn.Module):
         if flow.prediction == "velocity":
             return out
         clean = out + prepared.hints.unmasked if flow.skip else out
-        return velocity_from_clean(clean, state, t, least=flow.least_time)
+        return velocity_from_clean(clean, state, t, least=least or flow.least_time)
 
     def cascade_conditions(self, prepared: Prepared, level1: Tensor) -> Conditions:
         """What the cascade knows: clean context level 0, level 1 of all views, cameras (Eq. 3)."""
@@ -277,19 +279,21 @@ class GeoVerse(nn.Module):
         """Level-1 latents from (B, V, C, h, w) noise, one Euler step an interval."""
         flow = self.config.flow
         scale = flow.guidance if guidance is None else guidance
-        without = self._unconditional(prepared) if scale != 1 else None
+        without = self._unconditional(prepared) if scale != 1 else prepared
+        tau = check_bounds(bounds or flow.level1)
+        # The floor is for training. A step from t goes (t - next) / t of the way to the clean
+        # latents, however small t is; with the floor, short last steps would leave noise behind.
+        least = min(flow.least_time, tau[-2])
 
         def velocity(state: Tensor, t: Tensor) -> Tensor:
             with clock(LEVEL1):
-                return self.velocity1(prepared, state, t)
+                return self.velocity1(prepared, state, t, least=least)
 
         def unconditional(state: Tensor, t: Tensor) -> Tensor:
             with clock(LEVEL1):
-                return self.velocity1(without or prepared, state, t)
+                return self.velocity1(without, state, t, least=least)
 
-        return sample(
-            velocity, noise, bounds or flow.level1, unconditional=unconditional, guidance=scale
-        )
+        return sample(velocity, noise, tau, unconditional=unconditional, guidance=scale)
 
     def sample0(
         self,
@@ -314,24 +318,29 @@ class GeoVerse(nn.Module):
 
         return sample(velocity, noise, bounds or self.config.flow.cascade)
 
-    def decode(self, prepared: Prepared, level0: Tensor, level1: Tensor) -> Decoded:
+    def decode(
+        self, prepared: Prepared, level0: Tensor, level1: Tensor, *, clock: Clock = no_clock
+    ) -> Decoded:
         """Pictures of the targets and geometry of all views; gradients reach the latents."""
         grid = (level1.shape[-2], level1.shape[-1])
         encoder = self.geometry.encoder
-        pyramid = self.pyramid(level0, level1, prepared.hints.token)
-        normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
-        geometry = self.geometry.head(normed, grid)
-        context = prepared.batch.context
-        features = torch.cat([level[:, context:] for level in normed], dim=-1)
-        shape = features.shape[:2]
-        rgb = self.rgb_head(features.flatten(0, 1), grid).unflatten(0, shape)
+        with clock(BLOCKS):
+            pyramid = self.pyramid(level0, level1, prepared.hints.token)
+            normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
+        with clock(GEOMETRY):
+            geometry = self.geometry.head(normed, grid)
+        with clock(RGB):
+            context = prepared.batch.context
+            features = torch.cat([level[:, context:] for level in normed], dim=-1)
+            shape = features.shape[:2]
+            rgb = self.rgb_head(features.flatten(0, 1), grid).unflatten(0, shape)
         return Decoded(rgb, geometry)
 
     def pyramid(self, level0: Tensor, level1: Tensor, token: Tensor) -> list[Tensor]:
         """Four raw (B, V, 1 + N, C) levels of two (B, V, C, h, w) latents and token 0 (B, V, C)."""
         grid = (level1.shape[-2], level1.shape[-1])
         raw = []
-        for statistics, latent in zip(self.statistics, (level0, level1), strict=True):
+        for statistics, latent in zip(self._levels, (level0, level1), strict=True):
             tokens = statistics.denormalise(latent).flatten(3).transpose(2, 3)
             raw.append(torch.cat((token[:, :, None].to(tokens.dtype), tokens), dim=2))
         return [*raw, *self.geometry.encoder.propagate(raw[1], grid)]
@@ -378,14 +387,17 @@ class GeoVerse(nn.Module):
         )
         level0 = self.sample0(prepared, level1, noise("level0"), bounds=cascade_bounds, clock=clock)
         with clock(DECODE):
-            return Generated(level1, level0, self.decode(prepared, level0, level1))
+            decoded = self.decode(prepared, level0, level1, clock=clock)
+        return Generated(level1, level0, decoded)
 
     def _unconditional(self, prepared: Prepared) -> Prepared:
-        """Without cameras, as GLD's guidance has it: latents and hints are kept."""
+        """Without cameras, as GLD's guidance has it: latents, hints and video are kept."""
         camera = prepared.level1.camera.unconditional()
         grid = (prepared.hints.level1.shape[-2], prepared.hints.level1.shape[-1])
+        video = prepared.video
         return replace(
             prepared,
             level1=replace(prepared.level1, camera=camera),
             positions=Positions(self.config.level1, camera, grid),
+            keys=None if video is None else self._video_keys(camera, video, grid),
         )

@@ -2,7 +2,8 @@
 
 Context pictures are cropped about their centre to the targets' aspect and resampled; the cameras
 follow. A projection's colour is the mean of the valid pixels under a cell; its depth is that of
-one pixel, the nearest valid one to the cell's centre, so that no depth between two surfaces arises.
+one pixel, the cell's centre or, where that is a hole, the farthest, so that no depth between two
+surfaces arises. Lengths are in a unit of the views' own, whatever the scene's is.
 """
 
 from __future__ import annotations
@@ -18,16 +19,13 @@ from torch import Tensor
 from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.base import ContextView
 from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.resampling import resampled
 from gvtools.guidance import Guidance
 
 # A cell of the model's grid counts as valid from this share of valid pixels on.
 VALID_SHARE = 0.5
-
-
-def model_size(height: int, width: int, *, longest: int, patch: int) -> tuple[int, int]:
-    """(H, W) of the model's pictures: the aspect kept as well as multiples of the patch allow."""
-    factor = longest / max(height, width)
-    return tuple(max(1, round(side * factor / patch)) * patch for side in (height, width))  # type: ignore[return-value]
+# Views nearer to each other than this share of their distance from the origin stand at one place.
+COINCIDENT = 1e-12
 
 
 def view_batch(
@@ -41,24 +39,25 @@ def view_batch(
         size: (H, W) of the model's pictures.
 
     Returns:
-        The batch, its world being the first context view's frame, and all cameras (V) at ``size``
-        in the scene's own frame.
+        The batch, in the first context view's frame and a unit in which the farthest view stands
+        at a distance of 1, and all cameras (V) at ``size`` in the scene's own frame and unit.
     """
     height, width = int(targets.cameras.height[0]), int(targets.cameras.width[0])
     pictures, depths, cameras = [], [], []
     for view in context:
-        picture, depth, camera = _cropped(view, height / width)
-        pictures.append(_resampled(picture, size))
-        depths.append(_nearest(depth, size))
+        picture, observed, camera = _cropped(view, height / width)
+        pictures.append(_picture(picture, size))
+        depths.append(_nearest(observed, size))
         cameras.append(camera.resized(size[1], size[0]))
-    rgb, depth, valid = _reduced(targets, size)
+    rgb, projected, valid = _reduced(targets, size)
     cameras.append(targets.cameras.resized(size[1], size[0]))
     joined = concatenate(cameras)
     seen = torch.ones((len(context), 1, *size), dtype=torch.bool)
-    relative = joined.cam_from_world @ joined.world_from_cam[:1]
+    depth = torch.cat((torch.stack(depths), projected))
+    relative, unit = _relative(joined, depth)
     batch = ViewBatch(
         images=torch.cat((torch.stack(pictures), rgb))[None],
-        depth=torch.cat((torch.stack(depths), depth))[None],
+        depth=(depth / unit)[None],
         valid=torch.cat((seen, valid))[None],
         cam_from_world=torch.from_numpy(relative).float()[None],
         K=torch.from_numpy(joined.K).float()[None],
@@ -67,11 +66,20 @@ def view_batch(
     return batch, joined
 
 
-def enlarged(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """(T, C, h, w) to (T, C, H, W): bilinear, with an antialias filter where it shrinks."""
-    if tuple(x.shape[-2:]) == size:
-        return x
-    return F.interpolate(x, size=size, mode="bilinear", align_corners=False, antialias=True)
+def _relative(cameras: Cameras, depth: Tensor) -> tuple[NDArray[np.float64], float]:
+    """(V, 4, 4) ``cam_from_world`` in the first view's frame, and its unit in scene units.
+
+    The unit is the distance of the farthest view, or the median depth for views that all stand at
+    one place, so that networks see the same numbers in a scene of millimetres and of kilometres.
+    """
+    relative = cameras.cam_from_world @ cameras.world_from_cam[:1]
+    unit = float(np.linalg.norm(relative[:, :3, 3], axis=1).max())
+    if unit <= COINCIDENT * np.abs(cameras.cam_from_world[:, :3, 3]).max():
+        relative[:, :3, 3] = 0
+        known = depth[torch.isfinite(depth) & (depth > 0)]
+        return relative, float(known.median()) if known.numel() else 1.0
+    relative[:, :3, 3] /= unit
+    return relative, unit
 
 
 def _cropped(
@@ -88,10 +96,10 @@ def _cropped(
     return view.rgb[window], depth[window], camera
 
 
-def _resampled(picture: NDArray[np.float32], size: tuple[int, int]) -> Tensor:
+def _picture(picture: NDArray[np.float32], size: tuple[int, int]) -> Tensor:
     """(H, W, 3) to (3, h, w)."""
     image = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)[None].float()
-    return enlarged(image, size)[0].clamp(0, 1)
+    return resampled(image, size)[0].clamp(0, 1)
 
 
 def _nearest(depth: NDArray[np.float32], size: tuple[int, int]) -> Tensor:
@@ -102,12 +110,18 @@ def _nearest(depth: NDArray[np.float32], size: tuple[int, int]) -> Tensor:
 
 def _reduced(targets: Guidance, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
     """Colour (T, 3, h, w), depth (T, 1, h, w) and validity (T, 1, h, w) of projections."""
-    weight = torch.from_numpy(targets.valid).float()[:, None]
-    rgb = torch.from_numpy(np.ascontiguousarray(targets.rgb)).float().permute(0, 3, 1, 2) * weight
-    share = enlarged(weight, size)
-    colour = enlarged(rgb, size) / share.clamp_min(1e-6)
+    # Chosen, not multiplied: a NaN in a hole stays there.
+    rgb, depth = (
+        torch.from_numpy(np.where(known, values, np.float32(0)))
+        for known, values in (
+            (targets.valid[..., None], targets.rgb),
+            (targets.valid, targets.depth),
+        )
+    )
+    rgb, depth = rgb.permute(0, 3, 1, 2), depth[:, None]
+    share = resampled(torch.from_numpy(targets.valid).float()[:, None], size)
+    colour = resampled(rgb, size) / share.clamp_min(1e-6)
     valid = share >= VALID_SHARE
-    depth = torch.from_numpy(np.ascontiguousarray(targets.depth)).float()[:, None] * weight
     nearest = F.interpolate(depth, size=size, mode="nearest-exact")
     # Where the centre's own pixel is a hole, the greatest depth under the cell: the far side.
     window = [max(1, -(-full // cell)) for full, cell in zip(depth.shape[-2:], size, strict=True)]

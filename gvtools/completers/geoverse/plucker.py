@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from gvtools.errors import DegenerateError, OptionError, ShapeError
@@ -180,7 +179,9 @@ def plucker_map(
         (x.expand(height, width), y[:, None].expand(height, width), x.new_ones(height, width))
     )
     through = _product(world_from_cam[..., :3, :3], torch.linalg.inv(K))
-    direction = F.normalize(_product(through, pixel.flatten(1)), dim=2).unflatten(-1, size)
+    direction = _product(through, pixel.flatten(1))
+    # Never 0: z is 1 before the rotation. Torch's own norm is slow over a dimension in the middle.
+    direction = (direction / direction.square().sum(dim=2, keepdim=True).sqrt()).unflatten(-1, size)
     centre = world_from_cam[..., :3, 3, None, None].expand_as(direction)
     return torch.cat((direction, torch.linalg.cross(centre, direction, dim=2)), dim=2)
 

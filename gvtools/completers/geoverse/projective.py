@@ -85,41 +85,48 @@ class Projective:
         self.cos, self.sin = _angles(
             grid, head_dim // 8, base, position_scale, self.matrix.new_empty(0)
         )
+        # As wide as half a head, so that whole rows are multiplied: rows of four are slow.
+        self._query, self._key, self._output = (
+            _blocks(right, head_dim // 2)
+            for right in (self.matrix, self.key_matrix.mT, self.matrix.mT)
+        )
+        self._cos = torch.stack((self.cos, self.cos), dim=-2).flatten(-3)
+        self._sin = torch.stack((self.sin, -self.sin), dim=-2).flatten(-3)
+        self._swap = _swap(head_dim // 8, self.matrix.new_empty(0))
 
     def query(self, q: Tensor) -> Tensor:
         """(B, heads, V*h*w, head_dim) queries, encoded."""
-        return self._apply(q, self.matrix, forward=True)
+        return self._apply(q, self._query, 1)
 
     def key(self, k: Tensor) -> Tensor:
         """(B, heads, V*h*w, head_dim) keys, encoded."""
-        return self._apply(k, self.key_matrix.mT, forward=True)
+        return self._apply(k, self._key, 1)
 
     def value(self, v: Tensor) -> Tensor:
         """(B, heads, V*h*w, head_dim) values, encoded."""
-        return self._apply(v, self.key_matrix.mT, forward=True)
+        return self._apply(v, self._key, 1)
 
     def output(self, o: Tensor) -> Tensor:
         """(B, heads, V*h*w, head_dim) results of attention, taken back to each token's frame."""
-        return self._apply(o, self.matrix.mT, forward=False)
+        return self._apply(o, self._output, -1)
 
-    def _apply(self, x: Tensor, right: Tensor, *, forward: bool) -> Tensor:
-        """Rows of four times ``right`` (B, V, 4, 4), and the rotation or its inverse."""
+    def _apply(self, x: Tensor, blocks: Tensor, turn: int) -> Tensor:
+        """Half a head times ``blocks`` (B, V, half, half), the other half rotated by +-1 turn."""
         tokens = self.grid[0] * self.grid[1]
         if x.ndim != 4 or x.shape[2:] != (self.views * tokens, self.head_dim):
             raise ShapeError(
                 f"projective encoding: tokens {tuple(x.shape)}; expected (B, heads, "
                 f"{self.views * tokens}, {self.head_dim}) for {self.views} views of {self.grid}"
             )
-        dtype = torch.promote_types(x.dtype, right.dtype)
-        projected, turned = x.unflatten(2, (self.views, tokens)).chunk(2, dim=-1)
-        # Under autocast the product would be rounded to half precision, and P P⁻¹ with it.
+        dtype = torch.promote_types(x.dtype, blocks.dtype)
+        # Under autocast the products would be rounded to half precision, and P P⁻¹ with them.
         with torch.autocast(x.device.type, enabled=False):
-            rows = projected.to(dtype).unflatten(-1, (-1, GROUP)).flatten(3, 4)
-            projected = (rows @ right.to(dtype)[:, None]).reshape(projected.shape)
-        a, b = turned.unflatten(-1, (2, 2, -1)).unbind(-2)
-        sin = self.sin if forward else -self.sin
-        turned = torch.stack((self.cos * a + sin * b, self.cos * b - sin * a), dim=-2)
-        return torch.cat((projected.to(x.dtype), turned.flatten(-3).to(x.dtype)), -1).flatten(2, 3)
+            projected, turned = x.unflatten(2, (self.views, tokens)).to(dtype).chunk(2, dim=-1)
+            projected = projected @ blocks.to(dtype)[:, None]
+            turned = turned.contiguous()
+            other = turned @ self._swap.to(dtype)
+            turned = torch.addcmul(turned * self._cos, other, self._sin, value=turn)
+        return torch.cat((projected.to(x.dtype), turned.to(x.dtype)), -1).flatten(2, 3)
 
 
 def projection_matrices(
@@ -172,3 +179,16 @@ def _angles(
     exponent = torch.arange(frequencies, dtype=like.dtype, device=like.device) / frequencies
     angle = position[..., None] * base**-exponent
     return angle.cos(), angle.sin()
+
+
+def _blocks(right: Tensor, size: int) -> Tensor:
+    """(..., 4, 4) to (..., size, size) with as many copies along the diagonal as there is room."""
+    eye = torch.eye(size // GROUP, dtype=right.dtype, device=right.device)
+    blocks = eye[:, None, :, None] * right[..., None, :, None, :]
+    return blocks.flatten(-4, -3).flatten(-2, -1)
+
+
+def _swap(frequencies: int, like: Tensor) -> Tensor:
+    """The permutation of half a head that exchanges the two of each rotary pair."""
+    eye = torch.eye(4 * frequencies, dtype=like.dtype, device=like.device)
+    return eye.unflatten(1, (2, 2, frequencies)).flip(2).flatten(1)

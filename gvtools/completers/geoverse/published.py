@@ -6,11 +6,8 @@ and code in November 2026; the shapes come from our own modules, not from the fi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-
-from torch import Tensor
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
 
@@ -34,8 +31,11 @@ class Part:
         licence: its terms.
         nested: dictionaries in which the tensors may lie, the first that is there.
         strip: prefix that is taken off every key that has it.
-        only: keys without this prefix belong to other networks and are passed over; it is taken
-            off as well.
+        only: keys with none of these prefixes belong to other networks and are passed over; the
+            prefix is taken off as well.
+        tied: names that are one tensor in the publisher's network; a file may hold any of them.
+        optional: the model can do without it; where the file is there it has to fit all the same.
+        stated_bytes: the file's size as published, where it holds other networks, too.
         note: what else a user should know.
     """
 
@@ -46,25 +46,38 @@ class Part:
     licence: str
     nested: tuple[str, ...] = ()
     strip: str = ""
-    only: str = ""
+    only: tuple[str, ...] = ()
+    tied: tuple[tuple[str, ...], ...] = ()
+    optional: bool = False
+    stated_bytes: int | None = None
     note: str = ""
 
     def find(self, folder: Path) -> Path | None:
         """The part's file in a folder, if it is there."""
         return next((folder / file for file in self.files if (folder / file).is_file()), None)
 
-    def renamed(self, stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Stored tensors by the names of our module, without its prefix."""
-        found = {}
-        for key, tensor in stored.items():
-            if self.only and not key.startswith(self.only):
-                continue
-            found[key.removeprefix(self.only).removeprefix(self.strip)] = tensor
-        return found
+    def own_name(self, key: str) -> str | None:
+        """A stored key by the name of our module, without its prefix; None if it is another's."""
+        key = key.removeprefix(self.strip)
+        if not self.only:
+            return key
+        start = next((start for start in self.only if key.startswith(start)), None)
+        return None if start is None else key.removeprefix(start)
 
 
 GLD = "SeonghuJeon/GLD (Geometric Latent Diffusion)"
 GLD_TERMS = "Apache-2.0 (model card); code MIT"
+
+# Depth Anything 3 has one LayerNorm in its four ray outputs; safetensors store it under one name.
+_RAY_NORMS = "scratch.output_conv2_aux.{}.2.{}"
+
+
+def _tied(start: str) -> tuple[tuple[str, ...], ...]:
+    return tuple(
+        tuple(start + _RAY_NORMS.format(level, kind) for level in range(4))
+        for kind in ("weight", "bias")
+    )
+
 
 PARTS = (
     Part(
@@ -74,6 +87,7 @@ PARTS = (
         "depth-anything/DA3-BASE, model.safetensors; also in SeonghuJeon/GLD",
         "Apache-2.0",
         strip="model.",
+        tied=_tied("head."),
         note="the frozen encoder, geometry head, camera encoder and decoder",
     ),
     Part(
@@ -103,7 +117,8 @@ PARTS = (
         GLD,
         GLD_TERMS,
         nested=("ema", "model"),
-        only="decoder.",
+        strip="module.",
+        only=("decoder.",),
         note="the RGB head",
     ),
     *(
@@ -122,10 +137,34 @@ PARTS = (
     ),
 )
 
+# Read where it is there, as GLD does. GLD takes of it what has a name of the geometry head and says
+# nothing of the rest; here it has to be the whole head, and nothing else under its two prefixes.
+GEOMETRY_HEAD = Part(
+    "geometry_head",
+    "geometry.head.",
+    ("pretrained_models/da3/dpt_decoder.pt", "da3/dpt_decoder.pt"),
+    GLD,
+    GLD_TERMS,
+    nested=("model",),
+    strip="module.",
+    only=("decoder.", "pred."),
+    tied=_tied(""),
+    optional=True,
+    stated_bytes=400_000_000,
+    note="GLD's geometry head, in place of Depth Anything 3's own",
+)
+
 VIDEO_SOURCE = "alibaba-pai/Wan2.2-VACE-Fun-A14B, low_noise_model (34.7 GB), cut to 14.8 GB"
 VIDEO_TERMS = "Apache-2.0 (repository; check the model card)"
+# Tensors, numbers and bytes of what is left of it: blocks 0 to 15, VACE blocks 0, 5, 10 and 15, in
+# bfloat16 but for what diffusers keeps in float32; and of the VAE.
+VIDEO_SIZES = {
+    "transformer": (567, 7_393_674_304, 14_844_078_208),
+    "vae": (194, 126_892_531, 507_570_124),
+}
 
 
 def parts_of(config: GeoVerseConfig) -> tuple[Part, ...]:
-    """The published parts that a configuration has modules for."""
-    return tuple(p for p in PARTS if p.name != "cascade" or config.cascade is not None)
+    """The published parts that a configuration has modules for, the optional one last."""
+    parts = (*PARTS, GEOMETRY_HEAD)
+    return tuple(part for part in parts if part.name != "cascade" or config.cascade is not None)

@@ -86,9 +86,10 @@ class SharedAttention(nn.Module):
             positions: of the video grid, for each of them, in the units of the latents' grid.
         """
         found = {}
+        dtype = next(self.parameters()).dtype
         for index, (layer, feature) in enumerate(zip(self.config.layers, features, strict=True)):
             tokens = feature.flatten(3).transpose(2, 3).flatten(1, 2)
-            kv = self.kv[index](self.norms[index](tokens.to(self.kv[index].weight.dtype)))
+            kv = self.kv[index](self.norms[index](tokens.to(dtype)))
             key, value = kv.unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
             gate = self.gates[index] if self.config.gated else None
             found[layer] = VideoKeys(positions[index].key(key), positions[index].value(value), gate)

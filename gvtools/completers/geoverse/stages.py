@@ -12,6 +12,12 @@ LEVEL0 = "cascade step"
 DECODE = "decoding"
 STAGES = (HINTS, VIDEO, LEVEL1, LEVEL0, DECODE)
 
+# Within decoding.
+BLOCKS = "encoder blocks"
+GEOMETRY = "geometry head"
+RGB = "RGB head"
+DECODING = (BLOCKS, GEOMETRY, RGB)
+
 Clock = Callable[[str], AbstractContextManager[None]]
 
 

@@ -1,65 +1,51 @@
-"""``GeoVerse`` from a folder and into one."""
+"""``GeoVerse`` from a folder and into one.
+
+A weights folder is one of two: our own (``config.json`` and ``geoverse.safetensors`` with every
+tensor), or one of published files as they were downloaded (``published.py``), with or without a
+trained extension. The video prior lies in ``video/`` of either.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from gvtools.completers.geoverse import config as configs
-from gvtools.completers.geoverse.checkpoints import (
-    Fit,
-    check_finite,
-    expected_of,
-    fit,
-    is_extension,
-    load,
-    read_part,
-    read_tensors,
-    shapes,
-    write_tensors,
-)
+from gvtools.completers.geoverse.checkpoints import is_extension, load
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.control import ControlBranch
-from gvtools.completers.geoverse.denoiser import Denoiser
+from gvtools.completers.geoverse.extension import fresh_extension
+from gvtools.completers.geoverse.folder_check import check_folder, check_video_folder
+from gvtools.completers.geoverse.folder_parts import (
+    PartReport,
+    check_is_folder,
+    config_of,
+    empty_model,
+    examine,
+    pieces_of,
+)
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.published import (
     CONFIG_FILE,
     EXTENSION_FILE,
     VIDEO_FOLDER,
     WHOLE_FILE,
-    parts_of,
 )
-from gvtools.completers.geoverse.shared_attention import SharedAttention
+from gvtools.completers.geoverse.saved_tensors import DTYPES, save_tensors
 from gvtools.completers.geoverse.video_prior import VideoPrior
 from gvtools.errors import CheckpointError
+from gvtools.files import replaced_when_written
 
-DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
-
-
-@dataclass(frozen=True)
-class PartReport:
-    """What was found of one part of a folder.
-
-    Attributes:
-        name: of the part.
-        path: its file, or None.
-        ok: it can be loaded.
-        needed: the folder is of no use without it.
-        said: one line.
-        fit: names and shapes, where a file was read.
-        bytes: on disk.
-    """
-
-    name: str
-    path: Path | None
-    ok: bool
-    needed: bool
-    said: str
-    fit: Fit | None = None
-    bytes: int = 0
+__all__ = [
+    "DTYPES",
+    "PartReport",
+    "check_folder",
+    "config_of",
+    "from_pretrained",
+    "save_extension",
+    "save_pretrained",
+]
 
 
 def from_pretrained(
@@ -70,6 +56,9 @@ def from_pretrained(
     video: bool = True,
 ) -> GeoVerse:
     """The model of a weights folder, strictly loaded, in evaluation mode.
+
+    Tensors are mapped from disk and copied only where they are not float32, on another device, or
+    not aligned as torch would have them.
 
     Args:
         folder: with ``geoverse.safetensors``, or with published files (``gvtools weights list``).
@@ -82,19 +71,16 @@ def from_pretrained(
         CheckpointError: a file or a tensor is missing, unexpected, misshapen or not finite.
     """
     folder = Path(folder)
+    check_is_folder(folder)
     config = config or config_of(folder)
-    with torch.device("meta"):
-        model = GeoVerse(config)
-    whole = folder / WHOLE_FILE
-    if whole.is_file():
-        tensors = read_tensors(whole)
-        check_finite(tensors, where=whole)
-        load(model, tensors, where=whole)
-    else:
-        _load_published(model, folder)
+    model = empty_model(config, where=folder)
+    video = video and config.video is not None
+    if video:
+        check_video_folder(folder / VIDEO_FOLDER)
+    load(model, _tensors(folder, model), where=folder, device=device)
     model.freeze()
-    model = model.eval().to(device)
-    if video and config.video is not None:
+    model.eval()
+    if video:
         prior = VideoPrior.from_pretrained(
             folder / VIDEO_FOLDER, config=config.video, device=device
         )
@@ -102,165 +88,88 @@ def from_pretrained(
     return model
 
 
-def save_pretrained(model: GeoVerse, folder: Path | str, *, dtype: str = "float32") -> Path:
+def _tensors(folder: Path, model: GeoVerse) -> dict[str, Tensor]:
+    """All tensors of a model, by its names."""
+    loaded: dict[str, Tensor] = {}
+    for piece in pieces_of(folder, model):
+        report, tensors = examine(piece)
+        if not report.ok:
+            what = f"{folder}: {report.name}" if report.path is None else f"{report.path}"
+            raise CheckpointError(
+                f"{what}: {report.said}; gvtools weights list names what is needed"
+            )
+        loaded |= tensors
+    absent = [name for name in model.state_dict() if name not in loaded]
+    if any(is_extension(name) for name in absent):
+        loaded |= fresh_extension(model, loaded)
+    return loaded
+
+
+def save_pretrained(
+    model: GeoVerse, folder: Path | str, *, dtype: str = "float32", about: str = ""
+) -> Path:
     """Write ``config.json`` and ``geoverse.safetensors``; the video prior keeps its own folder.
+
+    Each appears under its name when it is whole, and the weights of an earlier model are never
+    beside the configuration of a later one.
 
     Args:
         model: to be saved.
         folder: made if absent.
-        dtype: of the stored weights, one of ``DTYPES``; statistics keep their float32.
+        dtype: of the stored weights, one of ``DTYPES``. Statistics, tables and Fourier frequencies,
+            whose rounding would change what the others mean, keep their float32.
+        about: further words for the weights' metadata.
 
     Returns:
         The weights' file.
+
+    Raises:
+        CheckpointError: numbers that are not finite, or too large for ``dtype``.
+        ProjectError: a file cannot be written.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    if dtype not in DTYPES:
-        raise CheckpointError(f"dtype {dtype!r}; expected one of {', '.join(DTYPES)}")
-    path = folder / WHOLE_FILE
-    write_tensors(
-        model.state_dict().items(), path, dtype=DTYPES[dtype], about=f"GeoVerse {model.config.name}"
-    )
-    configs.write(model.config, folder / CONFIG_FILE)
+    path, config_path = folder / WHOLE_FILE, folder / CONFIG_FILE
+    with replaced_when_written(config_path) as new_config:
+        configs.write(model.config, new_config)
+        with replaced_when_written(path) as new_weights:
+            _save(model, new_weights, model.state_dict(), dtype, about)
+            if config_path.is_file() and config_path.read_bytes() != new_config.read_bytes():
+                # Should the machine stop between the two names, the folder is not taken for whole.
+                config_path.unlink()
     return path
 
 
-def check_folder(folder: Path | str, config: GeoVerseConfig | None = None) -> list[PartReport]:
-    """What a folder holds of a configuration's parts, without building the model.
+def save_extension(model: GeoVerse, folder: Path | str, *, dtype: str = "float32") -> Path:
+    """Write what GeoVerse adds to published networks, to lie beside their files.
+
+    It belongs to a model whose other parts are still as published.
+
+    Args:
+        model: to be saved.
+        folder: made if absent.
+        dtype: of the stored weights, one of ``DTYPES``.
+
+    Returns:
+        The extension's file.
 
     Raises:
-        CheckpointError: there is no such folder, or its ``config.json`` is damaged.
+        CheckpointError: the configuration extends nothing; or see ``save_pretrained``.
+        ProjectError: the file cannot be written.
     """
-    folder = Path(folder)
-    config = config or config_of(folder)
-    with torch.device("meta"):
-        model = GeoVerse(config)
-    reports = []
-    whole = folder / WHOLE_FILE
-    if whole.is_file():
-        expected = shapes(model.state_dict())
-        reports.append(_report("geoverse", whole, expected, lambda: read_tensors(whole)))
-    else:
-        for part in parts_of(config):
-            path = part.find(folder)
-            if path is None:
-                said = f"absent: expected {part.files[0]} from {part.source}"
-                reports.append(PartReport(part.name, None, False, True, said))
-                continue
-            reports.append(
-                _report(
-                    part.name,
-                    path,
-                    expected_of(model, part),
-                    lambda path=path, part=part: read_part(path, part),
-                )
-            )
-        extension = folder / EXTENSION_FILE
-        wanted = {k: s for k, s in shapes(model.state_dict()).items() if is_extension(k)}
-        if extension.is_file():
-            reports.append(_report("extension", extension, wanted, lambda: read_tensors(extension)))
-        elif wanted:
-            said = f"absent: {len(wanted)} tensors start fresh; the published networks as they are"
-            reports.append(PartReport("extension", None, True, False, said))
-    if config.video is not None:
-        reports.append(_video_report(folder / VIDEO_FOLDER))
-    return reports
-
-
-def _report(name, path, expected, read) -> PartReport:  # type: ignore[no-untyped-def]
-    """Read one file and compare."""
-    size = path.stat().st_size
-    try:
-        tensors = read()
-        found = fit(shapes(tensors), expected)
-        if found.ok:
-            check_finite(tensors, where=path.name)
-    except CheckpointError as error:
-        return PartReport(name, path, False, True, str(error), bytes=size)
-    return PartReport(name, path, found.ok, True, str(found), found, size)
-
-
-def _video_report(folder: Path) -> PartReport:
-    """The truncated video model's folder; its own module says what is wrong with it."""
-    from gvtools.completers.geoverse.wan_folder import check_folder as check_video
-
-    try:
-        size, said = check_video(folder)
-    except CheckpointError as error:
-        path = folder if folder.exists() else None
-        return PartReport("video", path, False, True, str(error))
-    return PartReport("video", folder, True, True, said, bytes=size)
-
-
-def _load_published(model: GeoVerse, folder: Path) -> None:
-    """Fill a meta model from published files and, where there is one, the trained extension."""
-    loaded: dict[str, Tensor] = {}
-    for part in parts_of(model.config):
-        path = part.find(folder)
-        if path is None:
-            raise CheckpointError(
-                f"{folder}: neither {WHOLE_FILE} nor {part.files[0]}; expected a GeoVerse weights "
-                "folder; gvtools weights list names the files"
-            )
-        tensors = read_part(path, part)
-        found = fit(shapes(tensors), expected_of(model, part))
-        if not found.ok:
-            raise CheckpointError(f"{path}: {found}; the file is of another network or version")
-        check_finite(tensors, where=path)
-        loaded |= {part.module + name: tensor.float() for name, tensor in tensors.items()}
-    extension = folder / EXTENSION_FILE
-    fresh = [name for name in model.state_dict() if is_extension(name)]
-    if extension.is_file():
-        loaded |= read_tensors(extension)
-    elif fresh:
-        loaded |= _fresh_extension(model, loaded)
-    load(model, loaded, where=folder)
-
-
-def _fresh_extension(model: GeoVerse, loaded: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Untrained extensions of the published networks: they leave those networks as they are."""
-    config = model.config
-    fresh = {
-        name: torch.zeros(tuple(tensor.shape))
-        for name, tensor in model.state_dict().items()
-        if name.startswith("level1.depth_embedder.")
-    }
-    if model.control is not None and config.video is not None:
-        denoiser = Denoiser(replace(config.level1, depth_condition=False))
-        load(
-            denoiser,
-            {
-                name.removeprefix("level1."): tensor
-                for name, tensor in loaded.items()
-                if name.startswith("level1.")
-            },
-            where="level1",
-        )
-        control = ControlBranch(config.control, denoiser, video_channels=config.video.channels)
-        fresh |= {f"control.{name}": value for name, value in control.state_dict().items()}
-    if model.shared is not None and config.video is not None:
-        shared = SharedAttention(
-            config.shared,
-            width=config.level1.width,
-            heads=config.level1.heads,
-            video_channels=config.video.channels,
-        )
-        fresh |= {f"shared.{name}": value for name, value in shared.state_dict().items()}
-    return fresh
-
-
-def config_of(folder: Path) -> GeoVerseConfig:
-    """The folder's own configuration; ``base`` for published files without one."""
-    if not folder.is_dir():
+    path = Path(folder) / EXTENSION_FILE
+    tensors = {name: value for name, value in model.state_dict().items() if is_extension(name)}
+    if not tensors:
         raise CheckpointError(
-            f"no folder {folder}; expected GeoVerse weights (gvtools weights list)"
+            f"configuration {model.config.name!r} adds nothing to the published networks; save the "
+            "whole model with save_pretrained"
         )
-    if (folder / CONFIG_FILE).is_file():
-        return configs.read(folder / CONFIG_FILE)
-    base = configs.named("base")
-    if any(part.find(folder) for part in parts_of(base)):
-        return base
-    raise CheckpointError(
-        f"{folder}: neither {CONFIG_FILE} nor a published file in it; gvtools weights list names "
-        "what a weights folder holds"
-    )
+    with replaced_when_written(path) as temporary:
+        _save(model, temporary, tensors, dtype, "extension of published networks")
+    return path
+
+
+def _save(model: GeoVerse, file: Path, tensors: dict[str, Tensor], dtype: str, about: str) -> None:
+    exact = {name for name, _ in model.named_buffers()}
+    exact |= {name for name in tensors if name.endswith(".t_embedder.W")}
+    said = ", ".join(filter(None, (f"GeoVerse {model.config.name}", about)))
+    save_tensors(tensors, file, dtype=dtype, exact=exact, about=said)

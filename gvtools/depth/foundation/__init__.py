@@ -1,0 +1,1 @@
+"""Depth Anything 3 as a depth source; see ``source.py``."""

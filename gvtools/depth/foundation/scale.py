@@ -1,0 +1,131 @@
+"""From the network's unit to the scene's: one robust factor, reported, refused without support."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gvtools.completers.geoverse.similarity_scale import center_similarity
+from gvtools.scenes.scene import Scene
+from gvtools.similarity import align_depth_scale
+
+# Fewer sparse points on known depth, in all views together, say nothing of the scale.
+MIN_POINTS = 50
+# Predicted centres that correlate less with the known ones do not fix it either.
+MIN_CORRELATION = 0.9
+
+
+@dataclass(frozen=True)
+class FoundationScale:
+    """How the network's unit became the scene's.
+
+    Attributes:
+        status: "aligned", or "unsupported: ..." with the reason.
+        support: "points" or "cameras".
+        scale: scene units per unit of the network (after the known cameras' own unit).
+        inlier_share: of the points; the centres' correlation where they are the support.
+        residual: median relative deviation of the points; NaN for cameras.
+        count: points, or centres.
+    """
+
+    status: str
+    support: str
+    scale: float
+    inlier_share: float
+    residual: float
+    count: int
+
+    @property
+    def ok(self) -> bool:
+        """Whether the scale may be used."""
+        return self.status == "aligned"
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """One forward pass of the network.
+
+    Attributes:
+        depth: (h, w) z-depth by view, at the network's size, in its unit.
+        confidence: (h, w) in [0, 1) by view.
+        centres: (V, 3) predicted camera centres, frame of the first view, its unit.
+        names: of the V views.
+        unit: scene units a unit of the known cameras that the network saw; 1 without them.
+    """
+
+    depth: dict[str, NDArray[np.float32]]
+    confidence: dict[str, NDArray[np.float32]]
+    centres: NDArray[np.float64]
+    names: tuple[str, ...]
+    unit: float
+
+
+def fit_scale(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
+    """One scale for some passes: by their sparse points, or by their cameras' centres."""
+    by_points = _fit_points(scene, passes)
+    if by_points.ok:
+        return by_points
+    by_cameras = _fit_cameras(scene, passes)
+    if by_cameras.ok or scene.points is None:
+        return by_cameras
+    return by_points
+
+
+def _fit_points(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
+    points = scene.points
+    if points is None:
+        return FoundationScale("unsupported: no sparse points", "points", *(np.nan,) * 3, 0)
+    made, known = [np.zeros(0)], [np.zeros(0)]
+    for part in passes:
+        for name in part.names:
+            camera = scene[name].camera
+            mine = points.view_index == scene.names.index(name)
+            _, z = camera.project(points.positions[points.point_index[mine]])
+            depth = part.depth[name]
+            rows, columns = depth.shape
+            x = points.xy[mine, 0] * (columns / int(camera.width[0]))
+            y = points.xy[mine, 1] * (rows / int(camera.height[0]))
+            inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows) & (z[0] > 0)
+            cell = y[inside].astype(np.int64), x[inside].astype(np.int64)
+            made.append(depth[cell].astype(np.float64) * part.unit)
+            known.append(z[0][inside])
+    depth, reference = np.concatenate(made), np.concatenate(known)
+    fitted = align_depth_scale(
+        depth, reference, valid=depth > 0, min_support=MIN_POINTS, inlier_band=0.1
+    )
+    return FoundationScale(
+        fitted.status,
+        "points",
+        fitted.scale,
+        fitted.inlier_share,
+        fitted.residual,
+        fitted.support,
+    )
+
+
+def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
+    """The median of the passes' own fits, weighted by their views."""
+    scales, weights, correlations, reason = [], [], [], "no pass"
+    for part in passes:
+        known = np.concatenate([scene[name].camera.centers for name in part.names])
+        fitted = center_similarity(
+            torch.from_numpy(part.centres * part.unit)[None], torch.from_numpy(known)[None]
+        )
+        if not bool(fitted.ok[0]):
+            reason = fitted.status[0]
+        elif float(fitted.correlation[0]) < MIN_CORRELATION:
+            reason = f"centres correlate by {float(fitted.correlation[0]):.2f}"
+        else:
+            scales.append(float(fitted.scale[0]))
+            weights.append(len(part.names))
+            correlations.append(float(fitted.correlation[0]))
+    if not scales:
+        return FoundationScale(f"unsupported: {reason}", "cameras", np.nan, np.nan, np.nan, 0)
+    scale = float(np.median(np.repeat(scales, weights)))
+    return FoundationScale(
+        "aligned", "cameras", scale, float(np.median(correlations)), np.nan, sum(weights)
+    )

@@ -1,0 +1,189 @@
+"""Depth Anything 3 as a depth source: several photographs a pass, one scale a scene.
+
+The network sees the known cameras, so that all views of a pass share one unit; what is left is one
+factor for the scene. It comes from the sparse points where there are any, from the predicted camera
+centres otherwise (the paper's s*), and is refused where neither supports it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gvtools.cameras import concatenate
+from gvtools.completers.geoverse.depth_anything import DepthAnything3, relative_cameras
+from gvtools.completers.geoverse.depth_anything_weights import find_weights, load_depth_anything
+from gvtools.completers.geoverse.geometry_head import Geometry
+from gvtools.completers.geoverse.rays import camera_centres
+from gvtools.completers.geoverse.resampling import model_size, resampled
+from gvtools.depth.foundation.options import FoundationOptions
+from gvtools.depth.foundation.scale import FoundationScale, Pass, fit_scale
+from gvtools.depth.source import DepthMap
+from gvtools.errors import CheckpointError, DegenerateError, OptionError
+from gvtools.scenes.scene import Frame, Scene, View
+
+
+class FoundationDepth:
+    """Depth of photographs by Depth Anything 3; see gvtools.depth.source.DepthSource.
+
+    All passes are made when the first depth is asked for, since the scale is the scene's; kept are
+    a depth and a confidence map a view at the network's size (1.5 MB at 504x378).
+
+    Attributes:
+        name: "da3".
+        options: see FoundationOptions.
+        views: names of the views that it covers.
+    """
+
+    name = "da3"
+
+    def __init__(
+        self, scene: Scene, *, views: Sequence[str], options: FoundationOptions | None = None
+    ) -> None:
+        """Prepare; nothing is computed yet.
+
+        Args:
+            scene: the project.
+            views: names of the views to compute.
+            options: see FoundationOptions.
+
+        Raises:
+            CheckpointError: no weights are given, or the folder has none.
+            OptionError: CUDA without a CUDA device.
+        """
+        self.options = options or FoundationOptions()
+        self.views = tuple(dict.fromkeys(views))
+        self._scene = scene
+        if self.options.weights is None:
+            raise CheckpointError(
+                "depth da3: needs weights; give --set da3.weights=DIR, a folder with "
+                "model.safetensors of DA3-SMALL or DA3-BASE (gvtools weights list), or use auto"
+            )
+        self._weights = find_weights(Path(self.options.weights))
+        if self.options.device == "cuda" and not torch.cuda.is_available():
+            raise OptionError("da3.device = 'cuda', and torch sees no CUDA device here")
+        self._passes: dict[str, Pass] = {}
+        self._scales: dict[str, FoundationScale] = {}
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What decides the depth beside the pictures: the weights."""
+        return (self._weights,)
+
+    def covers(self, view: View) -> bool:
+        """The views that it was given."""
+        return view.name in self.views
+
+    def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
+        """The depth of ``view``, whose pixels are ``frame``.
+
+        Raises:
+            DegenerateError: nothing supports a scale.
+        """
+        if not self._passes:
+            self._compute()
+        fitted = self._scales[view.name]
+        if not fitted.ok:
+            raise DegenerateError(
+                f"depth da3: no scale for {view.name}: {fitted.status}; give a project with sparse "
+                "points or with cameras that move, or use plane-sweep"
+            )
+        made = self._passes[view.name]
+        size = frame.rgb.shape[:2]
+        factor = made.unit * fitted.scale
+        depth = _enlarged(made.depth[view.name], size) * np.float32(factor)
+        confidence = _enlarged(made.confidence[view.name], size)
+        known = np.isfinite(depth) & (depth > 0) & (confidence >= self.options.min_confidence)
+        if frame.mask is not None:
+            known &= frame.mask
+        confidence = np.clip(confidence, 1e-3, 1)
+        return DepthMap(
+            np.where(known, depth, np.float32(0)),
+            np.where(known, confidence, np.float32(1)),
+            self.name,
+        )
+
+    def scale(self, name: str) -> FoundationScale:
+        """How the unit of a view's pass became the scene's; computes what is needed for it."""
+        if not self._passes:
+            self._compute()
+        return self._scales[name]
+
+    def _compute(self) -> None:
+        """All passes, then the scale: one for the scene with known cameras, else one a pass."""
+        device = self.options.device
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        network = load_depth_anything(self._weights, device=device)
+        passes = [self._pass(network, group, device) for group in self._groups(network)]
+        for made in passes:
+            self._passes |= dict.fromkeys(made.names, made)
+        sharing = [passes] if self.options.cameras else [[made] for made in passes]
+        for together in sharing:
+            fitted = fit_scale(self._scene, together)
+            for made in together:
+                self._scales |= dict.fromkeys(made.names, fitted)
+
+    def _groups(self, network: DepthAnything3) -> list[tuple[tuple[str, ...], tuple[int, int]]]:
+        """Views that go together, in order, all of one size at the network's resolution."""
+        sizes: dict[tuple[int, int], list[str]] = {}
+        for name in self.views:
+            camera = self._scene[name].camera
+            size = model_size(
+                int(camera.height[0]),
+                int(camera.width[0]),
+                longest=self.options.longest,
+                patch=network.config.encoder.patch,
+            )
+            sizes.setdefault(size, []).append(name)
+        most = self.options.views
+        groups = []
+        for size, names in sizes.items():
+            # As equal as can be: a last pass of one view alone would have no baseline.
+            count = -(-len(names) // most)
+            bounds = [round(index * len(names) / count) for index in range(count + 1)]
+            groups += [(tuple(names[a:b]), size) for a, b in itertools.pairwise(bounds)]
+        return groups
+
+    @torch.no_grad()
+    def _pass(
+        self, network: DepthAnything3, group: tuple[tuple[str, ...], tuple[int, int]], device: str
+    ) -> Pass:
+        """One forward pass over some views."""
+        names, size = group
+        views = [self._scene[name] for name in names]
+        cameras = concatenate([view.camera for view in views]).resized(size[1], size[0])
+        pictures = []
+        for view in views:
+            rgb = torch.from_numpy(view.load().rgb).permute(2, 0, 1)[None].float() / 255
+            pictures.append(resampled(rgb, size)[0].clamp(0, 1))
+        images = torch.stack(pictures)[None].to(device)
+        relative = cameras.cam_from_world @ cameras.world_from_cam[:1]
+        pose, unit = relative_cameras(torch.from_numpy(relative)[None])
+        known = {}
+        if self.options.cameras:
+            known = {
+                "cam_from_world": pose.float().to(device),
+                "K": torch.from_numpy(cameras.K).float()[None].to(device),
+            }
+        geometry: Geometry = network(images, **known)
+        centres = camera_centres(geometry.ray, geometry.ray_confidence)[0].double().cpu().numpy()
+        depth = geometry.depth[0].float().cpu().numpy()
+        confidence = (1 - 1 / geometry.depth_confidence[0].float()).cpu().numpy()
+        return Pass(
+            dict(zip(names, depth, strict=True)),
+            dict(zip(names, confidence, strict=True)),
+            centres,
+            names,
+            float(unit[0]) if self.options.cameras else 1.0,
+        )
+
+
+def _enlarged(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """(h, w) to (H, W)."""
+    return resampled(torch.from_numpy(values)[None, None], size)[0, 0].numpy()

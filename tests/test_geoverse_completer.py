@@ -1,0 +1,521 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import geoverse_models as micro
+import numpy as np
+import pytest
+import torch
+
+from gvtools.cameras import Cameras
+from gvtools.completers import Completion, ContextView, create
+from gvtools.completers.geoverse.completer import GENERATED, nearest_views
+from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.model import Generated, GeoVerse
+from gvtools.completers.geoverse.model_views import view_batch
+from gvtools.completers.geoverse.resampling import model_size
+from gvtools.errors import CheckpointError, OptionError
+from gvtools.guidance import Guidance
+
+pytest.importorskip("safetensors", reason="weights are read with safetensors")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Encodes with known cameras and fills holes, as ``tiny`` does."""
+    hints = {"cameras": True, "fill": "push-pull", "mask": 0.0}
+    return micro.weights_folder(tmp_path_factory.mktemp("micro"), micro.config(hints=hints))
+
+
+def complete(
+    weights: Path,
+    context: list[ContextView],
+    known: Guidance,
+    *,
+    seed: int = 0,
+    **options: Any,
+) -> Completion:
+    options = {"alignment": "hint", "device": "cpu", **options}
+    return create("geoverse", weights=str(weights), **options).complete(context, known, seed=seed)
+
+
+def watched(monkeypatch: pytest.MonkeyPatch) -> list[tuple[ViewBatch, Any, Generated]]:
+    """Batches, names and results of the passes to come."""
+    seen: list[tuple[ViewBatch, Any, Generated]] = []
+    generate = GeoVerse.generate
+
+    def wrapper(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
+        made = generate(self, batch, **options)
+        seen.append((batch, options["names"][0], made))
+        return made
+
+    monkeypatch.setattr(GeoVerse, "generate", wrapper)
+    return seen
+
+
+FIELDS = ("rgb", "depth", "valid", "confidence", "generated")
+SIZES = [(30, 40), (24, 32), (17, 23), (9, 7), (64, 31), (1, 40), (100, 133)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_observed_pixels_are_kept_bit_for_bit_and_holes_are_filled(weights, size):
+    context, known = micro.context_views(2), micro.guidance(2, size=size)
+    result = complete(weights, context, known, alignment="centres" if min(size) < 20 else "hint")
+    assert known.valid.any() and not known.valid.all()
+    for name in ("rgb", "depth", "confidence"):
+        found, given = getattr(result, name), getattr(known, name)
+        assert found.dtype == np.float32
+        assert found[known.valid].tobytes() == given[known.valid].tobytes(), name
+    hole = ~known.valid
+    assert result.spent["holes"] == hole.sum()
+    assert result.rgb[hole].std() > 0.01 and result.rgb.min() >= 0 and result.rgb.max() <= 1
+    assert np.isfinite(result.rgb).all() and np.isfinite(result.depth).all()
+    assert result.spent["unfilled"] == (result.depth[hole] <= 0).sum()
+    confident = result.confidence[hole]
+    assert (confident >= 0).all() and (confident <= GENERATED).all()
+    assert ((result.depth[hole] > 0) == (confident > 0)).all()
+    if min(size) >= 20:
+        assert result.spent["unfilled"] == 0
+        assert 1 < np.median(result.depth[hole]) < 9
+    assert result.rays is not None
+    direction, moment = result.rays[..., :3], result.rays[..., 3:]
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, rtol=1e-4)
+    np.testing.assert_allclose((direction * moment).sum(-1), 0, atol=1e-3)
+
+
+def test_the_same_seed_gives_the_same_bytes(weights):
+    context, known = micro.context_views(2), micro.guidance(3)
+    first, again = (complete(weights, context, known, seed=5) for _ in range(2))
+    other = complete(weights, context, known, seed=6)
+    for name in ("rgb", "depth", "confidence", "rays"):
+        assert getattr(first, name).tobytes() == getattr(again, name).tobytes()
+    assert np.abs(first.rgb - other.rgb).max() > 1e-3
+
+
+def test_more_targets_than_a_pass_takes_go_through_several(weights, monkeypatch):
+    seen = watched(monkeypatch)
+    context, known = micro.context_views(3), micro.guidance(5)
+    result = complete(weights, context, known, context_views=2, views=4)
+    assert [batch.images.shape[1] for batch, _, _ in seen] == [4, 4, 3]
+    assert [batch.context for batch, _, _ in seen] == [2, 2, 2]
+    assert result.spent["passes"] == 3
+    names = [name for _, names, _ in seen for name in names[2:]]
+    assert names == [f"target {name}" for name in known.cameras.names]
+    for index in range(5):
+        hole = ~known.valid[index]
+        assert (result.depth[index][hole] > 0).all()
+    # Context takes all the room there is: one target a pass.
+    seen.clear()
+    complete(weights, context, known, context_views=3, views=2)
+    assert [batch.images.shape[1] for batch, _, _ in seen] == [4] * 5
+
+
+def test_views_without_holes_come_back_and_are_not_computed(weights, monkeypatch):
+    seen = watched(monkeypatch)
+    context, known = micro.context_views(1), micro.guidance(3)
+    full = micro.guidance(3, share=1.1)
+    parts = (known, full, known)
+    rows = (np.stack([getattr(part, name)[i] for i, part in enumerate(parts)]) for name in FIELDS)
+    mixed = Guidance(known.cameras, *rows)
+    result = complete(weights, context, mixed)
+    (_, names, _), = seen  # fmt: skip
+    assert names == ["context photo_0_0", "target target_1_0", "target target_1_2"]
+    for name in ("rgb", "depth", "confidence"):
+        assert getattr(result, name)[1].tobytes() == getattr(mixed, name)[1].tobytes()
+    expected = np.float32(mixed.cameras.plucker(1))
+    assert result.rays is not None and result.rays[1].tobytes() == expected.tobytes()
+    seen.clear()
+    whole = complete(weights, context, full)
+    assert not seen and whole.spent["passes"] == whole.spent["holes"] == 0
+    nothing = Guidance(full.cameras[:0], *(getattr(full, name)[:0] for name in FIELDS))
+    assert complete(weights, context, nothing).rgb.shape == (0, 30, 40, 3)
+
+
+@pytest.mark.parametrize("size", [(30, 40), (61, 33), (20, 90), (5, 6), (200, 150)])
+def test_context_pictures_may_have_any_size_and_aspect(weights, size, monkeypatch):
+    seen = watched(monkeypatch)
+    context = [*micro.context_views(1, size=size), *micro.context_views(1, seed=4, depth=False)]
+    result = complete(weights, context, micro.guidance(1))
+    assert (result.depth[0] > 0).all()
+    assert seen[0][0].images.shape == (1, 3, 3, *micro.SIZE)
+
+
+def test_one_photograph_is_enough_and_none_is_said(weights):
+    known = micro.guidance(2)
+    assert (complete(weights, micro.context_views(1), known).depth > 0).all()
+    with pytest.raises(OptionError, match="needs at least one context view, and got none"):
+        complete(weights, [], known)
+
+
+def test_a_photograph_and_a_target_of_one_name_start_from_different_noise(weights, monkeypatch):
+    seen = watched(monkeypatch)
+    context, known = micro.context_views(1), micro.guidance(1)
+    named = replace(known.cameras, names=("photo_0_0",))
+    complete(weights, context, replace(known, cameras=named))
+    assert seen[0][1] == ["context photo_0_0", "target photo_0_0"]
+
+
+TURN = micro.rotation((0.3, 1.0, -0.4), 2.0)
+WORLDS: dict[str, dict[str, Any]] = {
+    "kilometres": {"scale": 1e-3},
+    "millimetres": {"scale": 1e3},
+    "tiny": {"scale": 1e-7},
+    "turned": {"turn": TURN},
+    "far": {"shift": (3e5, -5e5, 1e5)},
+    "far, turned, in millimetres": {"turn": TURN, "shift": (40.0, 1e3, -2e3), "scale": 1e3},
+}
+
+
+@pytest.mark.parametrize("alignment", ["hint", "field"])
+@pytest.mark.parametrize("world", list(WORLDS))
+def test_neither_the_worlds_unit_nor_its_frame_matter(weights, alignment, world):
+    context, known = micro.context_views(2), micro.guidance(2)
+    expected = complete(weights, context, known, alignment=alignment)
+    found = complete(weights, *micro.moved(context, known, **WORLDS[world]), alignment=alignment)
+    scale = WORLDS[world].get("scale", 1.0)
+    assert expected.spent["views_without_scale"] == 0
+    np.testing.assert_allclose(found.rgb, expected.rgb, atol=2e-4)
+    np.testing.assert_allclose(found.depth, expected.depth * scale, rtol=5e-4)
+    np.testing.assert_allclose(found.confidence, expected.confidence, atol=2e-4)
+
+
+def test_cameras_that_only_turn_have_no_unit_but_that_of_depth(weights):
+    context, known = micro.context_views(2), micro.guidance(2)
+
+    def in_place(cameras: Cameras, centre: np.ndarray) -> Cameras:
+        pose = cameras.cam_from_world.copy()
+        pose[:, :3, 3] = -pose[:, :3, :3] @ centre
+        return replace(cameras, cam_from_world=pose)
+
+    results = []
+    for scale, centre in ((1.0, np.zeros(3)), (1e3, np.zeros(3)), (1.0, np.array([3e6, -7e6, 0]))):
+        views, hint = micro.moved(context, known, scale=scale)
+        views = [replace(view, camera=in_place(view.camera, centre)) for view in views]
+        hint = replace(hint, cameras=in_place(hint.cameras, centre))
+        results.append(complete(weights, views, hint))
+    for found, scale in zip(results[1:], (1e3, 1.0), strict=True):
+        np.testing.assert_allclose(found.rgb, results[0].rgb, atol=2e-4)
+        np.testing.assert_allclose(found.depth, results[0].depth * scale, rtol=5e-4)
+
+
+def blob(camera: Cameras, point: np.ndarray, sigma: float) -> np.ndarray:
+    """A picture of a soft dot where a camera sees a point."""
+    (((x, y),),), _ = camera.project(point[None])
+    columns = np.arange(int(camera.width[0])) + 0.5
+    rows = np.arange(int(camera.height[0]))[:, None] + 0.5
+    dot = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
+    return np.repeat(dot[..., None], 3, axis=2).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("context_size", "target_size"),
+    [
+        ((120, 160), (120, 160)),
+        ((200, 90), (120, 160)),
+        ((150, 150), (160, 100)),
+        ((61, 83), (77, 77)),
+    ],
+)  # fmt: skip
+def test_cameras_follow_pictures_that_are_cropped_and_resized(context_size, target_size):
+    """A dot drawn where a 3-D point is seen is found where the batch's camera puts the point."""
+    point = np.array([0.05, -0.1, 3.2])
+    views = []
+    for seed in range(2):
+        camera = micro.cameras(1, size=context_size, seed=seed)
+        rgb = blob(camera, point, max(context_size) / 20)
+        views.append(ContextView(f"photo_{seed}", camera, rgb))
+    cameras = micro.cameras(2, size=target_size, seed=5)
+    known = micro.guidance(2, size=target_size, share=1.1)
+    dots = np.stack([blob(camera, point, max(target_size) / 20) for camera in cameras])
+    known = replace(known, cameras=cameras, rgb=dots)
+    size = model_size(*target_size, longest=96, patch=8)
+    batch, joined = view_batch(views, known, size)
+    assert (
+        batch.size == size and (joined.height == size[0]).all() and (joined.width == size[1]).all()
+    )
+    local = joined.cam_from_world[0] @ np.append(point, 1)
+    unit = np.linalg.norm(joined.centers - joined.centers[0], axis=1).max()
+    world = torch.from_numpy(np.append(local[:3] / unit, 1)).float()
+    seen = (batch.cam_from_world[0] @ world)[:, :3]
+    pixel = torch.einsum("vij,vj->vi", batch.K[0], seen / seen[:, 2:])[:, :2].numpy()
+    expected, _ = joined.project(point[None])
+    np.testing.assert_allclose(pixel, expected[:, 0], atol=1e-3)
+    y, x = np.mgrid[: size[0], : size[1]] + 0.5
+    for view in range(4):
+        dot = batch.images[0, view, 0].double().numpy() ** 2  # the tails are cut off at the rim
+        centroid = np.array([(dot * x).sum(), (dot * y).sum()]) / dot.sum()
+        np.testing.assert_allclose(centroid, pixel[view], atol=0.15)
+
+
+@pytest.mark.parametrize("size", [(24, 32), (16, 24), (48, 64), (72, 40)])
+def test_projected_depth_is_never_averaged_between_two_surfaces(size):
+    rng = np.random.default_rng(0)
+    known = micro.guidance(2, share=0.7)
+    depth = np.where(rng.random(known.depth.shape) < 0.5, 1.0, 5.0).astype(np.float32)
+    depth *= known.valid
+    context = micro.context_views(1)
+    wall = np.where(rng.random((30, 40)) < 0.5, 2.0, 8.0).astype(np.float32)
+    context = [replace(context[0], depth=wall)]
+    batch, joined = view_batch(context, replace(known, depth=depth), size)
+    unit = np.linalg.norm(joined.centers - joined.centers[0], axis=1).max()
+    found = batch.depth[0].numpy() * unit
+    for views, surfaces in ((found[:1], (2, 8)), (found[1:], (0, 1, 5))):
+        gap = np.min([np.abs(views - surface) for surface in surfaces], axis=0)
+        assert gap.max() < 1e-5
+        assert all((np.abs(views - surface) < 1e-5).any() for surface in surfaces)
+    assert torch.equal(batch.valid[0, 1:], batch.depth[0, 1:] > 0)
+    assert batch.valid[0, 0].all()
+
+
+def test_a_projections_colour_is_that_of_its_valid_pixels_alone():
+    known = micro.guidance(1, size=(48, 64), share=0.8)
+    red = np.zeros_like(known.rgb)
+    red[..., 0] = 0.75
+    damaged = replace(
+        known,
+        rgb=np.where(known.valid[..., None], red, np.float32(np.nan)),
+        depth=np.where(known.valid, known.depth, np.float32(np.nan)),
+    )
+    batch, _ = view_batch(micro.context_views(1), damaged, (24, 32))
+    seen = batch.valid[0, 1, 0]
+    assert 0.5 < seen.float().mean() < 1
+    colour = batch.images[0, 1]
+    torch.testing.assert_close(colour[0][seen], torch.full_like(colour[0][seen], 0.75))
+    assert not colour[1:].any() and not colour[:, ~seen].any()
+    assert batch.depth.isfinite().all()
+
+
+def test_what_stands_in_holes_does_not_matter(weights):
+    context, known = micro.context_views(1), micro.guidance(1)
+    hole = ~known.valid
+    damaged = replace(known, rgb=known.rgb.copy(), depth=known.depth.copy(),
+                      confidence=known.confidence.copy())  # fmt: skip
+    for name in ("rgb", "depth", "confidence"):
+        getattr(damaged, name)[hole] = np.nan
+    expected, found = (complete(weights, context, g) for g in (known, damaged))
+    for name in ("rgb", "depth", "confidence"):
+        assert getattr(found, name).tobytes() == getattr(expected, name).tobytes()
+
+
+def test_a_pass_that_went_wrong_leaves_holes_and_says_so(weights, monkeypatch):
+    generate = GeoVerse.generate
+
+    def damaged(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
+        made = generate(self, batch, **options)
+        made.decoded.rgb[:, 0, :, :8, :8] = torch.nan
+        made.decoded.geometry.depth[:, -1] = torch.nan
+        return made
+
+    monkeypatch.setattr(GeoVerse, "generate", damaged)
+    known = micro.guidance(2)
+    result = complete(weights, micro.context_views(2), known, alignment="field")
+    for name in ("rgb", "depth", "confidence"):
+        assert np.isfinite(getattr(result, name)).all()
+    hole = ~known.valid
+    assert not result.depth[0, :6, :6][hole[0, :6, :6]].any()
+    assert not result.confidence[1][hole[1]].any() and not result.depth[1][hole[1]].any()
+    assert result.spent["unfilled"] == (result.depth[hole] <= 0).sum() > hole[1].sum()
+
+
+@pytest.mark.filterwarnings("error")
+def test_without_any_support_for_a_scale_there_is_no_depth(weights, monkeypatch):
+    """The requested cameras' rays stand where the predicted ones have no unit."""
+    monkeypatch.setattr(
+        "gvtools.completers.geoverse.completer.centre_scale", lambda *a: (float("nan"), "refused")
+    )
+    known = micro.guidance(2, share=-1.0)
+    result = complete(weights, micro.context_views(2), known)
+    assert not result.depth.any() and not result.confidence.any() and result.rgb.any()
+    assert result.spent["views_without_scale"] == 2
+    assert result.spent["unfilled"] == result.spent["holes"] == known.valid.size
+    assert result.rays is not None
+    np.testing.assert_array_equal(result.rays[1], np.float32(known.cameras.plucker(1)))
+
+
+def true_rays(cameras: Cameras, unit: float, grid: tuple[int, int]) -> torch.Tensor:
+    """(1, V, h, w, 6) what a perfect geometry head would say, in the first view's frame."""
+    world_from_cam = cameras.cam_from_world[0] @ cameras.world_from_cam
+    small = cameras.resized(grid[1], grid[0])
+    maps = []
+    for view, pose in enumerate(world_from_cam):
+        origin = np.broadcast_to(pose[:3, 3] / unit, (*grid, 3))
+        maps.append(np.concatenate((small.rays(view) @ pose[:3, :3].T, origin), axis=-1))
+    return torch.from_numpy(np.stack(maps)).float()[None]
+
+
+@pytest.mark.parametrize("world", [{}, {"turn": TURN, "shift": (4.0, -2.0, 9.0), "scale": 20.0}])
+def test_predicted_rays_come_back_to_the_world(weights, monkeypatch, world):
+    generate = GeoVerse.generate
+    context, known = micro.moved(micro.context_views(2), micro.guidance(2), **world)
+    order = nearest_views(context, known.cameras, 2)
+
+    def perfect(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
+        made = generate(self, batch, **options)
+        ray = made.decoded.geometry.ray
+        ray.copy_(true_rays(micro.joined(order, known), 2.5, (ray.shape[2], ray.shape[3])))
+        return made
+
+    monkeypatch.setattr(GeoVerse, "generate", perfect)
+    result = complete(weights, context, known, alignment="centres")
+    assert result.spent["centre_scale"] == pytest.approx(2.5, rel=1e-4)
+    assert result.rays is not None
+    for view in range(2):
+        expected = known.cameras.plucker(view)[4:-4, 4:-4]
+        # Predicted in the first view's frame and another unit; the rim is extrapolated.
+        np.testing.assert_allclose(result.rays[view][4:-4, 4:-4], expected, rtol=1e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("size", [(30, 40), (61, 83), (20, 30)])
+def test_generated_depth_is_never_averaged_between_two_surfaces(weights, monkeypatch, size):
+    generate = GeoVerse.generate
+
+    def stepped(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
+        made = generate(self, batch, **options)
+        depth = made.decoded.geometry.depth
+        near = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) < 0.5
+        depth.copy_(torch.where(near, 1.0, 1.5))
+        return made
+
+    monkeypatch.setattr(GeoVerse, "generate", stepped)
+    monkeypatch.setattr(
+        "gvtools.completers.geoverse.completer.centre_scale", lambda *a: (2.0, "aligned")
+    )
+    known = micro.guidance(1, size=size)
+    result = complete(weights, micro.context_views(1), known, alignment="centres")
+    np.testing.assert_allclose(np.unique(result.depth[~known.valid].round(4)), [2, 3])
+
+
+def looking(centre: tuple[float, float, float], angle: float, name: str) -> Cameras:
+    """A camera in a place, turned about y."""
+    pose = np.eye(4)
+    pose[:3, :3] = micro.rotation((0, 1, 0), angle).T
+    pose[:3, 3] = -pose[:3, :3] @ np.array(centre)
+    K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
+    return Cameras(K[None], pose[None], np.array([40]), np.array([30]), (name,))
+
+
+def photographs(*cameras: Cameras) -> list[ContextView]:
+    return [ContextView(c.names[0], c, np.zeros((30, 40, 3), np.float32)) for c in cameras]
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("shift", [0.0, 1e4])
+def test_the_nearest_views_stand_and_look_like_the_targets(scale, shift):
+    def place(x: float, angle: float, name: str) -> Cameras:
+        return looking((scale * (x + shift), 0, 0), angle, name)
+
+    context = photographs(
+        place(0, 0, "left"),
+        place(10, 0, "right"),
+        place(1, np.pi, "behind"),
+        place(4, 0, "middle"),
+        place(1, 0.1, "beside"),
+    )
+
+    def chosen(count: int, *targets: Cameras) -> list[str]:
+        joined = micro.concatenate(list(targets))
+        return [view.name for view in nearest_views(context, joined, count)]
+
+    near = place(1, 0, "target")
+    assert chosen(1, near) == ["beside"]
+    assert chosen(2, near) == ["beside", "left"]
+    assert chosen(1, place(1, np.pi, "turned")) == ["behind"]
+    assert chosen(1, place(9, 0, "target")) == ["right"]
+    # The first serves all targets; each then has its own: not the three that are best for one.
+    assert chosen(1, near, place(9.5, 0, "far")) == ["middle"]
+    assert set(chosen(3, near, place(9.5, 0, "far"))) == {"middle", "beside", "right"}
+    everything = chosen(9, near)
+    assert sorted(everything) == sorted(view.name for view in context)
+    assert everything[0] == "beside" and everything[-1] == "behind"
+
+
+@pytest.mark.parametrize("shift", [0.0, 3e6])
+def test_from_one_place_the_nearest_view_is_the_one_that_looks_the_same_way(shift):
+    centre = (shift, -shift, shift / 3)
+    context = photographs(*(looking(centre, angle, f"{angle}") for angle in (0.0, 1.0, 2.0, 3.0)))
+    for angle in (0.1, 1.1, 2.1, 2.9):
+        (found,) = nearest_views(context, looking(centre, angle, "target"), 1)
+        assert found.name == f"{round(angle)}.0"
+
+
+def test_steps_and_guidance_are_the_options(weights, monkeypatch):
+    calls: list[float] = []
+    velocity = GeoVerse.velocity1
+
+    def counted(self: GeoVerse, prepared: Any, state: Any, t: Any, **options: Any) -> Any:
+        calls.append(float(t[0]))
+        return velocity(self, prepared, state, t, **options)
+
+    monkeypatch.setattr(GeoVerse, "velocity1", counted)
+    context, known = micro.context_views(1), micro.guidance(1)
+    for options, times in (
+        ({}, [1, 2 / 3, 1 / 3]),
+        ({"steps": 2}, [1, 0.5]),
+        ({"steps": 2, "guidance": 1.5}, [1, 1, 0.5, 0.5]),
+    ):
+        calls.clear()
+        result = complete(weights, context, known, **options)
+        assert sorted(calls, reverse=True) == pytest.approx(times)
+        assert result.spent["steps"] == len(set(times))
+
+
+def test_half_precision_gives_nearly_the_same(weights):
+    context, known = micro.context_views(2), micro.guidance(2)
+    full = complete(weights, context, known, precision="float32")
+    half = complete(weights, context, known, precision="bfloat16")
+    error = np.abs(half.rgb - full.rgb)
+    assert 0 < error.max() < 0.05
+    np.testing.assert_allclose(half.depth, full.depth, rtol=0.05)
+
+
+def test_photographs_beyond_the_models_are_left_out(weights, monkeypatch):
+    seen = watched(monkeypatch)
+    complete(weights, micro.context_views(5), micro.guidance(1))
+    assert seen[0][0].context == micro.CONFIG.context == 2
+
+
+def folders(root: Path) -> dict[str, tuple[str | None, str]]:
+    (root / "empty").mkdir()
+    (root / "damaged").mkdir()
+    (root / "damaged" / "config.json").write_text("{")
+    (root / "unknown").mkdir()
+    (root / "unknown" / "config.json").write_text('{"image_sizes": 96}')
+    (root / "patchless").mkdir()
+    (root / "patchless" / "config.json").write_text('{"geometry": {"encoder": {"patch": 0}}}')
+    return {
+        "none": (None, "completer.weights=DIR"),
+        "absent": (str(root / "absent"), "gvtools weights list"),
+        "empty": (str(root / "empty"), "gvtools weights list"),
+        "damaged": (str(root / "damaged"), "config.json"),
+        "unknown": (str(root / "unknown"), "did you mean 'image_size'"),
+        "patchless": (str(root / "patchless"), "config.json"),
+    }
+
+
+@pytest.mark.parametrize("what", ["none", "absent", "empty", "damaged", "unknown", "patchless"])
+def test_a_folder_that_is_no_model_is_refused_in_one_line_at_creation(what, tmp_path):
+    folder, said = folders(tmp_path)[what]
+    with pytest.raises((OptionError, CheckpointError)) as refused:
+        create("geoverse", weights=folder)
+    assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"steps": 0}, "completer.steps 0; expected at least 1"),
+        ({"views": 1}, "completer.views 1; expected at least 2"),
+        ({"context_views": 0}, "expected at least 1"),
+        ({"guidance": -1.0}, "expected at least 0"),
+        ({"precision": "float64"}, "expected one of auto, float32, bfloat16"),
+        ({"device": "tpu"}, "expected one of auto, cpu, cuda"),
+        ({"alignment": "best"}, "expected one of centres, hint, field"),
+        ({"step": 3}, "did you mean 'steps'"),
+    ],
+)
+def test_options_out_of_range_are_refused(weights, options, said):
+    with pytest.raises(OptionError, match=said):
+        create("geoverse", weights=str(weights), **options)

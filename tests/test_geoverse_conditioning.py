@@ -1,0 +1,452 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import geoverse_models as micro
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gvtools.completers.geoverse.conditioning import (
+    LOG_DEPTH_LIMIT,
+    HintConfig,
+    Hints,
+    ViewBatch,
+    depth_condition,
+    encode_hints,
+    encode_latents,
+    feature_mask,
+    filled,
+)
+from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
+from gvtools.completers.geoverse.statistics import LatentStatistics
+from gvtools.errors import OptionError, ShapeError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+PAPER = HintConfig()
+KNOWN_CAMERAS = HintConfig(cameras=True)
+
+
+@pytest.fixture(scope="module")
+def model() -> Any:
+    return micro.model()
+
+
+def hints(model: Any, batch: ViewBatch, config: HintConfig = PAPER) -> Hints:
+    level0, level1 = model.statistics
+    return encode_hints(model.geometry, level0, level1, batch, config)
+
+
+def with_valid(batch: ViewBatch, valid: Tensor) -> ViewBatch:
+    """Context stays known; the rest becomes what ``valid`` says, (B, T, 1, H, W)."""
+    valid = torch.cat((batch.valid[:, : batch.context], valid), dim=1)
+    images, depth = batch.images * valid, batch.depth * valid
+    return replace(batch, images=images, depth=depth, valid=valid)
+
+
+def no_target(batch: ViewBatch) -> ViewBatch:
+    return with_valid(batch, torch.zeros_like(batch.valid[:, batch.context :]))
+
+
+def alone(model: Any, batch: ViewBatch) -> list[Tensor]:
+    """Normalised levels 0 and 1 of the context views, with no other view in sight."""
+    raw = model.geometry.encode(batch.images[:, : batch.context], levels=2)
+    return [
+        statistics.normalise(level[:, :, 1:].mT.unflatten(3, micro.GRID))
+        for statistics, level in zip(model.statistics, raw, strict=True)
+    ]
+
+
+def close(found: Tensor, expected: Tensor) -> None:
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+
+
+@torch.no_grad()
+def test_an_empty_hint_is_zero_padding_bit_for_bit(model):
+    batch = no_target(micro.batch(2, context=2, targets=3))
+    found = hints(model, batch)
+    level0, level1 = alone(model, batch)
+    for padded, context in ((found.level1, level1), (found.unmasked, level1)):
+        assert torch.equal(padded[:, :2], context)
+        assert torch.equal(padded[:, 2:], torch.zeros_like(padded[:, 2:]))
+    assert torch.equal(found.level0[:, :2], level0)
+    assert not found.level0[:, 2:].any()
+    assert found.mask[:, :2].all() and not found.mask[:, 2:].any()
+
+
+@pytest.mark.parametrize("fill", ["none", "push-pull"])
+@torch.no_grad()
+def test_scattered_pixels_that_fill_no_token_are_an_empty_hint_too(model, fill):
+    batch = micro.batch(1)
+    few = torch.zeros_like(batch.valid[:, 2:])
+    few[..., ::4, ::4] = True
+    sparse = with_valid(batch, few)
+    config = HintConfig(fill=fill)
+    found = hints(model, filled(sparse, config), config)
+    expected = hints(model, no_target(batch))
+    for name in ("level1", "unmasked", "level0", "token", "mask"):
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
+    # With no threshold their picture counts.
+    config = replace(config, mask=0.0)
+    assert hints(model, filled(sparse, config), config).level1[:, 2:].any()
+
+
+@torch.no_grad()
+def test_context_and_projections_are_encoded_jointly_and_masked_after_normalisation(model):
+    batch = micro.batch(2)
+    found = hints(model, batch)
+    raw = model.geometry.encode(batch.images, levels=2)[1][:, :, 1:]
+    joint = model.statistics[1].normalise(raw.mT.unflatten(3, micro.GRID))
+    mask = feature_mask(batch.valid, micro.GRID, 0.5)
+    assert 0 < mask[:, 2:].mean() < 1
+    close(found.unmasked, joint)
+    assert torch.equal(found.mask, mask)
+    assert torch.equal(found.level1, found.unmasked * mask)
+    # Projections are seen by the context, too.
+    assert (joint[:, :2] - alone(model, batch)[1]).abs().max() > 0.01
+
+
+def test_a_token_counts_from_its_share_of_valid_pixels_on():
+    valid = torch.zeros(1, 1, 1, *micro.SIZE, dtype=torch.bool)
+    pixels = micro.PATCH**2
+    counts = torch.arange(micro.GRID[0] * micro.GRID[1]) * 5 % (pixels + 1)
+    counts[3], counts[4], counts[5], counts[6] = 32, 31, 64, 63
+    for token, count in enumerate(counts.tolist()):
+        row, column = divmod(token, micro.GRID[1])
+        window = torch.zeros(pixels, dtype=torch.bool)
+        window[:count] = True
+        top, left = row * micro.PATCH, column * micro.PATCH
+        valid[0, 0, 0, top : top + micro.PATCH, left : left + micro.PATCH] = window.view(8, 8)
+    for share in (0.0, 1 / pixels, 0.25, 0.5, 63 / 64, 1.0):
+        mask = feature_mask(valid, micro.GRID, share)
+        assert mask.shape == (1, 1, 1, *micro.GRID) and mask.dtype == torch.float32
+        expected = counts >= math.ceil(share * pixels - 1e-9)
+        assert torch.equal(mask.flatten() > 0, expected), share
+
+
+@pytest.mark.parametrize("size", [(14, 14), (98, 70), (504, 504)])
+def test_half_of_a_token_is_half_in_every_patch_size(size):
+    """Means of 196 pixels are rounded; half of them is still enough for a share of a half."""
+    valid = torch.zeros(1, 1, 1, *size, dtype=torch.bool)
+    valid[..., ::2, :] = True
+    grid = (size[0] // 14, size[1] // 14)
+    assert feature_mask(valid, grid, 0.5).all()
+    valid[..., 0, 0] = False
+    assert not feature_mask(valid, grid, 0.5)[0, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("config", [PAPER, KNOWN_CAMERAS, HintConfig(token="own", mask=0.0)])
+@torch.no_grad()
+def test_views_that_tell_nothing_do_not_disturb_the_others(model, config):
+    batch = micro.batch(1, context=2, targets=3)
+    valid = batch.valid[:, 2:].clone()
+    valid[:, 1] = False
+    silent = with_valid(batch, valid)
+    rest = [0, 1, 2, 4]
+    without = ViewBatch(
+        silent.images[:, rest], silent.depth[:, rest], silent.valid[:, rest],
+        silent.cam_from_world[:, rest], silent.K[:, rest], 2,
+    )  # fmt: skip
+    found = hints(model, silent, config)
+    assert not found.level1[:, 3].any() and not found.unmasked[:, 3].any()
+    if not config.cameras:  # the unit of the cameras is that of all views
+        expected = hints(model, without, config)
+        for name in ("level1", "unmasked", "level0", "token"):
+            close(getattr(found, name)[:, rest], getattr(expected, name))
+    noisy = replace(silent, images=silent.images.clone())
+    noisy.images[:, 3] = 0.7
+    again = hints(model, noisy, config)
+    assert torch.equal(again.level1, found.level1) and torch.equal(again.token, found.token)
+
+
+@pytest.mark.parametrize("encode", ["jointly", "alone"])
+@pytest.mark.parametrize("token", ["first-context", "own"])
+@pytest.mark.parametrize("cameras", [False, True])
+@torch.no_grad()
+def test_samples_with_different_gaps_are_as_each_by_itself(model, encode, token, cameras):
+    batch = micro.batch(5, context=2, targets=2)
+    valid = batch.valid[:, 2:].clone()
+    for sample, silent in enumerate(((), (0,), (1,), (0, 1), (0,))):
+        valid[sample, list(silent)] = False
+    batch = with_valid(batch, valid)
+    config = HintConfig(encode=encode, token=token, cameras=cameras, cascade_context="jointly")
+    whole = hints(model, batch, config)
+    for sample in range(5):
+        part = hints(model, batch.samples(torch.tensor([sample])), config)
+        for name in ("level1", "unmasked", "level0", "token", "mask"):
+            close(getattr(whole, name)[sample], getattr(part, name)[0])
+
+
+@torch.no_grad()
+def test_encoded_alone_the_context_does_not_see_the_projections(model):
+    batch = micro.batch(1)
+    found = hints(model, batch, HintConfig(encode="alone"))
+    joint = hints(model, batch)
+    close(found.level1[:, :2], alone(model, batch)[1])
+    assert torch.equal(found.level1[:, 2:], joint.level1[:, 2:])
+
+
+@torch.no_grad()
+def test_level_0_of_the_context_comes_from_where_it_is_asked_for(model):
+    batch = micro.batch(1)
+    joint = model.geometry.encode(batch.images, levels=1)[0][:, :2, 1:]
+    expected = model.statistics[0].normalise(joint.mT.unflatten(3, micro.GRID))
+    for source, level in (("alone", alone(model, batch)[0]), ("jointly", expected)):
+        found = hints(model, batch, HintConfig(cascade_context=source)).level0
+        close(found[:, :2], level)
+        assert not found[:, 2:].any()
+    assert (expected - alone(model, batch)[0]).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("context", [1, 2])
+@torch.no_grad()
+def test_token_0_is_the_first_context_views_alone(model, context):
+    batch = micro.batch(2, context=context, targets=2)
+    first = model.geometry.encode(batch.images[:, :1], levels=2)[1][:, :, 0]
+    found = hints(model, batch).token
+    close(found, first.expand_as(found))
+    own = hints(model, batch, HintConfig(token="own")).token
+    close(own, model.geometry.encode(batch.images, levels=2)[1][:, :, 0])
+    silent = hints(model, no_target(batch), HintConfig(token="own")).token
+    mean = silent[:, :context].mean(1, keepdim=True)
+    close(silent[:, context:], mean.expand_as(silent[:, context:]))
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+@torch.no_grad()
+def test_known_cameras_count_relative_to_each_other_alone(model, factor):
+    batch = micro.batch(1)
+    expected = hints(model, batch, KNOWN_CAMERAS)
+    assert (expected.unmasked - hints(model, batch).unmasked).abs().max() > 0.01
+    world = torch.eye(4)
+    world[:3, :3] = torch.from_numpy(micro.rotation((1, -2, 0.5), 1.1)).float()
+    poses = batch.cam_from_world.clone()
+    poses[..., :3, 3] *= factor
+    found = hints(model, replace(batch, cam_from_world=poses @ world), KNOWN_CAMERAS)
+    close(found.unmasked, expected.unmasked)
+    turned = batch.cam_from_world.clone()
+    turned[:, 1] = turned[:, 2]
+    other = hints(model, replace(batch, cam_from_world=turned), KNOWN_CAMERAS)
+    assert (other.unmasked - expected.unmasked).abs().max() > 0.01
+
+
+@torch.no_grad()
+def test_the_context_is_encoded_once_more_only_where_it_is_asked_for(model, monkeypatch):
+    calls: list[int] = []
+    encode = type(model.geometry).encode
+
+    def counted(self: Any, images: Tensor, **options: Any) -> list[Tensor]:
+        calls.append(images.shape[1])
+        return encode(self, images, **options)
+
+    monkeypatch.setattr(type(model.geometry), "encode", counted)
+    batch = micro.batch(2, context=2, targets=2)
+    own = HintConfig(token="own", cascade_context="jointly")
+    for config, views in (
+        (own, [4]),
+        (replace(own, cascade_context="alone"), [4, 2]),
+        (replace(own, encode="alone"), [4, 2]),
+        (HintConfig(), [4, 2, 1]),
+    ):
+        calls.clear()
+        hints(model, batch, config)
+        assert sorted(calls, reverse=True) == views, config
+
+
+@torch.no_grad()
+def test_clean_latents_are_hints_of_which_everything_is_known(model):
+    batch = micro.batch(2, share=1.1)
+    batch = with_valid(batch, torch.ones_like(batch.valid[:, 2:]))
+    config = HintConfig(cascade_context="jointly")
+    found = hints(model, batch, config)
+    first, second = model.statistics
+    level0, level1 = encode_latents(model.geometry, first, second, batch)
+    close(found.level1, level1)
+    close(found.level0[:, :2], level0[:, :2])
+
+
+def test_depth_is_told_as_its_logarithm_in_the_cameras_unit():
+    nan, inf = math.nan, math.inf
+    depth = torch.tensor([2.0, nan, inf, -1.0, 0.0, 5.0, 1e9, 1e-9, 1.0]).view(1, 1, 1, 1, 9)
+    valid = torch.ones(1, 1, 1, 1, 9, dtype=torch.bool)
+    valid[..., 5] = False
+    found = depth_condition(depth, valid, torch.tensor([0.5]))
+    limit = LOG_DEPTH_LIMIT
+    log = [0, 0, 0, 0, 0, 0, limit, -limit, math.log(0.5)]
+    torch.testing.assert_close(found[0, 0, 0, 0], torch.tensor(log))
+    assert found[0, 0, 1, 0].tolist() == [1, 0, 0, 0, 0, 0, 1, 1, 1]
+
+
+def test_the_depth_condition_of_a_scene_does_not_depend_on_its_unit():
+    batch = micro.batch(2)
+    scale = torch.tensor([0.7, 3.0])
+    expected = depth_condition(batch.depth, batch.valid, scale)
+    found = depth_condition(batch.depth * 1000, batch.valid, scale / 1000)
+    torch.testing.assert_close(found, expected)
+    assert expected[:, :, 0].std() > 0.1
+
+
+@pytest.mark.parametrize("fill", ["none", "push-pull"])
+@torch.no_grad()
+def test_what_stands_in_the_holes_of_depth_does_not_matter(fill):
+    net = micro.model(micro.config(hints={"fill": fill}))
+    batch = micro.batch(1)
+    expected = net.prepare(batch)
+    damaged = torch.where(batch.valid, batch.depth, torch.nan)
+    found = net.prepare(replace(batch, depth=damaged))
+    assert found.level1.depth.isfinite().all()
+    assert torch.equal(found.level1.depth, expected.level1.depth)
+    # The true validity stands beside filled depth.
+    assert torch.equal(found.level1.depth[:, :, 1:] > 0, batch.valid)
+    holes = found.level1.depth[:, 2:, :1][~batch.valid[:, 2:]]
+    assert bool(holes.any()) is (fill == "push-pull")
+
+
+def windows_of_two(values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted means and mean weights of 2 x 2 windows, fewer at an odd edge."""
+    rows, columns = (-(-side // 2) for side in weight.shape)
+    mean = np.zeros((len(values), rows, columns))
+    share = np.zeros((rows, columns))
+    for i, j in np.ndindex(rows, columns):
+        window = np.s_[2 * i : 2 * i + 2, 2 * j : 2 * j + 2]
+        share[i, j] = weight[window].mean()
+        if weight[window].sum() > 0:
+            sums = (values * weight)[(slice(None), *window)].sum((1, 2))
+            mean[:, i, j] = sums / weight[window].sum()
+    return mean, share
+
+
+def between(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Bilinear, pixel by pixel."""
+    found = np.zeros((len(values), *size))
+    for i, j in np.ndindex(*size):
+        places = []
+        for index, side, full in ((i, values.shape[1], size[0]), (j, values.shape[2], size[1])):
+            place = min(max((index + 0.5) * side / full - 0.5, 0), side - 1)
+            low = int(place)
+            places.append((low, min(low + 1, side - 1), place - low))
+        (top, bottom, v), (left, right, u) = places
+        found[:, i, j] = (1 - v) * ((1 - u) * values[:, top, left] + u * values[:, top, right])
+        found[:, i, j] += v * ((1 - u) * values[:, bottom, left] + u * values[:, bottom, right])
+    return found
+
+
+def plain_push_pull(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """The definition, for one (C, H, W) image."""
+    known = np.where(valid, values, 0.0)
+    if valid.shape == (1, 1):
+        return known
+    coarse, share = windows_of_two(known, valid.astype(float))
+    return np.where(valid, values, between(_pulled(coarse, share), valid.shape))
+
+
+def _pulled(values: np.ndarray, share: np.ndarray) -> np.ndarray:
+    weight = np.minimum(4 * share, 1)
+    if share.shape == (1, 1):
+        return values
+    coarse, coarser = windows_of_two(values, weight)
+    return weight * values + (1 - weight) * between(_pulled(coarse, coarser), share.shape)
+
+
+@pytest.mark.parametrize(
+    "size", [(1, 1), (1, 2), (1, 9), (7, 1), (2, 2), (3, 3), (5, 8), (13, 6), (16, 16), (17, 11)]
+)
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
+def test_holes_are_filled_as_the_plain_algorithm_fills_them(size, share):
+    rng = np.random.default_rng(size[0] * 100 + size[1])
+    values = rng.normal(size=(2, 3, *size))
+    valid = rng.random((2, 1, *size)) < share
+    given = torch.from_numpy(np.where(valid, values, np.nan))
+    found = push_pull(given, torch.from_numpy(valid))
+    for index in range(2):
+        expected = plain_push_pull(values[index], valid[index, 0])
+        if not valid[index].any():
+            expected = np.zeros_like(expected)
+        np.testing.assert_allclose(found[index].numpy(), expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 6), (9, 14), (33, 20)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_known_pixels_and_constants_stay(size, dtype):
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(1, 3, *size, generator=generator).to(dtype)
+    valid = torch.rand(1, 1, *size, generator=generator) < 0.2
+    valid[..., -1, -1] = True
+    found = push_pull(values, valid)
+    assert torch.equal(found[valid.expand_as(found)], values[valid.expand_as(found)])
+    assert found.dtype == dtype
+    low, high = values.min(), values.max()
+    assert bool(((found >= low - 1e-2) & (found <= high + 1e-2)).all())
+    constant = push_pull(torch.full_like(values, 0.7), valid)
+    torch.testing.assert_close(constant, torch.full_like(values, 0.7))
+    assert not push_pull(values, torch.zeros_like(valid)).any()
+
+
+def test_depth_is_filled_in_its_logarithm():
+    depth = torch.zeros(3, 1, 4, 8)
+    depth[0, :, :, :4], depth[0, :, :, 6:] = 1.0, 4.0
+    depth[1, 0, 2, 2] = 7.0
+    depth[0, 0, 0, 0] = torch.nan
+    found = push_pull_depth(depth, torch.ones_like(depth, dtype=torch.bool))
+    log = push_pull(depth.nan_to_num(1).clamp_min(0.5).log(), depth > 0)
+    torch.testing.assert_close(found[0], log[0].exp())
+    assert found[0].min() >= 1 - 1e-6 and found[0].max() <= 4 + 1e-5
+    torch.testing.assert_close(found[1], torch.full_like(found[1], 7.0))
+    assert not found[2].any()
+
+
+def test_filling_leaves_the_context_and_the_validity_alone():
+    batch = micro.batch(2)
+    assert filled(batch, PAPER) is batch
+    found = filled(batch, HintConfig(fill="push-pull"))
+    known = batch.valid.expand_as(batch.images)
+    assert torch.equal(found.images[known], batch.images[known])
+    assert torch.equal(found.valid, batch.valid)
+    assert found.images[~known].any() and (found.depth[:, 2:] > 0).all()
+    assert ((found.images >= 0) & (found.images <= 1)).all()
+
+
+@pytest.mark.parametrize("dim", [-3, -1, 1])
+def test_statistics_there_and_back(dim):
+    statistics = LatentStatistics(5)
+    generator = torch.Generator().manual_seed(0)
+    statistics.mean.copy_(torch.randn(5, generator=generator) * 10)
+    statistics.var.copy_(torch.rand(5, generator=generator) * 100)
+    statistics.var[2] = 0
+    shape = [4, 3, 6, 2]
+    shape[dim] = 5
+    raw = torch.randn(shape, generator=generator, dtype=torch.float64)
+    latent = statistics.normalise(raw, dim=dim)
+    assert latent.dtype == torch.float64
+    moved = raw.movedim(dim, -1)
+    # The variance is a float32; that of a dead channel is held up by eps.
+    deviation = (statistics.var + 1e-5).sqrt().double()
+    expected = ((moved - statistics.mean.double()) / deviation).movedim(-1, dim)
+    torch.testing.assert_close(latent, expected)
+    torch.testing.assert_close(statistics.denormalise(latent, dim=dim), raw)
+
+
+@pytest.mark.parametrize(
+    "change", [{"fill": "black"}, {"encode": "both"}, {"token": "none"}, {"mask": 1.5}]
+)
+def test_unknown_ways_are_refused(change):
+    name = next(iter(change))
+    with pytest.raises(OptionError, match=rf"hints\.{name} = .*expected"):
+        HintConfig(**change)
+
+
+def test_views_of_wrong_shapes_are_refused():
+    batch = micro.batch(1)
+    for name in ("depth", "valid", "cam_from_world", "K"):
+        with pytest.raises(ShapeError, match=rf"{name} \(1, 3, .*expected \(1, 4, "):
+            replace(batch, **{name: getattr(batch, name)[:, :3]})
+    for images in (batch.images[0], batch.images[:, :, :2]):
+        with pytest.raises(ShapeError, match=r"images .*expected \(B, V, 3, H, W\)"):
+            replace(batch, images=images)
+    for context in (0, 5):
+        with pytest.raises(ShapeError, match="1 to V context views"):
+            replace(batch, context=context)

@@ -1,0 +1,274 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import geoverse_models as micro
+import pytest
+import torch
+from torch import Tensor
+
+from gvtools.completers.geoverse.control import ControlBranch, ControlConfig
+from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, DenoiserBlock, Positions
+from gvtools.completers.geoverse.projective import Projective
+from gvtools.completers.geoverse.shared_attention import SharedAttention, SharedAttentionConfig
+from gvtools.errors import ShapeError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+BARE = replace(micro.DENOISER, depth_condition=False)
+LAYERS = micro.LAYERS
+
+
+def extended(base: Denoiser) -> Any:
+    """The same weights with a fresh depth embedder."""
+    fresh = Denoiser(micro.DENOISER).eval()
+    missing = fresh.load_state_dict(base.state_dict(), strict=False)
+    assert not missing.unexpected_keys
+    assert all(name.startswith("depth_embedder.") for name in missing.missing_keys)
+    return fresh
+
+
+def control_branch(base: Denoiser) -> ControlBranch:
+    return ControlBranch(ControlConfig(LAYERS), base, video_channels=micro.VIDEO.channels)
+
+
+def shared_attention(*, gated: bool = True) -> SharedAttention:
+    return SharedAttention(
+        SharedAttentionConfig(LAYERS, gated=gated),
+        width=BARE.width,
+        heads=BARE.heads,
+        video_channels=micro.VIDEO.channels,
+    )
+
+
+def extensions(net: Denoiser, x: Tensor, t: Tensor, known: Conditions) -> dict[str, dict]:
+    """Fresh extensions by name, as keywords of ``forward``."""
+    samples, views = x.shape[:2]
+    features = micro.video_features(samples, views).tensors
+    positions = Positions(net.config, known.camera, micro.GRID)
+    branch = control_branch(net)
+    adapted = branch.adapted(features, micro.GRID)
+    coarse = Projective(
+        known.camera.cam_from_world, known.camera.K, known.camera.size, (2, 3), 16,
+        position_scale=(1.5, 4 / 3),
+    )  # fmt: skip
+    return {
+        "none": {},
+        "control": {
+            "residuals": branch(net, x, t, known, adapted=adapted, positions=positions),
+            "positions": positions,
+        },
+        "shared": {"video": shared_attention()(features, [coarse] * len(LAYERS))},
+    }
+
+
+@pytest.mark.parametrize("autocast", [False, True])
+@pytest.mark.parametrize("name", ["none", "control", "shared"])
+@torch.no_grad()
+def test_a_fresh_extension_changes_no_bit(name, autocast):
+    base = micro.denoiser(BARE)
+    x, t, known = micro.conditions()
+    net = extended(base)
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        expected = base(x, t, replace(known, depth=None))
+        found = net(x, t, known, **extensions(net, x, t, known)[name])
+    # The base does something: every encoder block and the head change its result.
+    assert expected.std() > 0.1
+    for block in base.blocks:
+        for tensor in block.adaLN_modulation[1].parameters():
+            assert tensor.abs().max() > 0.01
+    assert torch.equal(found, expected)
+
+
+@torch.no_grad()
+def test_extensions_that_are_not_fresh_change_the_result():
+    base = micro.denoiser(BARE)
+    x, t, known = micro.conditions()
+    expected = base(x, t, known)
+    net = extended(base)
+    micro.awake(net.depth_embedder)
+    assert (net(x, t, known) - expected).abs().max() > 0.01
+    net = extended(base)
+    features = micro.video_features(*x.shape[:2]).tensors
+    positions = Positions(net.config, known.camera, micro.GRID)
+    branch = micro.awake(control_branch(net))
+    adapted = branch.adapted(features, micro.GRID)
+    residuals = branch(net, x, t, known, adapted=adapted, positions=positions)
+    assert (net(x, t, known, residuals=residuals) - expected).abs().max() > 0.01
+
+
+@torch.no_grad()
+def test_depth_reaches_every_view_through_its_embedder_alone():
+    net = micro.denoiser()
+    x, t, known = micro.conditions()
+    assert known.depth is not None
+    other = known.depth.clone()
+    other[:, -1, 0, :8, :8] += 1  # the first token of the last view
+    found, changed = net(x, t, known), net(x, t, replace(known, depth=other))
+    assert ((found - changed).abs().amax((2, 3, 4)) > 1e-6).all()
+    (s, head), (s2, head2) = (net.embed(x, replace(known, depth=d)) for d in (known.depth, other))
+    token = torch.zeros(s.shape[:3], dtype=torch.bool)
+    token[:, -1, 0] = True
+    assert torch.equal((s != s2).any(-1), token)
+    assert torch.equal(head, head2)
+    # Without the condition it is as a depth of zero everywhere but for the embedder's bias.
+    net.depth_embedder.proj.bias.zero_()
+    assert torch.equal(
+        net(x, t, replace(known, depth=None)),
+        net(x, t, replace(known, depth=torch.zeros_like(known.depth))),
+    )
+
+
+@torch.no_grad()
+def test_context_views_come_first_and_have_their_own_embedders():
+    net = micro.denoiser()
+    x, _, known = micro.conditions(context=2, targets=3)
+    before = net.embed(x, known)
+    for name in ("s_embedder_ref", "x_embedder_ref"):
+        getattr(net, name).proj.bias += 1
+    for old, new in zip(before, net.embed(x, known), strict=True):
+        change = (new - old).abs().amax((0, 2, 3))
+        assert (change[:2] > 0.5).all() and not change[2:].any()
+
+
+@torch.no_grad()
+def test_one_time_a_sample_is_the_same_time_for_its_views():
+    net = micro.denoiser().double()
+    x, t, known = micro.conditions(dtype=torch.float64)
+    views = x.shape[1]
+    expected = net(x, t, known)
+    found = net(x, t[:, None].expand(-1, views), known)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    later = t[:, None].repeat(1, views)
+    later[:, -1] = 0.1
+    assert (net(x, later, known) - expected).abs().max() > 1e-3
+
+
+@torch.no_grad()
+def test_samples_of_a_batch_do_not_see_each_other():
+    net = micro.denoiser().double()
+    x, t, known = micro.conditions(samples=2, dtype=torch.float64)
+    whole = net(x, t, known)
+    for index in range(2):
+        row = slice(index, index + 1)
+        camera = replace(
+            known.camera,
+            map=known.camera.map[row],
+            cam_from_world=known.camera.cam_from_world[row],
+            K=known.camera.K[row],
+        )
+        assert known.depth is not None
+        part = Conditions(known.latents[row], camera, depth=known.depth[row])
+        torch.testing.assert_close(net(x[row], t[row], part), whole[row], rtol=1e-9, atol=1e-9)
+
+
+def permuted(known: Conditions, order: list[int]) -> Conditions:
+    assert known.depth is not None
+    camera = replace(
+        known.camera,
+        map=known.camera.map[:, order],
+        cam_from_world=known.camera.cam_from_world[:, order],
+        K=known.camera.K[:, order],
+    )
+    return replace(
+        known, latents=known.latents[:, order], camera=camera, depth=known.depth[:, order]
+    )
+
+
+@pytest.mark.parametrize("order", [[0, 1, 4, 2, 3], [1, 0, 2, 3, 4]])
+@torch.no_grad()
+def test_permuted_views_give_permuted_results(order):
+    net = micro.denoiser().double()
+    x, t, known = micro.conditions(dtype=torch.float64)
+    expected = net(x, t, known)[:, order]
+    found = net(x[:, order], t, permuted(known, order))
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    # Views differ, and a target is no context view.
+    assert (net(x, t, known) - expected).abs().max() > 0.1
+    swapped = [2, 1, 0, 3, 4]
+    there = net(x[:, swapped], t, permuted(known, swapped))
+    assert (there - net(x, t, known)[:, swapped]).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("invert_K", [True, False])
+@torch.no_grad()
+def test_attention_does_not_see_the_world_frame(invert_K):
+    net = micro.denoiser(replace(micro.DENOISER, invert_K=invert_K)).double()
+    x, t, known = micro.conditions(dtype=torch.float64)
+    world = torch.eye(4).double()
+    world[:3, :3] = torch.from_numpy(micro.rotation((1, 2, -1), 0.8))
+    world[:3, 3] = torch.tensor([0.5, -2.0, 1.0])
+    expected = net(x, t, known)
+
+    def seen_from(poses: Tensor) -> Tensor:
+        return net(x, t, replace(known, camera=replace(known.camera, cam_from_world=poses)))
+
+    found = seen_from(known.camera.cam_from_world @ world)
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-8)
+    # Moving all cameras changes nothing, bringing them together does.
+    assert (seen_from(world.expand(2, 5, 4, 4)) - expected).abs().max() > 0.01
+
+
+@torch.no_grad()
+def test_streams_stay_in_full_precision_under_autocast():
+    net = micro.denoiser()
+    x, t, known = micro.conditions()
+    seen: list[tuple[torch.dtype, torch.dtype]] = []
+    for module in net.modules():
+        if isinstance(module, DenoiserBlock):
+            module.register_forward_hook(lambda m, a, out: seen.append((a[0].dtype, out.dtype)))
+    expected = net(x, t, known)
+    seen.clear()
+    with torch.autocast("cpu", torch.bfloat16):
+        found = net(x, t, known)
+    assert seen == [(torch.float32, torch.float32)] * len(net.blocks)
+    error = (found.float() - expected).norm() / expected.norm()
+    assert 1e-6 < error < 0.03
+
+
+@torch.no_grad()
+def test_all_views_may_be_context_views():
+    net = micro.denoiser()
+    x, t, known = micro.conditions(context=3, targets=0)
+    assert net(x, t, known).shape == x.shape
+
+
+def test_only_the_encoder_is_conditioned_on_the_source():
+    cascade = micro.denoiser(micro.config().cascade)
+    x, t, known = micro.conditions()
+    source = torch.randn_like(x)
+    given = replace(known, source=source, depth=None)
+    (s, head), (s2, head2) = (
+        cascade.embed(x, given),
+        cascade.embed(x, replace(given, source=source + 1)),
+    )
+    assert torch.equal(head, head2) and not torch.equal(s, s2)
+    with pytest.raises(ShapeError, match="give the level-1 latents"):
+        cascade(x, t, known)
+
+
+def wrong(x: Tensor, t: Tensor, known: Conditions) -> dict[str, tuple[Tensor, Tensor, Conditions]]:
+    assert known.depth is not None
+    short = replace(known.camera, cam_from_world=known.camera.cam_from_world[:, :3])
+    return {
+        "channels": (x[:, :, :5], t, known),
+        "latents": (x, t, replace(known, latents=known.latents[:, :3])),
+        "grid": (x[..., :2], t, replace(known, latents=known.latents[..., :2])),
+        "time": (x, torch.ones(3), known),
+        "time per view": (x, torch.ones(2, 4), known),
+        "no time": (x, torch.tensor(0.5), known),
+        "depth": (x, t, replace(known, depth=known.depth[:, :, :1])),
+        "depth size": (x, t, replace(known, depth=known.depth[..., :8])),
+        "source": (x, t, replace(known, source=x[:, :3])),
+        "cameras": (x, t, replace(known, camera=short)),
+    }
+
+
+@pytest.mark.parametrize("what", list(wrong(*micro.conditions())))
+def test_a_wrong_shape_is_said_with_what_was_expected(what):
+    config = micro.config().cascade if what == "source" else micro.DENOISER
+    assert config is not None
+    net = micro.denoiser(config)
+    with pytest.raises(ShapeError, match=r"\(2, .*expected|expected .*\(2,"):
+        net(*wrong(*micro.conditions())[what])

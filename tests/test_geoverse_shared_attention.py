@@ -1,0 +1,230 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import geoverse_models as micro
+import pytest
+import torch
+from torch import Tensor
+
+from gvtools.completers.geoverse.denoiser import Positions
+from gvtools.completers.geoverse.projective import Projective
+from gvtools.completers.geoverse.shared_attention import (
+    SharedAttention,
+    SharedAttentionConfig,
+    VideoKeys,
+)
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+LAYERS = micro.LAYERS
+HEADS = micro.DENOISER.heads
+HEAD_DIM = micro.DENOISER.width // HEADS
+
+
+class Case:
+    """A denoiser, the projections of video features, and one step's input, in float64."""
+
+    def __init__(self, *, gated: bool = True, grid: tuple[int, int] = (2, 3)) -> None:
+        self.net: Any = micro.denoiser().double()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(2)
+            self.shared: Any = SharedAttention(
+                SharedAttentionConfig(LAYERS, gated=gated),
+                width=micro.DENOISER.width,
+                heads=HEADS,
+                video_channels=micro.VIDEO.channels,
+            ).double()
+        self.x, self.t, self.known = micro.conditions(dtype=torch.float64)
+        self.positions = Positions(self.net.config, self.known.camera, micro.GRID)
+        features = micro.video_features(*self.x.shape[:2], grid=grid)
+        self.features = features.to(dtype=torch.float64).tensors
+        camera = self.known.camera
+        self.video_positions = Projective(
+            camera.cam_from_world, camera.K, camera.size, grid, HEAD_DIM,
+            position_scale=(micro.GRID[0] / grid[0], micro.GRID[1] / grid[1]),
+        )  # fmt: skip
+
+    def keys(self) -> dict[int, VideoKeys]:
+        return self.shared(self.features, [self.video_positions] * len(LAYERS))
+
+    def velocity(self, keys: dict[int, VideoKeys] | None) -> Tensor:
+        return self.net(self.x, self.t, self.known, video=keys, positions=self.positions)
+
+
+def plain_attention(case: Case, layer: int, x: Tensor) -> Tensor:
+    """One joint attention, token by token, as the appendix words it."""
+    attention: Any = case.net.blocks[layer].attn
+    index = LAYERS.index(layer)
+    feature = case.features[index]
+    normed = case.shared.norms[index](feature.permute(0, 1, 3, 4, 2).flatten(1, 3))
+    both = case.shared.kv[index](normed)
+    width = micro.DENOISER.width
+
+    def heads(tokens: Tensor) -> Tensor:
+        return tokens.unflatten(-1, (HEADS, HEAD_DIM)).transpose(1, 2)
+
+    q, k, v = (heads(part) for part in attention.qkv(x).split(width, dim=-1))
+    encoding = case.positions.encoder
+    q, k, v = encoding.query(q), encoding.key(k), encoding.value(v)
+    video_k, video_v = (heads(part) for part in both.split(width, dim=-1))
+    video_k, video_v = case.video_positions.key(video_k), case.video_positions.value(video_v)
+    scores = torch.cat((q @ k.mT, q @ video_k.mT), dim=-1) / HEAD_DIM**0.5
+    weights = scores.exp() / scores.exp().sum(-1, keepdim=True)
+    count = k.shape[2]
+    out = weights[..., :count] @ v + weights[..., count:] @ video_v
+    return attention.proj(encoding.output(out).transpose(1, 2).flatten(2))
+
+
+@torch.no_grad()
+def test_attention_is_joint_over_both_kinds_of_tokens():
+    case = Case(gated=False)
+    keys = case.keys()
+    assert tuple(keys) == LAYERS
+    generator = torch.Generator().manual_seed(4)
+    tokens = case.x.shape[1] * micro.GRID[0] * micro.GRID[1]
+    x = torch.randn(2, tokens, micro.DENOISER.width, generator=generator).double()
+    for layer in LAYERS:
+        attention: Any = case.net.blocks[layer].attn
+        found = attention(x, case.positions.encoder, keys[layer])
+        torch.testing.assert_close(found, plain_attention(case, layer, x), rtol=1e-9, atol=1e-9)
+        assert (found - attention(x, case.positions.encoder)).abs().max() > 0.01
+
+
+@torch.no_grad()
+def test_video_tokens_stand_where_the_geometric_ones_stand():
+    """A second copy of every key and value changes no attention, if its position is the same."""
+    case = Case(gated=False, grid=micro.GRID)
+    generator = torch.Generator().manual_seed(4)
+    attention: Any = case.net.blocks[0].attn
+    feature = torch.randn(2, 5, micro.VIDEO.channels, *micro.GRID, generator=generator).double()
+    into = torch.randn(micro.DENOISER.width, micro.VIDEO.channels, generator=generator).double()
+    normed = case.shared.norms[0](feature.permute(0, 1, 3, 4, 2).flatten(1, 3))
+    x = normed @ into.T
+    width = micro.DENOISER.width
+    case.shared.kv[0].weight.copy_(attention.qkv.weight[width:] @ into)
+    case.shared.kv[0].bias.copy_(attention.qkv.bias[width:])
+    case.features = (feature, *case.features[1:])
+    found = attention(x, case.positions.encoder, case.keys()[0])
+    alone = attention(x, case.positions.encoder)
+    torch.testing.assert_close(found, alone, rtol=1e-9, atol=1e-9)
+    assert alone.std() > 0.05
+
+
+@torch.no_grad()
+def test_a_finer_video_grid_has_its_tokens_between_the_coarser_ones():
+    model = micro.model(micro.config(injection="shared"))
+    prepared = model.prepare(micro.batch(1), video=micro.video_features(1, 4, grid=micro.GRID))
+    fine = (3 * micro.GRID[0], 3 * micro.GRID[1])
+    features = micro.video_features(1, 4, grid=fine)
+    for level, coarse in zip(features.tensors, prepared.video.tensors, strict=True):
+        level[..., 1::3, 1::3] = coarse
+    found = model.with_video(prepared, features).keys[0].key.unflatten(2, (4, *fine))
+    expected = prepared.keys[0].key.unflatten(2, (4, *micro.GRID))
+    torch.testing.assert_close(found[:, :, :, 1::3, 1::3], expected, rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_only_coupled_blocks_and_all_of_them_see_the_video():
+    case = Case(gated=False)
+    keys = case.keys()
+    whole, alone = case.velocity(keys), case.velocity(None)
+    assert (whole - alone).abs().max() > 0.01
+    for layer in LAYERS:
+        rest = {index: value for index, value in keys.items() if index != layer}
+        assert (case.velocity(rest) - whole).abs().max() > 1e-4, layer
+    with pytest.raises(KeyError):
+        keys[2]
+
+
+@torch.no_grad()
+def test_a_gate_of_zero_is_the_pretrained_block_and_of_one_the_papers():
+    gated, ungated = Case(gated=True), Case(gated=False)
+    assert not gated.shared.gates.any() and not hasattr(ungated.shared, "gates")
+    ungated.shared.load_state_dict(
+        {k: v for k, v in gated.shared.state_dict().items() if k != "gates"}
+    )
+    expected = ungated.velocity(ungated.keys())
+    assert torch.equal(gated.velocity(gated.keys()), gated.velocity(None))
+    gated.shared.gates.fill_(1)
+    torch.testing.assert_close(gated.velocity(gated.keys()), expected, rtol=1e-9, atol=1e-9)
+    gated.shared.gates.fill_(0.5)
+    assert (gated.velocity(gated.keys()) - expected).abs().max() > 1e-3
+
+
+def test_the_gates_learn_first_and_the_projections_after_them():
+    case = Case(gated=True)
+
+    def learning() -> dict[str, set[bool]]:
+        case.shared.zero_grad()
+        case.velocity(case.keys()).square().mean().backward()
+        found: dict[str, set[bool]] = {}
+        for name, parameter in case.shared.named_parameters():
+            assert parameter.grad is not None
+            found.setdefault(name.split(".")[0], set()).add(bool(parameter.grad.all()))
+            if not parameter.grad.all():
+                assert not parameter.grad.any(), name
+        return found
+
+    assert learning() == {"gates": {True}, "kv": {False}, "norms": {False}}
+    torch.optim.SGD(case.shared.parameters(), lr=10.0).step()
+    assert case.shared.gates.all()
+    # The bias of a key shifts all scores of a query alike only without positions.
+    assert learning()["kv"] == {True}
+
+
+@torch.no_grad()
+def test_video_keys_are_computed_once_and_do_not_see_the_state(monkeypatch):
+    model = micro.model(micro.config(injection="shared"))
+    model.shared.gates.fill_(0.7)
+    batch = micro.batch(1)
+    features = micro.video_features(1, 4)
+    calls: list[int] = []
+    forward = SharedAttention.forward
+
+    def counted(self: SharedAttention, *args: Any) -> dict[int, VideoKeys]:
+        calls.append(1)
+        return forward(self, *args)
+
+    monkeypatch.setattr(SharedAttention, "forward", counted)
+    bounds = (1.0, 0.6, 0.3, 0.1, 0.0)
+    made = model.generate(batch, video=features, bounds=bounds)
+    assert len(calls) == 1
+    # Computed anew for every step, they are the same.
+    steps: list[int] = []
+    velocity = type(model).velocity1
+
+    def recomputed(self: Any, prepared: Any, state: Tensor, t: Tensor, **options: Any) -> Tensor:
+        steps.append(1)
+        before = prepared.keys
+        prepared = self.with_video(replace(prepared, keys=None), features)
+        for layer, keys in prepared.keys.items():
+            assert torch.equal(keys.key, before[layer].key)
+            assert torch.equal(keys.value, before[layer].value)
+        return velocity(self, prepared, state, t, **options)
+
+    monkeypatch.setattr(type(model), "velocity1", recomputed)
+    again = model.generate(batch, video=features, bounds=bounds)
+    assert len(steps) == 4 and torch.equal(again.level1, made.level1)
+    monkeypatch.undo()
+    other = model.generate(batch, video=micro.video_features(1, 4, seed=1), bounds=bounds)
+    assert (other.level1 - made.level1).abs().max() > 1e-3
+
+
+@torch.no_grad()
+def test_the_unconditional_branch_has_no_camera_in_the_video_keys_either():
+    model = micro.model(micro.config(injection="shared"))
+    model.shared.gates.fill_(1.0)
+    batch = micro.batch(1)
+    prepared = model.prepare(batch, video=micro.video_features(1, 4))
+    turned = replace(batch, cam_from_world=batch.cam_from_world.flip(1))
+    other = model.prepare(turned, video=micro.video_features(1, 4))
+    # All that is left of the cameras is the unit of the depth condition.
+    other = replace(other, level1=replace(other.level1, depth=prepared.level1.depth))
+    state = torch.randn(prepared.hints.level1.shape, generator=torch.Generator().manual_seed(0))
+    t = torch.tensor([0.5])
+    found = [model.velocity1(model._unconditional(p), state, t) for p in (prepared, other)]
+    assert torch.equal(*found)
+    given = [model.velocity1(p, state, t) for p in (prepared, other)]
+    assert (given[0] - given[1]).abs().max() > 1e-3
