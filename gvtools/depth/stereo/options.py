@@ -32,6 +32,10 @@ class StereoOptions:
         cost: highest photometric cost that is kept, 0 for a perfect match to 1 for none.
         align: adjust the poses to the pictures first; None does so for scenes without sparse
             points, whose poses come from a tracker or a sensor, not from a bundle adjustment.
+        trim: take back depth that windows carried past the outlines of the picture; see
+            gvtools.depth.stereo.silhouettes.
+        regrow: how far depth is then continued, where colour and depth run on, into pixels that
+            match but that no other view confirms, pixels of the finest level; 0 for not at all.
         speckle: smallest connected patch of depth that is kept, pixels of the finest level.
         backend: "cpu" (compiled) or "torch" (the reference that defines the result, on ``device``).
         device: where "torch" computes: "cpu", "cuda", or "auto" for CUDA where there is one.
@@ -49,6 +53,8 @@ class StereoOptions:
     tolerance: float = 0.03
     cost: float = 0.6
     align: bool | None = None
+    trim: bool = True
+    regrow: int = 20
     speckle: int = 100
     backend: str = "cpu"
     device: str = "auto"
@@ -65,6 +71,7 @@ class StereoOptions:
         check_range("stereo.views", self.views, least=0, most=8)
         check_range("stereo.tolerance", self.tolerance, above=0, below=1)
         check_range("stereo.cost", self.cost, above=0, most=1)
+        check_range("stereo.regrow", self.regrow, least=0)
         check_range("stereo.speckle", self.speckle, least=0)
         if self.window % 2 == 0:
             raise OptionError(f"stereo.window {self.window}; expected an odd number")

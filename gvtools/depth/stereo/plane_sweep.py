@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
 from gvtools.depth.source import DepthMap
-from gvtools.depth.stereo import cleanup
+from gvtools.depth.stereo import cleanup, silhouettes
 from gvtools.depth.stereo.alignment import PoseEquations, adjusted, pose_equations
 from gvtools.depth.stereo.confidence import confidence_of
 from gvtools.depth.stereo.consistency import agreement
 from gvtools.depth.stereo.depth_range import DepthRange, estimate_range
 from gvtools.depth.stereo.matching import make_matcher
 from gvtools.depth.stereo.options import StereoOptions
-from gvtools.depth.stereo.pyramid import Pyramid, build_pyramid, resampled
+from gvtools.depth.stereo.pyramid import Pyramid, build_pyramid, resampled, resampled_colors
 from gvtools.depth.stereo.residual_flow import residual_flow
 from gvtools.depth.stereo.single_view import (
     CoarseDepth,
@@ -100,13 +100,13 @@ class PlaneSweepStereo:
             [(other.inverse_depth, other.camera) for other in others],
             tolerance=options.tolerance,
         )  # fmt: skip
-        kept = (compared.views >= min(options.views, options.sources)) & (raw.cost <= options.cost)
-        kept &= raw.contrast > options.noise
+        matched = (raw.cost <= options.cost) & (raw.contrast > options.noise)
+        confirmed = matched & (compared.views >= min(options.views, options.sources))
         confidence = confidence_of(raw.cost, compared.views, compared.spread)
-        depth = torch.where(kept, 1 / compared.inverse_depth.clamp(min=1e-9), 0).float()
+        depth = (1 / compared.inverse_depth.clamp(min=1e-9)).float().cpu().numpy()
         guide = self._pyramid(view, frame).images[0].numpy()
         trust = confidence.cpu().numpy()
-        known = cleanup.without_speckles(depth.cpu().numpy(), options.tolerance, options.speckle)
+        known = self._outlined(depth, matched.cpu().numpy(), confirmed.cpu().numpy(), frame)
         known = cleanup.weighted_median(known, guide, trust, 2)
         height, width = frame.rgb.shape[:2]
         if known.shape != (height, width):
@@ -115,6 +115,28 @@ class PlaneSweepStereo:
         if frame.mask is not None:
             known = np.where(frame.mask, known, np.float32(0))
         return DepthMap(known, np.where(known > 0, trust, np.float32(1)), self.name)
+
+    def _outlined(
+        self,
+        depth: NDArray[np.float32],
+        matched: NDArray[np.bool_],
+        confirmed: NDArray[np.bool_],
+        frame: Frame,
+    ) -> NDArray[np.float32]:
+        """(H, W) confirmed depth, cut back to outlines and continued where it matches."""
+        options = self.options
+        nothing = np.float32(0)
+        known = np.where(confirmed, depth, nothing)
+        known = cleanup.without_speckles(known, options.tolerance, options.speckle)
+        if not (options.trim or options.regrow):
+            return known
+        rgb = resampled_colors(frame.rgb, depth.shape[1], depth.shape[0])
+        candidates = np.where(matched, depth, known)
+        if options.trim:
+            known = silhouettes.trimmed(known, rgb, options.window // 2 + 2)
+        if options.regrow:
+            known = silhouettes.regrown(known, candidates, rgb, options.tolerance, options.regrow)
+        return cleanup.without_speckles(known, options.tolerance, options.speckle)
 
     def raw(self, view: View, frame: Frame | None = None) -> RawDepth:
         """A view's own estimate, before other views are asked; kept for the views in ``views``."""

@@ -72,6 +72,14 @@ def resampled(image: torch.Tensor, width: int, height: int) -> torch.Tensor:
     )[0, 0].contiguous()
 
 
+def resampled_colors(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """(height, width, 3) uint8 of an (H, W, 3) uint8 picture; see ``resampled``."""
+    if rgb.shape[:2] == (height, width):
+        return np.ascontiguousarray(rgb)
+    channels = [resampled(torch.from_numpy(rgb[..., c]).float(), width, height) for c in range(3)]
+    return torch.stack(channels, dim=-1).round().clamp(0, 255).to(torch.uint8).numpy()
+
+
 def window_taps(window: int) -> torch.Tensor:
     """(T, 2) int32 dx, dy: every other pixel of a square window, without its centre."""
     radius = window // 2

@@ -1,0 +1,100 @@
+"""Exposures of photographs: factors that were put in come out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from stereo_scenes import plane_scene
+
+from gvtools.depth.source import DepthMap
+from gvtools.depth.stereo.exposure import estimate_exposures
+from gvtools.errors import DegenerateError
+from gvtools.scenes.scene import Frame, Scene
+
+GAINS = np.array([[1.0, 1.0, 1.0], [0.7, 0.75, 0.8], [1.2, 1.1, 1.0], [0.9, 1.0, 1.1], [1, 0.8, 1]])
+
+
+def exposed(gains: np.ndarray = GAINS, *, spoilt: float = 0.0):
+    """Five views of a plane, each times its factors, and their true depth.
+
+    ``spoilt`` is the share of each picture that shows something else altogether.
+    """
+    made = plane_scene(slope=(0.2, 0.1))
+    views, depths = [], {}
+    for i, (view, gain) in enumerate(zip(made.scene, gains, strict=True)):
+        rgb = 40 + 0.5 * view.load().rgb.astype(float)
+        rgb[:, : round(spoilt * rgb.shape[1])] = 50 + 30 * i
+        shown = np.clip(np.round(rgb * gain), 0, 255).astype(np.uint8)
+        views.append(replace(view, load=partial(Frame, shown)))
+        depth = made.depths[i].astype(np.float32)
+        depths[view.name] = DepthMap(depth, np.ones_like(depth), "truth")
+    return Scene(made.scene.root, "colmap", tuple(views)), depths
+
+
+def normalised(gains: np.ndarray) -> np.ndarray:
+    return gains / np.exp(np.log(gains).mean(axis=0))
+
+
+@pytest.mark.parametrize("spoilt", [0.0, 0.15])
+def test_gains_are_found(spoilt):
+    scene, depths = exposed(spoilt=spoilt)
+    found = estimate_exposures(scene, depths)
+    np.testing.assert_allclose(found.gain, normalised(1 / GAINS), rtol=0.02)
+
+
+def test_pictures_of_one_exposure_are_left_alone():
+    scene, depths = exposed(np.ones((5, 3)))
+    np.testing.assert_allclose(estimate_exposures(scene, depths).gain, 1, rtol=0.005)
+
+
+def test_few_neighbours_chain_to_the_same_answer():
+    scene, depths = exposed()
+    found = estimate_exposures(scene, depths, others=1)
+    np.testing.assert_allclose(found.gain, normalised(1 / GAINS), rtol=0.03)
+
+
+def test_common_colours_agree_and_come_back_at_the_cameras_own_place():
+    scene, depths = exposed()
+    found = estimate_exposures(scene, depths)
+    means = np.array([found.common(view.load().rgb, view.name).mean((0, 1)) for view in scene])
+    before = np.array([view.load().rgb.mean((0, 1)) for view in scene])
+    assert np.ptp(means, axis=0).max() < 0.3 * np.ptp(before, axis=0).max()
+    own = scene.views[1]
+    rgb = own.load().rgb
+    back = found.as_taken_at(found.common(rgb, own.name), own.camera)
+    assert np.abs(back.astype(int) - rgb).max() <= 1
+
+
+def test_between_two_cameras_the_exposure_lies_between_theirs():
+    scene, depths = exposed()
+    found = estimate_exposures(scene, depths)
+    one, two = scene.views[1].camera, scene.views[2].camera
+    pose = one.cam_from_world.copy()
+    pose[0, :3, 3] = -pose[0, :3, :3] @ (0.5 * (one.centers[0] + two.centers[0]))
+    middle = found.gain_at(replace(one, cam_from_world=pose))
+    np.testing.assert_allclose(middle, np.sqrt(found.gain[1] * found.gain[2]), rtol=1e-6)
+
+
+def test_views_that_share_nothing_keep_their_exposure():
+    scene, depths = exposed()
+    lost = depths["v4"]
+    depths["v4"] = DepthMap(np.zeros_like(lost.depth), lost.confidence, "none")
+    found = estimate_exposures(scene, depths)
+    ratio = found.gain[:4] / found.gain[0]
+    np.testing.assert_allclose(ratio, (1 / GAINS[:4]) * GAINS[0], rtol=0.02)
+    assert np.isfinite(found.gain).all()
+
+
+def test_views_without_depth_are_never_looked_at():
+    def forbidden() -> Frame:
+        raise AssertionError("a held-out picture was read")
+
+    scene, depths = exposed()
+    scene = replace(scene, views=(*scene.views[:4], replace(scene.views[4], load=forbidden)))
+    del depths["v4"]
+    assert estimate_exposures(scene, depths).gain.shape == (4, 3)
+    with pytest.raises(DegenerateError, match="0 views"):
+        estimate_exposures(scene, {})
