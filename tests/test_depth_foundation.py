@@ -208,7 +208,7 @@ def test_choice_takes_it_when_weights_are_given(tmp_path, weights):
 def test_wrong_options_and_folders_are_one_clear_line(tmp_path, weights, capsys):
     with pytest.raises(OptionError, match=r"da3\.device"):
         FoundationOptions(device="tpu")
-    with pytest.raises(CheckpointError, match="no model.safetensors"):
+    with pytest.raises(CheckpointError, match=r"no model\.safetensors"):
         load_depth_anything(tmp_path)
     with pytest.raises(CheckpointError, match="cannot be read"):
         load_depth_anything(weights)

@@ -21,9 +21,9 @@ from torch import Tensor, nn
 
 from gvtools.completers.geoverse.attention import attend
 from gvtools.completers.geoverse.plucker import CameraCondition
-from gvtools.completers.geoverse.projective import Projective
+from gvtools.completers.geoverse.projective import HEAD_MULTIPLE, Projective
 from gvtools.completers.geoverse.shared_attention import VideoKeys
-from gvtools.errors import ShapeError
+from gvtools.errors import OptionError, ShapeError
 
 CAMERA_CHANNELS = 7
 DEPTH_CHANNELS = 2
@@ -68,6 +68,17 @@ class DenoiserConfig:
     projective_size: int | None = None
     invert_K: bool = False
     depth_condition: bool = False
+
+    def __post_init__(self) -> None:
+        for what, width, heads in (
+            ("heads", self.width, self.heads),
+            ("head_heads", self.head_width, self.head_heads),
+        ):
+            if heads < 1 or width % (HEAD_MULTIPLE * heads):
+                raise OptionError(
+                    f"denoiser {what} = {heads} of {width} channels; expected heads of a multiple "
+                    f"of {HEAD_MULTIPLE} channels"
+                )
 
 
 @dataclass(frozen=True)

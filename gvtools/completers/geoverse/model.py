@@ -18,6 +18,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from gvtools.completers.geoverse import stages
 from gvtools.completers.geoverse.conditioning import (
     ViewBatch,
     depth_condition,
@@ -35,18 +36,7 @@ from gvtools.completers.geoverse.plucker import CameraCondition, camera_conditio
 from gvtools.completers.geoverse.projective import Projective
 from gvtools.completers.geoverse.rgb_head import RGBHead
 from gvtools.completers.geoverse.shared_attention import SharedAttention, VideoKeys
-from gvtools.completers.geoverse.stages import (
-    BLOCKS,
-    DECODE,
-    GEOMETRY,
-    HINTS,
-    LEVEL0,
-    LEVEL1,
-    RGB,
-    VIDEO,
-    Clock,
-    no_clock,
-)
+from gvtools.completers.geoverse.stages import Clock, no_clock
 from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior
 from gvtools.errors import CheckpointError, OptionError, ShapeError
@@ -140,7 +130,7 @@ class GeoVerse(nn.Module):
             CheckpointError: the configuration has a video prior and none is attached.
         """
         config = self.config
-        with clock(HINTS):
+        with clock(stages.HINTS):
             source = batch
             batch = filled(batch, config.hints)
             camera = camera_condition(
@@ -164,7 +154,7 @@ class GeoVerse(nn.Module):
             prepared = Prepared(batch, hints, conditions, positions)
         if config.injection == "none":
             return prepared
-        with clock(VIDEO):
+        with clock(stages.VIDEO):
             features = self._video_features(source, seed) if video is None else video
             return self.with_video(prepared, features)
 
@@ -286,11 +276,11 @@ class GeoVerse(nn.Module):
         least = min(flow.least_time, tau[-2])
 
         def velocity(state: Tensor, t: Tensor) -> Tensor:
-            with clock(LEVEL1):
+            with clock(stages.LEVEL1):
                 return self.velocity1(prepared, state, t, least=least)
 
         def unconditional(state: Tensor, t: Tensor) -> Tensor:
-            with clock(LEVEL1):
+            with clock(stages.LEVEL1):
                 return self.velocity1(without, state, t, least=least)
 
         return sample(velocity, noise, tau, unconditional=unconditional, guidance=scale)
@@ -313,7 +303,7 @@ class GeoVerse(nn.Module):
         positions = Positions(cascade.config, conditions.camera, grid)
 
         def velocity(state: Tensor, t: Tensor) -> Tensor:
-            with clock(LEVEL0):
+            with clock(stages.LEVEL0):
                 return cascade(state, t, conditions, positions=positions)
 
         return sample(velocity, noise, bounds or self.config.flow.cascade)
@@ -324,12 +314,12 @@ class GeoVerse(nn.Module):
         """Pictures of the targets and geometry of all views; gradients reach the latents."""
         grid = (level1.shape[-2], level1.shape[-1])
         encoder = self.geometry.encoder
-        with clock(BLOCKS):
+        with clock(stages.BLOCKS):
             pyramid = self.pyramid(level0, level1, prepared.hints.token)
             normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
-        with clock(GEOMETRY):
+        with clock(stages.GEOMETRY):
             geometry = self.geometry.head(normed, grid)
-        with clock(RGB):
+        with clock(stages.RGB):
             context = prepared.batch.context
             features = torch.cat([level[:, context:] for level in normed], dim=-1)
             shape = features.shape[:2]
@@ -386,7 +376,7 @@ class GeoVerse(nn.Module):
             prepared, noise("level1"), bounds=bounds, guidance=guidance, clock=clock
         )
         level0 = self.sample0(prepared, level1, noise("level0"), bounds=cascade_bounds, clock=clock)
-        with clock(DECODE):
+        with clock(stages.DECODE):
             decoded = self.decode(prepared, level0, level1, clock=clock)
         return Generated(level1, level0, decoded)
 
