@@ -21,6 +21,7 @@ COMMANDS = {
     "render": "pipelines.render",
     "evaluate": "pipelines.evaluate",
     "trajectory": "pipelines.trajectory",
+    "weights": "pipelines.weights",
     "export": "pipelines.export",
     "bench": "pipelines.bench",
 }
