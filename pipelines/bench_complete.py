@@ -11,7 +11,7 @@ from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.stages import DECODE, VIDEO
-from gvtools.completers.geoverse.weights_folder import from_pretrained
+from gvtools.completers.geoverse.weights.folder import from_pretrained
 from pipelines.completion_flops import PassFlops, pass_flops
 from pipelines.completion_options import CompleteOptions
 from pipelines.completion_timing import (

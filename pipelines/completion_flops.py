@@ -18,13 +18,13 @@ from torch.utils.flop_counter import FlopCounterMode
 from gvtools.completers.geoverse.conditioning import Hints, ViewBatch, encode_hints
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.denoiser import Conditions, Positions
-from gvtools.completers.geoverse.depth_anything import DepthAnything3
+from gvtools.completers.geoverse.depth_anything.network import DepthAnything3
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.passes import Prepared
 from gvtools.completers.geoverse.plucker import CameraCondition
 from gvtools.completers.geoverse.stages import DECODE, HINTS, LEVEL0, LEVEL1, VIDEO
 from gvtools.completers.geoverse.statistics import LatentStatistics
-from gvtools.completers.geoverse.video_prior import VideoFeatures
+from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
 from gvtools.errors import CheckpointError
 from pipelines.random_model import random_features, random_model, random_video
 from pipelines.stage_clock import StageClock

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from gvtools.completers.geoverse.config import GeoVerseConfig, named
-from gvtools.completers.geoverse.weights_folder import config_of
+from gvtools.completers.geoverse.weights.folder import config_of
 from gvtools.errors import OptionError
 from gvtools.options import check_range
 

@@ -17,7 +17,7 @@ from gvtools.completers.geoverse import denoiser, shared_attention
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.stages import LEVEL0, LEVEL1, no_clock
-from gvtools.completers.geoverse.video_prior import VideoFeatures
+from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
 from pipelines.side_by_side import Comparison, alternate, compared
 from pipelines.stage_clock import StageClock, seconds, total
 

@@ -112,7 +112,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 def _list(args: argparse.Namespace, console: Console) -> None:
     from gvtools.completers.geoverse.config import NAMES
-    from gvtools.completers.geoverse.needed_files import needed_files
+    from gvtools.completers.geoverse.weights.needed_files import needed_files
     from pipelines.console import write_json
 
     names = NAMES if args.config is None else (args.config,)
@@ -130,8 +130,8 @@ def _list(args: argparse.Namespace, console: Console) -> None:
 
 
 def _check(args: argparse.Namespace, console: Console) -> None:
-    from gvtools.completers.geoverse.folder_check import check_folder
-    from gvtools.completers.geoverse.folder_parts import check_is_folder, config_of
+    from gvtools.completers.geoverse.weights.folder_check import check_folder
+    from gvtools.completers.geoverse.weights.folder_parts import check_is_folder, config_of
     from pipelines.console import write_json
 
     folder = args.folder
@@ -166,10 +166,10 @@ def _check(args: argparse.Namespace, console: Console) -> None:
 def _create(args: argparse.Namespace, console: Console) -> None:
     import torch
 
-    from gvtools.completers.geoverse.folder_parts import empty_model
     from gvtools.completers.geoverse.model import GeoVerse
-    from gvtools.completers.geoverse.published import VIDEO_FOLDER
-    from gvtools.completers.geoverse.weights_folder import save_pretrained
+    from gvtools.completers.geoverse.weights.folder import save_pretrained
+    from gvtools.completers.geoverse.weights.folder_parts import empty_model
+    from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
 
     config, folder = _config(args.config), args.folder
     if folder.is_file() or (
@@ -198,8 +198,8 @@ def _create(args: argparse.Namespace, console: Console) -> None:
 
 
 def _truncate(args: argparse.Namespace, console: Console) -> None:
-    from gvtools.completers.geoverse.wan_checkpoint import truncate
-    from gvtools.completers.geoverse.wan_folder import EMPTY_PROMPT
+    from gvtools.completers.geoverse.video_prior.wan_checkpoint import truncate
+    from gvtools.completers.geoverse.video_prior.wan_folder import EMPTY_PROMPT
 
     truncate(
         args.source,
@@ -216,8 +216,8 @@ def _truncate(args: argparse.Namespace, console: Console) -> None:
 
 
 def _empty_prompt(args: argparse.Namespace, console: Console) -> None:
-    from gvtools.completers.geoverse.wan_checkpoint import write_empty_prompt
-    from gvtools.completers.geoverse.wan_folder import EMPTY_PROMPT
+    from gvtools.completers.geoverse.video_prior.wan_checkpoint import write_empty_prompt
+    from gvtools.completers.geoverse.video_prior.wan_folder import EMPTY_PROMPT
 
     path = args.folder / EMPTY_PROMPT
     if not args.folder.is_dir():

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gvtools.completers.geoverse.config import GeoVerseConfig
-    from gvtools.completers.geoverse.folder_parts import PartReport
-    from gvtools.completers.geoverse.needed_files import NeededFile, NeededFiles
+    from gvtools.completers.geoverse.weights.folder_parts import PartReport
+    from gvtools.completers.geoverse.weights.needed_files import NeededFile, NeededFiles
     from pipelines.console import Console
 
 

@@ -16,15 +16,15 @@ from gvtools.completers.geoverse.conditioning import HintConfig, ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.control import ControlConfig
 from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, DenoiserConfig
-from gvtools.completers.geoverse.depth_anything import DepthAnythingConfig
-from gvtools.completers.geoverse.encoder import EncoderConfig
-from gvtools.completers.geoverse.geometry_head import GeometryHeadConfig
+from gvtools.completers.geoverse.depth_anything.encoder import EncoderConfig
+from gvtools.completers.geoverse.depth_anything.geometry_head import GeometryHeadConfig
+from gvtools.completers.geoverse.depth_anything.network import DepthAnythingConfig
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.plucker import CENTRED, camera_condition
 from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
 from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
-from gvtools.completers.geoverse.video_config import VideoPriorConfig
-from gvtools.completers.geoverse.video_prior import VideoFeatures
+from gvtools.completers.geoverse.video_prior.config import VideoPriorConfig
+from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
 from gvtools.guidance import Guidance
 
 PATCH = 8

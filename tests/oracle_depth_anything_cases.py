@@ -8,9 +8,9 @@ import torch
 from oracle_networks import Fixture, fill_, formula_input
 from torch import Tensor
 
-from gvtools.completers.geoverse.depth_anything import DepthAnything3, DepthAnythingConfig
-from gvtools.completers.geoverse.encoder import EncoderConfig
-from gvtools.completers.geoverse.geometry_head import GeometryHeadConfig
+from gvtools.completers.geoverse.depth_anything.encoder import EncoderConfig
+from gvtools.completers.geoverse.depth_anything.geometry_head import GeometryHeadConfig
+from gvtools.completers.geoverse.depth_anything.network import DepthAnything3, DepthAnythingConfig
 
 # The released sizes, for fixtures that name a model instead of giving its dimensions.
 SIZES = {

@@ -22,7 +22,7 @@ from gvtools.completers.geoverse.flow import (
     unshift_time,
     velocity_target,
 )
-from gvtools.completers.geoverse.losses import flow_matching_loss, view_errors
+from gvtools.completers.geoverse.objective.losses import flow_matching_loss, view_errors
 
 TIME = 1e-6
 

@@ -13,7 +13,8 @@ from oracle_networks import MATRIX, NETWORK, Fixture, fill_, formula_input
 from torch import Tensor
 
 from gvtools.completers.geoverse.attention import attend
-from gvtools.completers.geoverse.homography import candidates
+from gvtools.completers.geoverse.depth_anything.homography import candidates
+from gvtools.completers.geoverse.depth_anything.rays import poses_least_squares, poses_ransac
 from gvtools.completers.geoverse.plucker import (
     GLD_PIXEL_OFFSET,
     camera_condition,
@@ -21,7 +22,6 @@ from gvtools.completers.geoverse.plucker import (
     plucker_map,
 )
 from gvtools.completers.geoverse.projective import Projective
-from gvtools.completers.geoverse.rays import poses_least_squares, poses_ransac
 from gvtools.completers.geoverse.rgb_head import RGBHead, RGBHeadConfig
 
 TABLE = "decoder_pos_embed"

@@ -14,7 +14,7 @@ from gvtools.completers.geoverse import denoiser, shared_attention
 from gvtools.completers.geoverse.attention import attend
 from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.denoiser import CameraAttention
-from gvtools.completers.geoverse.depth_anything import DepthAnything3
+from gvtools.completers.geoverse.depth_anything.network import DepthAnything3
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.projective import Projective
 from gvtools.completers.geoverse.stages import LEVEL0, LEVEL1

@@ -10,10 +10,10 @@ import torch
 from safetensors.torch import save_file
 from tiny_scan import render, write_colmap_scan, write_scan
 
-from gvtools.completers.geoverse.depth_anything import DepthAnything3, DepthAnythingConfig
-from gvtools.completers.geoverse.depth_anything_weights import RELEASED, load_depth_anything
-from gvtools.completers.geoverse.encoder import EncoderConfig
-from gvtools.completers.geoverse.geometry_head import Geometry, GeometryHeadConfig
+from gvtools.completers.geoverse.depth_anything.encoder import EncoderConfig
+from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry, GeometryHeadConfig
+from gvtools.completers.geoverse.depth_anything.network import DepthAnything3, DepthAnythingConfig
+from gvtools.completers.geoverse.depth_anything.weights import RELEASED, load_depth_anything
 from gvtools.completers.geoverse.resampling import resampled
 from gvtools.depth.choice import choose_source
 from gvtools.depth.foundation import source as module

@@ -21,18 +21,19 @@ from published_folder import CASCADE, GEOMETRY, LEVEL1, RGB_HEAD, STATISTICS
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from gvtools.completers.geoverse import GeoVerse, named, saved_tensors
-from gvtools.completers.geoverse.checkpoints import READABLE, expected_of
+from gvtools.completers.geoverse import GeoVerse, named
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.config_json import to_json
-from gvtools.completers.geoverse.folder_parts import PartReport, empty_model
-from gvtools.completers.geoverse.published import PARTS, WHOLE_FILE
-from gvtools.completers.geoverse.weights_folder import (
+from gvtools.completers.geoverse.weights import saved_tensors
+from gvtools.completers.geoverse.weights.checkpoints import READABLE, expected_of
+from gvtools.completers.geoverse.weights.folder import (
     check_folder,
     from_pretrained,
     save_extension,
     save_pretrained,
 )
+from gvtools.completers.geoverse.weights.folder_parts import PartReport, empty_model
+from gvtools.completers.geoverse.weights.published import PARTS, WHOLE_FILE
 from gvtools.errors import CheckpointError, GvError, ProjectError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -420,7 +421,7 @@ def test_other_contents_of_a_pytorch_file_are_refused(folder: Path) -> None:
 @pytest.mark.parametrize("file", [STATISTICS[0], Path("a.safetensors")], ids=lambda f: f.suffix)
 def test_no_damage_ends_in_another_error(folder: Path, file: Path) -> None:
     """Every ending, and random bytes: either it is read, or the error is our own."""
-    from gvtools.completers.geoverse.checkpoints import read_tensors
+    from gvtools.completers.geoverse.weights.checkpoints import read_tensors
 
     path = folder / file
     if file.suffix == ".safetensors":

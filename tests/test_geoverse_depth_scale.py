@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
 from gvtools.completers.geoverse.depth_scale import (
     ALIGNMENTS,
     MAX_FIELD,
     centre_scale,
     scaled_depth,
 )
-from gvtools.completers.geoverse.geometry_head import Geometry
 from gvtools.completers.geoverse.resampling import EDGE, resampled, resampled_depth
 from gvtools.errors import OptionError
 

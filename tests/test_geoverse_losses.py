@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gvtools.completers.geoverse.losses import (
+from gvtools.completers.geoverse.objective.losses import (
     depth_loss,
     flow_matching_loss,
     high_gradient_loss,
     rgb_loss,
     view_errors,
 )
-from gvtools.completers.geoverse.similarity_scale import center_similarity
+from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.errors import OptionError, ShapeError
 
 B, V, CONTEXT, H, W = 2, 5, 2, 5, 6

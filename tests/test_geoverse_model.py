@@ -14,13 +14,13 @@ from torch import Tensor
 from gvtools.completers.geoverse.conditioning import ViewBatch, encode_latents
 from gvtools.completers.geoverse.config import FlowConfig, named
 from gvtools.completers.geoverse.denoiser import Denoiser
-from gvtools.completers.geoverse.depth_anything import DepthAnything3
-from gvtools.completers.geoverse.losses import depth_loss, rgb_loss
+from gvtools.completers.geoverse.depth_anything.network import DepthAnything3
+from gvtools.completers.geoverse.depth_anything.rays import camera_centres
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.rays import camera_centres
-from gvtools.completers.geoverse.similarity_scale import center_similarity
+from gvtools.completers.geoverse.objective.losses import depth_loss, rgb_loss
+from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.completers.geoverse.statistics import LatentStatistics
-from gvtools.completers.geoverse.video_prior import VideoFeatures
+from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
 from gvtools.errors import CheckpointError, OptionError
 
 pytestmark = pytest.mark.usefixtures("one_thread")

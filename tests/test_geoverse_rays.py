@@ -6,8 +6,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from gvtools.completers.geoverse import homography
-from gvtools.completers.geoverse.rays import (
+from gvtools.completers.geoverse.depth_anything import homography
+from gvtools.completers.geoverse.depth_anything.rays import (
     camera_centres,
     nearest_rotation,
     poses_least_squares,

@@ -16,7 +16,7 @@ from gvtools.completers.geoverse.flow import (
     unshift_time,
     velocity_from_clean,
 )
-from gvtools.completers.geoverse.losses import flow_matching_loss
+from gvtools.completers.geoverse.objective.losses import flow_matching_loss
 from gvtools.completers.geoverse.reflow import (
     fast_loss,
     interval_ends,

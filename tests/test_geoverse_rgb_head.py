@@ -9,7 +9,7 @@ import torch
 from oracle import ABSENT, ORACLE
 from torch import nn
 
-from gvtools.completers.geoverse.encoder import IMAGENET_MEAN, IMAGENET_STD
+from gvtools.completers.geoverse.depth_anything.encoder import IMAGENET_MEAN, IMAGENET_STD
 from gvtools.completers.geoverse.rgb_head import RGBHead, RGBHeadConfig, sine_table
 from gvtools.errors import ShapeError
 

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvtools.completers.geoverse.similarity_scale import DEFECTS, center_similarity
+from gvtools.completers.geoverse.objective.similarity_scale import DEFECTS, center_similarity
 from gvtools.errors import ShapeError
 from gvtools.similarity import fit_similarity
 

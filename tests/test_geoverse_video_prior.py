@@ -16,9 +16,9 @@ pytest.importorskip("diffusers", reason="the extra wan is not installed")
 import tiny_wan as tiny
 
 from gvtools.completers.geoverse.noise import view_seed
-from gvtools.completers.geoverse.video_layouts import packed_mask, view_layout
-from gvtools.completers.geoverse.video_prior import VideoPrior, VideoPriorConfig
-from gvtools.completers.geoverse.video_views import resized
+from gvtools.completers.geoverse.video_prior.layouts import packed_mask, view_layout
+from gvtools.completers.geoverse.video_prior.prior import VideoPrior, VideoPriorConfig
+from gvtools.completers.geoverse.video_prior.views import resized
 from gvtools.errors import CheckpointError, OptionError, ShapeError
 
 LAYOUTS = ("per_view", "video9", "repeat4")
@@ -422,8 +422,8 @@ def test_shapes_that_do_not_fit_are_refused(network: Any) -> None:
 
 def test_importing_the_module_leaves_diffusers_alone() -> None:
     code = (
-        "import sys, gvtools.completers.geoverse.video_prior, "
-        "gvtools.completers.geoverse.wan_checkpoint; "
+        "import sys, gvtools.completers.geoverse.video_prior.prior, "
+        "gvtools.completers.geoverse.video_prior.wan_checkpoint; "
         "print([m for m in ('diffusers', 'safetensors', 'transformers') if m in sys.modules])"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

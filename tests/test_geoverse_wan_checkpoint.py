@@ -19,17 +19,17 @@ pytest.importorskip("diffusers", reason="the extra wan is not installed")
 import tiny_wan as tiny
 from safetensors.torch import load_file, save_file
 
-from gvtools.completers.geoverse import wan_checkpoint, wan_files, wan_folder
-from gvtools.completers.geoverse.video_prior import VideoPrior
-from gvtools.completers.geoverse.wan_checkpoint import (
+from gvtools.completers.geoverse.video_prior import wan_checkpoint, wan_files, wan_folder
+from gvtools.completers.geoverse.video_prior.prior import VideoPrior
+from gvtools.completers.geoverse.video_prior.wan_checkpoint import (
     expected_tensors,
     truncate,
     write_empty_prompt,
 )
-from gvtools.completers.geoverse.wan_files import TensorFiles
-from gvtools.completers.geoverse.wan_folder import EMPTY_PROMPT, check_folder
-from gvtools.completers.geoverse.wan_library import network_class
-from gvtools.completers.geoverse.wan_names import diffusers_name
+from gvtools.completers.geoverse.video_prior.wan_files import TensorFiles
+from gvtools.completers.geoverse.video_prior.wan_folder import EMPTY_PROMPT, check_folder
+from gvtools.completers.geoverse.video_prior.wan_library import network_class
+from gvtools.completers.geoverse.video_prior.wan_names import diffusers_name
 from gvtools.errors import CheckpointError, OptionError, ProjectError
 
 # Of a Wan with six blocks and hints at 0, 2 and 4, the first four blocks and two hints.

@@ -19,11 +19,11 @@ import torch
 from oracle import ABSENT, ORACLE
 from oracle_networks import Fixture
 
-from gvtools.completers.geoverse.checkpoints import shapes
 from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.denoiser import Denoiser, DenoiserConfig
-from gvtools.completers.geoverse.depth_anything import DepthAnything3, DepthAnythingConfig
+from gvtools.completers.geoverse.depth_anything.network import DepthAnything3, DepthAnythingConfig
 from gvtools.completers.geoverse.rgb_head import RGBHead
+from gvtools.completers.geoverse.weights.checkpoints import shapes
 
 NAMES = sorted(path.stem for path in ORACLE.glob("*.json")) if ORACLE.is_dir() else []
 pytestmark = pytest.mark.skipif(not NAMES, reason=ABSENT)

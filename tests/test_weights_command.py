@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 
 from gvtools.completers.geoverse import from_pretrained, named
 from gvtools.completers.geoverse.config_json import to_json
-from gvtools.completers.geoverse.published import VIDEO_SIZES, WHOLE_FILE
+from gvtools.completers.geoverse.weights.published import VIDEO_SIZES, WHOLE_FILE
 from pipelines.cli import build_parser, main
 from pipelines.console import Console
 from pipelines.weights import _progress
@@ -109,7 +109,7 @@ def test_nothing_is_published_of_the_small_one(listed: dict[str, Any]) -> None:
 
 def test_the_video_prior_has_the_size_of_its_networks() -> None:
     pytest.importorskip("diffusers", reason="the extra wan is not installed")
-    from gvtools.completers.geoverse.wan_folder import dtype_of, expected_tensors
+    from gvtools.completers.geoverse.video_prior.wan_folder import dtype_of, expected_tensors
 
     sizes = {
         "num_layers": 16,

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse.video_prior import VideoPrior, VideoPriorConfig
-from gvtools.completers.geoverse.wan_library import network_class
+from gvtools.completers.geoverse.video_prior.prior import VideoPrior, VideoPriorConfig
+from gvtools.completers.geoverse.video_prior.wan_library import network_class
 
 TEXT = 20
 TAPS = (0, 1, 2, 3)

@@ -21,9 +21,9 @@ from gvtools.completers.geoverse.depth_scale import ALIGNMENTS, centre_scale, sc
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import Generated, GeoVerse
 from gvtools.completers.geoverse.model_views import view_batch
-from gvtools.completers.geoverse.published import CONFIG_FILE, WHOLE_FILE
 from gvtools.completers.geoverse.resampling import model_size, resampled, resampled_depth
-from gvtools.completers.geoverse.weights_folder import config_of, from_pretrained
+from gvtools.completers.geoverse.weights.folder import config_of, from_pretrained
+from gvtools.completers.geoverse.weights.published import CONFIG_FILE, WHOLE_FILE
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 from gvtools.options import check_range

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gvtools.completers.geoverse.depth_anything import DepthAnything3, relative_cameras
+from gvtools.completers.geoverse.depth_anything.network import DepthAnything3, relative_cameras
 from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
 from gvtools.completers.geoverse.plucker import normalised_poses
 from gvtools.completers.geoverse.statistics import LatentStatistics

@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
+from gvtools.completers.geoverse.depth_anything.rays import camera_centres
 from gvtools.completers.geoverse.fill import push_pull
-from gvtools.completers.geoverse.geometry_head import Geometry
-from gvtools.completers.geoverse.rays import camera_centres
-from gvtools.completers.geoverse.similarity_scale import center_similarity
+from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.similarity import align_depth_scale
 

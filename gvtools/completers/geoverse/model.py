@@ -28,7 +28,7 @@ from gvtools.completers.geoverse.conditioning import (
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.control import ControlBranch
 from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
-from gvtools.completers.geoverse.depth_anything import DepthAnything3
+from gvtools.completers.geoverse.depth_anything.network import DepthAnything3
 from gvtools.completers.geoverse.flow import check_bounds, sample, velocity_from_clean
 from gvtools.completers.geoverse.noise import seeded_noise, view_seed
 from gvtools.completers.geoverse.passes import Decoded, Generated, Prepared
@@ -38,7 +38,7 @@ from gvtools.completers.geoverse.rgb_head import RGBHead
 from gvtools.completers.geoverse.shared_attention import SharedAttention, VideoKeys
 from gvtools.completers.geoverse.stages import Clock, no_clock
 from gvtools.completers.geoverse.statistics import LatentStatistics
-from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior
+from gvtools.completers.geoverse.video_prior.prior import VideoFeatures, VideoPrior
 from gvtools.errors import CheckpointError, OptionError, ShapeError
 
 __all__ = ["Decoded", "Generated", "GeoVerse", "Prepared"]
@@ -80,13 +80,13 @@ class GeoVerse(nn.Module):
     @classmethod
     def from_pretrained(cls, folder: Path | str, **options: Any) -> GeoVerse:
         """The model of a weights folder; see ``weights_folder.from_pretrained``."""
-        from gvtools.completers.geoverse.weights_folder import from_pretrained
+        from gvtools.completers.geoverse.weights.folder import from_pretrained
 
         return from_pretrained(folder, **options)
 
     def save_pretrained(self, folder: Path | str, **options: Any) -> Path:
         """Write a weights folder; see ``weights_folder.save_pretrained``."""
-        from gvtools.completers.geoverse.weights_folder import save_pretrained
+        from gvtools.completers.geoverse.weights.folder import save_pretrained
 
         return save_pretrained(self, folder, **options)
 

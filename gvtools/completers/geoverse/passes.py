@@ -8,9 +8,9 @@ from torch import Tensor
 
 from gvtools.completers.geoverse.conditioning import Hints, ViewBatch
 from gvtools.completers.geoverse.denoiser import Conditions, Positions
-from gvtools.completers.geoverse.geometry_head import Geometry
+from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
 from gvtools.completers.geoverse.shared_attention import VideoKeys
-from gvtools.completers.geoverse.video_prior import VideoFeatures
+from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
 
 
 @dataclass(frozen=True)

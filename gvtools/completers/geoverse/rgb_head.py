@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from gvtools.completers.geoverse.attention import attend
-from gvtools.completers.geoverse.encoder import IMAGENET_MEAN, IMAGENET_STD
+from gvtools.completers.geoverse.depth_anything.encoder import IMAGENET_MEAN, IMAGENET_STD
 from gvtools.errors import ShapeError
 
 SINE_BASE = 10000.0

@@ -16,10 +16,10 @@ import torch
 from numpy.typing import NDArray
 
 from gvtools.cameras import concatenate
-from gvtools.completers.geoverse.depth_anything import DepthAnything3, relative_cameras
-from gvtools.completers.geoverse.depth_anything_weights import find_weights, load_depth_anything
-from gvtools.completers.geoverse.geometry_head import Geometry
-from gvtools.completers.geoverse.rays import camera_centres
+from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
+from gvtools.completers.geoverse.depth_anything.network import DepthAnything3, relative_cameras
+from gvtools.completers.geoverse.depth_anything.rays import camera_centres
+from gvtools.completers.geoverse.depth_anything.weights import find_weights, load_depth_anything
 from gvtools.completers.geoverse.resampling import model_size, resampled
 from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.foundation.scale import FoundationScale, Pass, fit_scale

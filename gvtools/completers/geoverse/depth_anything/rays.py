@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse import homography
+from gvtools.completers.geoverse.depth_anything import homography
 from gvtools.errors import DegenerateError, OptionError, ShapeError
 
 # Share of the largest singular value below which the rays of a view do not span three directions.

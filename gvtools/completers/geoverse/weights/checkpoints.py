@@ -14,12 +14,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.pickled_tensors import (
+from gvtools.completers.geoverse.weights.pickled_tensors import (
     check_not_placeholder,
     first_line,
     read_pickled,
 )
-from gvtools.completers.geoverse.published import EXTENSION, Part
+from gvtools.completers.geoverse.weights.published import EXTENSION, Part
 from gvtools.errors import CheckpointError
 
 Shapes = Mapping[str, tuple[int, ...]]

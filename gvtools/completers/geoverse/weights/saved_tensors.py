@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse.checkpoints import not_finite
+from gvtools.completers.geoverse.weights.checkpoints import not_finite
 from gvtools.errors import CheckpointError
 
 DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}

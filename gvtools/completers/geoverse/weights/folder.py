@@ -13,11 +13,13 @@ import torch
 from torch import Tensor
 
 from gvtools.completers.geoverse import config as configs
-from gvtools.completers.geoverse.checkpoints import is_extension, load
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.extension import fresh_extension
-from gvtools.completers.geoverse.folder_check import check_folder, check_video_folder
-from gvtools.completers.geoverse.folder_parts import (
+from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.video_prior.prior import VideoPrior
+from gvtools.completers.geoverse.weights.checkpoints import is_extension, load
+from gvtools.completers.geoverse.weights.extension import fresh_extension
+from gvtools.completers.geoverse.weights.folder_check import check_folder, check_video_folder
+from gvtools.completers.geoverse.weights.folder_parts import (
     PartReport,
     check_is_folder,
     config_of,
@@ -25,15 +27,13 @@ from gvtools.completers.geoverse.folder_parts import (
     examine,
     pieces_of,
 )
-from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.published import (
+from gvtools.completers.geoverse.weights.published import (
     CONFIG_FILE,
     EXTENSION_FILE,
     VIDEO_FOLDER,
     WHOLE_FILE,
 )
-from gvtools.completers.geoverse.saved_tensors import DTYPES, save_tensors
-from gvtools.completers.geoverse.video_prior import VideoPrior
+from gvtools.completers.geoverse.weights.saved_tensors import DTYPES, save_tensors
 from gvtools.errors import CheckpointError
 from gvtools.files import replaced_when_written
 

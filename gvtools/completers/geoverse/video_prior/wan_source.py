@@ -10,9 +10,9 @@ from typing import Any
 
 from torch import Tensor
 
-from gvtools.completers.geoverse.wan_files import TensorFiles
-from gvtools.completers.geoverse.wan_library import COMPONENTS, read_config
-from gvtools.completers.geoverse.wan_names import by_diffusers_name, config_of_tensors
+from gvtools.completers.geoverse.video_prior.wan_files import TensorFiles
+from gvtools.completers.geoverse.video_prior.wan_library import COMPONENTS, read_config
+from gvtools.completers.geoverse.video_prior.wan_names import by_diffusers_name, config_of_tensors
 from gvtools.errors import CheckpointError
 
 

@@ -15,10 +15,20 @@ from typing import Any
 
 import torch
 
-from gvtools.completers.geoverse.wan_files import INDEX, TensorFiles, check_present, check_tensors
-from gvtools.completers.geoverse.wan_folder import EMPTY_PROMPT, cast, dtype_of, expected_tensors
-from gvtools.completers.geoverse.wan_library import read_config
-from gvtools.completers.geoverse.wan_source import Source, find_source
+from gvtools.completers.geoverse.video_prior.wan_files import (
+    INDEX,
+    TensorFiles,
+    check_present,
+    check_tensors,
+)
+from gvtools.completers.geoverse.video_prior.wan_folder import (
+    EMPTY_PROMPT,
+    cast,
+    dtype_of,
+    expected_tensors,
+)
+from gvtools.completers.geoverse.video_prior.wan_library import read_config
+from gvtools.completers.geoverse.video_prior.wan_source import Source, find_source
 from gvtools.errors import CheckpointError, OptionError, ProjectError
 
 __all__ = ["expected_tensors", "truncate", "write_empty_prompt"]

@@ -18,13 +18,17 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.wan_files import TensorFiles, check_present, check_tensors
-from gvtools.completers.geoverse.wan_library import empty_network, read_config
-from gvtools.completers.geoverse.wan_names import kept_in_float32
+from gvtools.completers.geoverse.video_prior.wan_files import (
+    TensorFiles,
+    check_present,
+    check_tensors,
+)
+from gvtools.completers.geoverse.video_prior.wan_library import empty_network, read_config
+from gvtools.completers.geoverse.video_prior.wan_names import kept_in_float32
 from gvtools.errors import CheckpointError
 
 EMPTY_PROMPT = "empty_prompt.safetensors"
-_MAKER = "gvtools.completers.geoverse.wan_checkpoint"
+_MAKER = "gvtools.completers.geoverse.video_prior.wan_checkpoint"
 
 
 def expected_tensors(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.vit import Block, Mlp
+from gvtools.completers.geoverse.depth_anything.vit import Block, Mlp
 
 POSE_CHANNELS = 9
 

@@ -8,11 +8,17 @@ from math import prod
 from typing import Any
 
 from gvtools.completers.geoverse import config as configs
-from gvtools.completers.geoverse.checkpoints import Shapes, expected_of, is_extension, shapes
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.folder_parts import empty_model
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.published import (
+from gvtools.completers.geoverse.video_prior.config import VideoPriorConfig
+from gvtools.completers.geoverse.weights.checkpoints import (
+    Shapes,
+    expected_of,
+    is_extension,
+    shapes,
+)
+from gvtools.completers.geoverse.weights.folder_parts import empty_model
+from gvtools.completers.geoverse.weights.published import (
     CONFIG_FILE,
     EXTENSION_FILE,
     VIDEO_FOLDER,
@@ -23,7 +29,6 @@ from gvtools.completers.geoverse.published import (
     Part,
     parts_of,
 )
-from gvtools.completers.geoverse.video_config import VideoPriorConfig
 
 _FLOAT32 = 4
 _OWN = "one's own: gvtools train, or gvtools weights create for an untrained one"

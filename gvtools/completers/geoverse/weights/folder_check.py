@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.folder_parts import (
+from gvtools.completers.geoverse.video_prior.prior import VideoPrior, VideoPriorConfig
+from gvtools.completers.geoverse.weights.folder_parts import (
     PartReport,
     check_is_folder,
     config_of,
@@ -13,8 +14,7 @@ from gvtools.completers.geoverse.folder_parts import (
     examine,
     pieces_of,
 )
-from gvtools.completers.geoverse.published import VIDEO_FOLDER
-from gvtools.completers.geoverse.video_prior import VideoPrior, VideoPriorConfig
+from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
 from gvtools.errors import CheckpointError
 
 
@@ -52,9 +52,9 @@ def check_video_folder(folder: Path) -> None:
 
 def _video_report(folder: Path, config: VideoPriorConfig) -> PartReport:
     """The truncated video model's folder; its own modules say what is wrong with it."""
-    from gvtools.completers.geoverse.wan_folder import check_folder as check_wan
-    from gvtools.completers.geoverse.wan_folder import read_empty_prompt
-    from gvtools.completers.geoverse.wan_library import empty_network, read_config
+    from gvtools.completers.geoverse.video_prior.wan_folder import check_folder as check_wan
+    from gvtools.completers.geoverse.video_prior.wan_folder import read_empty_prompt
+    from gvtools.completers.geoverse.video_prior.wan_library import empty_network, read_config
 
     try:
         check_video_folder(folder)

@@ -18,15 +18,15 @@ import torch
 from torch import Tensor
 
 from gvtools.completers.geoverse.noise import seeded_noise, view_seed
-from gvtools.completers.geoverse.video_config import VideoPriorConfig
-from gvtools.completers.geoverse.video_layouts import (
+from gvtools.completers.geoverse.video_prior.config import VideoPriorConfig
+from gvtools.completers.geoverse.video_prior.layouts import (
     ViewLayout,
     packed_mask,
     view_layout,
 )
-from gvtools.completers.geoverse.video_views import check_views, resized, seed_rows
-from gvtools.completers.geoverse.wan_folder import load_network, read_empty_prompt
-from gvtools.completers.geoverse.wan_networks import STRIDE, WanNetworks
+from gvtools.completers.geoverse.video_prior.views import check_views, resized, seed_rows
+from gvtools.completers.geoverse.video_prior.wan_folder import load_network, read_empty_prompt
+from gvtools.completers.geoverse.video_prior.wan_networks import STRIDE, WanNetworks
 from gvtools.errors import CheckpointError
 
 __all__ = ["VideoFeatures", "VideoPrior", "VideoPriorConfig"]

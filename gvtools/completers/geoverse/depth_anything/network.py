@@ -11,9 +11,17 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.camera_token import CameraDecoder, CameraEncoder
-from gvtools.completers.geoverse.encoder import Backbone, EncoderConfig, imagenet_normalised
-from gvtools.completers.geoverse.geometry_head import Geometry, GeometryHead, GeometryHeadConfig
+from gvtools.completers.geoverse.depth_anything.camera_token import CameraDecoder, CameraEncoder
+from gvtools.completers.geoverse.depth_anything.encoder import (
+    Backbone,
+    EncoderConfig,
+    imagenet_normalised,
+)
+from gvtools.completers.geoverse.depth_anything.geometry_head import (
+    Geometry,
+    GeometryHead,
+    GeometryHeadConfig,
+)
 
 
 @dataclass(frozen=True)

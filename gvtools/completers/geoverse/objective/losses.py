@@ -13,8 +13,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse.gradient_weights import DELTA, gradient_weights
-from gvtools.completers.geoverse.similarity_scale import CenterSimilarity
+from gvtools.completers.geoverse.objective.gradient_weights import DELTA, gradient_weights
+from gvtools.completers.geoverse.objective.similarity_scale import CenterSimilarity
 from gvtools.errors import OptionError, ShapeError
 from gvtools.options import check_range
 

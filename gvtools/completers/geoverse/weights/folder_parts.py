@@ -13,7 +13,9 @@ import torch
 from torch import Tensor
 
 from gvtools.completers.geoverse import config as configs
-from gvtools.completers.geoverse.checkpoints import (
+from gvtools.completers.geoverse.config import GeoVerseConfig
+from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.weights.checkpoints import (
     Fit,
     Shapes,
     Stored,
@@ -26,10 +28,8 @@ from gvtools.completers.geoverse.checkpoints import (
     read_tensors,
     shapes,
 )
-from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.pickled_tensors import first_line
-from gvtools.completers.geoverse.published import (
+from gvtools.completers.geoverse.weights.pickled_tensors import first_line
+from gvtools.completers.geoverse.weights.published import (
     CONFIG_FILE,
     EXTENSION_FILE,
     WHOLE_FILE,

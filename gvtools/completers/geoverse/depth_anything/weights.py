@@ -6,12 +6,17 @@ from pathlib import Path
 
 import torch
 
-from gvtools.completers.geoverse.checkpoints import check_finite, load, read_part, read_tensors
 from gvtools.completers.geoverse.config import read
-from gvtools.completers.geoverse.depth_anything import DepthAnything3, DepthAnythingConfig
-from gvtools.completers.geoverse.encoder import EncoderConfig
-from gvtools.completers.geoverse.geometry_head import GeometryHeadConfig
-from gvtools.completers.geoverse.published import CONFIG_FILE, PARTS, WHOLE_FILE
+from gvtools.completers.geoverse.depth_anything.encoder import EncoderConfig
+from gvtools.completers.geoverse.depth_anything.geometry_head import GeometryHeadConfig
+from gvtools.completers.geoverse.depth_anything.network import DepthAnything3, DepthAnythingConfig
+from gvtools.completers.geoverse.weights.checkpoints import (
+    check_finite,
+    load,
+    read_part,
+    read_tensors,
+)
+from gvtools.completers.geoverse.weights.published import CONFIG_FILE, PARTS, WHOLE_FILE
 from gvtools.errors import CheckpointError
 
 # Released models by the width of their tokens.

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.vit import Block, RotaryTable
+from gvtools.completers.geoverse.depth_anything.vit import Block, RotaryTable
 from gvtools.errors import ShapeError
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)

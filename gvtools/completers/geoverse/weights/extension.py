@@ -11,11 +11,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse.checkpoints import is_extension, load
 from gvtools.completers.geoverse.control import ControlBranch
 from gvtools.completers.geoverse.denoiser import Denoiser
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.shared_attention import SharedAttention
+from gvtools.completers.geoverse.weights.checkpoints import is_extension, load
 
 _DEPTH, _LEVEL1 = "level1.depth_embedder.", "level1."
 # Of what starts at random; nothing of it reaches the output before training.

@@ -15,7 +15,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse.losses import (
+from gvtools.completers.geoverse.objective.losses import (
     Reduction,
     WithoutScale,
     depth_loss,
@@ -25,7 +25,7 @@ from gvtools.completers.geoverse.losses import (
     rgb_loss,
     rgb_mask,
 )
-from gvtools.completers.geoverse.similarity_scale import center_similarity
+from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.errors import OptionError
 from gvtools.options import check_range
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gvtools.completers.geoverse.video_layouts import LAYOUTS
+from gvtools.completers.geoverse.video_prior.layouts import LAYOUTS
 from gvtools.errors import OptionError
 from gvtools.options import check_range
 

@@ -1,0 +1,1 @@
+"""The training objective: its five terms, and the camera-centre scale."""

@@ -1,0 +1,1 @@
+"""Weights on disk: published files, strict loading, saving, and what does not fit."""
