@@ -126,12 +126,12 @@ def test_each_alignment_uses_its_own_evidence():
     truth[1] *= 2
     hint = np.where(valid, truth, 0)
     found = {
-        name: scaled_depth(made, hint, valid, centres=5.0, alignment=name) for name in ALIGNMENTS
+        name: scaled_depth(made, hint, valid, centres=4.3, alignment=name) for name in ALIGNMENTS
     }
-    np.testing.assert_allclose(found["centres"].scale, [5, 5])
+    np.testing.assert_allclose(found["centres"].scale, [4.3, 4.3])
     np.testing.assert_allclose(found["hint"].scale, [3, 6], rtol=1e-4)
     np.testing.assert_allclose(found["field"].scale, [3, 6], rtol=1e-4)
-    np.testing.assert_allclose(found["centres"].depth, 5 * made.numpy(), rtol=1e-6)
+    np.testing.assert_allclose(found["centres"].depth, 4.3 * made.numpy(), rtol=1e-6)
 
 
 def test_a_field_follows_the_memory_and_stays_within_its_limit():
@@ -181,6 +181,24 @@ def test_depth_that_does_not_follow_the_memory_is_no_support():
     truth = np.random.default_rng(3).uniform(0.1, 10, truth.shape).astype(np.float32)
     found = scaled_depth(made, truth, valid, centres=math.nan, alignment="hint")
     assert found.method == ("none",) and not found.depth.any()
+
+
+def test_a_scale_that_contradicts_the_memory_is_not_taken():
+    made, truth, valid = scene(views=2, scale=3.0)
+    hint = np.where(valid, truth, 0)
+    # The centres are off by thirty: the memory is asked instead.
+    found = scaled_depth(made, hint, valid, centres=90.0, alignment="centres")
+    assert found.method == ("hint", "hint")
+    np.testing.assert_allclose(found.scale, [3, 3], rtol=1e-4)
+    # Depth without any relation to the memory is left out, whatever the centres say.
+    noise = np.random.default_rng(3).uniform(0.01, 10, truth.shape).astype(np.float32)
+    for centres in (3.0, 90.0):
+        found = scaled_depth(made, noise, valid, centres=centres, alignment="field")
+        assert found.method == ("none", "none") and not found.depth.any()
+    # Where the memory knows too little to tell, the centres stand.
+    valid[:] = False
+    found = scaled_depth(made, hint, valid, centres=90.0, alignment="centres")
+    assert found.method == ("centres", "centres")
 
 
 @pytest.mark.parametrize("alignment", ALIGNMENTS)

@@ -24,6 +24,9 @@ from gvtools.similarity import align_depth_scale
 ALIGNMENTS = ("centres", "hint", "field")
 # Centres that fit the cameras worse than this say nothing of the scale.
 MIN_CORRELATION = 0.9
+# Depth that is off the memory's by more than this factor, in the median, is refused where at least
+# so many pixels know both.
+MAX_FACTOR, MIN_SUPPORT = 1.5, 200
 # A log-ratio field that asks for more than this factor about its median is no scale error.
 MAX_FIELD = 1.5
 
@@ -99,7 +102,15 @@ def scaled_depth(
             "field": ("field", "hint", "centres"),
         }[alignment]
         known = {"centres": centres, "hint": fitted.scale, "field": fitted.scale}
-        method = next((name for name in order if np.isfinite(known[name])), "none")
+        method = next(
+            (
+                name
+                for name in order
+                if np.isfinite(known[name])
+                and not _contradicts(view * known[name], hint[index], valid[index])
+            ),
+            "none",
+        )
         methods.append(method)
         if method == "none":
             continue
@@ -109,6 +120,17 @@ def scaled_depth(
             result[index] *= _field(result[index], hint[index], valid[index])
     result[~np.isfinite(result)] = 0
     return ScaledDepth(result, scale, tuple(methods))
+
+
+def _contradicts(
+    depth: NDArray[np.float64], hint: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> bool:
+    """Whether scaled depth is far from the memory's where both are known: no scale then helps."""
+    with np.errstate(invalid="ignore"):
+        both = valid & (hint > 0) & (depth > 0) & np.isfinite(hint) & np.isfinite(depth)
+    if both.sum() < MIN_SUPPORT:
+        return False
+    return float(np.median(np.abs(np.log(hint[both] / depth[both])))) > np.log(MAX_FACTOR)
 
 
 def _field(
