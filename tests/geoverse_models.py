@@ -120,7 +120,7 @@ def model(configuration: GeoVerseConfig = CONFIG, *, seed: int = 0) -> Any:
     if built.control is not None:
         built.control.copy_from(built.level1)
     generator = torch.Generator().manual_seed(seed + 1)
-    for statistics in built._levels:
+    for statistics in built.level_statistics:
         statistics.mean.normal_(generator=generator)
         statistics.var.uniform_(0.2, 1.2, generator=generator)
     return built.eval()

@@ -23,6 +23,7 @@ from gvtools.completers.geoverse.conditioning import (
     ViewBatch,
     depth_condition,
     encode_hints,
+    encode_latents,
     filled,
 )
 from gvtools.completers.geoverse.config import GeoVerseConfig
@@ -30,16 +31,16 @@ from gvtools.completers.geoverse.control import ControlBranch
 from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
 from gvtools.completers.geoverse.depth_anything.network import DepthAnything3
 from gvtools.completers.geoverse.flow import check_bounds, sample, velocity_from_clean
+from gvtools.completers.geoverse.injection import check_features, video_keys
 from gvtools.completers.geoverse.noise import seeded_noise, view_seed
 from gvtools.completers.geoverse.passes import Decoded, Generated, Prepared
-from gvtools.completers.geoverse.plucker import CameraCondition, camera_condition
-from gvtools.completers.geoverse.projective import Projective
+from gvtools.completers.geoverse.plucker import camera_condition
 from gvtools.completers.geoverse.rgb_head import RGBHead
-from gvtools.completers.geoverse.shared_attention import SharedAttention, VideoKeys
+from gvtools.completers.geoverse.shared_attention import SharedAttention
 from gvtools.completers.geoverse.stages import Clock, no_clock
 from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.completers.geoverse.video_prior.prior import VideoFeatures, VideoPrior
-from gvtools.errors import CheckpointError, OptionError, ShapeError
+from gvtools.errors import CheckpointError
 
 __all__ = ["Decoded", "Generated", "GeoVerse", "Prepared"]
 
@@ -96,7 +97,7 @@ class GeoVerse(nn.Module):
         self.rgb_head.requires_grad_(False)
 
     @property
-    def _levels(self) -> Sequence[LatentStatistics]:
+    def level_statistics(self) -> Sequence[LatentStatistics]:
         """Statistics of level 0 and of level 1."""
         return cast("Sequence[LatentStatistics]", self.statistics)
 
@@ -141,7 +142,7 @@ class GeoVerse(nn.Module):
                 reference=config.camera.reference,
                 pixel_offset=config.camera.pixel_offset,
             )
-            level0, level1 = self._levels
+            level0, level1 = self.level_statistics
             hints = encode_hints(self.geometry, level0, level1, batch, config.hints)
             depth = None
             if config.level1.depth_condition:
@@ -158,6 +159,14 @@ class GeoVerse(nn.Module):
             features = self._video_features(source, seed) if video is None else video
             return self.with_video(prepared, features)
 
+    @torch.no_grad()
+    def clean_latents(self, batch: ViewBatch) -> tuple[Tensor, Tensor]:
+        """Level-0 and level-1 latents, (B, V, C, h, w) each, of true pictures of all views."""
+        level0, level1 = self.level_statistics
+        return encode_latents(
+            self.geometry, level0, level1, batch, cameras=self.config.hints.cameras
+        )
+
     def with_video(self, prepared: Prepared, features: VideoFeatures) -> Prepared:
         """``prepared`` with video features; gradients reach the adapters.
 
@@ -166,46 +175,11 @@ class GeoVerse(nn.Module):
         """
         latents = prepared.hints.level1
         grid = (latents.shape[-2], latents.shape[-1])
-        self._check_video(features, tuple(latents.shape[:2]))
+        check_features(features, self.config.video, tuple(latents.shape[:2]))
         if self.control is not None:
             return replace(prepared, adapted=self.control.adapted(features.tensors, grid))
-        keys = self._video_keys(prepared.level1.camera, features, grid)
+        keys = video_keys(self.shared, self.config.level1, prepared.level1.camera, features, grid)
         return replace(prepared, video=features, keys=keys)
-
-    def _check_video(self, features: VideoFeatures, views: tuple[int, ...]) -> None:
-        config = self.config.video
-        if config is None:
-            raise OptionError(
-                "video features for a GeoVerse without a video prior; expected none, or a "
-                "configuration with injection = 'control' or 'shared'"
-            )
-        shapes = [tuple(level.shape) for level in features.tensors]
-        wanted = (*views, config.channels)
-        if len(shapes) != len(config.taps) or any(shape[:3] != wanted for shape in shapes):
-            raise ShapeError(
-                f"video features {shapes}; expected {len(config.taps)} of {wanted} and a grid"
-            )
-
-    def _video_keys(
-        self, camera: CameraCondition, features: VideoFeatures, grid: tuple[int, int]
-    ) -> dict[int, VideoKeys] | None:
-        """Keys and values of the coupled blocks, positioned by the given cameras."""
-        if self.shared is None:
-            return None
-        heads = self.config.level1.width // self.config.level1.heads
-        positions = [
-            Projective(
-                camera.cam_from_world,
-                camera.K,
-                camera.size,
-                (level.shape[-2], level.shape[-1]),
-                heads,
-                position_scale=(grid[0] / level.shape[-2], grid[1] / level.shape[-1]),
-                invert_K=self.config.level1.invert_K,
-            )
-            for level in features.tensors
-        ]
-        return self.shared(features.tensors, positions)
 
     def _video_features(
         self, batch: ViewBatch, seeds: int | Sequence[Sequence[int]]
@@ -269,7 +243,7 @@ class GeoVerse(nn.Module):
         """Level-1 latents from (B, V, C, h, w) noise, one Euler step an interval."""
         flow = self.config.flow
         scale = flow.guidance if guidance is None else guidance
-        without = self._unconditional(prepared) if scale != 1 else prepared
+        without = self.without_cameras(prepared) if scale != 1 else prepared
         tau = check_bounds(bounds or flow.level1)
         # The floor is for training. A step from t goes (t - next) / t of the way to the clean
         # latents, however small t is; with the floor, short last steps would leave noise behind.
@@ -330,7 +304,7 @@ class GeoVerse(nn.Module):
         """Four raw (B, V, 1 + N, C) levels of two (B, V, C, h, w) latents and token 0 (B, V, C)."""
         grid = (level1.shape[-2], level1.shape[-1])
         raw = []
-        for statistics, latent in zip(self._levels, (level0, level1), strict=True):
+        for statistics, latent in zip(self.level_statistics, (level0, level1), strict=True):
             tokens = statistics.denormalise(latent).flatten(3).transpose(2, 3)
             raw.append(torch.cat((token[:, :, None].to(tokens.dtype), tokens), dim=2))
         return [*raw, *self.geometry.encoder.propagate(raw[1], grid)]
@@ -380,14 +354,30 @@ class GeoVerse(nn.Module):
             decoded = self.decode(prepared, level0, level1, clock=clock)
         return Generated(level1, level0, decoded)
 
-    def _unconditional(self, prepared: Prepared) -> Prepared:
-        """Without cameras, as GLD's guidance has it: latents, hints and video are kept."""
-        camera = prepared.level1.camera.unconditional()
+    def without_cameras(self, prepared: Prepared, drop: Tensor | None = None) -> Prepared:
+        """Without cameras, as GLD's guidance has it: latents, hints and video are kept.
+
+        Args:
+            prepared: from ``prepare``.
+            drop: (B,) bool, samples that lose their cameras; None for all.
+        """
+        known = prepared.level1.camera
+        camera = known.unconditional()
+        if drop is not None:
+            at = drop[:, None, None, None]
+            camera = replace(
+                camera,
+                map=torch.where(at[..., None], camera.map, known.map),
+                cam_from_world=torch.where(at, camera.cam_from_world, known.cam_from_world),
+                K=torch.where(at, camera.K, known.K),
+            )
         grid = (prepared.hints.level1.shape[-2], prepared.hints.level1.shape[-1])
         video = prepared.video
         return replace(
             prepared,
             level1=replace(prepared.level1, camera=camera),
             positions=Positions(self.config.level1, camera, grid),
-            keys=None if video is None else self._video_keys(camera, video, grid),
+            keys=None
+            if video is None
+            else video_keys(self.shared, self.config.level1, camera, video, grid),
         )
