@@ -32,6 +32,7 @@ class Plan:
         source_reason: why from there, in words.
         ignored: settings of stereo that this source does not look at.
         weights: files of networks that decide the result.
+        notes: what the completer has the user told.
     """
 
     scene: Scene
@@ -43,6 +44,7 @@ class Plan:
     source_reason: str
     ignored: tuple[str, ...] = ()
     weights: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | None = None) -> Plan:
@@ -102,6 +104,7 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
         chosen.reason,
         chosen.ignored,
         tuple(weights),
+        tuple(getattr(completer, "notes", ())),
     )
 
 
@@ -169,6 +172,8 @@ def describe(plan: Plan, console: Console) -> None:
             f"{len(targets.cameras) - scheduled} of {len(targets.cameras)} targets are in no "
             "round; raise --rounds or --views-per-round"
         )
+    for note in plan.notes:
+        console.warn(note)
     if plan.ignored:
         console.warn(
             f"{', '.join(plan.ignored)} changes nothing: no plane sweep computes depth here, but "

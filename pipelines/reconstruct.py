@@ -265,6 +265,12 @@ def _round(
                     "coverage_after": end_of_round.coverage,
                 }
             )
+        refused = [view for view in views if view["scale"]["status"] != "aligned"]
+        if refused:
+            console.warn(
+                f"round {number}: {len(refused)} of {len(views)} completions give no points, first "
+                f"{refused[0]['name']}: {refused[0]['scale']['status']}"
+            )
     generated = int(memory.generated.sum())
     return {
         "round": number,

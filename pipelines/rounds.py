@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from gvtools.guidance import Guidance
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.scenes.scene import Scene
-from gvtools.similarity import align_depth_scale
+from gvtools.similarity import ScaleFit, align_depth_scale
 from pipelines.config import RunConfig
 from pipelines.context_depth import KeptDepth, depth_report
 
@@ -188,6 +188,7 @@ def _row(completion: Completion, index: int) -> Completion:
         completion.confidence[rows],
         rays,
         completion.spent,
+        None if completion.support is None else completion.support[rows],
     )
 
 
@@ -209,6 +210,9 @@ def _align_and_fuse(
             confidence=guidance.confidence[0],
             max_residual=config.fusion.max_scale_residual,
         )
+    said = None if completion.support is None else completion.support[0]
+    if said is not None:
+        fit = _vouched(fit, said)
     made = ~valid & (depth > 0)
     fused = made & (confidence >= config.fusion.min_confidence) & (confidence > 0)
     report = FuseReport()
@@ -238,7 +242,19 @@ def _align_and_fuse(
             "inlier_share": fit.inlier_share,
             "residual": fit.residual,
             "support": fit.support,
+            "by": said,
         },
         "fuse": asdict(report),
     }
     return TargetResult(guidance, completion, fused, figures), report
+
+
+def _vouched(fit: ScaleFit, said: str) -> ScaleFit:
+    """The fit of a completion whose scale the completer found itself.
+
+    Its known pixels are the memory's own, so the comparison with them tells nothing: a refusal
+    stands, and a view that the memory does not know is accepted.
+    """
+    if said.startswith("refused"):
+        return replace(fit, status=said, scale=float("nan"))
+    return replace(fit, status="aligned", scale=1.0)

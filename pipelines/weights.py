@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -182,7 +183,7 @@ def _create(args: argparse.Namespace, console: Console) -> None:
     empty_model(config, where=args.config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(args.seed)
-        model = GeoVerse(config)
+        model = GeoVerse(replace(config, trained=False))
     path = save_pretrained(model, folder, about=f"untrained, seed {args.seed}")
     numbers = sum(tensor.numel() for tensor in model.state_dict().values())
     console.line(f"{path}: {numbers:,} numbers, {size_text(path.stat().st_size)}")

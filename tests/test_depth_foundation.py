@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
-from tiny_scan import render, write_colmap_scan, write_scan
+from tiny_scan import SQUARE, WALL, render, write_colmap_scan, write_scan
 
 from gvtools.completers.geoverse.depth_anything.encoder import EncoderConfig
 from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry, GeometryHeadConfig
@@ -165,6 +165,75 @@ def test_a_scale_without_support_is_refused(tmp_path, monkeypatch, weights, wron
         source.depth(scene, view, view.load())
 
 
+class Recorder:
+    """A network that keeps what it is given and answers with what the cameras alone decide."""
+
+    def __init__(self) -> None:
+        self.config = DepthAnythingConfig(EncoderConfig(patch=14), GeometryHeadConfig())
+        self.given: list[dict[str, torch.Tensor]] = []
+
+    def __call__(self, images, cam_from_world, K):
+        self.given.append({"images": images, "cam_from_world": cam_from_world, "K": K})
+        centres = torch.linalg.inv(cam_from_world)[..., :3, 3]
+        ray = torch.ones(*images.shape[:2], 4, 4, 6)
+        ray[..., 3:] = centres[:, :, None, None]
+        depth = 1 + images.mean(2) + centres.norm(dim=-1)[..., None, None]
+        return Geometry(depth, torch.full_like(depth, 5.0), ray, torch.ones(ray.shape[:-1]))
+
+
+def in_another_unit(scene: Scene, factor: float) -> Scene:
+    """The scene with all lengths of its cameras times ``factor``."""
+
+    def changed(view):
+        pose = view.camera.cam_from_world.copy()
+        pose[:, :3, 3] *= factor
+        return replace(view, camera=replace(view.camera, cam_from_world=pose))
+
+    return replace(scene, views=tuple(changed(view) for view in scene.views))
+
+
+@pytest.mark.parametrize("factor", [0.01, 100.0])
+def test_the_scenes_unit_changes_the_depths_unit_alone(tmp_path, monkeypatch, weights, factor):
+    network = Recorder()
+    monkeypatch.setattr(module, "load_depth_anything", lambda path, device: network)
+    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    options = FoundationOptions(weights=weights, longest=56)
+    depths = []
+    for other in (scene, in_another_unit(scene, factor)):
+        source = FoundationDepth(other, views=other.names, options=options)
+        view = other.views[-1]
+        depths.append(source.depth(other, view, replace(view.load(), depth=None)).depth)
+    before, after = network.given
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value, rtol=1e-5, atol=1e-6)
+    assert (depths[0] > 0).all()
+    np.testing.assert_allclose(depths[1], factor * depths[0], rtol=1e-5)
+
+
+def test_no_depth_lies_between_two_surfaces(tmp_path, monkeypatch, weights):
+    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    oracle = stand_in(monkeypatch, scene)
+    original = Oracle.__call__
+
+    def sharp(self, *args, **known):
+        """Every pixel of the network on one of the two surfaces."""
+        made = original(self, *args, **known)
+        unit = made.depth.amax() / WALL
+        nearer = made.depth < unit * (SQUARE + WALL) / 2
+        return replace(made, depth=torch.where(nearer, unit * SQUARE, unit * WALL))
+
+    monkeypatch.setattr(Oracle, "__call__", sharp)
+    options = FoundationOptions(weights=weights, longest=56)
+    source = FoundationDepth(scene, views=scene.names, options=options)
+    view = scene.views[0]
+    made = source.depth(scene, view, view.load()).depth
+    assert oracle.calls and made.shape == view.load().rgb.shape[:2]
+    found = made[made > 0]
+    gaps = np.minimum(np.abs(found / SQUARE - 1), np.abs(found / WALL - 1))
+    assert gaps.max() < 0.02
+    assert 100 < (np.abs(found / SQUARE - 1) < 0.02).sum() < found.size / 2
+
+
 def test_unsure_pixels_and_masked_ones_stay_empty(tmp_path, monkeypatch, weights):
     scene = read_sevenscenes(write_scan(tmp_path / "scan"))
     stand_in(monkeypatch, scene)
@@ -231,3 +300,21 @@ def test_the_released_small_model_is_known_by_its_width(tmp_path):
     assert network.config == RELEASED[384]
     assert not any(parameter.requires_grad for parameter in network.parameters())
     assert next(network.parameters()).dtype == torch.float32
+
+
+def test_points_that_fit_no_scale_refuse_whatever_the_centres_say(tmp_path, monkeypatch, weights):
+    scene = read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
+    stand_in(monkeypatch, scene, wrong="depth")
+    options = FoundationOptions(weights=weights, longest=56)
+    source = FoundationDepth(scene, views=scene.names, options=options)
+    fitted = source.scale(scene.names[0])
+    assert not fitted.ok and fitted.support == "points"
+
+
+def test_two_centres_alone_are_no_support(tmp_path, monkeypatch, weights):
+    scene = read_sevenscenes(write_scan(tmp_path / "scan", views=2))
+    stand_in(monkeypatch, scene)
+    options = FoundationOptions(weights=weights, longest=56)
+    source = FoundationDepth(scene, views=scene.names, options=options)
+    with pytest.raises(DegenerateError, match="at least 4"):
+        source.depth(scene, scene.views[0], scene.views[0].load())

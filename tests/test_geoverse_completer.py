@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ from gvtools.cameras import Cameras
 from gvtools.completers import Completion, ContextView, create
 from gvtools.completers.geoverse.completer import GENERATED, nearest_views
 from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.depth_scale import PassScale
 from gvtools.completers.geoverse.model import Generated, GeoVerse
 from gvtools.completers.geoverse.model_views import view_batch
 from gvtools.completers.geoverse.resampling import model_size
@@ -107,10 +110,10 @@ def test_more_targets_than_a_pass_takes_go_through_several(weights, monkeypatch)
     for index in range(5):
         hole = ~known.valid[index]
         assert (result.depth[index][hole] > 0).all()
-    # Context takes all the room there is: one target a pass.
+    # The context leaves room for one target at least.
     seen.clear()
     complete(weights, context, known, context_views=3, views=2)
-    assert [batch.images.shape[1] for batch, _, _ in seen] == [4] * 5
+    assert [(batch.images.shape[1], batch.context) for batch, _, _ in seen] == [(2, 1)] * 5
 
 
 def test_views_without_holes_come_back_and_are_not_computed(weights, monkeypatch):
@@ -324,12 +327,15 @@ def test_a_pass_that_went_wrong_leaves_holes_and_says_so(weights, monkeypatch):
 def test_without_any_support_for_a_scale_there_is_no_depth(weights, monkeypatch):
     """The requested cameras' rays stand where the predicted ones have no unit."""
     monkeypatch.setattr(
-        "gvtools.completers.geoverse.completer.centre_scale", lambda *a: (float("nan"), "refused")
+        "gvtools.completers.geoverse.completer.pass_scale",
+        lambda *a: PassScale(float("nan"), "refused: nothing to go by"),
     )
     known = micro.guidance(2, share=-1.0)
     result = complete(weights, micro.context_views(2), known)
     assert not result.depth.any() and not result.confidence.any() and result.rgb.any()
     assert result.spent["views_without_scale"] == 2
+    assert result.support is not None
+    assert all(said.startswith("refused: nothing to go by") for said in result.support)
     assert result.spent["unfilled"] == result.spent["holes"] == known.valid.size
     assert result.rays is not None
     np.testing.assert_array_equal(result.rays[1], np.float32(known.cameras.plucker(1)))
@@ -349,7 +355,9 @@ def true_rays(cameras: Cameras, unit: float, grid: tuple[int, int]) -> torch.Ten
 @pytest.mark.parametrize("world", [{}, {"turn": TURN, "shift": (4.0, -2.0, 9.0), "scale": 20.0}])
 def test_predicted_rays_come_back_to_the_world(weights, monkeypatch, world):
     generate = GeoVerse.generate
-    context, known = micro.moved(micro.context_views(2), micro.guidance(2), **world)
+    context, known = micro.moved(micro.context_views(2), micro.guidance(2, share=-1.0), **world)
+    # Without any known depth, the centres alone give the scale.
+    context = [replace(view, depth=None) for view in context]
     order = nearest_views(context, known.cameras, 2)
 
     def perfect(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
@@ -360,7 +368,7 @@ def test_predicted_rays_come_back_to_the_world(weights, monkeypatch, world):
 
     monkeypatch.setattr(GeoVerse, "generate", perfect)
     result = complete(weights, context, known, alignment="centres")
-    assert result.spent["centre_scale"] == pytest.approx(2.5, rel=1e-4)
+    assert result.support == ("centres", "centres")
     assert result.rays is not None
     for view in range(2):
         expected = known.cameras.plucker(view)[4:-4, 4:-4]
@@ -381,9 +389,9 @@ def test_generated_depth_is_never_averaged_between_two_surfaces(weights, monkeyp
 
     monkeypatch.setattr(GeoVerse, "generate", stepped)
     monkeypatch.setattr(
-        "gvtools.completers.geoverse.completer.centre_scale", lambda *a: (2.0, "aligned")
+        "gvtools.completers.geoverse.completer.pass_scale", lambda *a: PassScale(2.0, "centres")
     )
-    known = micro.guidance(1, size=size)
+    known = micro.guidance(1, size=size, share=-1.0)
     result = complete(weights, micro.context_views(1), known, alignment="centres")
     np.testing.assert_allclose(np.unique(result.depth[~known.valid].round(4)), [2, 3])
 
@@ -519,3 +527,32 @@ def test_a_folder_that_is_no_model_is_refused_in_one_line_at_creation(what, tmp_
 def test_options_out_of_range_are_refused(weights, options, said):
     with pytest.raises(OptionError, match=said):
         create("geoverse", weights=str(weights), **options)
+
+
+def test_weights_that_cannot_be_loaded_are_refused_before_anything_is_computed(weights, tmp_path):
+    torn = tmp_path / "torn"
+    shutil.copytree(weights, torn)
+    file = torn / "geoverse.safetensors"
+    file.write_bytes(file.read_bytes()[:-10])
+    with pytest.raises(CheckpointError, match=r"geoverse\.safetensors"):
+        create("geoverse", weights=str(torn))
+    file.unlink()
+    with pytest.raises(CheckpointError, match="absent"):
+        create("geoverse", weights=str(torn))
+    other = tmp_path / "other"
+    shutil.copytree(weights, other)
+    config = json.loads((other / "config.json").read_text())
+    config["level1"]["depth"] += 1
+    (other / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match="absent"):
+        create("geoverse", weights=str(other))
+
+
+def test_untrained_weights_are_said(tmp_path, weights):
+    assert not create("geoverse", weights=str(weights)).notes
+    plain = tmp_path / "plain"
+    shutil.copytree(weights, plain)
+    config = json.loads((plain / "config.json").read_text())
+    (plain / "config.json").write_text(json.dumps({**config, "trained": False}))
+    (note,) = create("geoverse", weights=str(plain)).notes
+    assert "untrained" in note

@@ -11,7 +11,9 @@ from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
 from gvtools.completers.geoverse.depth_scale import (
     ALIGNMENTS,
     MAX_FIELD,
+    PassScale,
     centre_scale,
+    pass_scale,
     scaled_depth,
 )
 from gvtools.completers.geoverse.resampling import EDGE, resampled, resampled_depth
@@ -44,7 +46,7 @@ def model_centres(world_from_cam: np.ndarray, scale: float) -> np.ndarray:
     return relative[:, :3, 3] / scale
 
 
-@pytest.mark.parametrize("views", [2, 3, 6])
+@pytest.mark.parametrize("views", [4, 6])
 @pytest.mark.parametrize("scale", [1e-3, 0.4, 2500.0])
 def test_the_scale_between_centres_is_found(views, scale):
     known = poses(views)
@@ -90,6 +92,7 @@ def refused() -> dict[str, tuple[Geometry, np.ndarray]]:
         "rounding": (geometry(rounding), known),
         "same requested": (geometry(centres), one_place),
         "one view": (geometry(centres[:1]), known[:1]),
+        "three views": (geometry(centres[:3]), known[:3]),
     }
 
 
@@ -123,15 +126,15 @@ def test_all_alignments_agree_where_everything_fits(alignment, scale):
 
 def test_each_alignment_uses_its_own_evidence():
     made, truth, valid = scene(scale=3.0)
-    truth[1] *= 2
+    truth[1] *= 1.2
     hint = np.where(valid, truth, 0)
     found = {
-        name: scaled_depth(made, hint, valid, centres=4.3, alignment=name) for name in ALIGNMENTS
+        name: scaled_depth(made, hint, valid, centres=3.3, alignment=name) for name in ALIGNMENTS
     }
-    np.testing.assert_allclose(found["centres"].scale, [4.3, 4.3])
-    np.testing.assert_allclose(found["hint"].scale, [3, 6], rtol=1e-4)
-    np.testing.assert_allclose(found["field"].scale, [3, 6], rtol=1e-4)
-    np.testing.assert_allclose(found["centres"].depth, 4.3 * made.numpy(), rtol=1e-6)
+    np.testing.assert_allclose(found["centres"].scale, [3.3, 3.3])
+    np.testing.assert_allclose(found["hint"].scale, [3, 3.6], rtol=1e-4)
+    np.testing.assert_allclose(found["field"].scale, [3, 3.6], rtol=1e-4)
+    np.testing.assert_allclose(found["centres"].depth, 3.3 * made.numpy(), rtol=1e-6)
 
 
 def test_a_field_follows_the_memory_and_stays_within_its_limit():
@@ -162,8 +165,8 @@ def test_without_support_the_next_one_is_asked_and_at_last_none():
     hint = np.where(valid, truth, 0)
     nan = math.nan
     for alignment, centres, methods in (
-        ("hint", 5.0, ("hint", "centres", "centres")),
-        ("field", 5.0, ("field", "centres", "centres")),
+        ("hint", 3.6, ("hint", "centres", "centres")),
+        ("field", 3.6, ("field", "centres", "centres")),
         ("centres", nan, ("hint", "none", "none")),
         ("hint", nan, ("hint", "none", "none")),
         ("field", nan, ("field", "none", "none")),
@@ -186,7 +189,12 @@ def test_depth_that_does_not_follow_the_memory_is_no_support():
 def test_a_scale_that_contradicts_the_memory_is_not_taken():
     made, truth, valid = scene(views=2, scale=3.0)
     hint = np.where(valid, truth, 0)
-    # The centres are off by thirty: the memory is asked instead.
+    # The centres are off by thirty: the memory is asked instead, and a view that knows nothing is
+    # not given a scale that its sibling refutes.
+    blind = valid.copy()
+    blind[1] = False
+    found = scaled_depth(made, hint, blind, centres=90.0, alignment="centres")
+    assert found.method == ("hint", "none")
     found = scaled_depth(made, hint, valid, centres=90.0, alignment="centres")
     assert found.method == ("hint", "hint")
     np.testing.assert_allclose(found.scale, [3, 3], rtol=1e-4)
@@ -257,3 +265,29 @@ def test_depth_at_a_smaller_size_is_that_of_a_pixel():
     for size in ((7, 9), (30, 39), (60, 20)):
         found = resampled_depth(depth, size)
         assert torch.isin(found, depth).all()
+
+
+def test_one_scale_a_pass_stands_on_centres_and_on_the_context():
+    known = poses(6)
+    made = geometry(model_centres(known, 2.0))
+    truth = np.random.default_rng(1).uniform(1, 3, (2, 40, 50)).astype(np.float32)
+    fitting = torch.from_numpy(np.concatenate((truth, np.ones((4, 40, 50), np.float32))))[None]
+
+    def of(depth: torch.Tensor, context: np.ndarray, cameras: np.ndarray = known) -> PassScale:
+        ray, sure = made.ray[:, : len(cameras)], made.ray_confidence[:, : len(cameras)]
+        return pass_scale(Geometry(depth, depth + 1, ray, sure), cameras, context)
+
+    agreed = of(fitting / 2.0, truth)
+    assert agreed.by == "centres" and agreed.scale == pytest.approx(2.0, rel=1e-4)
+    # The context's own depth is better evidence than the centres, and stands in for them.
+    for cameras in (known, known[:2]):
+        other = of(fitting / 50.0, truth, cameras)
+        assert other.by == "context" and other.scale == pytest.approx(50.0, rel=1e-4)
+    # A model that misses the depth of its own context is not believed.
+    noise = torch.from_numpy(np.random.default_rng(2).uniform(0.01, 9, fitting.shape)).float()
+    missed = of(noise, truth)
+    assert missed.by.startswith("refused: the context") and math.isnan(missed.scale)
+    # Without known depth the centres decide, if there are enough of them.
+    nothing = np.zeros_like(truth)
+    assert of(fitting, nothing).by == "centres"
+    assert "at least 4" in of(fitting, nothing, known[:3]).by

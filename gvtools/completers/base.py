@@ -65,6 +65,9 @@ class Completion:
         confidence: (V, H, W) float32 in [0, 1]; below 1 where generated, 0 where nothing is known.
         rays: (V, H, W, 6) float32 Plücker rays, world frame, from completers that predict them.
         spent: what the completion cost and met, such as ``seconds``, ``steps``, ``unfilled``.
+        support: for each view, what the scale of its generated depth stands on, by the completer's
+            own account: "..." of its evidence, or "refused: ..." with the reason, and then its
+            depth is 0 where it was generated. None where depth has no scale to find.
     """
 
     rgb: Float32
@@ -72,6 +75,7 @@ class Completion:
     confidence: Float32
     rays: Float32 | None = None
     spent: Mapping[str, float] = field(default_factory=dict)
+    support: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         shape = self.depth.shape
@@ -79,6 +83,10 @@ class Completion:
             raise ShapeError(
                 f"completion: rgb {self.rgb.shape}, depth {shape}, confidence "
                 f"{self.confidence.shape}; expected (V, H, W, 3), (V, H, W) and (V, H, W)"
+            )
+        if self.support is not None and len(self.support) != shape[0]:
+            raise ShapeError(
+                f"completion: support of {len(self.support)} views; expected {shape[0]}"
             )
         if self.rays is not None and self.rays.shape != (*shape, 6):
             raise ShapeError(f"completion: rays {self.rays.shape}; expected {(*shape, 6)}")
@@ -89,7 +97,8 @@ class Completer(Protocol):
     """Fills what memory does not know of the target views.
 
     One with ``joint`` = True gets all targets of a round at once. One that reads weights names them
-    in an attribute ``files``: they decide the result.
+    in an attribute ``files``: they decide the result. What a user should be told before a run may
+    stand in ``notes``.
     """
 
     name: str

@@ -17,13 +17,14 @@ from torch import Tensor
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completion, ContextView
-from gvtools.completers.geoverse.depth_scale import ALIGNMENTS, centre_scale, scaled_depth
+from gvtools.completers.geoverse.depth_scale import ALIGNMENTS, pass_scale, scaled_depth
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import Generated, GeoVerse
-from gvtools.completers.geoverse.model_views import view_batch
+from gvtools.completers.geoverse.model_views import context_depth, view_batch
 from gvtools.completers.geoverse.resampling import model_size, resampled, resampled_depth
-from gvtools.completers.geoverse.weights.folder import config_of, from_pretrained
-from gvtools.completers.geoverse.weights.published import CONFIG_FILE, WHOLE_FILE
+from gvtools.completers.geoverse.weights.folder import from_pretrained
+from gvtools.completers.geoverse.weights.folder_check import check_headers
+from gvtools.completers.geoverse.weights.folder_parts import config_of
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 from gvtools.options import check_range
@@ -40,8 +41,8 @@ class GeoVerseCompleter:
 
     Attributes:
         weights: folder of a GeoVerse model; see ``gvtools weights list``.
-        steps: level-1 steps; None for the model's own interval bounds.
-        cascade_steps: level-0 steps; None for the model's own.
+        steps: level-1 steps, equally spaced in time; None for the model's own interval bounds.
+        cascade_steps: level-0 steps, likewise.
         guidance: classifier-free guidance scale; None for the model's own.
         context_views: most photographs in a pass; None for the model's own.
         views: most views in a pass, photographs and targets; None for the model's own.
@@ -86,7 +87,14 @@ class GeoVerseCompleter:
                 "'gvtools weights list' describes it"
             )
         # A folder that cannot be a model is refused before anything is computed.
-        config_of(Path(self.weights))
+        check_headers(Path(self.weights))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should be told before a run."""
+        if self.weights is None or config_of(Path(self.weights)).trained:
+            return ()
+        return (f"the weights in {self.weights} are untrained: what they complete is noise",)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -102,11 +110,12 @@ class GeoVerseCompleter:
         if not context:
             raise OptionError("completer geoverse needs at least one context view, and got none")
         device = self._device()
-        model = _loaded(*_identity(self.weights or "", device))
+        model = _loaded(str(Path(self.weights or "").resolve()), str(device), self._times())
         canvas = _Canvas(guidance)
         holes = [index for index in range(len(guidance)) if not guidance.valid[index].all()]
-        most = self.context_views or model.config.context
-        room = max(1, (self.views or model.config.views) - min(most, len(context)))
+        views = self.views or model.config.views
+        most = min(self.context_views or model.config.context, views - 1)
+        room = views - min(most, len(context))
         passes = 0
         for first in range(0, len(holes), room):
             rows = holes[first : first + room]
@@ -147,20 +156,28 @@ class GeoVerseCompleter:
                 guidance=self.guidance,
             )
         return _brought_back(
-            made, part, cameras, full, len(context), self.alignment or model.config.alignment
+            made,
+            part,
+            cameras,
+            context_depth(context, part, size),
+            self.alignment or model.config.alignment,
         )
 
     def _bounds(self, model: GeoVerse) -> tuple[float, ...]:
         flow = model.config.flow
         if self.steps is None or self.steps == len(flow.level1) - 1:
             return flow.level1
-        return interval_bounds(self.steps, shift=flow.shift)
+        return interval_bounds(self.steps)
 
     def _cascade_bounds(self, model: GeoVerse) -> tuple[float, ...]:
         flow = model.config.flow
         if self.cascade_steps is None:
             return flow.cascade
-        return interval_bounds(self.cascade_steps, shift=flow.shift)
+        return interval_bounds(self.cascade_steps)
+
+    def _times(self) -> tuple[float, ...]:
+        """When the weights' files were written: a changed file is read again."""
+        return tuple(path.stat().st_mtime for path in self.files)
 
     def _device(self) -> torch.device:
         if self.device == "auto":
@@ -180,8 +197,8 @@ class _Made:
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
     rays: NDArray[np.float32] | None
-    centre_scale: float
     scales: NDArray[np.float64]
+    support: tuple[str, ...]
 
 
 class _Canvas:
@@ -198,6 +215,7 @@ class _Canvas:
         for index in range(len(guidance)):
             self.rays[index] = guidance.cameras.plucker(index)
         self.spent = {"holes": float((~valid).sum()), "unfilled": 0.0, "views_without_scale": 0.0}
+        self.support = ["nothing to complete"] * len(guidance)
 
     def put(self, rows: Sequence[int], made: _Made, part: Guidance) -> None:
         """Fill the holes of some views."""
@@ -206,16 +224,21 @@ class _Canvas:
             self.rgb[row][hole] = made.rgb[position][hole]
             self.depth[row][hole] = made.depth[position][hole]
             self.confidence[row][hole] = made.confidence[position][hole]
-            if made.rays is not None:
-                self.rays[row] = made.rays[position]
+            if made.rays is not None and np.isfinite(made.scales[position]):
+                self.rays[row][hole] = made.rays[position][hole]
+            self.support[row] = made.support[position]
             self.spent["unfilled"] += float((made.depth[position][hole] <= 0).sum())
             self.spent["views_without_scale"] += float(not np.isfinite(made.scales[position]))
-        self.spent["centre_scale"] = made.centre_scale
 
     def completion(self, spent: dict[str, float]) -> Completion:
         """The result."""
         return Completion(
-            self.rgb, self.depth, self.confidence, self.rays, spent={**self.spent, **spent}
+            self.rgb,
+            self.depth,
+            self.confidence,
+            self.rays,
+            spent={**self.spent, **spent},
+            support=tuple(self.support),
         )
 
 
@@ -257,29 +280,43 @@ def _brought_back(
     made: Generated,
     part: Guidance,
     cameras: Cameras,
-    full: tuple[int, int],
-    context: int,
+    known: NDArray[np.float32],
     alignment: str,
 ) -> _Made:
-    """Pictures, depth, confidence and rays of the targets at their own size, in scene units."""
-    geometry = made.decoded.geometry
+    """Pictures, depth, confidence and rays of the targets at their own size, in scene units.
+
+    Args:
+        made: of the pass.
+        part: its targets' projections.
+        cameras: of all views, at the model's size.
+        known: (C, h, w) depth of the context at the model's size.
+        alignment: see ``depth_scale``.
+    """
+    geometry, context = made.decoded.geometry, len(known)
+    full = (part.depth.shape[1], part.depth.shape[2])
     rgb = resampled(made.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
     depth = resampled_depth(geometry.depth[0, context:].float().cpu(), full)
     certain = resampled(geometry.depth_confidence[0, context:, None].float().cpu(), full)[:, 0]
     world_from_cam = cameras.world_from_cam
-    scale, _ = centre_scale(geometry, world_from_cam)
+    whole = pass_scale(geometry, world_from_cam, known)
     # A pixel without a colour has no depth either: nothing of it enters the memory.
     depth = torch.where(rgb.isfinite().all(1), depth, torch.nan)
-    scaled = scaled_depth(depth, part.depth, part.valid, centres=scale, alignment=alignment)
+    scaled = scaled_depth(depth, part.depth, part.valid, centres=whole.scale, alignment=alignment)
     confidence = (GENERATED * (1 - 1 / certain.clamp_min(1))).numpy().astype(np.float32)
     confidence[~((scaled.depth > 0) & np.isfinite(confidence))] = 0
-    found = [value for value in (scale, *scaled.scale) if np.isfinite(value)]
+    support = []
+    for method in scaled.method:
+        if method == "none":
+            reason = whole.by if whole.by.startswith("refused") else "refused: it contradicts"
+            support.append(f"{reason}; the memory gives no scale either")
+        else:
+            support.append(whole.by if method == "centres" else method)
+    found = scaled.scale[np.isfinite(scaled.scale)]
     rays = None
-    if found:
-        unit = scale if np.isfinite(scale) else float(np.median(found))
-        rays = _plucker(geometry.ray[0, context:], world_from_cam[0], unit, full)
+    if len(found):
+        rays = _plucker(geometry.ray[0, context:], world_from_cam[0], float(np.median(found)), full)
     picture = rgb.nan_to_num().permute(0, 2, 3, 1).numpy()
-    return _Made(picture, scaled.depth, confidence, rays, scale, scaled.scale)
+    return _Made(picture, scaled.depth, confidence, rays, scaled.scale, tuple(support))
 
 
 def _plucker(
@@ -306,13 +343,6 @@ def _rows(guidance: Guidance, rows: Sequence[int]) -> Guidance:
         guidance.confidence[index],
         guidance.generated[index],
     )
-
-
-def _identity(weights: str, device: torch.device) -> tuple[str, str, tuple[float, ...]]:
-    """What a loaded model is kept by: its folder, device, and its files' times."""
-    folder = Path(weights).resolve()
-    files = [folder / name for name in (CONFIG_FILE, WHOLE_FILE)]
-    return str(folder), str(device), tuple(f.stat().st_mtime for f in files if f.exists())
 
 
 @lru_cache(maxsize=1)

@@ -52,6 +52,9 @@ class FlowConfig:
             )
         if self.skip and self.prediction != "clean":
             raise OptionError("flow.skip needs flow.prediction = 'clean'")
+        check_range("flow.least_time", self.least_time, above=0, most=1)
+        check_range("flow.shift", self.shift, above=0)
+        check_range("flow.guidance", self.guidance, least=0)
         check_bounds(self.level1)
         check_bounds(self.cascade)
 
@@ -63,7 +66,8 @@ class CameraConfig:
     Attributes:
         pixel_offset: what is added to a pixel's column and row before it becomes a ray. GLD's
             checkpoints were trained with (-0.5, 0.5); (0.5, 0.5) is the centre of the pixel.
-        reference: the view whose frame the Plücker rays are given in; GLD's is the last.
+        reference: index, of the views of a pass, of the one whose frame the Plücker rays are
+            given in; GLD's is the last, -1.
     """
 
     pixel_offset: tuple[float, float] = (-0.5, 0.5)
@@ -79,6 +83,8 @@ class GeoVerseConfig:
         image_size: longest side of the model's pictures, px, a multiple of the patch.
         views: views of a pass, context and targets.
         context: most context views of a pass.
+        decode_views: views that the geometry head and the RGB head decode together; bounds the
+            memory, not the result.
         geometry: the frozen encoder and geometry head.
         rgb: the RGB head.
         level1: the level-1 denoiser.
@@ -92,12 +98,14 @@ class GeoVerseConfig:
         injection: how video features enter: "control", "shared" (MoT) or "none".
         control: of the control branch.
         shared: of the MoT variant.
+        trained: False beside weights that no training has made useful yet.
     """
 
     name: str = "base"
     image_size: int = 504
     views: int = 8
     context: int = 4
+    decode_views: int = 8
     geometry: DepthAnythingConfig = field(default_factory=DepthAnythingConfig)
     rgb: RGBHeadConfig = field(default_factory=RGBHeadConfig)
     level1: DenoiserConfig = field(default_factory=lambda: DenoiserConfig(depth_condition=True))
@@ -114,6 +122,7 @@ class GeoVerseConfig:
     injection: str = "control"
     control: ControlConfig = field(default_factory=ControlConfig)
     shared: SharedAttentionConfig = field(default_factory=SharedAttentionConfig)
+    trained: bool = True
 
     def __post_init__(self) -> None:
         encoder = self.geometry.encoder
@@ -137,6 +146,10 @@ class GeoVerseConfig:
         check_range("image_size", self.image_size, least=encoder.patch)
         check_range("views", self.views, least=2)
         check_range("context", self.context, least=1)
+        check_range("decode_views", self.decode_views, least=1)
+        check_range(
+            "camera.reference", self.camera.reference, least=-self.views, most=self.views - 1
+        )
         if self.image_size % encoder.patch:
             raise OptionError(
                 f"image_size = {self.image_size}; expected a multiple of the patch {encoder.patch}"

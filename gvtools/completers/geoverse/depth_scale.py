@@ -8,6 +8,7 @@ refused where nothing supports it, and then the next one is asked.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,16 +20,21 @@ from gvtools.completers.geoverse.depth_anything.rays import camera_centres
 from gvtools.completers.geoverse.fill import push_pull
 from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.errors import DegenerateError, OptionError
-from gvtools.similarity import align_depth_scale
+from gvtools.similarity import ScaleFit, align_depth_scale
 
 ALIGNMENTS = ("centres", "hint", "field")
-# Centres that fit the cameras worse than this say nothing of the scale.
-MIN_CORRELATION = 0.9
-# Depth that is off the memory's by more than this factor, in the median, is refused where at least
+# Fewer centres fit each other by chance: of four at random, one set in a hundred correlates by more
+# than 0.956, of three by 0.998, of two by 1.
+MIN_CENTRES, MIN_CORRELATION = 4, 0.97
+# Depth that is off what is known by more than this factor, in the median, is refused where at least
 # so many pixels know both.
-MAX_FACTOR, MIN_SUPPORT = 1.5, 200
+MAX_FACTOR, MIN_SUPPORT = 1.35, 200
+# Generated depth is smooth at a token's size: this far from the scale a pixel still follows it.
+MAX_RESIDUAL, INLIER_BAND = 0.3, 0.15
 # A log-ratio field that asks for more than this factor about its median is no scale error.
 MAX_FIELD = 1.5
+# A scale is fitted to about so many pixels.
+FITTED = 100_000
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,45 @@ class ScaledDepth:
     method: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class PassScale:
+    """One scale for all views of a pass.
+
+    Attributes:
+        scale: scene units per unit of the model; NaN where refused.
+        by: "centres", "context" (the known depth of the context views), or "refused: ...".
+    """
+
+    scale: float
+    by: str
+
+
+def pass_scale(
+    geometry: Geometry,
+    world_from_cam: NDArray[np.float64],
+    known: NDArray[np.float32],
+) -> PassScale:
+    """s* from the camera centres, unless the context's own depth says otherwise.
+
+    Args:
+        geometry: (1, V, ...) of a pass.
+        world_from_cam: (V, 4, 4), scene units.
+        known: (C, H, W) depth of the context views at the model's size, scene units; 0 = none.
+    """
+    centres, said = centre_scale(geometry, world_from_cam)
+    made = geometry.depth[0, : len(known)].float().cpu().numpy().astype(np.float64)
+    fitted = _fitted(made, known, known > 0)
+    if fitted.support >= 20 and int((known > 0).sum()) >= MIN_SUPPORT:
+        if not fitted.ok:
+            return PassScale(np.nan, f"refused: the context's own depth is missed, {fitted.status}")
+        if np.isfinite(centres) and abs(np.log(centres / fitted.scale)) <= np.log(MAX_FACTOR):
+            return PassScale(centres, "centres")
+        return PassScale(fitted.scale, "context")
+    if np.isfinite(centres):
+        return PassScale(centres, "centres")
+    return PassScale(np.nan, f"refused: {said}")
+
+
 def centre_scale(geometry: Geometry, world_from_cam: NDArray[np.float64]) -> tuple[float, str]:
     """s* between the predicted centres of all views and the requested ones, or NaN with a reason.
 
@@ -62,6 +107,9 @@ def centre_scale(geometry: Geometry, world_from_cam: NDArray[np.float64]) -> tup
     fitted = center_similarity(predicted, reference)
     if not bool(fitted.ok[0]):
         return float("nan"), fitted.status[0]
+    used = int(fitted.used[0])
+    if used < MIN_CENTRES:
+        return float("nan"), f"{used} camera centres, at least {MIN_CENTRES} are needed"
     correlation = float(fitted.correlation[0])
     if correlation < MIN_CORRELATION:
         return float("nan"), f"centres correlate by {correlation:.2f}, below {MIN_CORRELATION}"
@@ -94,8 +142,11 @@ def scaled_depth(
     result = np.zeros_like(made)
     scale = np.full(len(made), np.nan)
     methods = []
+    # One scale a pass: a view that contradicts it refutes it for the others too.
+    if any(_contradicts(v * centres, h, k) for v, h, k in zip(made, hint, valid, strict=True)):
+        centres = float("nan")
     for index, view in enumerate(made):
-        fitted = align_depth_scale(view, hint[index], valid=valid[index], max_residual=0.5)
+        fitted = _fitted(view, hint[index], valid[index])
         order = {
             "centres": ("centres", "hint"),
             "hint": ("hint", "centres"),
@@ -120,6 +171,22 @@ def scaled_depth(
             result[index] *= _field(result[index], hint[index], valid[index])
     result[~np.isfinite(result)] = 0
     return ScaledDepth(result, scale, tuple(methods))
+
+
+def _fitted(
+    depth: NDArray[np.floating[Any]], known: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> ScaleFit:
+    """The robust scale to what is known, on about ``FITTED`` pixels."""
+    step = max(1, int((depth.size / FITTED) ** 0.5))
+    at = (..., slice(None, None, step), slice(None, None, step))
+    return align_depth_scale(
+        depth[at],
+        known[at],
+        valid=valid[at],
+        min_support=max(20, MIN_SUPPORT // step**2),
+        max_residual=MAX_RESIDUAL,
+        inlier_band=INLIER_BAND,
+    )
 
 
 def _contradicts(

@@ -1,6 +1,6 @@
 """GeoVerse: the whole model, from views and projections to target pictures, depth and rays.
 
-Data flow of one pass (tensor shapes in ``docs``; equations are the paper's)::
+Data flow of one pass (tensor shapes in the README.md beside this file; equations are the paper's)::
 
     pictures, projections --filled--> encode_hints (Eq. 1) --> hints
     hints, cameras, depth --> Conditions;  video prior --> control residuals | shared keys (once)
@@ -80,13 +80,13 @@ class GeoVerse(nn.Module):
 
     @classmethod
     def from_pretrained(cls, folder: Path | str, **options: Any) -> GeoVerse:
-        """The model of a weights folder; see ``weights_folder.from_pretrained``."""
+        """The model of a weights folder; see ``weights.folder.from_pretrained``."""
         from gvtools.completers.geoverse.weights.folder import from_pretrained
 
         return from_pretrained(folder, **options)
 
     def save_pretrained(self, folder: Path | str, **options: Any) -> Path:
-        """Write a weights folder; see ``weights_folder.save_pretrained``."""
+        """Write a weights folder; see ``weights.folder.save_pretrained``."""
         from gvtools.completers.geoverse.weights.folder import save_pretrained
 
         return save_pretrained(self, folder, **options)
@@ -292,12 +292,13 @@ class GeoVerse(nn.Module):
             pyramid = self.pyramid(level0, level1, prepared.hints.token)
             normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
         with clock(stages.GEOMETRY):
-            geometry = self.geometry.head(normed, grid)
+            geometry = self.geometry.head(normed, grid, views_at_once=self.config.decode_views)
         with clock(stages.RGB):
             context = prepared.batch.context
             features = torch.cat([level[:, context:] for level in normed], dim=-1)
             shape = features.shape[:2]
-            rgb = self.rgb_head(features.flatten(0, 1), grid).unflatten(0, shape)
+            rgb = self.rgb_head(features.flatten(0, 1), grid, chunk=self.config.decode_views)
+            rgb = rgb.unflatten(0, shape)
         return Decoded(rgb, geometry)
 
     def pyramid(self, level0: Tensor, level1: Tensor, token: Tensor) -> list[Tensor]:

@@ -82,6 +82,15 @@ def _relative(cameras: Cameras, depth: Tensor) -> tuple[NDArray[np.float64], flo
     return relative, unit
 
 
+def context_depth(
+    context: Sequence[ContextView], targets: Guidance, size: tuple[int, int]
+) -> NDArray[np.float32]:
+    """(C, H, W) known depth of the context as ``view_batch`` crops it, scene units; 0 = none."""
+    aspect = int(targets.cameras.height[0]) / int(targets.cameras.width[0])
+    depths = [_nearest(_cropped(view, aspect)[1], size)[0].numpy() for view in context]
+    return np.stack(depths).astype(np.float32)
+
+
 def _cropped(
     view: ContextView, aspect: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], Cameras]:

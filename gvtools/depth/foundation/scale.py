@@ -15,8 +15,11 @@ from gvtools.similarity import align_depth_scale
 
 # Fewer sparse points on known depth, in all views together, say nothing of the scale.
 MIN_POINTS = 50
-# Predicted centres that correlate less with the known ones do not fix it either.
-MIN_CORRELATION = 0.9
+# Fewer centres fit each other by chance: of four at random, one set in a hundred correlates by more
+# than 0.956, of three by 0.998, of two by 1.
+MIN_CENTRES, MIN_CORRELATION = 4, 0.97
+# So many passes of fewer views count together where their scales agree within this factor.
+MIN_PASSES, PASSES_AGREE = 3, 1.35
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ class Pass:
 def fit_scale(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
     """One scale for some passes: by their sparse points, or by their cameras' centres."""
     by_points = _fit_points(scene, passes)
-    if by_points.ok:
+    # Points that fit no scale refuse the depth itself; what the centres say does not mend it.
+    if by_points.ok or by_points.count >= MIN_POINTS:
         return by_points
     by_cameras = _fit_cameras(scene, passes)
     if by_cameras.ok or scene.points is None:
@@ -108,7 +112,7 @@ def _fit_points(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
 
 
 def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
-    """The median of the passes' own fits, weighted by their views."""
+    """The median of the passes' own fits, weighted by their views; see ``MIN_CENTRES``."""
     scales, weights, correlations, reason = [], [], [], "no pass"
     for part in passes:
         known = np.concatenate([scene[name].camera.centers for name in part.names])
@@ -123,6 +127,12 @@ def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
             scales.append(float(fitted.scale[0]))
             weights.append(len(part.names))
             correlations.append(float(fitted.correlation[0]))
+    if scales and max(weights) < MIN_CENTRES:
+        # Each of them would fit by chance; several that agree do not.
+        agree = len(scales) >= MIN_PASSES and max(scales) <= PASSES_AGREE * min(scales)
+        if not agree:
+            reason = f"{max(weights)} views a pass, at least {MIN_CENTRES} are needed"
+            scales = []
     if not scales:
         return FoundationScale(f"unsupported: {reason}", "cameras", np.nan, np.nan, np.nan, 0)
     scale = float(np.median(np.repeat(scales, weights)))

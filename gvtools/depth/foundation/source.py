@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gvtools.cameras import concatenate
 from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
 from gvtools.completers.geoverse.depth_anything.network import DepthAnything3, relative_cameras
 from gvtools.completers.geoverse.depth_anything.rays import camera_centres
 from gvtools.completers.geoverse.depth_anything.weights import find_weights, load_depth_anything
-from gvtools.completers.geoverse.resampling import model_size, resampled
+from gvtools.completers.geoverse.plucker import normalised_poses
+from gvtools.completers.geoverse.resampling import model_size, resampled, resampled_depth
 from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.foundation.scale import FoundationScale, Pass, fit_scale
 from gvtools.depth.source import DepthMap
@@ -96,8 +96,10 @@ class FoundationDepth:
         made = self._passes[view.name]
         size = frame.rgb.shape[:2]
         factor = made.unit * fitted.scale
-        depth = _enlarged(made.depth[view.name], size) * np.float32(factor)
-        confidence = _enlarged(made.confidence[view.name], size)
+        small = torch.from_numpy(made.depth[view.name])[None]
+        certain = torch.from_numpy(made.confidence[view.name])[None, None]
+        depth = resampled_depth(small, size)[0].numpy() * np.float32(factor)
+        confidence = resampled(certain, size)[0, 0].numpy()
         known = np.isfinite(depth) & (depth > 0) & (confidence >= self.options.min_confidence)
         if frame.mask is not None:
             known &= frame.mask
@@ -163,8 +165,12 @@ class FoundationDepth:
             rgb = torch.from_numpy(view.load().rgb).permute(2, 0, 1)[None].float() / 255
             pictures.append(resampled(rgb, size)[0].clamp(0, 1))
         images = torch.stack(pictures)[None].to(device)
-        relative = cameras.cam_from_world @ cameras.world_from_cam[:1]
-        pose, unit = relative_cameras(torch.from_numpy(relative)[None])
+        # The camera encoder's unit has a floor, a tenth of a scene unit: in shares of the views'
+        # extent it means the same in every scene.
+        extent, scale = normalised_poses(
+            torch.from_numpy(cameras.world_from_cam)[None], reference=0
+        )
+        pose, unit = relative_cameras(torch.linalg.inv(extent))
         known = {}
         if self.options.cameras:
             known = {
@@ -180,10 +186,5 @@ class FoundationDepth:
             dict(zip(names, confidence, strict=True)),
             centres,
             names,
-            float(unit[0]) if self.options.cameras else 1.0,
+            float(unit[0] / scale[0]) if self.options.cameras else 1.0,
         )
-
-
-def _enlarged(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """(h, w) to (H, W)."""
-    return resampled(torch.from_numpy(values)[None, None], size)[0, 0].numpy()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior, VideoPriorConfig
+from gvtools.completers.geoverse.video_prior.wan_files import TensorFiles, check_tensors
 from gvtools.completers.geoverse.weights.folder_parts import (
     PartReport,
     check_is_folder,
@@ -39,6 +40,34 @@ def check_folder(folder: Path | str, config: GeoVerseConfig | None = None) -> li
     if config.video is not None:
         reports.append(_video_report(folder / VIDEO_FOLDER, config.video))
     return reports
+
+
+def check_headers(folder: Path | str) -> GeoVerseConfig:
+    """Refuse a folder that cannot be loaded, by what can be seen without reading weights.
+
+    Args:
+        folder: of weights.
+
+    Returns:
+        Its configuration.
+
+    Raises:
+        CheckpointError: a file is absent or damaged, or names and shapes in a .safetensors file do
+            not fit.
+    """
+    folder = Path(folder)
+    check_is_folder(folder)
+    config = config_of(folder)
+    for piece in pieces_of(folder, empty_model(config, where=folder)):
+        if piece.path is None:
+            if piece.needed:
+                raise CheckpointError(f"{folder}: {piece.name} is {piece.absent}")
+            continue
+        if piece.path.suffix == ".safetensors" and piece.part is None:
+            check_tensors(TensorFiles.find(piece.path), piece.expected, where=piece.path)
+    if config.video is not None:
+        check_video_folder(folder / VIDEO_FOLDER)
+    return config
 
 
 def check_video_folder(folder: Path) -> None:
