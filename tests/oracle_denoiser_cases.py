@@ -77,7 +77,7 @@ def check_case(fixture: Fixture, case: int) -> None:
     module = network(fixture, what["model"])
     inputs = fixture.inputs(case)
     batch, views = what["B"], what["V"]
-    context, size = int(inputs["cond_num"]), tuple(int(v) for v in inputs["image_hw"])
+    context, size = int(inputs["cond_num"]), _size(inputs)
     rays = formula_input(what["camera_input"], (batch * views, 6, *size))
     mask = (torch.arange(views) >= context).float().repeat(batch)[:, None, None, None]
     rays = torch.cat((mask.expand(-1, 1, *size), rays), dim=1).unflatten(0, (batch, views))
@@ -96,6 +96,7 @@ def check_case(fixture: Fixture, case: int) -> None:
     without = replace(conditions, camera=camera.unconditional(guidance_mode(entry)))
     base = module(noisy, t, without)
     fixture.check(case, "velocity_cfg1p5", (base + 1.5 * (velocity - base)).flatten(0, 1))
+    fixture.check_complete(case)
 
 
 @torch.no_grad()
@@ -123,6 +124,11 @@ def check_sampler(fixture: Fixture, case: int) -> None:
     fixture.check(case, "latent_after_step1", trajectory[1][0], LATENTS)
     fixture.check(case, "latent_mid", trajectory[len(trajectory) // 2][0], LATENTS)
     fixture.check(case, "latent_final", final[0], LATENTS)
+    if "cond_half_final_absdiff" in fixture.outputs(case):
+        # The context half of upstream's state: ours is no part of the state and may not change.
+        drift = (conditions.latents[0] - inputs["ref_cond"]).abs().max()
+        fixture.check(case, "cond_half_final_absdiff", drift.double().reshape(1), 1e-6)
+    fixture.check_complete(case)
     again = integrate(lambda x, t: torch.zeros_like(x), final, times)
     assert torch.equal(again, final)
 
@@ -142,11 +148,12 @@ def check_loss(fixture: Fixture, name: str) -> None:
     fixture.check(name, "loss", loss)
     fixture.check(name, "ref_loss", loss[:context])
     fixture.check(name, "tgt_loss", loss[context:])
+    fixture.check_complete(name)
 
 
 def _real_conditions(fixture: Fixture, case: int | str, inputs: dict[str, Tensor]) -> Conditions:
     """Conditions of (V, 4, 4) cameras, their built parts checked."""
-    size = tuple(int(value) for value in inputs["image_hw"])
+    size = _size(inputs)
     context = int(inputs["cond_num"])
     camera = camera_condition(
         inputs["c2w"].float()[None], inputs["K"].float(), size, context=context
@@ -161,6 +168,12 @@ def _real_conditions(fixture: Fixture, case: int | str, inputs: dict[str, Tensor
     return Conditions(
         inputs["ref_cond"][None], camera, source=None if source is None else source[None]
     )
+
+
+def _size(inputs: dict[str, Tensor]) -> tuple[int, int]:
+    """(H, W) of the pictures."""
+    height, width = inputs["image_hw"]
+    return int(height), int(width)
 
 
 def _views(x: Tensor, batch: int) -> Tensor:

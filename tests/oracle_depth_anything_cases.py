@@ -77,6 +77,7 @@ def check_case(fixture: Fixture, module: DepthAnything3, case: int) -> None:
         fixture.check(case, "posed_cam_token", token)
         posed = module.encode(images, cam_from_world=cam_from_world, K=K)
         _check_pass(fixture, module, case, posed, grid, prefix="posed_")
+    fixture.check_complete(case)
 
 
 def _check_pass(
@@ -135,6 +136,7 @@ def check_propagation(fixture: Fixture, module: DepthAnything3, case: int) -> No
     for index, found in enumerate(levels, start=1):
         fixture.check(case, f"patches_level{index}", module.encoder.normed(found[:, :, 1:]))
         fixture.check(case, f"token0_level{index}", found[:, :, 0])
+    fixture.check_complete(case)
 
 
 def _named(text: str) -> str:

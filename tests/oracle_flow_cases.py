@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -25,6 +26,25 @@ from gvtools.completers.geoverse.flow import (
 from gvtools.completers.geoverse.objective.losses import flow_matching_loss, view_errors
 
 TIME = 1e-6
+
+
+# Every array of ``gld_time``.
+TIME_ARRAYS = (
+    r"grid\.s\d+\.N\d+",
+    r"train_shift\.s\d+\.t_(uniform|shifted)",
+    r"path\.(t|noise_x0|clean_x1|x_t|target_velocity)",
+)
+
+
+def check_known(names: Iterable[str]) -> None:
+    """Whether the checks below read every array of ``gld_time``.
+
+    Raises:
+        AssertionError: an array of another name.
+    """
+    known = re.compile("|".join(TIME_ARRAYS))
+    if unknown := sorted(name for name in names if not known.fullmatch(name)):
+        raise AssertionError(f"time grids: nothing to compare {unknown} with")
 
 
 def check_shifts(fixture: Fixture) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +165,34 @@ class Fixture:
                 f"{self.name}: {key} deviates by {deviation:.3g}, more than {tolerance:g}"
             )
         return deviation
+
+    def check_complete(self, case: int | str, *, beside: tuple[str, ...] = ()) -> None:
+        """Whether every stored output of a case has been compared.
+
+        Args:
+            case: its number, or its prefix.
+            beside: names of outputs that another check reads, or that have no counterpart here.
+
+        Raises:
+            AssertionError: the case has no output, or one that nothing was compared with.
+        """
+        stored = self.outputs(case)
+        start = f"{_prefix(case)}.out."
+        left = [name for name in stored if start + name not in self.deviations]
+        unknown = sorted(set(left) - set(beside))
+        if not stored or unknown:
+            what = f"nothing was compared with {unknown}" if stored else "no output is stored"
+            raise AssertionError(f"{self.name}: {_prefix(case)}: {what}")
+
+    def check_prefixes(self, known: Iterable[str]) -> None:
+        """Whether every stored output belongs to one of the ``known`` cases.
+
+        Raises:
+            AssertionError: outputs of another case.
+        """
+        prefixes = {key.split(".out.")[0] for key in self.arrays.files if ".out." in key}
+        if stray := sorted(prefixes - set(known)):
+            raise AssertionError(f"{self.name}: outputs of cases that nothing runs: {stray}")
 
     def check_weights(self, module: nn.Module, *, prefix: str = "", part: str = "") -> None:
         """Compare the weights of a filled module with the samples that the JSON holds.

@@ -13,7 +13,7 @@ import torch
 
 from gvtools.cameras import Cameras
 from gvtools.completers import Completion, ContextView, create
-from gvtools.completers.geoverse.completer import GENERATED, nearest_views
+from gvtools.completers.geoverse.completer import GENERATED, GeoVerseCompleter, nearest_views
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.depth_scale import PassScale
 from gvtools.completers.geoverse.model import Generated, GeoVerse
@@ -549,10 +549,10 @@ def test_weights_that_cannot_be_loaded_are_refused_before_anything_is_computed(w
 
 
 def test_untrained_weights_are_said(tmp_path, weights):
-    assert not create("geoverse", weights=str(weights)).notes
+    assert not GeoVerseCompleter(weights=str(weights)).notes
     plain = tmp_path / "plain"
     shutil.copytree(weights, plain)
     config = json.loads((plain / "config.json").read_text())
     (plain / "config.json").write_text(json.dumps({**config, "trained": False}))
-    (note,) = create("geoverse", weights=str(plain)).notes
+    (note,) = GeoVerseCompleter(weights=str(plain)).notes
     assert "untrained" in note

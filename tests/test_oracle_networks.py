@@ -7,7 +7,6 @@ by GVTOOLS_ORACLE, is tried as well. Which check a fixture gets follows from its
 from __future__ import annotations
 
 import functools
-import json
 from pathlib import Path
 
 import oracle_denoiser_cases
@@ -16,7 +15,7 @@ import oracle_flow_cases
 import oracle_geometry_cases
 import pytest
 import torch
-from oracle import ABSENT, ORACLE
+from oracle import ABSENT, ORACLE, network_fixtures, unclaimed, without_cases
 from oracle_networks import Fixture
 
 from gvtools.completers.geoverse.config import named
@@ -25,18 +24,28 @@ from gvtools.completers.geoverse.depth_anything.network import DepthAnything3, D
 from gvtools.completers.geoverse.rgb_head import RGBHead
 from gvtools.completers.geoverse.weights.checkpoints import shapes
 
-NAMES = sorted(path.stem for path in ORACLE.glob("*.json")) if ORACLE.is_dir() else []
-pytestmark = pytest.mark.skipif(not NAMES, reason=ABSENT)
+FIXTURES = network_fixtures(ORACLE)
+pytestmark = pytest.mark.skipif(not FIXTURES, reason=ABSENT)
+# Beginnings of the names that a test below takes, and of those that it takes case by case.
+CLAIMED: set[str] = set()
+BY_CASE: set[str] = set()
 
 
-def cases(*starts: str, key: str = "cases") -> list[tuple[str, int]]:
+def names(start: str) -> list[str]:
+    """The fixtures with such names."""
+    CLAIMED.add(start)
+    return [name for name in FIXTURES if name.startswith(start)]
+
+
+def cases(*starts: str) -> list[tuple[str, int]]:
     """Fixture and case number of every case of the fixtures with such names."""
-    found = []
-    for name in NAMES:
-        if name.startswith(starts):
-            data = json.loads((ORACLE / f"{name}.json").read_text(encoding="utf-8"))
-            found += [(name, index) for index in range(len(data.get(key, [])))]
-    return found
+    BY_CASE.update(starts)
+    return [
+        (name, index)
+        for start in starts
+        for name in names(start)
+        for index in range(len(FIXTURES[name].get("cases", [])))
+    ]
 
 
 @functools.lru_cache(maxsize=1)
@@ -79,25 +88,31 @@ def test_whole_sampling_run(name: str, case: int) -> None:
     oracle_denoiser_cases.check_sampler(fixture_of(name), case)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("gld_sampler")])
+def loss_names(fixture: Fixture) -> list[str]:
+    """Prefixes of the training losses that a sampler's fixture stores."""
+    return sorted({key.split(".")[0] for key in fixture.arrays.files if key.startswith("loss")})
+
+
+@pytest.mark.parametrize("name", names("gld_sampler"))
 def test_training_loss_at_a_fixed_time(name: str) -> None:
     fixture = fixture_of(name)
-    losses = sorted({key.split(".")[0] for key in fixture.arrays.files if key.startswith("loss")})
+    losses = loss_names(fixture)
     assert losses
     for loss in losses:
         oracle_denoiser_cases.check_loss(fixture, loss)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("gld_time")])
+@pytest.mark.parametrize("name", names("gld_time"))
 def test_time_grids_and_path(name: str) -> None:
     fixture = fixture_of(name)
+    oracle_flow_cases.check_known(fixture.arrays.files)
     oracle_flow_cases.check_shifts(fixture)
     oracle_flow_cases.check_grids(fixture)
     oracle_flow_cases.check_training_shift(fixture)
     oracle_flow_cases.check_path(fixture)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("gld_sampler")])
+@pytest.mark.parametrize("name", names("gld_sampler"))
 def test_time_grids_and_losses_of_the_sampler(name: str) -> None:
     oracle_flow_cases.check_sampler_grids(fixture_of(name))
     oracle_flow_cases.check_losses(fixture_of(name))
@@ -116,6 +131,23 @@ def test_rgb_head(name: str, case: int) -> None:
 @pytest.mark.parametrize(("name", "case"), cases("ray_pose"))
 def test_poses_from_rays(name: str, case: int) -> None:
     oracle_geometry_cases.check_ray_pose(fixture_of(name), case)
+
+
+def test_every_fixture_is_claimed_and_has_cases() -> None:
+    assert unclaimed(ORACLE, CLAIMED) == []
+    assert without_cases(ORACLE, BY_CASE) == []
+
+
+@pytest.mark.parametrize("name", list(FIXTURES))
+def test_every_stored_output_belongs_to_a_case_that_is_run(name: str) -> None:
+    fixture = fixture_of(name)
+    known = [f"case{index}" for index in range(len(fixture.cases))]
+    if name.startswith("ray_pose"):
+        numbers = range(len(fixture.cases))
+        known = [oracle_geometry_cases.ray_pose_name(fixture, case)[1] for case in numbers]
+    if name.startswith("gld_sampler"):
+        known += loss_names(fixture)
+    fixture.check_prefixes(known)
 
 
 def key_list(path: Path) -> dict[str, tuple[int, ...]]:

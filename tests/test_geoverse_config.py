@@ -1,0 +1,88 @@
+"""Values that a configuration refuses, and the one that changes nothing but the memory."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+
+import geoverse_models as micro
+import pytest
+import torch
+
+from gvtools.completers.geoverse.config import CameraConfig, FlowConfig, GeoVerseConfig, named
+from gvtools.completers.geoverse.config_json import from_json, to_json
+from gvtools.errors import OptionError
+
+
+@pytest.mark.parametrize("value", [0.0, -3.0, float("nan")])
+def test_a_shift_that_is_none_is_refused(value):
+    with pytest.raises(OptionError, match=r"flow\.shift .*more than 0"):
+        FlowConfig(shift=value)
+
+
+@pytest.mark.parametrize("value", [0.0, -0.1, 1.5, float("nan")])
+def test_a_least_time_outside_the_path_is_refused(value):
+    with pytest.raises(OptionError, match=r"flow\.least_time .*more than 0 and at most 1"):
+        FlowConfig(least_time=value)
+    assert FlowConfig(least_time=1.0).least_time == 1
+
+
+def test_negative_guidance_is_refused():
+    with pytest.raises(OptionError, match=r"flow\.guidance .*at least 0"):
+        FlowConfig(guidance=-1.0)
+    assert FlowConfig(guidance=0.0).guidance == 0
+
+
+@pytest.mark.parametrize("index", [-6, 5])
+def test_a_reference_that_is_no_view_is_refused(index):
+    with pytest.raises(OptionError, match=r"camera\.reference .*at least -5 and at most 4"):
+        micro.config(views=5, camera=CameraConfig(reference=index))
+    for known in (-5, 0, 4):
+        micro.config(views=5, camera=CameraConfig(reference=known))
+
+
+def test_wrong_ranges_in_a_file_are_refused():
+    data = to_json(named("tiny"))
+    for part, key, value in (("flow", "shift", 0.0), ("camera", "reference", 8)):
+        changed = {**data, part: {**data[part], key: value}}
+        with pytest.raises(OptionError, match=rf"{part}\.{key}"):
+            from_json(GeoVerseConfig, changed)
+
+
+@pytest.mark.parametrize("name", ["base", "tiny"])
+def test_the_files_say_how_many_views_are_decoded_at_once(name):
+    folder = resources.files("gvtools.completers.geoverse") / "configs"
+    stored = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    assert stored["decode_views"] == named(name).decode_views == 8
+
+
+@pytest.mark.parametrize("value", [0, -1])
+def test_no_views_at_once_are_refused(value):
+    with pytest.raises(OptionError, match=r"decode_views .*at least 1"):
+        micro.config(decode_views=value)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_views_decoded_at_once_change_the_memory_alone(monkeypatch):
+    batch = micro.batch(2, context=2, targets=3)
+    whole = micro.model(micro.config(decode_views=100)).generate(batch).decoded
+    model = micro.model(micro.config(decode_views=2))
+    sizes: dict[str, list[int]] = {"geometry": [], "rgb": []}
+    decode, views = model.geometry.head._decode, model.rgb_head._views
+
+    def geometry_chunk(levels, grid):
+        sizes["geometry"].append(len(levels[0]))
+        return decode(levels, grid)
+
+    def rgb_chunk(features, position):
+        sizes["rgb"].append(len(features))
+        return views(features, position)
+
+    monkeypatch.setattr(model.geometry.head, "_decode", geometry_chunk)
+    monkeypatch.setattr(model.rgb_head, "_views", rgb_chunk)
+    parts = model.generate(batch).decoded
+    assert sizes == {"geometry": [2] * 5, "rgb": [2] * 3}
+    torch.testing.assert_close(parts.rgb, whole.rgb, rtol=1e-4, atol=1e-5)
+    for name in ("depth", "depth_confidence", "ray", "ray_confidence"):
+        found, expected = getattr(parts.geometry, name), getattr(whole.geometry, name)
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
