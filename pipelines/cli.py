@@ -22,6 +22,7 @@ COMMANDS = {
     "evaluate": "pipelines.evaluate",
     "trajectory": "pipelines.trajectory",
     "weights": "pipelines.weights",
+    "train": "pipelines.train",
     "export": "pipelines.export",
     "bench": "pipelines.bench",
 }

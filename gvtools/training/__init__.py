@@ -1,0 +1,1 @@
+"""What the generative core is trained on: procedural scenes, recorded scenes, hints, batches."""

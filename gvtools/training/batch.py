@@ -1,0 +1,54 @@
+"""What a training step is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gvtools.completers.geoverse.conditioning import ViewBatch
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingBatch:
+    """Views with their hints, and the truth of all of them.
+
+    Attributes:
+        views: as the model gets them: context pictures and depth, then the targets' projections.
+        images: (B, V, 3, H, W) true pictures in [0, 1].
+        depth: (B, V, 1, H, W) true z-depth; 0 = unknown.
+    """
+
+    views: ViewBatch
+    images: Tensor
+    depth: Tensor
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def true_views(self) -> ViewBatch:
+        """The same views with true pictures and depth everywhere."""
+        return replace(
+            self.views,
+            images=self.images,
+            depth=self.depth,
+            valid=torch.ones_like(self.views.valid),
+        )
+
+    @property
+    def centers(self) -> Tensor:
+        """(B, V, 3) true camera centres in the frame of the first view."""
+        pose = self.views.cam_from_world
+        relative = pose.double() @ torch.linalg.inv(pose[:, :1].double())
+        rotation, translation = relative[..., :3, :3], relative[..., :3, 3:]
+        return -(rotation.mT @ translation)[..., 0].to(self.images.dtype)
+
+    def samples(self, index: Tensor) -> TrainingBatch:
+        """Some samples of the batch."""
+        return TrainingBatch(self.views.samples(index), self.images[index], self.depth[index])
+
+    def to(self, device: torch.device | str) -> TrainingBatch:
+        """On another device."""
+        return TrainingBatch(self.views.to(device), self.images.to(device), self.depth.to(device))

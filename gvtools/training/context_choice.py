@@ -1,0 +1,77 @@
+"""Which views of a path are given, and how many: by rules as users choose their context."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gvtools.errors import OptionError
+from gvtools.options import check_range
+
+RULES = ("every", "ends", "first")
+COUNTS = 101  # the stream of random numbers that counts are drawn from
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContextOptions:
+    """How many views are given, and which.
+
+    Attributes:
+        least: context views.
+        most: context views.
+        group: so many samples in a row have the same number, so that a batch of them is possible.
+        extrapolation: chance that the first views are given, and not views all along the path.
+        ends: chance, of the other cases, that both ends are given and not every k-th view.
+    """
+
+    least: int = 1
+    most: int = 4
+    group: int = 8
+    extrapolation: float = 0.5
+    ends: float = 0.4
+
+    def __post_init__(self) -> None:
+        check_range("context.least", self.least, least=1)
+        check_range("context.most", self.most, least=self.least)
+        check_range("context.group", self.group, least=1)
+        check_range("context.extrapolation", self.extrapolation, least=0, most=1)
+        check_range("context.ends", self.ends, least=0, most=1)
+
+    def count(self, seed: list[int], index: int) -> int:
+        """The number of context views of a sample; ``seed`` is the data set's."""
+        rng = np.random.default_rng([*seed, index // self.group, COUNTS])
+        return int(rng.integers(self.least, self.most + 1))
+
+    def chosen(self, rng: np.random.Generator, views: int, count: int) -> tuple[int, ...]:
+        """Which of a path's views are given, ascending."""
+        rule = "first"
+        if rng.random() >= self.extrapolation:
+            rule = "ends" if rng.random() < self.ends else "every"
+        return chosen_context(rng, views, count, rule)
+
+
+def chosen_context(rng: np.random.Generator, views: int, count: int, rule: str) -> tuple[int, ...]:
+    """Which views of a path are given, ascending.
+
+    Args:
+        rng: places the views of "every".
+        views: of the path.
+        count: of context views.
+        rule: "every" k-th view; evenly spaced with both "ends"; or the "first" ones.
+
+    Raises:
+        OptionError: no such rule, or no view is left as a target.
+    """
+    if not 1 <= count < views:
+        raise OptionError(f"{count} context views of {views}; expected 1 to {views - 1}")
+    if rule == "first":
+        return tuple(range(count))
+    if rule == "ends":
+        last = views - 1
+        return tuple(round(i * last / max(count - 1, 1)) for i in range(count))
+    if rule != "every":
+        raise OptionError(f"context rule {rule!r}; expected one of {', '.join(RULES)}")
+    step = views // count
+    start = int(rng.integers(0, views - step * (count - 1)))
+    return tuple(start + step * i for i in range(count))

@@ -1,0 +1,160 @@
+"""What is wrong with real observations, done to clean ones before they are lifted to memory.
+
+Every fault has its own range and switch. A sample draws each fault's strength once, uniformly, and
+the fault itself for every context view. Targets and the truth stay clean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.options import check_range
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorruptionOptions:
+    """The largest strength of every fault; 0 switches it off.
+
+    Attributes:
+        clean: share of samples without any fault.
+        absent: chance that a fault is absent from a sample that has faults.
+        depth_noise: standard deviation of depth, as a share of the depth, at the view's mean depth;
+            it grows in proportion to the depth. Half of its variance is smooth over the picture.
+        depth_scale: standard deviation of a factor on all depths of a view.
+        holes: share of the pixels that lose their depth, in patches.
+        flying: share of the pixels at depth edges that lie somewhere between front and back.
+        rotation: standard deviation of the rotation by which a view is lifted wrongly, degrees.
+        translation: the same of its centre, as a share of the mean depth.
+        dropped: chance that a context view has no depth at all; never the first.
+        exposure: standard deviation of the exposure, in natural logarithm; the first context view
+            keeps its own, which is the targets'.
+        color: standard deviation of a gain a channel, likewise.
+        projection: standard deviation of noise on the colours of valid projections. The paper adds
+            0.1 to what the video prior gets; the model's own input has none.
+    """
+
+    clean: float = 0.25
+    absent: float = 0.4
+    depth_noise: float = 0.02
+    depth_scale: float = 0.015
+    holes: float = 0.25
+    flying: float = 0.5
+    rotation: float = 0.4
+    translation: float = 0.006
+    dropped: float = 0.15
+    exposure: float = 0.12
+    color: float = 0.03
+    projection: float = 0.0
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            check_range(f"corruption.{entry.name}", getattr(self, entry.name), least=0)
+        for name in ("clean", "absent", "holes", "flying", "dropped"):
+            check_range(f"corruption.{name}", getattr(self, name), most=1)
+
+
+NOTHING = CorruptionOptions(
+    **{entry.name: 0.0 for entry in fields(CorruptionOptions) if entry.name not in ("clean",)}
+)
+
+
+def drawn(rng: np.random.Generator, options: CorruptionOptions) -> CorruptionOptions:
+    """The strengths of one sample's faults.
+
+    Args:
+        rng: draws the same number of values whatever the options are.
+        options: the largest strengths.
+    """
+    perfect = rng.random() < options.clean
+    strengths = {}
+    for entry in fields(options):
+        if entry.name in ("clean", "absent"):
+            continue
+        chance, share = rng.random(2)
+        largest = getattr(options, entry.name)
+        off = perfect or chance < options.absent
+        strengths[entry.name] = 0.0 if off else largest * share
+    # A view has depth or has none: what is drawn for it is the chance itself.
+    strengths["dropped"] = options.dropped if strengths["dropped"] > 0 else 0.0
+    return replace(NOTHING, **strengths)
+
+
+def corrupted_depth(
+    rng: np.random.Generator, depth: Float32, strength: CorruptionOptions
+) -> Float32:
+    """(H, W) depth with flying pixels, noise, a wrong scale and holes; 0 = none."""
+    known = depth > 0
+    if not known.any():
+        return depth
+    out = depth
+    if strength.flying > 0:
+        out = _flying(rng, out, strength.flying)
+    if strength.depth_noise > 0:
+        mean = depth[known].mean()
+        noise = np.sqrt(0.5) * (_smooth(rng, depth.shape) + rng.standard_normal(depth.shape))
+        spread = strength.depth_noise * out / mean
+        out = out * np.clip(1 + spread * noise, 0.5, 1.5)
+    out = out * np.exp(strength.depth_scale * rng.standard_normal())
+    if strength.holes > 0:
+        field = _smooth(rng, depth.shape)
+        known = known & (field > np.quantile(field, strength.holes * rng.uniform(0, 1)))
+    return np.where(known, out, 0).astype(np.float32)
+
+
+def corrupted_color(
+    rng: np.random.Generator, rgb: NDArray[np.uint8], strength: CorruptionOptions
+) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 in another exposure and white balance."""
+    if strength.exposure == 0 and strength.color == 0:
+        return rgb
+    gain = np.exp(strength.exposure * rng.standard_normal())
+    gain = gain * np.exp(strength.color * rng.standard_normal(3))
+    table = np.clip(np.rint(np.arange(256)[:, None] * gain), 0, 255).astype(np.uint8)
+    return np.stack([table[rgb[..., c], c] for c in range(3)], axis=-1)
+
+
+def corrupted_camera(
+    rng: np.random.Generator, camera: Cameras, unit: float, strength: CorruptionOptions
+) -> Cameras:
+    """A camera that is turned and shifted a little.
+
+    Args:
+        rng: draws how.
+        camera: a batch of one.
+        unit: mean depth, scene units.
+        strength: of the faults.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turn = np.radians(strength.rotation) * rng.standard_normal(3)
+    shift = strength.translation * unit * rng.standard_normal(3)
+    error = np.eye(4)
+    error[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    error[:3, 3] = shift
+    return replace(camera, cam_from_world=error @ camera.cam_from_world)
+
+
+def _smooth(rng: np.random.Generator, shape: tuple[int, ...]) -> Float32:
+    """(H, W) smooth noise of about unit variance."""
+    from PIL import Image
+
+    cells = int(rng.integers(4, 13))
+    grid = Image.fromarray(rng.standard_normal((cells, cells)).astype(np.float32))
+    field = np.asarray(grid.resize((shape[1], shape[0]), Image.Resampling.BICUBIC))
+    return (field / max(float(field.std()), 1e-6)).astype(np.float32)
+
+
+def _flying(rng: np.random.Generator, depth: Float32, share: float) -> Float32:
+    """Some pixels at depth edges between the nearest and the farthest of their neighbours."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    near, far = minimum_filter(depth, 3), maximum_filter(depth, 3)
+    edge = (near > 0) & (far > 1.1 * near) & (rng.random(depth.shape) < share)
+    mixed = near + (far - near) * rng.random(depth.shape, np.float32)
+    return np.where(edge, mixed, depth)

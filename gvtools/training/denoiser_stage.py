@@ -1,0 +1,95 @@
+"""Stage 1: the level-1 denoiser and the level-0 cascade under the complete objective (Eq. 7)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from gvtools.completers.geoverse.depth_anything.rays import camera_centres
+from gvtools.completers.geoverse.flow import (
+    clean_from_velocity,
+    interpolate,
+    shift_time,
+    velocity_target,
+)
+from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.objective.objective import Prediction, Reference, objective
+from gvtools.training.batch import TrainingBatch
+from gvtools.training.draws import Draws
+from gvtools.training.options import DenoiserStageOptions
+
+# Times are drawn below 1, as GLD draws them: at 1 the state tells nothing.
+LATEST = 0.999
+
+
+class DenoiserStage(nn.Module):
+    """Loss of stage 1; see the module."""
+
+    name = "denoiser"
+
+    def __init__(self, model: GeoVerse, options: DenoiserStageOptions) -> None:
+        super().__init__()
+        self.model = model
+        self.options = options
+        model.requires_grad_(False)
+        for part in (model.level1, model.cascade, model.control, model.shared):
+            if part is not None:
+                part.requires_grad_(True)
+                for module in part.modules():
+                    if hasattr(module, "W"):
+                        module.W.requires_grad_(False)
+
+    def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss, and its terms for the log."""
+        model, options = self.model, self.options
+        prepared = model.prepare(batch.views)
+        clean0, clean1 = model.clean_latents(batch.true_views)
+        device = clean1.device
+        drop = draws.uniform("cameras", 1)[:, 0] < options.cameras
+        if bool(drop.any()):
+            prepared = model.without_cameras(prepared, drop.to(device))
+
+        t1, noise1 = self._time(draws, "t1", device), draws.normal("eps1", clean1.shape, device)
+        state1 = interpolate(clean1, noise1, t1)
+        velocity1 = model.velocity1(prepared, state1, t1)
+        predicted = {"level1": velocity1}
+        wanted = {"level1": velocity_target(clean1, noise1)}
+
+        found0 = torch.zeros_like(clean1)
+        if model.cascade is not None:
+            t0, noise0 = self._time(draws, "t0", device), draws.normal("eps0", clean0.shape, device)
+            state0 = interpolate(clean0, noise0, t0)
+            amount = options.source_noise * draws.uniform("source", 1, 1, 1, 1).to(device)
+            source = clean1 + amount * draws.normal("source_eps", clean1.shape, device)
+            velocity0 = model.cascade(state0, t0, model.cascade_conditions(prepared, source))
+            predicted["level0"] = velocity0
+            wanted["level0"] = velocity_target(clean0, noise0)
+            found0 = clean_from_velocity(velocity0, state0, t0)
+
+        if draws.chance("decode", options.decode):
+            found1 = clean_from_velocity(velocity1, state1, t1)
+            decoded = model.decode(prepared, found0, found1)
+            context = batch.views.context
+            predicted |= {
+                "image": decoded.rgb.float(),
+                "depth": decoded.geometry.depth[:, context:],
+                "centers": camera_centres(decoded.geometry.ray, decoded.geometry.ray_confidence),
+            }
+            wanted |= {
+                "image": batch.images[:, context:],
+                "depth": batch.depth[:, context:, 0],
+                "centers": batch.centers,
+            }
+        result = objective(
+            Prediction(**predicted),
+            Reference(**wanted),
+            context=batch.views.context,
+            weights=options.weights,
+            context_weight=options.context_weight,
+        )
+        return result.total, {**result.terms, **result.counts}
+
+    def _time(self, draws: Draws, name: str, device: torch.device) -> Tensor:
+        """(B,) times, uniform before the shift."""
+        u = draws.uniform(name, 1)[:, 0] * LATEST
+        return shift_time(u, self.model.config.flow.shift).to(device)

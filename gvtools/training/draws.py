@@ -1,0 +1,56 @@
+"""Random draws of a training step that depend on the seed, the stage and each sample alone.
+
+Not on the number of processes, on accumulation, or on what was drawn before: a resumed training and
+one on several processes draw the same numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gvtools.completers.geoverse.noise import seeded_noise, view_seed
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Draws for one mini-batch.
+
+    Attributes:
+        seed: of the training.
+        stage: its name.
+        step: number of the optimiser step.
+        samples: the samples' numbers, B of them; a sample is seen once in a training.
+    """
+
+    seed: int
+    stage: str
+    step: int
+    samples: tuple[int, ...]
+
+    def chance(self, name: str, share: float) -> bool:
+        """Whether something happens in this step; the same for all samples and processes."""
+        seed = view_seed(self.seed, self.stage, name, "step", self.step)
+        return float(torch.rand((), generator=torch.Generator().manual_seed(seed))) < share
+
+    def uniform(self, name: str, *shape: int) -> Tensor:
+        """(B, *shape) in [0, 1), float32 on the CPU."""
+        return torch.stack([torch.rand(shape, generator=g) for g in self._generators(name)])
+
+    def normal(self, name: str, shape: Sequence[int], device: torch.device | str) -> Tensor:
+        """(B, V, ...) standard normal, every view by itself."""
+        views = int(shape[1])
+        seeds = [
+            [view_seed(self.seed, self.stage, name, sample, view) for view in range(views)]
+            for sample in self.samples
+        ]
+        return seeded_noise(shape, seeds, device=device)
+
+    def _generators(self, name: str) -> list[torch.Generator]:
+        return [
+            torch.Generator().manual_seed(view_seed(self.seed, self.stage, name, sample))
+            for sample in self.samples
+        ]

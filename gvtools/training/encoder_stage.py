@@ -1,0 +1,204 @@
+"""Stage 0: a small geometric encoder from scratch, with its geometry, ray, pose and RGB heads.
+
+Published encoders skip this stage. The heads are trained on noisy features and without level 0 now
+and then, since generated features are noisy and a cascade may be left out. Depth, origins and
+camera centres are in units of the mean context depth, in the frame of the first view.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from gvtools.completers.geoverse.conditioning import ViewBatch, filled
+from gvtools.completers.geoverse.depth_anything.camera_token import encode_cameras
+from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
+from gvtools.completers.geoverse.depth_anything.network import relative_cameras
+from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.objective.losses import high_gradient_loss
+from gvtools.training.batch import TrainingBatch
+from gvtools.training.draws import Draws
+from gvtools.training.options import EncoderStageOptions
+
+# Pull of the confidence towards certainty against the error that it weighs (DA3, VGGT).
+CONFIDENCE_REWARD = 0.2
+
+
+class EncoderStage(nn.Module):
+    """Loss of stage 0; see the module."""
+
+    name = "encoder"
+
+    def __init__(self, model: GeoVerse, options: EncoderStageOptions) -> None:
+        super().__init__()
+        self.model = model
+        self.options = options
+        model.requires_grad_(False)
+        model.geometry.requires_grad_(True)
+        model.rgb_head.requires_grad_(True)
+
+    def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss, and its terms for the log."""
+        model, options = self.model, self.options
+        geometry, noised = self._heads(batch, draws)
+        rgb = model.rgb_head(torch.cat(noised, dim=-1).flatten(0, 1), self._grid(batch)).unflatten(
+            0, batch.images.shape[:2]
+        )
+        unit = scene_unit(batch)
+        depth = batch.depth[:, :, 0] / unit[:, None, None, None]
+        terms = {
+            "depth": _depth_error(geometry, depth),
+            "gradient": _gradient_error(geometry.depth, depth),
+            "ray": ray_error(geometry, batch, unit),
+            "rgb": (rgb - batch.images).abs().mean(),
+            "hf": high_gradient_loss(rgb, batch.images).mean(),
+            "pose": self._pose_error(batch, unit),
+        }
+        total = sum(getattr(options, name) * value for name, value in terms.items())
+        with torch.no_grad():
+            terms["rgb_psnr"] = -10 * (rgb.clamp(0, 1) - batch.images).square().mean().log10()
+            known = depth > 0
+            terms["depth_rel"] = (geometry.depth[known] / depth[known] - 1).abs().median()
+        return torch.as_tensor(total), terms
+
+    def _heads(self, batch: TrainingBatch, draws: Draws) -> tuple[Geometry, list[Tensor]]:
+        """Geometry and normed features of all views, from noised levels 0 and 1."""
+        model, options = self.model, self.options
+        views = self._shown(batch, draws)
+        cameras, _ = relative_cameras(views.cam_from_world)
+        known = {"cam_from_world": cameras, "K": views.K} if model.config.hints.cameras else {}
+        levels = model.geometry.encode(views.images, levels=2, **known)
+        amount = options.noise * draws.uniform("noise", 1, 1, 1).to(views.images.device)
+        noisy = []
+        for index, level in enumerate(levels):
+            spread = level.detach().float().std(dim=(1, 2), keepdim=True)
+            noise = draws.normal(f"noise{index}", level.shape, level.device)
+            noisy.append(level + amount * spread * noise)
+        drop = draws.uniform("level0", 1, 1, 1).to(level.device) < options.drop_level0
+        mean = noisy[0].detach().mean(dim=(1, 2), keepdim=True)
+        noisy[0] = torch.where(drop, mean, noisy[0])
+        encoder = model.geometry.encoder
+        grid = self._grid(batch)
+        pyramid = [*noisy, *encoder.propagate(noisy[1], grid)]
+        normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
+        self._last_token = pyramid[-1][:, :, 0]
+        return model.geometry.head(normed, grid), normed
+
+    def _shown(self, batch: TrainingBatch, draws: Draws) -> ViewBatch:
+        """True pictures; some targets show their projection, filled as inference fills it."""
+        views = batch.true_views
+        hints = filled(batch.views, self.model.config.hints).images
+        count = views.images.shape[1]
+        swap = draws.uniform("hints", count).to(hints.device) < self.options.hints
+        swap[:, : views.context] = False
+        images = torch.where(swap[:, :, None, None, None], hints, views.images)
+        return ViewBatch(
+            images, views.depth, views.valid, views.cam_from_world, views.K, views.context
+        )
+
+    def _pose_error(self, batch: TrainingBatch, unit: Tensor) -> Tensor:
+        """The camera decoder's L1 error, centres in units of the mean context depth."""
+        pose = batch.views.cam_from_world
+        relative = (pose.double() @ torch.linalg.inv(pose[:, :1].double())).float()
+        relative = torch.cat((relative[..., :3], relative[..., 3:] / _homogeneous(unit)), dim=-1)
+        truth = encode_cameras(relative, batch.views.K, batch.views.size)
+        return (self.model.geometry.cam_dec(self._last_token.float()) - truth).abs().mean()
+
+    def _grid(self, batch: TrainingBatch) -> tuple[int, int]:
+        return self.model.geometry.encoder.grid(*batch.views.size)
+
+
+def scene_unit(batch: TrainingBatch) -> Tensor:
+    """(B,) mean true depth of the context views: the network's unit of length."""
+    depth = batch.depth[:, : batch.views.context]
+    known = depth > 0
+    return (depth * known).sum(dim=(1, 2, 3, 4)) / known.sum(dim=(1, 2, 3, 4)).clamp_min(1)
+
+
+def true_rays(batch: TrainingBatch, unit: Tensor, grid: tuple[int, int]) -> Tensor:
+    """(B, V, h, w, 6) directions (z = 1 in the camera) and origins, frame of the first view.
+
+    A ray belongs to the middle of its cell of the ray grid.
+    """
+    height, width = batch.views.size
+    device = batch.images.device
+    y = (torch.arange(grid[0], device=device) + 0.5) * (height / grid[0])
+    x = (torch.arange(grid[1], device=device) + 0.5) * (width / grid[1])
+    pixel = torch.stack(
+        (x.expand(grid[0], -1), y[:, None].expand(-1, grid[1]), torch.ones(grid, device=device)), -1
+    )
+    pose = batch.views.cam_from_world
+    relative = (pose.double() @ torch.linalg.inv(pose[:, :1].double())).float()
+    turn = relative[..., :3, :3].mT @ torch.linalg.inv(batch.views.K)
+    direction = torch.einsum("bvij,hwj->bvhwi", turn, pixel)
+    origin = batch.centers / unit[:, None, None]
+    return torch.cat((direction, origin[:, :, None, None].expand_as(direction)), dim=-1)
+
+
+def ray_error(geometry: Geometry, batch: TrainingBatch, unit: Tensor) -> Tensor:
+    """Confidence-weighted L1 of directions and origins."""
+    grid = (geometry.ray.shape[-3], geometry.ray.shape[-2])
+    error = (geometry.ray - true_rays(batch, unit, grid)).abs()
+    return _weighted(error.mean(-1), geometry.ray_confidence)
+
+
+def _depth_error(geometry: Geometry, depth: Tensor) -> Tensor:
+    """Confidence-weighted L1 of the logarithm, where depth is known."""
+    known = depth > 0
+    error = (geometry.depth.log() - torch.where(known, depth, 1.0).log()).abs()
+    return _weighted(error, geometry.depth_confidence, known)
+
+
+def _weighted(error: Tensor, confidence: Tensor, known: Tensor | None = None) -> Tensor:
+    """Mean over samples of each sample's mean over its known values."""
+    value = confidence * error - CONFIDENCE_REWARD * confidence.log()
+    if known is None:
+        return value.mean()
+    return _masked_mean(value, known)
+
+
+def _masked_mean(value: Tensor, known: Tensor) -> Tensor:
+    total = torch.where(known, value, 0.0).flatten(1).sum(1)
+    return (total / known.flatten(1).sum(1).clamp_min(1)).mean()
+
+
+def _gradient_error(predicted: Tensor, depth: Tensor) -> Tensor:
+    """L1 of log-depth differences between neighbours, where both are known."""
+    total = predicted.new_zeros(())
+    known = depth > 0
+    log = torch.where(known, depth, 1.0).log()
+    for dim in (-1, -2):
+        size = depth.shape[dim] - 1
+        both = known.narrow(dim, 0, size) & known.narrow(dim, 1, size)
+        gap = predicted.log().diff(dim=dim) - log.diff(dim=dim)
+        total = total + _masked_mean(gap.abs(), both)
+    return total
+
+
+def _homogeneous(unit: Tensor) -> Tensor:
+    """(B, 1, 4, 1) divisors of a translation column."""
+    one = torch.ones_like(unit)
+    return torch.stack((unit, unit, unit, one), dim=-1)[:, None, :, None]
+
+
+@torch.no_grad()
+def measure_statistics(model: GeoVerse, batches: list[TrainingBatch]) -> None:
+    """Mean and variance of levels 0 and 1 over true pictures, into ``model.statistics``."""
+    channels = model.config.geometry.encoder.channels
+    sums = torch.zeros(2, channels, dtype=torch.float64)
+    squares = torch.zeros_like(sums)
+    count = 0
+    for batch in batches:
+        views = batch.true_views
+        cameras, _ = relative_cameras(views.cam_from_world)
+        known = {"cam_from_world": cameras, "K": views.K} if model.config.hints.cameras else {}
+        levels = model.geometry.encode(views.images, levels=2, **known)
+        for index, level in enumerate(levels):
+            patches = level[:, :, 1:].double()
+            sums[index] += patches.sum(dim=(0, 1, 2)).cpu()
+            squares[index] += patches.square().sum(dim=(0, 1, 2)).cpu()
+        count += levels[0][..., 1:, 0].numel()
+    for index, statistics in enumerate(model.level_statistics):
+        mean = sums[index] / count
+        statistics.mean.copy_(mean)
+        statistics.var.copy_(squares[index] / count - mean.square())

@@ -1,0 +1,115 @@
+"""One process or several: who does what, and gradients that are averaged over all of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from gvtools.errors import OptionError
+
+
+@dataclass(frozen=True)
+class Processes:
+    """The group that ``torchrun`` started, or one process alone.
+
+    Attributes:
+        rank: number of this process.
+        count: how many there are.
+        device: of this process.
+    """
+
+    rank: int
+    count: int
+    device: torch.device
+
+    @property
+    def first(self) -> bool:
+        """Whether this process writes."""
+        return self.rank == 0
+
+    def share(self, samples: range) -> range:
+        """This process's part of a step's samples; contiguous, equal for all.
+
+        Raises:
+            OptionError: the samples cannot be divided.
+        """
+        if len(samples) % self.count:
+            raise OptionError(
+                f"a batch of {len(samples)} samples over {self.count} processes; expected a "
+                "multiple; change optimizer.batch"
+            )
+        size = len(samples) // self.count
+        start = samples.start + self.rank * size
+        return range(start, start + size)
+
+    @torch.no_grad()
+    def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Mean of the gradients over all processes; absent ones count as zero."""
+        if self.count == 1:
+            return
+        wanted = [p for p in parameters if p.requires_grad]
+        # One flat buffer a dtype: few messages, and a fixed order of the sums.
+        flat = torch.cat(
+            [(p.grad if p.grad is not None else torch.zeros_like(p)).flatten() for p in wanted]
+        )
+        dist.all_reduce(flat)
+        flat /= self.count
+        start = 0
+        for parameter in wanted:
+            size = parameter.numel()
+            parameter.grad = flat[start : start + size].view_as(parameter).clone()
+            start += size
+
+    def mean(self, values: dict[str, float]) -> dict[str, float]:
+        """Means of numbers over all processes."""
+        if self.count == 1 or not values:
+            return values
+        names = sorted(values)
+        packed = torch.tensor([values[name] for name in names], dtype=torch.float64)
+        packed = packed.to(self.device if dist.get_backend() == "nccl" else "cpu")
+        dist.all_reduce(packed)
+        return dict(zip(names, (packed / self.count).tolist(), strict=True))
+
+    def any(self, flag: bool) -> bool:
+        """Whether it is so in any process."""
+        if self.count == 1:
+            return flag
+        value = Tensor([float(flag)])
+        value = value.to(self.device if dist.get_backend() == "nccl" else "cpu")
+        dist.all_reduce(value, op=dist.ReduceOp.MAX)
+        return bool(value.item())
+
+
+@contextmanager
+def started(device: str = "auto") -> Iterator[Processes]:
+    """The processes of this training; joins the group that ``torchrun`` describes.
+
+    Args:
+        device: "auto", "cpu" or "cuda".
+
+    Raises:
+        OptionError: CUDA without a CUDA device.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise OptionError("device cuda, and torch sees no CUDA device here; use cpu")
+    use_cuda = device != "cpu" and torch.cuda.is_available()
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    rank = int(os.environ.get("RANK", "0"))
+    local = int(os.environ.get("LOCAL_RANK", "0"))
+    place = torch.device("cuda", local) if use_cuda else torch.device("cpu")
+    if count == 1:
+        yield Processes(0, 1, place)
+        return
+    if use_cuda:
+        torch.cuda.set_device(place)
+    dist.init_process_group("nccl" if use_cuda else "gloo")
+    try:
+        yield Processes(rank, count, place)
+    finally:
+        dist.destroy_process_group()

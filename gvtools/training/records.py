@@ -1,0 +1,56 @@
+"""The log of a training: one JSON line a record, and TensorBoard's file where it is installed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+LOG = "log.jsonl"
+
+
+class TrainingLog:
+    """Appends records; those after the step that a training is resumed at are dropped.
+
+    Args:
+        folder: of the stage.
+        step: records after this step are of a part that is done again.
+    """
+
+    def __init__(self, folder: Path, *, step: int = 0) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.path = folder / LOG
+        kept = [line for line in read_log(folder) if line["step"] <= step]
+        text = "".join(json.dumps(line) + "\n" for line in kept)
+        self.path.write_text(text, encoding="utf-8")
+        self._board = _tensorboard(folder, step)
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        """One record."""
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"step": step, **values}) + "\n")
+        if self._board is not None:
+            for name, value in values.items():
+                self._board.add_scalar(name, value, step)
+            self._board.flush()
+
+
+def read_log(folder: Path) -> list[dict[str, Any]]:
+    """The whole records of a stage; a line that was cut by a kill is left out."""
+    path = folder / LOG
+    records = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+        try:
+            records.append(json.loads(line))
+        except ValueError:
+            continue
+    return records
+
+
+def _tensorboard(folder: Path, step: int) -> Any:
+    """TensorBoard's writer, or None where tensorboard is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    return SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)

@@ -1,0 +1,92 @@
+"""Stage 2: piecewise reflow distillation of level 1 into one step an interval."""
+
+from __future__ import annotations
+
+import copy
+
+from torch import Tensor, nn
+
+from gvtools.completers.geoverse.flow import (
+    guided,
+    interpolate,
+    shift_time,
+    velocity_target,
+)
+from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.objective.losses import flow_matching_loss
+from gvtools.completers.geoverse.reflow import fast_loss, interval_ends, reflow_pair
+from gvtools.training.batch import TrainingBatch
+from gvtools.training.denoiser_stage import LATEST
+from gvtools.training.draws import Draws
+from gvtools.training.options import ReflowStageOptions
+
+
+class ReflowStage(nn.Module):
+    """Loss of stage 2: rho L_PRF + (1 - rho) L_FM; see the module.
+
+    The student starts as the teacher. The cascade and the heads are not touched.
+    """
+
+    name = "reflow"
+
+    def __init__(self, model: GeoVerse, options: ReflowStageOptions) -> None:
+        super().__init__()
+        self.model = model
+        self.options = options
+        model.requires_grad_(False)
+        teacher = copy.deepcopy(model).eval()
+        # Not a submodule: its weights are no part of the stage's state.
+        self._teacher = [teacher]
+        for part in (model.level1, model.control, model.shared):
+            if part is not None:
+                part.requires_grad_(True)
+                for module in part.modules():
+                    if hasattr(module, "W"):
+                        module.W.requires_grad_(False)
+
+    @property
+    def bounds(self) -> tuple[float, ...]:
+        """tau_0 .. tau_K."""
+        return self.options.bounds or self.model.config.flow.level1
+
+    def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss, and its terms for the log."""
+        model, options = self.model, self.options
+        teacher = self._teacher[0].to(batch.images.device)
+        prepared = model.prepare(batch.views)
+        _, clean = model.clean_latents(batch.true_views)
+        device = clean.device
+        context = batch.views.context
+        noise = draws.normal("eps", clean.shape, device)
+        count = len(self.bounds) - 1
+        intervals = (draws.uniform("interval", 1)[:, 0] * count).long().clamp(max=count - 1)
+        upper, lower = interval_ends(intervals, self.bounds)
+        t = (lower + draws.uniform("t_inside", 1)[:, 0] * (upper - lower)).float()
+        known = teacher.prepare(batch.views) if options.rho > 0 else prepared
+        without = teacher.without_cameras(known) if options.guidance != 1 else known
+        pair = reflow_pair(
+            guided(
+                lambda state, time: teacher.velocity1(known, state, time),
+                lambda state, time: teacher.velocity1(without, state, time),
+                options.guidance,
+            ),
+            clean,
+            noise,
+            intervals=intervals,
+            t=t,
+            bounds=self.bounds,
+            steps=options.steps,
+            shift=model.config.flow.shift,
+        )
+        student = model.velocity1(prepared, pair.state, pair.t)
+        time = shift_time(draws.uniform("t", 1)[:, 0] * LATEST, model.config.flow.shift).to(device)
+        state = interpolate(clean, noise, time)
+        plain = model.velocity1(prepared, state, time)
+        weight = options.context_weight
+        reflow = flow_matching_loss(
+            student, pair.velocity, context=context, context_weight=weight
+        ).mean()
+        flow = flow_matching_loss(
+            plain, velocity_target(clean, noise), context=context, context_weight=weight
+        ).mean()
+        return fast_loss(reflow, flow, rho=options.rho), {"reflow": reflow, "flow": flow}

@@ -1,0 +1,174 @@
+"""One stage of a training as a user runs it: its start, its data, its log, its weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from gvtools.completers.geoverse.config_json import to_json
+from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.errors import CheckpointError
+from gvtools.training.batch import TrainingBatch
+from gvtools.training.denoiser_stage import DenoiserStage
+from gvtools.training.encoder_stage import EncoderStage, measure_statistics
+from gvtools.training.loop import Reporting, Trainer
+from gvtools.training.names import STAGES
+from gvtools.training.options import TrainingConfig
+from gvtools.training.processes import Processes
+from gvtools.training.records import TrainingLog, read_log
+from gvtools.training.reflow_stage import ReflowStage
+from gvtools.training.samples import TrainingSamples
+from gvtools.training.sheets import write_sheet
+from gvtools.training.state import FILE
+
+WEIGHTS = "weights"
+SHEET_SAMPLES = 3
+
+
+class StageRun:
+    """A stage in its folder ``OUT/STAGE``.
+
+    Args:
+        config: of the training.
+        stage: its name.
+        out: of the training; each stage has a folder in it.
+        processes: this process and the others.
+        model_folder: where a relative path of the model's configuration is looked up.
+        init: weights to start from, instead of the stage before.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        stage: str,
+        out: Path,
+        *,
+        processes: Processes,
+        model_folder: Path | None = None,
+        init: Path | None = None,
+    ) -> None:
+        self.config, self.stage, self.out = config, stage, out
+        self.folder = out / stage
+        self.processes = processes
+        self.model_config = config.model_config(model_folder)
+        self.init = init
+        self.options = getattr(config, stage)
+
+    def train(
+        self,
+        *,
+        resume: bool = False,
+        until: int | None = None,
+        sheet_every: int = 0,
+        say: Callable[[str], None] = print,
+    ) -> dict[str, float]:
+        """Train, and write ``OUT/STAGE/weights`` from the averaged weights when all is done.
+
+        Returns:
+            The last record.
+
+        Raises:
+            CheckpointError: there is a state and ``resume`` is not set, or one that does not fit.
+        """
+        if (self.folder / FILE).exists() and not resume:
+            raise CheckpointError(
+                f"{self.folder}: a training is there already; continue it with --resume, or "
+                "choose another --out"
+            )
+        model = self._start(say)
+        module = self._module(model)
+        samples = TrainingSamples(self.config, self.model_config)
+        trainer = Trainer(
+            module.to(self.processes.device),
+            self.options.optimizer,
+            samples.batch,
+            folder=self.folder,
+            seed=self.config.seed,
+            identity=self._identity(),
+            processes=self.processes,
+        )
+        resumed = trainer.resume() if resume else False
+        if resumed:
+            say(f"{self.stage}: goes on after step {trainer.progress.step}")
+        samples.start(trainer, self.processes)
+        log = TrainingLog(self.folder, step=trainer.progress.step) if self.processes.first else None
+
+        def record(step: int, values: dict[str, float]) -> None:
+            if log is not None:
+                log.write(step, values)
+            shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if "count" not in k)
+            say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
+
+        held_out = samples.held_out(SHEET_SAMPLES) if sheet_every and self.processes.first else None
+
+        def sheet(step: int) -> None:
+            if held_out is not None and self.stage != "encoder":
+                batch = held_out.to(self.processes.device)
+                write_sheet(model, batch, self.folder / "sheets" / f"step_{step:06d}.png")
+
+        try:
+            trainer.train(
+                Reporting(sheet_every=sheet_every, record=record, sheet=sheet), until=until
+            )
+        finally:
+            samples.close()
+        if trainer.progress.step >= self.options.optimizer.steps and self.processes.first:
+            self._write_weights(model, trainer, samples)
+            say(f"{self.stage}: weights in {self.folder / WEIGHTS}")
+        records = read_log(self.folder)
+        return records[-1] if records else {}
+
+    def _start(self, say: Callable[[str], None]) -> GeoVerse:
+        """The model that the stage begins with; every process makes the same."""
+        from gvtools.completers.geoverse.weights.folder import from_pretrained
+
+        before = [name for name in STAGES[: STAGES.index(self.stage)]]
+        sources = [self.init] if self.init else [self.out / n / WEIGHTS for n in reversed(before)]
+        for source in sources:
+            if source is not None and (self.init or source.exists()):
+                say(f"{self.stage}: starts from {source}")
+                return from_pretrained(source, config=self.model_config)
+        if before:
+            raise CheckpointError(
+                f"stage {self.stage} needs weights to start from; run --stage {before[-1]} first, "
+                "or give --init DIR"
+            )
+        torch.manual_seed(self.config.seed)
+        return GeoVerse(self.model_config)
+
+    def _module(self, model: GeoVerse) -> nn.Module:
+        if self.stage == "encoder":
+            return EncoderStage(model, self.options)
+        if self.stage == "denoiser":
+            return DenoiserStage(model, self.options)
+        return ReflowStage(model, self.options)
+
+    def _identity(self) -> dict[str, Any]:
+        """What may not change between the parts of a stage."""
+        data = to_json(self.config.data)
+        data.pop("workers")
+        return {
+            "stage": self.stage,
+            "seed": self.config.seed,
+            "model": to_json(self.model_config),
+            "options": to_json(self.options),
+            "data": data,
+        }
+
+    def _write_weights(self, model: GeoVerse, trainer: Trainer, samples: TrainingSamples) -> None:
+        """The averaged weights; after stage 0 with the latents' statistics."""
+        with trainer.ema.swapped_in():
+            if self.stage == "encoder":
+                batches: list[TrainingBatch] = [
+                    samples.aside(index, self.options.optimizer.batch).to(self.processes.device)
+                    for index in range(self.options.statistics)
+                ]
+                measure_statistics(model, batches)
+            # An encoder alone completes nothing.
+            model.config = replace(self.model_config, trained=self.stage != "encoder")
+            model.save_pretrained(self.folder / WEIGHTS)

@@ -1,0 +1,91 @@
+"""The samples of a training: procedural scenes, and recorded ones where the settings name some."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gvtools.completers.geoverse.config import GeoVerseConfig
+from gvtools.training.batch import TrainingBatch
+from gvtools.training.context_choice import ContextOptions
+from gvtools.training.dataset import MixedViews, ProceduralViews
+from gvtools.training.dataset import Samples as DataSet
+from gvtools.training.loader import BatchLoader
+from gvtools.training.loop import Trainer
+from gvtools.training.options import TrainingConfig
+from gvtools.training.processes import Processes
+from gvtools.training.view_sample import collated
+
+# Numbers of samples that no training step sees: for statistics.
+ASIDE = 10**9
+
+
+class TrainingSamples:
+    """Batches of a training by the numbers of their samples.
+
+    Args:
+        config: of the training.
+        model: whose context views a sample may have.
+    """
+
+    def __init__(self, config: TrainingConfig, model: GeoVerseConfig) -> None:
+        self.config = config
+        most = min(model.context, config.data.views - 1)
+        self._context = ContextOptions(most=most)
+        self._loader: BatchLoader | None = None
+        self._data = self._data_set("train")
+
+    def start(self, trainer: Trainer, processes: Processes) -> None:
+        """Make samples ahead, from the trainer's next step on."""
+        options = trainer.options
+        self._loader = BatchLoader(
+            self._data,
+            options.batch,
+            workers=self.config.data.workers,
+            share=processes.share,
+            start=trainer.progress.step * options.batch,
+        )
+
+    def batch(self, samples: range) -> TrainingBatch:
+        """The samples with these numbers."""
+        if self._loader is None:
+            return collated([self._data.sample(index) for index in samples])
+        return self._loader(samples)
+
+    def aside(self, index: int, count: int) -> TrainingBatch:
+        """Training scenes that no step sees."""
+        group = self._context.group
+        first = ASIDE // group * group + index * group
+        return collated([self._data.sample(first + n) for n in range(min(count, group))])
+
+    def held_out(self, count: int) -> TrainingBatch:
+        """Scenes of other photographs and layouts."""
+        data = self._data_set("held-out")
+        return collated([data.sample(index) for index in range(min(count, self._context.group))])
+
+    def close(self) -> None:
+        """End the processes that make samples."""
+        if self._loader is not None:
+            self._loader.close()
+
+    def _data_set(self, split: str) -> DataSet:
+        data = self.config.data
+        rooms = ProceduralViews(
+            seed=self.config.seed,
+            split=split,
+            views=data.views,
+            size=data.size,
+            context=self._context,
+        )
+        if not data.scenes or data.scene_share == 0 or split != "train":
+            return rooms
+        from gvtools.scenes.project import open_project
+        from gvtools.training.scene_views import SceneViews
+
+        recorded = SceneViews(
+            scenes=tuple(open_project(Path(path)) for path in data.scenes),
+            seed=self.config.seed,
+            views=data.views,
+            size=data.size,
+            context=self._context,
+        )
+        return MixedViews(rooms, recorded, data.scene_share, group=self._context.group)

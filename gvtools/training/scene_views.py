@@ -1,0 +1,226 @@
+"""Samples from recorded scenes with depth: windows of ordered views that see the same things."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras, concatenate
+from gvtools.completers.geoverse.resampling import resampled
+from gvtools.errors import DegenerateError, ProjectError
+from gvtools.options import check_range
+from gvtools.scenes.scene import Scene, View
+from gvtools.training.context_choice import ContextOptions
+from gvtools.training.corruption import CorruptionOptions, drawn
+from gvtools.training.dataset import FAULTS, PATH, RECORDED
+from gvtools.training.hints import Clip, HintOptions
+from gvtools.training.view_sample import Sample, make_sample
+
+ATTEMPTS = 40
+KEPT_FRAMES = 512  # reduced frames that a data set keeps, so that files are read once
+# Depths that differ by no more than this share belong to one surface.
+SAME_SURFACE = 0.1
+PROBE = 24  # points along a side of a picture that overlap is measured with
+
+
+@dataclass(frozen=True, eq=False)
+class _Reduced:
+    """One view, cropped and reduced: as it is observed, and at the model's size."""
+
+    observed: Clip
+    truth: Clip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneViews:
+    """Windows of recorded scenes; a scene is drawn in proportion to the root of its view count.
+
+    What depth a view has counts as true. Faults are added on top of what real depth has anyway, so
+    the default is gentle.
+
+    Attributes:
+        scenes: with depth; views without any are left out.
+        seed: 0 or more.
+        views: of a sample.
+        size: (H, W) of the pictures; views are cropped about their centre to this aspect.
+        detail: memory is made at so many times the size, where a view is large enough.
+        stride: steps between the views of a window, drawn uniformly.
+        overlap: least share of a view's depth that the next view of the window shows, too.
+        context: how many views are given, and which.
+        faults: see CorruptionOptions; None for none.
+        hints: see HintOptions.
+    """
+
+    scenes: tuple[Scene, ...]
+    seed: int = 0
+    views: int = 8
+    size: tuple[int, int] = (96, 96)
+    detail: int = 2
+    stride: tuple[int, int] = (1, 6)
+    overlap: float = 0.4
+    context: ContextOptions = field(default_factory=ContextOptions)
+    faults: CorruptionOptions | None = field(
+        default_factory=lambda: CorruptionOptions(depth_noise=0.01, holes=0.05, flying=0.0)
+    )
+    hints: HintOptions = field(default_factory=HintOptions)
+    _kept: OrderedDict[tuple[int, int], _Reduced] = field(
+        init=False, repr=False, default_factory=OrderedDict
+    )
+    _usable: tuple[tuple[View, ...], ...] = field(init=False, repr=False, default=())
+
+    def __post_init__(self) -> None:
+        check_range("data.seed", self.seed, least=0)
+        check_range("data.detail", self.detail, least=1)
+        check_range("data.overlap", self.overlap, least=0, below=1)
+        check_range("data.views", self.views, least=self.context.most + 1)
+        usable = tuple(tuple(v for v in scene if v.has_depth) for scene in self.scenes)
+        for scene, views in zip(self.scenes, usable, strict=True):
+            if len(views) < self.views:
+                raise ProjectError(
+                    f"{scene.root}: {len(views)} of {len(scene)} views have depth; samples need "
+                    f"{self.views}; give a scene with recorded depth, or fewer views a sample"
+                )
+        if not usable:
+            raise ProjectError("no scene to draw samples from; expected at least one")
+        object.__setattr__(self, "_usable", usable)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_kept": OrderedDict()}
+
+    def sample(self, index: int) -> Sample:
+        """The sample of a number, 0 or more.
+
+        Raises:
+            DegenerateError: no window of views that overlap was found.
+        """
+        clip, truth = self.clips(index)
+        rng = np.random.default_rng([self.seed, RECORDED, index, FAULTS])
+        strength = drawn(rng, self.faults or CorruptionOptions(clean=1.0))
+        count = self.context.count([self.seed, RECORDED], index)
+        context = self.context.chosen(rng, self.views, count)
+        return make_sample(clip, truth, context, rng=rng, strength=strength, hints=self.hints)
+
+    def clips(self, index: int) -> tuple[Clip, Clip]:
+        """The window of a sample: as it is observed, and at the model's size."""
+        rng = np.random.default_rng([self.seed, RECORDED, index, PATH])
+        share = np.sqrt([len(views) for views in self._usable])
+        best = 0.0
+        for attempt in range(ATTEMPTS):
+            number = int(rng.choice(len(share), p=share / share.sum()))
+            total = len(self._usable[number])
+            # Later attempts take smaller steps.
+            most = max(self.stride[0], round(self.stride[1] * (1 - attempt / ATTEMPTS)))
+            step = int(rng.integers(self.stride[0], most + 1))
+            step = max(1, min(step, (total - 1) // (self.views - 1)))
+            start = int(rng.integers(0, total - step * (self.views - 1)))
+            rows = [start + step * i for i in range(self.views)]
+            if rng.random() < 0.5:
+                rows.reverse()
+            frames = [self._frame(number, row) for row in rows]
+            truth = _joined([frame.truth for frame in frames])
+            found = min(overlaps(truth))
+            best = max(best, found)
+            if found >= self.overlap:
+                return _joined([frame.observed for frame in frames]), truth
+        raise DegenerateError(
+            f"no window of {self.views} views in {ATTEMPTS} attempts of which neighbours share "
+            f"{self.overlap:.0%} of their depth (best {best:.0%}); lower the overlap or the stride"
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that decides the samples, as plain data; scenes by folder and view names."""
+        plain = ("seed", "views", "size", "detail", "stride", "overlap")
+        parts = ("context", "faults", "hints")
+        return {
+            "source": "recorded",
+            "scenes": [
+                {"root": str(scene.root), "views": [view.name for view in views]}
+                for scene, views in zip(self.scenes, self._usable, strict=True)
+            ],
+            **{name: getattr(self, name) for name in plain},
+            **{n: None if getattr(self, n) is None else asdict(getattr(self, n)) for n in parts},
+        }
+
+    def _frame(self, scene: int, row: int) -> _Reduced:
+        key = (scene, row)
+        if key not in self._kept:
+            self._kept[key] = _reduced(self._usable[scene][row], self.size, self.detail)
+            if len(self._kept) > KEPT_FRAMES:
+                self._kept.popitem(last=False)
+        return self._kept[key]
+
+
+def overlaps(clip: Clip) -> list[float]:
+    """Share of each view's known depth that the next view shows likewise; 0 without any."""
+    height, width = clip.depth.shape[1:]
+    rows = np.linspace(0, height - 1, PROBE).astype(int)[:, None]
+    columns = np.linspace(0, width - 1, PROBE).astype(int)[None]
+    out = []
+    for i in range(len(clip) - 1):
+        depth = clip.depth[i][rows, columns]
+        known = depth > 0
+        if not known.any():
+            out.append(0.0)
+            continue
+        camera = clip.cameras[i]
+        local = (camera.rays()[rows, columns] * depth[..., None])[known]
+        world = camera.world_from_cam[0]
+        xy, z = clip.cameras[i + 1].project(local @ world[:3, :3].T + world[:3, 3])
+        with np.errstate(invalid="ignore"):
+            x, y = np.floor(xy[0]).T
+            inside = (z[0] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        there = clip.depth[i + 1][y[inside].astype(int), x[inside].astype(int)]
+        # Where the next view has no depth it cannot disagree.
+        agree = (there == 0) | (np.abs(there / z[0][inside] - 1) < SAME_SURFACE)
+        out.append(float(agree.sum() / known.sum()))
+    return out
+
+
+def _reduced(view: View, size: tuple[int, int], detail: int) -> _Reduced:
+    """A view at ``detail`` times the model's size (or less, if it is smaller) and at that size."""
+    frame = view.load()
+    height, width = frame.rgb.shape[:2]
+    aspect = size[0] / size[1]
+    rows = min(height, max(1, round(width * aspect)))
+    columns = min(width, max(1, round(height / aspect)))
+    top, left = (height - rows) // 2, (width - columns) // 2
+    window = np.s_[top : top + rows, left : left + columns]
+    depth = np.zeros((height, width), np.float32) if frame.depth is None else frame.depth
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+    if frame.mask is not None:
+        depth = np.where(frame.mask, depth, np.float32(0))
+    camera = view.camera.cropped(left, top, columns, rows)
+    factor = max(1, min(detail, rows // size[0], columns // size[1]))
+    parts = [
+        _resized(frame.rgb[window], depth[window], camera, (size[0] * times, size[1] * times))
+        for times in (factor, 1)
+    ]
+    return _Reduced(*parts)
+
+
+def _resized(
+    rgb: NDArray[np.uint8], depth: NDArray[np.float32], camera: Cameras, size: tuple[int, int]
+) -> Clip:
+    """A clip of one view: filtered colours, and the depth of the pixel under each centre."""
+    picture = torch.from_numpy(np.ascontiguousarray(rgb)).permute(2, 0, 1)[None].float()
+    picture = resampled(picture, size)[0].permute(1, 2, 0).round().clamp(0, 255)
+    lengths = torch.from_numpy(np.ascontiguousarray(depth))[None, None]
+    lengths = F.interpolate(lengths, size=size, mode="nearest-exact")[0]
+    return Clip(
+        picture.to(torch.uint8).numpy()[None], lengths.numpy(), camera.resized(size[1], size[0])
+    )
+
+
+def _joined(clips: list[Clip]) -> Clip:
+    """Views of one size as one clip."""
+    return Clip(
+        np.concatenate([clip.rgb for clip in clips]),
+        np.concatenate([clip.depth for clip in clips]),
+        concatenate([clip.cameras for clip in clips]),
+    )

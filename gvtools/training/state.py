@@ -1,0 +1,81 @@
+"""The state of a stage on disk: everything that an exact continuation needs, written atomically."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gvtools.errors import CheckpointError
+
+FILE = "state.pt"
+
+
+@dataclass
+class Progress:
+    """Where a stage is.
+
+    Attributes:
+        step: optimiser steps made; the next sample is ``step`` x batch.
+        skipped: batches that were left out, not finite or too large.
+        seconds: spent so far.
+    """
+
+    step: int = 0
+    skipped: int = 0
+    seconds: float = 0.0
+
+
+@dataclass
+class StageState:
+    """What is saved.
+
+    Attributes:
+        identity: what must not change between the parts of a training.
+        progress: see Progress.
+        model: trainable parameters by name.
+        optimizer: the optimiser's state.
+        ema: the averages' state.
+    """
+
+    identity: dict[str, Any]
+    progress: Progress = field(default_factory=Progress)
+    model: dict[str, Any] = field(default_factory=dict)
+    optimizer: dict[str, Any] = field(default_factory=dict)
+    ema: dict[str, Any] = field(default_factory=dict)
+
+
+def save_state(state: StageState, folder: Path) -> None:
+    """Write to a temporary name, then rename: a kill leaves the previous state whole."""
+    folder.mkdir(parents=True, exist_ok=True)
+    part = folder / f".{FILE}.part"
+    torch.save({**vars(state), "progress": asdict(state.progress)}, part)
+    os.replace(part, folder / FILE)
+
+
+def load_state(folder: Path, identity: dict[str, Any]) -> StageState | None:
+    """The saved state, or None where there is none.
+
+    Raises:
+        CheckpointError: damaged, or of other settings (the first that differs is named).
+    """
+    path = folder / FILE
+    if not path.exists():
+        return None
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        state = StageState(**{**content, "progress": Progress(**content["progress"])})
+    except Exception as error:
+        raise CheckpointError(
+            f"{path}: cannot be read ({error}); start the stage again without --resume"
+        ) from None
+    for key, value in identity.items():
+        if state.identity.get(key) != value:
+            raise CheckpointError(
+                f"{path}: was trained with {key} = {state.identity.get(key)!r}, now {value!r}; "
+                "use the same settings, or another --out"
+            )
+    return state

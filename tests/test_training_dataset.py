@@ -1,0 +1,330 @@
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from gvtools.errors import OptionError, ShapeError
+from gvtools.training.context_choice import ContextOptions
+from gvtools.training.corruption import (
+    NOTHING,
+    CorruptionOptions,
+    corrupted_camera,
+    corrupted_color,
+    corrupted_depth,
+    drawn,
+)
+from gvtools.training.dataset import MixedViews, ProceduralViews
+from gvtools.training.hints import Clip, observed, projected
+from gvtools.training.photographs import photograph_names
+from gvtools.training.view_sample import Sample, collated
+from gvtools.training.visibility import seen_by_context
+
+CLEAN = ProceduralViews(faults=None)
+COUNT = 24
+
+
+@cache
+def _samples(split: str, clean: bool) -> list[Sample]:
+    data = ProceduralViews(split=split)
+    data = replace(data, faults=None) if clean else data
+    return [data.sample(index) for index in range(COUNT)]
+
+
+def _equal(a: Sample, b: Sample) -> bool:
+    pairs = ((getattr(a, entry.name), getattr(b, entry.name)) for entry in fields(Sample))
+    return all(torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y for x, y in pairs)
+
+
+def _legacy_state() -> np.ndarray:
+    """Of numpy's global generator."""
+    state = np.random.get_state(legacy=True)
+    assert isinstance(state, tuple)
+    return np.array(state[1])
+
+
+def test_a_sample_follows_from_its_number_alone() -> None:
+    data = ProceduralViews()
+    before = torch.get_rng_state(), _legacy_state()
+    assert _equal(data.sample(5), _samples("train", False)[5])
+    assert torch.equal(before[0], torch.get_rng_state())
+    assert np.array_equal(before[1], _legacy_state())
+    assert not torch.equal(data.sample(6).images, data.sample(5).images)
+    assert not torch.equal(ProceduralViews(seed=1).sample(5).images, data.sample(5).images)
+
+
+def test_one_thread_makes_the_same_samples() -> None:
+    import numba
+
+    before = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+    try:
+        again = ProceduralViews().sample(7)
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
+    assert _equal(again, _samples("train", False)[7])
+
+
+def test_splits_have_other_scenes_and_photographs() -> None:
+    train, held_out = (ProceduralViews(split=split) for split in ("train", "held-out"))
+    assert not torch.equal(_samples("train", True)[0].depth, _samples("held-out", True)[0].depth)
+    assert not set(train.describe()["photographs"]) & set(held_out.describe()["photographs"])
+    assert train.describe()["photographs"] == photograph_names("train")
+    with pytest.raises(OptionError, match="held-out"):
+        ProceduralViews(split="test")
+
+
+@pytest.mark.parametrize("clean", [True, False])
+@pytest.mark.parametrize("split", ["train", "held-out"])
+def test_shapes_ranges_and_unit(split: str, clean: bool) -> None:
+    for index, sample in enumerate(_samples(split, clean)):
+        k = sample.context
+        assert k == ProceduralViews(split=split).context_count(index)
+        assert sample.images.shape == sample.hint.shape == (8, 3, 96, 96)
+        assert sample.depth.shape == sample.hint_depth.shape == sample.valid.shape == (8, 1, 96, 96)
+        for entry in fields(Sample):
+            value = getattr(sample, entry.name)
+            assert isinstance(value, int) or bool(torch.isfinite(value.float()).all())
+        assert float(sample.hint.min()) >= 0 and float(sample.hint.max()) <= 1
+        assert bool((sample.depth > 0).all()) and bool(sample.valid[:k].all())
+        known = sample.hint_depth[:k]
+        assert float(known[known > 0].mean()) == pytest.approx(1, abs=1e-4)
+        holes = ~sample.valid[k:]
+        assert not sample.hint_depth[k:][holes].any()
+        assert not sample.hint[k:][holes.expand(-1, 3, -1, -1)].any()
+        assert bool((sample.hint_depth[k:][~holes] > 0).all())
+        torch.testing.assert_close(sample.cam_from_world[0], torch.eye(4), atol=1e-6, rtol=0)
+        place = sample.place.tolist()
+        assert sorted(place) == list(range(8))
+        assert place[:k] == sorted(place[:k]) and place[k:] == sorted(place[k:])
+
+
+def test_true_depth_of_one_view_is_that_of_the_others() -> None:
+    """Unprojected from one view and projected into the next: equal wherever both see a point."""
+    agreed = []
+    for sample in _samples("train", True):
+        first, second = (int(i) for i in sample.place.argsort()[3:5])
+        z, there = _carried(sample, first, second)
+        relative = (there / z - 1).abs()
+        agreed.append((relative < 0.02).float().mean())
+        # What is not equal is hidden: the other view sees something nearer.
+        assert ((there < z * 1.05) | (relative < 0.05)).float().mean() > 0.97
+    assert np.mean(agreed) > 0.85
+
+
+def _carried(sample: Sample, first: int, second: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Depths that the first view's pixels have in the second, and the second's own there."""
+    height, width = sample.depth.shape[2:]
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixel = torch.stack((x, y, torch.ones_like(x))).flatten(1)
+    pose = sample.cam_from_world
+    local = torch.linalg.inv(sample.K[first]) @ pixel * sample.depth[first].flatten()
+    turn = pose[second] @ torch.linalg.inv(pose[first])
+    there = sample.K[second] @ (turn[:3, :3] @ local + turn[:3, 3:])
+    column, row = (there[i] / there[2] for i in (0, 1))
+    inside = (there[2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    own = sample.depth[second, 0][row[inside].long(), column[inside].long()]
+    return there[2][inside], own
+
+
+def test_clean_hints_are_the_truth_where_they_are_valid() -> None:
+    squared, depth, count = 0.0, [], 0
+    for split in ("train", "held-out"):
+        for sample in _samples(split, True):
+            k, valid = sample.context, sample.valid[sample.context :]
+            error = (sample.hint[k:] - sample.images[k:]).square().mean(1, keepdim=True)
+            squared, count = squared + float(error[valid].sum()), count + int(valid.sum())
+            ratio = sample.hint_depth[k:][valid] / sample.depth[k:][valid] - 1
+            depth.append(float(ratio.abs().median()))
+            assert torch.equal(sample.hint[:k], sample.images[:k])
+    assert -10 * np.log10(squared / count) >= 27
+    assert np.median(depth) < 2e-3
+
+
+def test_coverage_leaves_something_to_generate() -> None:
+    for split in ("train", "held-out"):
+        samples = _samples(split, False)
+        cover = [float(v.float().mean()) for s in samples for v in s.valid[s.context :]]
+        assert 0.5 < np.mean(cover) < 0.9
+        assert np.quantile(cover, 0.1) < 0.6
+        unseen = [float((~seen_by_context(s)[s.context :]).float().mean()) for s in samples]
+        assert 0.05 < np.mean(unseen) < 0.5
+
+
+def test_what_context_shows_covers_the_hints() -> None:
+    told = known = 0
+    for sample in _samples("train", True):
+        seen = seen_by_context(sample)
+        valid = sample.valid[sample.context :]
+        told += int((seen[sample.context :] & valid).sum())
+        known += int(valid.sum())
+        assert bool(seen[: sample.context].all())
+    assert told > 0.97 * known
+
+
+def test_faults_do_harm_and_leave_the_truth_alone() -> None:
+    harmed = 0
+    for clean, faulty in zip(_samples("train", True), _samples("train", False), strict=True):
+        same = clean.place.equal(faulty.place)
+        assert torch.equal(
+            clean.images[clean.place.argsort()], faulty.images[faulty.place.argsort()]
+        )
+        if same and not torch.equal(clean.hint_depth, faulty.hint_depth):
+            harmed += 1
+    assert harmed > COUNT // 2
+
+
+def _plane() -> Clip:
+    return CLEAN.clips(3)[1]
+
+
+@pytest.mark.parametrize(
+    "fault", [e.name for e in fields(CorruptionOptions) if e.name not in ("clean", "absent")]
+)
+def test_every_fault_by_itself(fault: str) -> None:
+    clip = _plane()
+    strength = replace(NOTHING, **{fault: 1.0 if fault in ("flying", "dropped") else 0.2})
+    perfect = observed(clip, (0, 2), NOTHING, np.random.default_rng(0))
+    harmed = observed(clip, (0, 2), strength, np.random.default_rng(0))
+    first, second = harmed.views
+    kept = perfect.views[1]
+    assert kept.depth is not None and np.array_equal(kept.depth, clip.depth[2])
+    assert np.array_equal(np.rint(kept.rgb * 255), clip.rgb[2])
+    depth_faults = ("depth_noise", "depth_scale", "holes", "flying")
+    assert (second.depth is None) == (fault == "dropped") and first.depth is not None
+    if fault in depth_faults:
+        assert second.depth is not None and not np.array_equal(second.depth, kept.depth)
+    if fault in ("exposure", "color"):
+        assert not np.array_equal(second.rgb, kept.rgb)
+        assert np.array_equal(first.rgb, perfect.views[0].rgb)
+    moved = [
+        not np.allclose(a.cam_from_world, b.camera.cam_from_world)
+        for a, b in zip(harmed.lifted, harmed.views, strict=True)
+    ]
+    assert moved == [fault in ("rotation", "translation")] * 2
+
+
+def test_depth_noise_grows_with_depth() -> None:
+    rng = np.random.default_rng(0)
+    depth = np.repeat(np.linspace(1, 4, 128, dtype=np.float32)[None], 128, 0)
+    strength = replace(NOTHING, depth_noise=0.02)
+    errors = np.array([corrupted_depth(rng, depth, strength) / depth - 1 for _ in range(40)])
+    spread = errors.std((0, 1))
+    expected = 0.02 * depth[0] / depth.mean()
+    assert np.abs(spread / expected - 1).mean() < 0.15
+
+
+def test_holes_take_the_share_they_are_given() -> None:
+    rng = np.random.default_rng(0)
+    depth = np.ones((64, 64), np.float32)
+    strength = replace(NOTHING, holes=0.4)
+    shares = [(corrupted_depth(rng, depth, strength) == 0).mean() for _ in range(200)]
+    assert max(shares) <= 0.4 + 1e-3 and np.mean(shares) == pytest.approx(0.2, abs=0.03)
+
+
+def test_flying_pixels_lie_between_front_and_back() -> None:
+    depth = np.ones((32, 32), np.float32)
+    depth[:, 16:] = 3
+    out = corrupted_depth(np.random.default_rng(0), depth, replace(NOTHING, flying=1.0))
+    changed = out != depth
+    assert changed[:, 15:17].mean() > 0.95 and not changed[:, :15].any()
+    assert out.min() >= 1 and out.max() <= 3
+
+
+def test_gains_are_gains() -> None:
+    rgb = np.full((4, 4, 3), 100, np.uint8)
+    out = corrupted_color(np.random.default_rng(0), rgb, replace(NOTHING, exposure=0.3))
+    assert np.ptp(out) == 0 and out[0, 0, 0] != 100
+
+
+def test_wrong_cameras_are_rigid() -> None:
+    camera = _plane().cameras[0]
+    strength = replace(NOTHING, rotation=1.0, translation=0.01)
+    moved = corrupted_camera(np.random.default_rng(0), camera, 2.0, strength)
+    rotation = moved.cam_from_world[0, :3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert 0 < np.linalg.norm(moved.centers - camera.centers) < 0.2
+
+
+def test_projection_noise_touches_valid_target_pixels_alone() -> None:
+    noisy = replace(CLEAN, faults=replace(NOTHING, projection=0.1)).sample(2)
+    clean = replace(CLEAN, faults=NOTHING).sample(2)
+    k = clean.context
+    assert torch.equal(noisy.hint[:k], clean.hint[:k])
+    assert not noisy.hint[k:][~noisy.valid[k:].expand(-1, 3, -1, -1)].any()
+    change = (noisy.hint - clean.hint)[k:][clean.valid[k:].expand(-1, 3, -1, -1)]
+    assert 0 < float(change.std()) <= 0.1
+
+
+def test_strengths_are_drawn_within_their_ranges() -> None:
+    options = CorruptionOptions()
+    strengths = [drawn(np.random.default_rng(n), options) for n in range(400)]
+    for entry in fields(options):
+        if entry.name not in ("clean", "absent"):
+            values = np.array([getattr(strength, entry.name) for strength in strengths])
+            assert values.min() == 0 and values.max() <= getattr(options, entry.name)
+    untouched = np.mean([strength == NOTHING for strength in strengths])
+    assert untouched == pytest.approx(options.clean, abs=0.08)
+    assert drawn(np.random.default_rng(0), CorruptionOptions(clean=1.0)) == NOTHING
+
+
+def test_a_memory_without_points_projects_nothing() -> None:
+    clip = _plane()
+    blind = Clip(clip.rgb, np.zeros_like(clip.depth), clip.cameras)
+    guidance = projected(observed(blind, (0,), NOTHING, np.random.default_rng(0)), clip.cameras[1:])
+    assert not guidance.valid.any()
+
+
+def test_detail_reduces_a_finer_memory() -> None:
+    coarse, fine = replace(CLEAN, size=(48, 48)), replace(CLEAN, size=(48, 48), detail=2)
+    errors = []
+    for data in (coarse, fine):
+        samples = [data.sample(index) for index in range(6)]
+        assert all(s.images.shape == (8, 3, 48, 48) for s in samples)
+        pairs = [
+            ((s.hint - s.images).square().mean(1, keepdim=True)[s.context :], s.valid[s.context :])
+            for s in samples
+        ]
+        errors.append(np.mean([float(e[v].mean()) for e, v in pairs]))
+    assert errors[1] < errors[0]
+    a, b = coarse.sample(0), fine.sample(0)
+    assert torch.equal(a.images, b.images)
+    torch.testing.assert_close(a.depth, b.depth, rtol=0.02, atol=0)
+
+
+def test_batches_are_what_the_model_takes() -> None:
+    samples = _samples("train", False)[:8]
+    batch = collated(samples)
+    assert batch.views.images.shape == (8, 8, 3, 96, 96)
+    assert batch.views.context == samples[0].context and batch.views.valid.dtype == torch.bool
+    assert torch.equal(batch.images[3], samples[3].images)
+    data = ProceduralViews(context=ContextOptions(group=1), size=(24, 24))
+    mixed = [data.sample(index) for index in range(12)]
+    with pytest.raises(ShapeError, match="group"):
+        collated(mixed)
+
+
+def test_mixed_sources_keep_groups_together() -> None:
+    first, second = (ProceduralViews(split=s, size=(12, 12)) for s in ("train", "held-out"))
+    mixed = MixedViews(first, second, share=0.5, group=2)
+    origin = []
+    for index in range(12):
+        sample = mixed.sample(index)
+        own = [_equal(sample, data.sample(index)) for data in (first, second)]
+        assert sum(own) == 1
+        origin.append(own.index(True))
+    assert origin[::2] == origin[1::2] and len(set(origin)) == 2
+
+
+def test_impossible_data_is_refused() -> None:
+    with pytest.raises(OptionError, match=r"data\.views"):
+        ProceduralViews(views=4)
+    with pytest.raises(OptionError, match="sample -1"):
+        CLEAN.sample(-1)
+    with pytest.raises(OptionError, match=r"corruption\.holes"):
+        CorruptionOptions(holes=1.5)

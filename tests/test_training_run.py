@@ -1,0 +1,125 @@
+"""``gvtools train`` on the micro configuration: it learns, goes on, and runs on two processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gvtools.completers.geoverse import from_pretrained
+from gvtools.training.records import read_log
+from gvtools.training.state import load_state
+from pipelines.cli import main
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SHORT = ["--device", "cpu", "--sheets", "0", "--quiet"]
+
+
+def train(out: Path, stage: str, *more: str) -> int:
+    return main(["train", "micro", "--stage", stage, "--out", str(out), *SHORT, *more])
+
+
+def steps(stage: str, count: int) -> list[str]:
+    return ["--set", f"{stage}.optimizer.steps={count}"]
+
+
+def weights_of(folder: Path) -> dict[str, torch.Tensor]:
+    return from_pretrained(folder / "weights").state_dict()
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """All three stages, a few steps each."""
+    out = tmp_path_factory.mktemp("training")
+    torch.set_num_threads(1)
+    assert train(out, "encoder", *steps("encoder", 24)) == 0
+    assert train(out, "denoiser", *steps("denoiser", 6)) == 0
+    assert train(out, "reflow", *steps("reflow", 3)) == 0
+    return out
+
+
+def test_the_loss_falls_and_every_stage_leaves_weights_that_load(trained):
+    records = read_log(trained / "encoder")
+    assert records[-1]["step"] == 24
+    assert records[-1]["loss"] < records[0]["loss"]
+    encoder = from_pretrained(trained / "encoder" / "weights")
+    assert not encoder.config.trained
+    assert float(encoder.level_statistics[1].var.std()) > 0
+    student = from_pretrained(trained / "reflow" / "weights")
+    assert student.config.trained
+    # The student's stage moves level 1 alone.
+    teacher = weights_of(trained / "denoiser")
+    for name, tensor in student.state_dict().items():
+        same = torch.equal(tensor, teacher[name])
+        if not name.startswith("level1."):
+            assert same, name
+    assert any(
+        not torch.equal(tensor, teacher[name])
+        for name, tensor in student.state_dict().items()
+        if name.startswith("level1.")
+    )
+
+
+def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
+    again = tmp_path / "again"
+    assert train(again, "encoder", *steps("encoder", 24), "--until", "9") == 0
+    assert not (again / "encoder" / "weights").exists()
+    assert train(again, "encoder", *steps("encoder", 24), "--resume") == 0
+    whole, parts = weights_of(trained / "encoder"), weights_of(again / "encoder")
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_a_training_is_not_mixed_with_another(trained, tmp_path, capsys):
+    assert train(trained, "encoder", *steps("encoder", 24)) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert train(trained, "encoder", *steps("encoder", 25), "--resume") == 2
+    assert "options" in capsys.readouterr().err
+    assert train(tmp_path / "new", "denoiser") == 2
+    assert "run --stage encoder first" in capsys.readouterr().err
+    assert train(tmp_path / "new", "encoder", "--set", "encoder.optimizer.stepz=3") == 2
+    assert "did you mean 'steps'" in capsys.readouterr().err
+    assert main(["train", "huge", "--out", str(tmp_path / "x")]) == 2
+    assert "known: micro, tiny" in capsys.readouterr().err
+
+
+def test_a_torn_state_is_one_clear_line(trained, tmp_path, capsys):
+    folder = tmp_path / "torn" / "encoder"
+    folder.mkdir(parents=True)
+    whole = (trained / "encoder" / "state.pt").read_bytes()
+    (folder / "state.pt").write_bytes(whole[: len(whole) // 2])
+    assert train(tmp_path / "torn", "encoder", "--resume") == 2
+    assert "cannot be read" in capsys.readouterr().err
+
+
+def test_bad_batches_are_skipped_and_counted(tmp_path):
+    more = ["--set", "encoder.optimizer.largest_loss=1e-6", *steps("encoder", 2)]
+    assert train(tmp_path, "encoder", *more) == 0
+    assert read_log(tmp_path / "encoder")[-1]["skipped"] == 2
+    state = torch.load(tmp_path / "encoder" / "state.pt", weights_only=True)
+    loaded = load_state(tmp_path / "encoder", state["identity"])
+    assert loaded is not None and loaded.progress.skipped == 2
+
+
+@pytest.mark.slow
+def test_two_processes_see_what_one_would(tmp_path):
+    """The same global batch on two CPU processes gives the same curve."""
+    arguments = ["train", "micro", "--stage", "encoder", *SHORT, *steps("encoder", 4)]
+    arguments += ["--set", "encoder.statistics=1"]
+    assert main([*arguments, "--out", str(tmp_path / "one")]) == 0
+    command = [
+        *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
+        *("-m", "pipelines.cli", *arguments, "--out", str(tmp_path / "two")),
+    ]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    root = Path(__file__).resolve().parent.parent
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    one, two = (read_log(tmp_path / name / "encoder")[-1] for name in ("one", "two"))
+    for name in ("loss", "depth", "rgb", "ray", "pose"):
+        assert two[name] == pytest.approx(one[name], rel=1e-4), json.dumps([one, two])
