@@ -80,3 +80,44 @@ def plane_scene(
         views.append(View(f"v{i}", made, load))
         depths.append(plane_depth(made, normal, distance))
     return PlaneScene(Scene(Path("planes"), "colmap", tuple(views)), tuple(depths))
+
+
+def niche_depth(view: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) z-depth of a wall at 2 with a niche whose back is at 3, and where that is seen."""
+    x, y, _ = np.moveaxis(view.centers[0] + 2 * view.rays(), -1, 0)
+    inside = (np.abs(x) < 0.45) & (np.abs(y) < 0.35)
+    return np.where(inside, 3.0, 2.0), inside
+
+
+def niche_picture(view: Cameras, shading: str, noise: float, seed: int) -> Frame:
+    """A textured wall, and a niche whose back is shaded alone."""
+    depth, inside = niche_depth(view)
+    x, y, _ = np.moveaxis(view.centers[0] + depth[..., None] * view.rays(), -1, 0)
+    shades = {"ramp": 0.5 + 0.25 * x + 0.1 * y, "bowl": 0.75 - 0.3 * (x**2 + y**2)}
+    value = np.where(inside, shades[shading], texture(3 * x, 3 * y))
+    value = value + np.random.default_rng(seed).normal(0, noise, value.shape)
+    gray = np.clip(np.round(255 * value), 0, 255).astype(np.uint8)
+    return Frame(np.repeat(gray[..., None], 3, axis=-1))
+
+
+def niche_scene(shading: str, noise: float) -> Scene:
+    """Five views side by side, twice as large as the others of this module."""
+    views = []
+    for i in range(5):
+        made = camera(((i - 2) * 0.12, 0.05 * (i % 2), 0.0), name=f"v{i}")
+        made = made.resized(2 * WIDTH, 2 * HEIGHT)
+        views.append(View(f"v{i}", made, partial(niche_picture, made, shading, noise, i)))
+    return Scene(Path("niche"), "colmap", tuple(views))
+
+
+def turning_scene(
+    jitter: float, *, at: tuple[float, float, float] = (0.0, 0.0, 0.0), count: int = 4
+) -> Scene:
+    """Pictures that one camera takes as it turns; its positions differ by ``jitter``."""
+    views = []
+    for i in range(count):
+        true = camera((0.0, 0.0, 0.0), 0.05 * i, f"v{i}")
+        told = camera((at[0] + jitter * i, at[1], at[2]), 0.05 * i, f"v{i}")
+        load = partial(picture, true, np.array([0.0, 0.0, 1.0]), 2.0)
+        views.append(View(f"v{i}", told, load))
+    return Scene(Path("turning"), "colmap", tuple(views))

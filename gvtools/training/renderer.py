@@ -60,64 +60,79 @@ def developed(light: Float32, exposure: float) -> NDArray[np.uint8]:
 _TONES = encode_srgb(np.linspace(0, BRIGHTEST, STEPS, dtype=np.float32))
 
 
-@compiled(parallel=True, fastmath=FAST)
+@compiled(parallel=True)
 def _render_rows(geometry, look, rays, centers, rects, focal, supersample, color, depth):
-    views, height, width = depth.shape
-    total = len(geometry.rooms)
+    views, height = depth.shape[:2]
     for job in prange(views * height):
         v = job // height
         row = job % height
-        count = width * supersample
-        ends = np.empty((6, count))
-        points = np.empty((9, count))
-        local = np.empty((6, count))
-        floats = np.empty((FLOATS + 2 * total, count))
-        codes = np.empty((CODES + total, count), np.int64)
-        hits = np.empty((5, count), np.int64)
-        t = np.empty(count)
-        squares = np.empty(count, np.float32)
-        pixels = color[v, row]
-        pixels[:] = np.float32(0)
-        for line in range(supersample):
-            y = row + (line + 0.5) / supersample
-            trace_row(
-                geometry, v, rays, centers, rects, row, y, supersample, ends[:3], ends[3:], local,
-                floats, codes, t, hits[0], hits[1], hits[2], hits[3],
-            )  # fmt: skip
-            for k in range(3):
-                for i in range(count):
-                    points[k, i] = centers[v, k] + t[i] * ends[3 + k, i]
-            # Places and levels outlive the light, which needs the other scratch.
-            place = points[6:8]
-            level = points[8]
-            surface_places(
-                geometry, look, ends[3:], points[:3], hits[0], hits[1], hits[2], hits[3],
-                points[3:6], hits[4], place, level,
-            )  # fmt: skip
-            texture_levels(t, 1.0 / (supersample * focal[v]), level, squares, level)
-            light = floats[4 + 2 * total : 7 + 2 * total]
-            light_on(
-                geometry, look, points[:3], points[3:6], light, ends[:3], ends[3:], local,
-                floats, codes,
-            )  # fmt: skip
-            add_colors(look, hits[4], place, level, light, supersample, pixels)
-        share = np.float32(1.0 / (supersample * supersample))
-        for col in range(width):
-            for k in range(3):
-                pixels[col, k] *= share
-        # Arrays of its own: parts of the others would be compiled for once more.
-        ends = np.empty((6, width))
-        local = np.empty((6, width))
-        floats = np.empty((FLOATS + 2 * total, width))
-        codes = np.empty((CODES + total, width), np.int64)
-        hits = np.empty((5, width), np.int64)
-        t = np.empty(width)
+        color[v, row] = np.float32(0)
+        _color_row(
+            geometry, look, v, rays, centers, rects, row, supersample,
+            1.0 / (supersample * focal[v]), color[v, row],
+        )  # fmt: skip
+        _depth_row(geometry, v, rays, centers, rects, row, depth[v, row])
+
+
+@compiled(fastmath=FAST)
+def _color_row(geometry, look, view, rays, centers, rects, row, supersample, pixel, color):
+    """Add up the rays of a row's pixels; ``pixel`` is the width of one ray's share at z-depth 1."""
+    count = len(color) * supersample
+    total = len(geometry.rooms)
+    ends = np.empty((6, count))
+    points = np.empty((9, count))
+    local = np.empty((6, count))
+    floats = np.empty((FLOATS + 2 * total, count))
+    codes = np.empty((CODES + total, count), np.int64)
+    hits = np.empty((5, count), np.int64)
+    t = np.empty(count)
+    squares = np.empty(count, np.float32)
+    for line in range(supersample):
+        y = row + (line + 0.5) / supersample
         trace_row(
-            geometry, v, rays, centers, rects, row, row + 0.5, 1, ends[:3], ends[3:], local,
+            geometry, view, rays, centers, rects, row, y, supersample, ends[:3], ends[3:], local,
             floats, codes, t, hits[0], hits[1], hits[2], hits[3],
         )  # fmt: skip
-        for col in range(width):
-            depth[v, row, col] = t[col]
+        for k in range(3):
+            for i in range(count):
+                points[k, i] = centers[view, k] + t[i] * ends[3 + k, i]
+        # Places and levels outlive the light, which needs the other scratch.
+        place = points[6:8]
+        level = points[8]
+        surface_places(
+            geometry, look, ends[3:], points[:3], hits[0], hits[1], hits[2], hits[3], points[3:6],
+            hits[4], place, level,
+        )  # fmt: skip
+        texture_levels(t, pixel, level, squares, level)
+        light = floats[4 + 2 * total : 7 + 2 * total]
+        light_on(
+            geometry, look, points[:3], points[3:6], light, ends[:3], ends[3:], local, floats,
+            codes,
+        )  # fmt: skip
+        add_colors(look, hits[4], place, level, light, supersample, color)
+    share = np.float32(1.0 / (supersample * supersample))
+    for col in range(len(color)):
+        for k in range(3):
+            color[col, k] *= share
+
+
+@compiled()
+def _depth_row(geometry, view, rays, centers, rects, row, depth):
+    """Depths of the rays through a row's pixel centres."""
+    width = len(depth)
+    total = len(geometry.rooms)
+    ends = np.empty((6, width))
+    local = np.empty((6, width))
+    floats = np.empty((FLOATS + 2 * total, width))
+    codes = np.empty((CODES + total, width), np.int64)
+    hits = np.empty((4, width), np.int64)
+    t = np.empty(width)
+    trace_row(
+        geometry, view, rays, centers, rects, row, row + 0.5, 1, ends[:3], ends[3:], local,
+        floats, codes, t, hits[0], hits[1], hits[2], hits[3],
+    )  # fmt: skip
+    for col in range(width):
+        depth[col] = t[col]
 
 
 @compiled()

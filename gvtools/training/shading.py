@@ -55,86 +55,79 @@ def surface_places(geometry, look, d, p, room, solid, code, cutter, normal, what
     (3, count); ``place`` (2, count) is in copies of the texture; ``spread`` (count,) gets the
     square of copies a metre, over the cosine between normal and ray (which has z-depth 1).
     """
-    rotation = geometry.rotation
     for i in range(len(what)):
-        n = solid[i]
-        c = code[i]
-        along = 1.0
-        down = 1.0
-        if n < 0:
+        if solid[i] < 0:
+            c = code[i]
             positive = d[c, i] < 0
-            nx = ny = nz = 0.0
             facing = abs(d[c, i])
-            sign = 1.0 if positive else -1.0
-            if c == 0:
-                nx = sign
-                u = p[1, i]
-                v = -p[2, i]
-            elif c == 1:
-                ny = sign
-                u = p[0, i]
-                v = -p[2, i]
-            else:
-                nz = sign
-                u = p[0, i]
-                v = p[1, i]
+            for k in range(3):
+                normal[k, i] = 0.0
+            normal[c, i] = 1.0 if positive else -1.0
             m = geometry.room_material[room[i], 2 * c + (0 if positive else 1)]
+            u = p[1, i] if c == 0 else p[0, i]
+            v = p[1, i] if c == 2 else -p[2, i]
+            along = down = 1.0
         else:
-            px = p[0, i] - geometry.centre[n, 0]
-            py = p[1, i] - geometry.centre[n, 1]
-            pz = p[2, i] - geometry.centre[n, 2]
-            x = rotation[n, 0, 0] * px + rotation[n, 0, 1] * py + rotation[n, 0, 2] * pz
-            y = rotation[n, 1, 0] * px + rotation[n, 1, 1] * py + rotation[n, 1, 2] * pz
-            z = rotation[n, 2, 0] * px + rotation[n, 2, 1] * py + rotation[n, 2, 2] * pz
-            mx = my = mz = 0.0
-            if c == 0:
-                mx = 1.0
-                u = y
-                v = -z
-            elif c == 1:
-                my = 1.0
-                u = x
-                v = -z
-            elif c == 2:
-                mz = 1.0
-                u = x
-                v = y
-            else:
-                hx = geometry.half[n, 0]
-                hy = geometry.half[n, 1]
-                hz = geometry.half[n, 2]
-                mx = x / (hx * hx)
-                my = y / (hy * hy)
-                mz = z / (hz * hz) if c == 3 else 0.0
-                scale = 1.0 / np.sqrt(mx * mx + my * my + mz * mz)
-                mx *= scale
-                my *= scale
-                mz *= scale
-                # Half turns: two mirrored copies close round the body without a seam.
-                u = np.arctan2(y / hy, x / hx) / np.pi
-                along = 1.0 / (np.pi * np.sqrt(hx * hy))
-                v = -z
-                if c == 3:
-                    v = np.arccos(min(max(z / hz, -1.0), 1.0)) / np.pi
-                    down = 1.0 / (np.pi * hz)
-            nx = rotation[n, 0, 0] * mx + rotation[n, 1, 0] * my + rotation[n, 2, 0] * mz
-            ny = rotation[n, 0, 1] * mx + rotation[n, 1, 1] * my + rotation[n, 2, 1] * mz
-            nz = rotation[n, 0, 2] * mx + rotation[n, 1, 2] * my + rotation[n, 2, 2] * mz
-            facing = -(nx * d[0, i] + ny * d[1, i] + nz * d[2, i])
-            if facing < 0:
-                nx, ny, nz = -nx, -ny, -nz
-                facing = -facing
+            n = solid[i]
             m = geometry.material[n] if cutter[i] < 0 else geometry.cutter_material[cutter[i]]
-        normal[0, i] = nx
-        normal[1, i] = ny
-        normal[2, i] = nz
-        what[i] = m
-        # Round coordinates are in turns already: a copy is half a turn, whatever the tile.
+            facing, u, v, along, down = _solid_place(geometry, n, code[i], i, d, p, normal)
+        # Round coordinates are in half turns, which a copy covers whatever the tile is.
         tu = look.tile[m, 0] if along == 1.0 else 1.0
         tv = look.tile[m, 1] if down == 1.0 else 1.0
+        what[i] = m
         place[0, i] = (u - look.offset[m, 0]) / tu
         place[1, i] = (v - look.offset[m, 1]) / tv
         spread[i] = along * down / (tu * tv * max(facing, 1e-3))
+
+
+@compiled(fastmath=FAST)
+def _solid_place(geometry, n, code, i, d, p, normal):
+    """Place of point i on solid n; writes its normal.
+
+    Returns the cosine between normal and ray, u and v before tile and offset, and their lengths a
+    metre (1 where they are metres).
+    """
+    R = geometry.rotation
+    x = p[0, i] - geometry.centre[n, 0]
+    y = p[1, i] - geometry.centre[n, 1]
+    z = p[2, i] - geometry.centre[n, 2]
+    a = R[n, 0, 0] * x + R[n, 0, 1] * y + R[n, 0, 2] * z
+    b = R[n, 1, 0] * x + R[n, 1, 1] * y + R[n, 1, 2] * z
+    c = R[n, 2, 0] * x + R[n, 2, 1] * y + R[n, 2, 2] * z
+    along = down = 1.0
+    if code <= 2:
+        mx = 1.0 if code == 0 else 0.0
+        my = 1.0 if code == 1 else 0.0
+        mz = 1.0 if code == 2 else 0.0
+        u = b if code == 0 else a
+        v = b if code == 2 else -c
+    else:
+        hx = geometry.half[n, 0]
+        hy = geometry.half[n, 1]
+        hz = geometry.half[n, 2]
+        mx = a / (hx * hx)
+        my = b / (hy * hy)
+        mz = c / (hz * hz) if code == 3 else 0.0
+        scale = 1.0 / np.sqrt(mx * mx + my * my + mz * mz)
+        mx *= scale
+        my *= scale
+        mz *= scale
+        # Two mirrored copies of half a turn close round the body without a seam.
+        u = np.arctan2(b / hy, a / hx) / np.pi
+        along = 1.0 / (np.pi * np.sqrt(hx * hy))
+        v = -c
+        if code == 3:
+            v = np.arccos(min(max(c / hz, -1.0), 1.0)) / np.pi
+            down = 1.0 / (np.pi * hz)
+    x = R[n, 0, 0] * mx + R[n, 1, 0] * my + R[n, 2, 0] * mz
+    y = R[n, 0, 1] * mx + R[n, 1, 1] * my + R[n, 2, 1] * mz
+    z = R[n, 0, 2] * mx + R[n, 1, 2] * my + R[n, 2, 2] * mz
+    facing = -(x * d[0, i] + y * d[1, i] + z * d[2, i])
+    sign = 1.0 if facing > 0 else -1.0
+    normal[0, i] = sign * x
+    normal[1, i] = sign * y
+    normal[2, i] = sign * z
+    return abs(facing), u, v, along, down
 
 
 @compiled(fastmath=FAST)

@@ -24,14 +24,11 @@ class Agreement:
         views: (H, W) int64, how many others confirm each pixel.
         spread: (H, W) float32, mean relative difference to those that do; 0 without any.
         inverse_depth: (H, W) float32, mean of the view's own and the confirming views'.
-        ahead: (H, W) int64, how many others see through the pixel: they know something clearly
-            farther along the same ray of theirs.
     """
 
     views: torch.Tensor
     spread: torch.Tensor
     inverse_depth: torch.Tensor
-    ahead: torch.Tensor
 
 
 def agreement(
@@ -56,7 +53,6 @@ def agreement(
     v, u = pixel_centers(height, width, inverse_depth.device)
     known = inverse_depth > 0
     count = torch.zeros((height, width), dtype=torch.int64, device=inverse_depth.device)
-    ahead = torch.zeros_like(count)
     total = torch.zeros_like(inverse_depth)
     spread = torch.zeros_like(inverse_depth)
     for other, camera in others:
@@ -80,13 +76,9 @@ def agreement(
         difference = inverse_depth / seen - 1
         near = inside & (difference.abs() <= tolerance)
         count += near
-        ahead += inside & (difference > 3 * tolerance)
         total += torch.where(near, OTHERS * seen, torch.zeros_like(seen))
         spread += torch.where(near, difference.abs(), torch.zeros_like(seen))
     mean = (inverse_depth + total) / (1 + OTHERS * count)
     return Agreement(
-        count,
-        spread / count.clamp(min=1),
-        torch.where(known, mean, torch.zeros_like(mean)),
-        ahead,
+        count, spread / count.clamp(min=1), torch.where(known, mean, torch.zeros_like(mean))
     )

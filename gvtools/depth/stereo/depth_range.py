@@ -20,6 +20,8 @@ MARGIN = 1.5  # on either end, as a factor of the depth
 MEETING_ANGLE = 4.0
 # Without sparse points or meeting axes: typical depth over the distance to the nearest views.
 DEPTH_OF_BASELINE = 12.0
+# Centres that are less than this many roundings of their coordinates apart stand at one place.
+ROUNDINGS = 256
 # How far the unknown range reaches on either side of the typical depth, as a factor.
 UNKNOWN_NEAR, UNKNOWN_FAR = 8.0, 16.0
 
@@ -93,7 +95,8 @@ def estimate_range(scene: Scene, name: str) -> DepthRange:
     and get a wide range, to be narrowed by ``range_of_depths``.
 
     Raises:
-        DegenerateError: one view, or all views at one place, and no points.
+        DegenerateError: one view, or all views at one place as far as their coordinates tell, and
+            no points.
     """
     tracks = seen_points(scene, name)
     camera = scene[name].camera
@@ -122,6 +125,14 @@ def range_of_depths(depths: Float64, *, origin: str, margin: float = MARGIN) -> 
     return DepthRange(float(low / margin), float(high * margin), float(lower), float(upper), origin)
 
 
+def baselines(scene: Scene, name: str) -> Float64:
+    """(V,) distance from a view to each of the scene's; 0 where it drowns in the rounding."""
+    centers = scene.cameras.centers
+    distance = np.linalg.norm(centers - centers[scene.names.index(name)], axis=-1)
+    rounding = ROUNDINGS * np.finfo(np.float64).eps * float(np.abs(centers).max())
+    return np.where(distance > rounding, distance, 0.0)
+
+
 def _meeting_depth(scene: Scene, name: str) -> float | None:
     """Median depth at which the view's optical axis comes closest to those of the others."""
     cameras = scene.cameras
@@ -131,6 +142,7 @@ def _meeting_depth(scene: Scene, name: str) -> float | None:
     gap = centers - centers[view]
     sine2 = 1 - cosine**2
     turned = (sine2 > np.sin(np.deg2rad(MEETING_ANGLE)) ** 2) & (cosine > 0)
+    turned &= baselines(scene, name) > 0
     mine, theirs = gap @ axes[view], np.einsum("vj,vj->v", gap, axes)
     with np.errstate(divide="ignore", invalid="ignore"):
         along = (mine - cosine * theirs) / sine2
@@ -143,12 +155,11 @@ def _meeting_depth(scene: Scene, name: str) -> float | None:
 
 def _baseline_depth(scene: Scene, name: str) -> float:
     """Typical depth when the distance to the nearest views is all there is to go by."""
-    centers = scene.cameras.centers
-    distance = np.sort(np.linalg.norm(centers - centers[scene.names.index(name)], axis=-1))[1:5]
-    baseline = float(np.median(distance)) if len(distance) else 0.0
-    if not baseline > 0:
+    distance = baselines(scene, name)
+    nearest = np.sort(distance[distance > 0])[:4]
+    if not len(nearest):
         raise DegenerateError(
             f"{scene.root}: view {name} has no other view at another place among {len(scene)}; "
             "stereo needs two viewpoints; add photographs taken a step aside"
         )
-    return DEPTH_OF_BASELINE * baseline
+    return DEPTH_OF_BASELINE * float(np.median(nearest))

@@ -25,9 +25,11 @@ class StereoOptions:
         levels: of the pyramid, each half the size of the one below.
         window: side of the compared window, pixels of its level, odd.
         iterations: rounds of propagation on each level finer than the coarsest.
-        noise: standard deviation of the pictures' noise, 0 to 1 for black to white; what varies
-            less than this counts as without texture.
-        views: source views whose own depth must confirm a pixel's, at most ``sources``.
+        noise: standard deviation of the pictures' noise, 0 to 1 for black to white; where nothing
+            but shading is left below two thirds of it, or below a quarter more than the blankest
+            parts of the picture have, there is no texture.
+        views: source views whose own depth must confirm a pixel's, at most ``sources``; where a
+            view has fewer sources than this, none of its depth is kept.
         tolerance: relative depth difference up to which another view confirms.
         cost: highest photometric cost that is kept, 0 for a perfect match to 1 for none.
         align: adjust the poses to the pictures first; None does so for scenes without sparse
@@ -73,6 +75,11 @@ class StereoOptions:
         check_range("stereo.cost", self.cost, above=0, most=1)
         check_range("stereo.regrow", self.regrow, least=0)
         check_range("stereo.speckle", self.speckle, least=0)
+        if self.views > self.sources:
+            raise OptionError(
+                f"stereo.views {self.views} is more than stereo.sources {self.sources}; expected "
+                "as many sources as views that must confirm; lower the one or raise the other"
+            )
         if self.window % 2 == 0:
             raise OptionError(f"stereo.window {self.window}; expected an odd number")
         for name, value, known in (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
@@ -15,8 +16,15 @@ from gvtools.depth.stereo.confidence import confidence_of
 from gvtools.depth.stereo.consistency import agreement
 from gvtools.depth.stereo.depth_range import DepthRange, estimate_range
 from gvtools.depth.stereo.matching import make_matcher
+from gvtools.depth.stereo.motion import enough_disparity, only_turned
 from gvtools.depth.stereo.options import StereoOptions
-from gvtools.depth.stereo.pyramid import Pyramid, build_pyramid, resampled, resampled_colors
+from gvtools.depth.stereo.pyramid import (
+    Pyramid,
+    build_pyramid,
+    resampled,
+    resampled_colors,
+    working_size,
+)
 from gvtools.depth.stereo.residual_flow import residual_flow
 from gvtools.depth.stereo.single_view import (
     CoarseDepth,
@@ -26,6 +34,7 @@ from gvtools.depth.stereo.single_view import (
     narrowed,
 )
 from gvtools.depth.stereo.sources import choose_sources
+from gvtools.depth.stereo.texture import textured
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.scenes.scene import Frame, Scene, View
 
@@ -100,10 +109,11 @@ class PlaneSweepStereo:
             [(other.inverse_depth, other.camera) for other in others],
             tolerance=options.tolerance,
         )  # fmt: skip
-        matched = (raw.cost <= options.cost) & (raw.contrast > options.noise)
-        confirmed = matched & (compared.views >= min(options.views, options.sources))
+        matched = (raw.cost <= options.cost) & raw.textured
+        confirmed = matched & (compared.views >= options.views)
         confidence = confidence_of(raw.cost, compared.views, compared.spread)
-        depth = (1 / compared.inverse_depth.clamp(min=1e-9)).float().cpu().numpy()
+        inverse = compared.inverse_depth
+        depth = torch.where(inverse > 0, 1 / inverse, torch.zeros_like(inverse)).cpu().numpy()
         guide = self._pyramid(view, frame).images[0].numpy()
         trust = confidence.cpu().numpy()
         known = self._outlined(depth, matched.cpu().numpy(), confirmed.cpu().numpy(), frame)
@@ -216,7 +226,20 @@ class PlaneSweepStereo:
             reference, sources, depths,
             options=self.options, matcher=self._matcher, device=self._device,
         )  # fmt: skip
+        if depths.origin != "points":
+            self._refuse_turned(view, coarse)
         return coarse, reference, sources, names
+
+    def _refuse_turned(self, view: View, coarse: CoarseDepth) -> None:
+        """Raise when a turn alone explains the pictures; sparse points vouch for positions."""
+        options = self.options
+        detailed = textured(coarse.level.reference, window=options.window, noise=options.noise)
+        if only_turned(coarse.level, coarse.cost, detailed, self._matcher):
+            raise DegenerateError(
+                f"{self._scene.root}: the pictures beside {view.name} differ from it by a turn of "
+                "the camera alone, whatever their positions say; stereo needs two viewpoints; add "
+                "photographs taken a step aside"
+            )
 
     def _range(self, view: View, reference: Pyramid) -> DepthRange:
         """Where the view's depths lie, narrowed by a first sweep when there are no points."""
@@ -236,12 +259,25 @@ class PlaneSweepStereo:
         chosen = choose_sources(
             self._known(view), view.name, self.views, count=self.options.sources, depths=depths
         )
-        if not chosen:
+        names = tuple(source.name for source in chosen)
+        if names:
+            # As large as the finest level, whose pixels are meant.
+            camera, *others = (
+                self._finest(self._scene[name].camera) for name in (view.name, *names)
+            )
+            moved = enough_disparity(camera, concatenate(others), depths)
+            names = tuple(name for name, far in zip(names, moved, strict=True) if far)
+        if not names:
             raise DegenerateError(
                 f"{self._scene.root}: none of the {len(self.views)} views shows what {view.name} "
                 "does from another place; leave it out or add photographs beside it"
             )
-        return tuple(source.name for source in chosen)
+        return names
+
+    def _finest(self, camera: Cameras) -> Cameras:
+        """The camera of the finest level."""
+        width, height = int(camera.width[0]), int(camera.height[0])
+        return camera.resized(*working_size(width, height, self.options.max_side))
 
     def _known(self, view: View) -> Scene:
         """The scene of the views that may be looked at and the view itself."""

@@ -14,6 +14,7 @@ from gvtools.depth.stereo.matching import Level, Matcher
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.pyramid import Pyramid, level_of
 from gvtools.depth.stereo.refinement import fitted, refined, upsampled
+from gvtools.depth.stereo.texture import textured
 
 # Cost below which a first estimate tells the range of depths, and the share of pixels it needs.
 SURE, SURE_SHARE = 0.3, 0.1
@@ -43,14 +44,14 @@ class RawDepth:
     Attributes:
         inverse_depth: (H, W) float32, 1 / scene units.
         cost: (H, W) float32 photometric cost.
-        contrast: (H, W) float32, standard deviation of the luminance in the window.
+        textured: (H, W) bool, where there is detail to match; see gvtools.depth.stereo.texture.
         camera: of the finest level, a batch of one.
         sources: names of the views that it was matched with.
     """
 
     inverse_depth: torch.Tensor
     cost: torch.Tensor
-    contrast: torch.Tensor
+    textured: torch.Tensor
     camera: Cameras
     sources: tuple[str, ...]
 
@@ -114,17 +115,5 @@ def fine_depth(
             planes, level, matcher,
             step=step, bounds=bounds, iterations=options.iterations * 2**index,
         )  # fmt: skip
-    return RawDepth(planes[0].clamp(*bounds), cost, contrast(level), reference.cameras[0], names)
-
-
-def contrast(level: Level) -> torch.Tensor:
-    """(H, W) standard deviation of the reference's luminance over the window, unweighted."""
-    image = level.reference
-    window = 2 * int(level.taps.abs().max()) + 1
-    padded = torch.nn.functional.pad(image[None, None], (window // 2,) * 4, mode="replicate")
-    pool = torch.nn.functional.avg_pool2d
-    first, second = (
-        pool(pool(part, (window, 1), stride=1), (1, window), stride=1)[0, 0]
-        for part in (padded, padded**2)
-    )
-    return (second - first**2).clamp(min=0).sqrt()
+    detailed = textured(level.reference, window=options.window, noise=options.noise)
+    return RawDepth(planes[0].clamp(*bounds), cost, detailed, reference.cameras[0], names)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.depth.stereo.depth_range import DepthRange, seen_points
+from gvtools.depth.stereo.depth_range import DepthRange, baselines, seen_points
 from gvtools.depth.stereo.warps import pixel_grid
 from gvtools.scenes.scene import Scene
 
@@ -48,7 +48,8 @@ def choose_sources(
 
     Each candidate is rated by the points of the reference that it sees too, each weighted by its
     parallax: sparse points with their tracks when the reference has enough of them, else points
-    spread over its frustum inside the depth range. Candidates close to a chosen one count less.
+    spread over its frustum inside the depth range. Candidates close to a chosen one count less, and
+    those at the reference's own place are none.
 
     Args:
         scene: the project.
@@ -78,7 +79,8 @@ def choose_sources(
     turned = reference.cam_from_world[0, 2, :3] @ sources.cam_from_world[:, 2, :3].T
     overlap = shared.mean(1)
     score = weight.mean(1) * (turned > np.cos(np.deg2rad(60))) * (overlap >= LEAST_OVERLAP)
-    chosen = _spread_out(score, reference.centers[0], sources.centers, count)
+    baseline = baselines(scene, name)[rows]
+    chosen = _spread_out(score * (baseline > 0), baseline, sources.centers, count)
     return tuple(
         SourceView(others[i], float(overlap[i]), float(np.median(angle[i][shared[i]])))
         for i in chosen
@@ -94,16 +96,18 @@ def parallax(center: Float64, others: Float64, points: Float64) -> Float64:
     return np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def _spread_out(score: Float64, center: Float64, centers: Float64, count: int) -> list[int]:
-    """Rows of the best scores, each lowered by how near it stands to those already taken."""
+def _spread_out(score: Float64, baseline: Float64, centers: Float64, count: int) -> list[int]:
+    """Rows of the best scores, each lowered by how near it stands to those already taken.
+
+    A score is 0 where the baseline is.
+    """
     chosen: list[int] = []
-    baseline = np.linalg.norm(centers - center, axis=-1) + 1e-300
-    score = score.copy()
+    baseline = np.where(baseline > 0, baseline, np.inf)
     while len(chosen) < count and score.max() > 0:
         best = int(np.argmax(score))
         chosen.append(best)
         gap = np.linalg.norm(centers - centers[best], axis=-1) / baseline
-        score *= 1 - np.exp(-0.5 * (gap / APART) ** 2)
+        score = score * (1 - np.exp(-0.5 * (gap / APART) ** 2))
         score[best] = 0
     return chosen
 
