@@ -22,8 +22,8 @@ from gvtools.completers.geoverse.reflow import (
     interval_ends,
     interval_of,
     interval_share,
+    interval_times,
     reflow_pair,
-    sample_interval_times,
     straight_state,
     straight_velocity,
     teacher_times,
@@ -57,7 +57,8 @@ def test_a_time_lies_in_the_interval_that_begins_at_or_above_it():
 def test_drawn_times_lie_in_their_intervals(inner, seed):
     bounds = (1.0, *sorted(inner, reverse=True), 0.0)
     generator = torch.Generator().manual_seed(seed)
-    intervals, t = sample_interval_times(64, bounds, generator=generator)
+    which, share = torch.rand(2, 64, generator=generator)
+    intervals, t = interval_times(which, share, bounds)
     upper, lower = interval_ends(intervals, bounds)
     assert bool(((t <= upper.float()) & (t >= lower.float())).all())
     eta = interval_share(t.double(), upper=upper, lower=lower)
@@ -65,7 +66,8 @@ def test_drawn_times_lie_in_their_intervals(inner, seed):
 
 
 def test_intervals_are_drawn_equally_often_and_times_uniformly():
-    intervals, t = sample_interval_times(30000, BOUNDS, generator=torch.Generator().manual_seed(0))
+    which, inside = torch.rand(2, 30000, generator=torch.Generator().manual_seed(0))
+    intervals, t = interval_times(which, inside, BOUNDS)
     share = torch.bincount(intervals, minlength=3) / 30000
     assert float((share - 1 / 3).abs().max()) < 5 * math.sqrt(2 / 9 / 30000)
     upper, lower = interval_ends(intervals, BOUNDS)

@@ -9,7 +9,7 @@ from gvtools.completers.geoverse.depth_anything.rays import camera_centres
 from gvtools.completers.geoverse.flow import (
     clean_from_velocity,
     interpolate,
-    shift_time,
+    training_times,
     velocity_target,
 )
 from gvtools.completers.geoverse.model import GeoVerse
@@ -17,9 +17,6 @@ from gvtools.completers.geoverse.objective.objective import Prediction, Referenc
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 from gvtools.training.options import DenoiserStageOptions
-
-# Times are drawn below 1, as GLD draws them: at 1 the state tells nothing.
-LATEST = 0.999
 
 
 class DenoiserStage(nn.Module):
@@ -91,5 +88,5 @@ class DenoiserStage(nn.Module):
 
     def _time(self, draws: Draws, name: str, device: torch.device) -> Tensor:
         """(B,) times, uniform before the shift."""
-        u = draws.uniform(name, 1)[:, 0] * LATEST
-        return shift_time(u, self.model.config.flow.shift).to(device)
+        uniform = draws.uniform(name, 1)[:, 0]
+        return training_times(uniform, shift=self.model.config.flow.shift).to(device)

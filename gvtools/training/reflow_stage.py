@@ -9,14 +9,13 @@ from torch import Tensor, nn
 from gvtools.completers.geoverse.flow import (
     guided,
     interpolate,
-    shift_time,
+    training_times,
     velocity_target,
 )
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective.losses import flow_matching_loss
-from gvtools.completers.geoverse.reflow import fast_loss, interval_ends, reflow_pair
+from gvtools.completers.geoverse.reflow import fast_loss, interval_times, reflow_pair
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.denoiser_stage import LATEST
 from gvtools.training.draws import Draws
 from gvtools.training.options import ReflowStageOptions
 
@@ -58,10 +57,9 @@ class ReflowStage(nn.Module):
         device = clean.device
         context = batch.views.context
         noise = draws.normal("eps", clean.shape, device)
-        count = len(self.bounds) - 1
-        intervals = (draws.uniform("interval", 1)[:, 0] * count).long().clamp(max=count - 1)
-        upper, lower = interval_ends(intervals, self.bounds)
-        t = (lower + draws.uniform("t_inside", 1)[:, 0] * (upper - lower)).float()
+        intervals, t = interval_times(
+            draws.uniform("interval", 1)[:, 0], draws.uniform("t_inside", 1)[:, 0], self.bounds
+        )
         known = teacher.prepare(batch.views) if options.rho > 0 else prepared
         without = teacher.without_cameras(known) if options.guidance != 1 else known
         pair = reflow_pair(
@@ -79,7 +77,7 @@ class ReflowStage(nn.Module):
             shift=model.config.flow.shift,
         )
         student = model.velocity1(prepared, pair.state, pair.t)
-        time = shift_time(draws.uniform("t", 1)[:, 0] * LATEST, model.config.flow.shift).to(device)
+        time = training_times(draws.uniform("t", 1)[:, 0], shift=model.config.flow.shift).to(device)
         state = interpolate(clean, noise, time)
         plain = model.velocity1(prepared, state, time)
         weight = options.context_weight

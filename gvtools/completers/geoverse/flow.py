@@ -102,23 +102,14 @@ def check_bounds(bounds: Sequence[float]) -> tuple[float, ...]:
     return tau
 
 
-def sample_times(
-    batch: int,
-    *,
-    shift: float = 1.0,
-    most: float = 0.999,
-    generator: torch.Generator | None = None,
-    device: torch.device | str | None = None,
-) -> Tensor:
-    """Training times (B,) float32: uniform on [0, ``most``), then shifted.
+def training_times(uniform: Tensor, *, shift: float = 1.0, most: float = 0.999) -> Tensor:
+    """Training times (B,) of uniform draws (B,) in [0, 1): scaled to [0, ``most``), then shifted.
 
     The paper's t ~ U(0, 1) is ``most`` 1, ``shift`` 1; Geometric Latent Diffusion has 0.999 and
-    ``latent_shift``. Drawn where ``generator`` lives, on the CPU without one.
+    ``latent_shift``.
     """
     check_range("largest training time", most, above=0, most=1)
-    home = "cpu" if generator is None else generator.device
-    uniform = torch.rand(batch, generator=generator, device=home) * most
-    return shift_time(uniform, shift).to(device=device)
+    return shift_time(uniform * most, shift)
 
 
 def over_state(t: float | Tensor, state: Tensor) -> float | Tensor:

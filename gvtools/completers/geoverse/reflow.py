@@ -66,17 +66,17 @@ def interval_ends(intervals: Tensor, bounds: Sequence[float]) -> tuple[Tensor, T
     return tau[index], tau[index + 1]
 
 
-def sample_interval_times(
-    batch: int, bounds: Sequence[float], *, generator: torch.Generator | None = None
-) -> tuple[Tensor, Tensor]:
+def interval_times(which: Tensor, share: Tensor, bounds: Sequence[float]) -> tuple[Tensor, Tensor]:
     """An interval (B,) int64, each as likely, and t ~ U(tau_{a+1}, tau_a) (B,) float32; on the CPU.
 
-    ``generator`` is a CPU generator.
+    Args:
+        which: (B,) uniform draws in [0, 1) of the interval.
+        share: (B,) uniform draws in [0, 1) of the place in it.
+        bounds: tau_0 .. tau_K.
     """
     count = len(check_bounds(bounds)) - 1
-    intervals = torch.randint(count, (batch,), generator=generator)
+    intervals = (which * count).long().clamp(max=count - 1)
     upper, lower = interval_ends(intervals, bounds)
-    share = torch.rand(batch, generator=generator, dtype=torch.float64)
     return intervals, (lower + share * (upper - lower)).float()
 
 
@@ -126,7 +126,7 @@ def reflow_pair(
         clean: (B, ...) reference latents F^1.
         noise: (B, ...).
         intervals: (B,) int64, a.
-        t: (B,) in each interval, see ``sample_interval_times``.
+        t: (B,) in each interval, see ``interval_times``.
         bounds: tau_0 .. tau_K.
         steps: of the teacher in each interval.
         shift: of the teacher's time, see ``flow.shift_time``.
