@@ -45,6 +45,14 @@ class Guidance:
             self.generated[rows],
         )
 
+    def emptied(self) -> Guidance:
+        """The same cameras, and a memory that knows nothing."""
+        zeros = {
+            name: np.zeros_like(getattr(self, name))
+            for name in ("rgb", "depth", "valid", "confidence", "generated")
+        }
+        return Guidance(self.cameras, **zeros)
+
     @property
     def coverage(self) -> float:
         """The share of pixels that memory supports."""

@@ -23,6 +23,7 @@ COMMANDS = {
     "trajectory": "pipelines.trajectory",
     "weights": "pipelines.weights",
     "train": "pipelines.train",
+    "experiment": "pipelines.experiment",
     "export": "pipelines.export",
     "bench": "pipelines.bench",
 }

@@ -38,6 +38,20 @@ class TrainingBatch:
         )
 
     @property
+    def unprojected(self) -> TrainingBatch:
+        """The same views with nothing projected into the targets."""
+        context = self.views.context
+        known = torch.zeros_like(self.views.valid)
+        known[:, :context] = True
+        views = replace(
+            self.views,
+            images=self.views.images * known,
+            depth=self.views.depth * known,
+            valid=self.views.valid & known,
+        )
+        return replace(self, views=views)
+
+    @property
     def centers(self) -> Tensor:
         """(B, V, 3) true camera centres in the frame of the first view."""
         pose = self.views.cam_from_world

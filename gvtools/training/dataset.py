@@ -40,6 +40,25 @@ class Samples(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What a sample is made of.
+
+    Attributes:
+        clip: its views in order, as they are observed.
+        truth: the same views at the model's size.
+        context: which of them are given, ascending.
+        strength: of its faults.
+        rng: draws the faults; used up by one sample.
+    """
+
+    clip: Clip
+    truth: Clip
+    context: tuple[int, ...]
+    strength: CorruptionOptions
+    rng: np.random.Generator
+
+
 @dataclass(frozen=True, kw_only=True)
 class ProceduralViews:
     """Views of procedural scenes; every number has a scene of its own.
@@ -80,11 +99,23 @@ class ProceduralViews:
 
     def sample(self, index: int) -> Sample:
         """The sample of a number, 0 or more."""
+        given = self.given(index)
+        return make_sample(
+            given.clip,
+            given.truth,
+            given.context,
+            rng=given.rng,
+            strength=given.strength,
+            hints=self.hints,
+        )
+
+    def given(self, index: int) -> Given:
+        """What the sample of a number is made of."""
         clip, truth = self.clips(index)
         rng = self._rng(index, FAULTS)
         strength = drawn(rng, self.faults or CorruptionOptions(clean=1.0))
         context = self.context.chosen(rng, self.views, self.context_count(index))
-        return make_sample(clip, truth, context, rng=rng, strength=strength, hints=self.hints)
+        return Given(clip, truth, context, strength, rng)
 
     def clips(self, index: int) -> tuple[Clip, Clip]:
         """The views of a sample in order: as they are observed, and at the model's size."""

@@ -10,10 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.conditioning import ViewBatch, filled
+from gvtools.completers.geoverse.conditioning import ViewBatch, encode_views, filled
 from gvtools.completers.geoverse.depth_anything.camera_token import encode_cameras
 from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
-from gvtools.completers.geoverse.depth_anything.network import relative_cameras
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective.losses import high_gradient_loss
 from gvtools.training.batch import TrainingBatch
@@ -65,9 +64,8 @@ class EncoderStage(nn.Module):
         """Geometry and normed features of all views, from noised levels 0 and 1."""
         model, options = self.model, self.options
         views = self._shown(batch, draws)
-        cameras, _ = relative_cameras(views.cam_from_world)
-        known = {"cam_from_world": cameras, "K": views.K} if model.config.hints.cameras else {}
-        levels = model.geometry.encode(views.images, levels=2, **known)
+        cameras = model.config.hints.cameras
+        levels = encode_views(model.geometry, views, slice(None), cameras=cameras)
         amount = options.noise * draws.uniform("noise", 1, 1, 1).to(views.images.device)
         noisy = []
         for index, level in enumerate(levels):
@@ -189,10 +187,8 @@ def measure_statistics(model: GeoVerse, batches: list[TrainingBatch]) -> None:
     squares = torch.zeros_like(sums)
     count = 0
     for batch in batches:
-        views = batch.true_views
-        cameras, _ = relative_cameras(views.cam_from_world)
-        known = {"cam_from_world": cameras, "K": views.K} if model.config.hints.cameras else {}
-        levels = model.geometry.encode(views.images, levels=2, **known)
+        cameras = model.config.hints.cameras
+        levels = encode_views(model.geometry, batch.true_views, slice(None), cameras=cameras)
         for index, level in enumerate(levels):
             patches = level[:, :, 1:].double()
             sums[index] += patches.sum(dim=(0, 1, 2)).cpu()

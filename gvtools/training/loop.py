@@ -185,7 +185,7 @@ class Trainer:
         else:
             self.optimizer.step()
             self.ema.update()
-            values.append({"gradient": float(norm)})
+            values.append({"gradient_norm": float(norm)})
         self.optimizer.zero_grad(set_to_none=True)
         self.progress.step += 1
         return _averaged(values)

@@ -159,20 +159,27 @@ class DataOptions:
         views: of a sample.
         size: (H, W) of the pictures, px.
         workers: processes that render; 0 renders in the training process.
+        projections: False: nothing of the memory is projected into the targets.
         scenes: paths of projects that gvtools reads, mixed in by ``scene_share``.
         scene_share: share of samples from ``scenes``.
+        scene_select: which of their views are used, a selection such as "every:20".
+        scene_overlap: least share of a view's depth that the next view of a sample shows, too.
     """
 
     views: int = 8
     size: tuple[int, int] = (96, 96)
     workers: int = 1
+    projections: bool = True
     scenes: tuple[str, ...] = ()
     scene_share: float = 0.0
+    scene_select: str = "all"
+    scene_overlap: float = 0.4
 
     def __post_init__(self) -> None:
         check_range("data.views", self.views, least=2)
         check_range("data.workers", self.workers, least=0)
         check_range("data.scene_share", self.scene_share, least=0, most=1)
+        check_range("data.scene_overlap", self.scene_overlap, least=0, below=1)
 
 
 @dataclass(frozen=True, kw_only=True)

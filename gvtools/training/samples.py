@@ -48,8 +48,8 @@ class TrainingSamples:
     def batch(self, samples: range) -> TrainingBatch:
         """The samples with these numbers."""
         if self._loader is None:
-            return collated([self._data.sample(index) for index in samples])
-        return self._loader(samples)
+            return self._shown(collated([self._data.sample(index) for index in samples]))
+        return self._shown(self._loader(samples))
 
     def aside(self, index: int, count: int) -> TrainingBatch:
         """Training scenes that no step sees."""
@@ -60,12 +60,17 @@ class TrainingSamples:
     def held_out(self, count: int) -> TrainingBatch:
         """Scenes of other photographs and layouts."""
         data = self._data_set("held-out")
-        return collated([data.sample(index) for index in range(min(count, self._context.group))])
+        return self._shown(
+            collated([data.sample(index) for index in range(min(count, self._context.group))])
+        )
 
     def close(self) -> None:
         """End the processes that make samples."""
         if self._loader is not None:
             self._loader.close()
+
+    def _shown(self, batch: TrainingBatch) -> TrainingBatch:
+        return batch if self.config.data.projections else batch.unprojected
 
     def _data_set(self, split: str) -> DataSet:
         data = self.config.data
@@ -83,6 +88,8 @@ class TrainingSamples:
 
         recorded = SceneViews(
             scenes=tuple(open_project(Path(path)) for path in data.scenes),
+            select=data.scene_select,
+            overlap=data.scene_overlap,
             seed=self.config.seed,
             views=data.views,
             size=data.size,

@@ -16,6 +16,7 @@ from gvtools.completers.geoverse.resampling import resampled
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.options import check_range
 from gvtools.scenes.scene import Scene, View
+from gvtools.scenes.selection import select
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.corruption import CorruptionOptions, drawn
 from gvtools.training.dataset import FAULTS, PATH, RECORDED
@@ -46,6 +47,7 @@ class SceneViews:
 
     Attributes:
         scenes: with depth; views without any are left out.
+        select: which of a scene's views are used, see ``selection.select``.
         seed: 0 or more.
         views: of a sample.
         size: (H, W) of the pictures; views are cropped about their centre to this aspect.
@@ -58,6 +60,7 @@ class SceneViews:
     """
 
     scenes: tuple[Scene, ...]
+    select: str = "all"
     seed: int = 0
     views: int = 8
     size: tuple[int, int] = (96, 96)
@@ -79,11 +82,19 @@ class SceneViews:
         check_range("data.detail", self.detail, least=1)
         check_range("data.overlap", self.overlap, least=0, below=1)
         check_range("data.views", self.views, least=self.context.most + 1)
-        usable = tuple(tuple(v for v in scene if v.has_depth) for scene in self.scenes)
+        usable = tuple(
+            tuple(
+                scene[name]
+                for name in select([view.name for view in scene], self.select)
+                if scene[name].has_depth
+            )
+            for scene in self.scenes
+        )
         for scene, views in zip(self.scenes, usable, strict=True):
             if len(views) < self.views:
                 raise ProjectError(
-                    f"{scene.root}: {len(views)} of {len(scene)} views have depth; samples need "
+                    f"{scene.root}: {len(views)} of {len(scene)} views are selected and have "
+                    "depth; samples need "
                     f"{self.views}; give a scene with recorded depth, or fewer views a sample"
                 )
         if not usable:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completion, ContextView
+from gvtools.completers.geoverse.color_field import COLOR_ALIGNMENTS, aligned_color
 from gvtools.completers.geoverse.depth_scale import ALIGNMENTS, pass_scale, scaled_depth
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import Generated, GeoVerse
@@ -31,6 +32,8 @@ from gvtools.options import check_range
 
 PRECISIONS = ("auto", "float32", "bfloat16")
 DEVICES = ("auto", "cpu", "cuda")
+# The model that ships: see MODEL_CARD.md there.
+SHIPPED = Path(__file__).parent / "pretrained" / "tiny"
 # Confidence of a generated pixel at most: below what was observed.
 GENERATED = 0.9
 
@@ -40,13 +43,17 @@ class GeoVerseCompleter:
     """The generative core (see ``model.py``), with the memory's pixels kept as they are.
 
     Attributes:
-        weights: folder of a GeoVerse model; see ``gvtools weights list``.
-        steps: level-1 steps, equally spaced in time; None for the model's own interval bounds.
+        weights: folder of a GeoVerse model, see ``gvtools weights list``; None for the small one
+            that ships.
+        steps: level-1 steps, equally spaced in time; None for the model's own interval bounds; 0
+            decodes the features of the filled projections as they are.
         cascade_steps: level-0 steps, likewise.
         guidance: classifier-free guidance scale; None for the model's own.
         context_views: most photographs in a pass; None for the model's own.
         views: most views in a pass, photographs and targets; None for the model's own.
         alignment: how depth gets the memory's scale, see ``depth_scale``; None for the model's own.
+        color_alignment: whether colours follow the memory's, see ``color_field``; None for the
+            model's own.
         precision: "auto" is bfloat16 on a GPU and float32 on a CPU.
         device: "auto" takes a GPU where there is one.
     """
@@ -61,11 +68,12 @@ class GeoVerseCompleter:
     context_views: int | None = None
     views: int | None = None
     alignment: str | None = None
+    color_alignment: str | None = None
     precision: str = "auto"
     device: str = "auto"
 
     def __post_init__(self) -> None:
-        check_range("completer.steps", self.steps, least=1)
+        check_range("completer.steps", self.steps, least=0)
         check_range("completer.cascade_steps", self.cascade_steps, least=1)
         check_range("completer.guidance", self.guidance, least=0)
         check_range("completer.context_views", self.context_views, least=1)
@@ -74,6 +82,7 @@ class GeoVerseCompleter:
             ("precision", self.precision, PRECISIONS),
             ("device", self.device, DEVICES),
             ("alignment", self.alignment or ALIGNMENTS[0], ALIGNMENTS),
+            ("color_alignment", self.color_alignment or "none", COLOR_ALIGNMENTS),
         ):
             if value not in known:
                 raise OptionError(
@@ -81,26 +90,35 @@ class GeoVerseCompleter:
                 )
         if self.device == "cuda" and not torch.cuda.is_available():
             raise OptionError("completer.device = 'cuda', and torch sees no CUDA device here")
-        if self.weights is None:
+        if self.weights is None and not self.folder.is_dir():
             raise OptionError(
-                "completer geoverse needs weights; give --set completer.weights=DIR, a folder as "
-                "'gvtools weights list' describes it"
+                "completer geoverse: the weights that ship are absent from this installation; "
+                "give --set completer.weights=DIR, a folder as 'gvtools weights list' describes it"
             )
         # A folder that cannot be a model is refused before anything is computed.
-        check_headers(Path(self.weights))
+        check_headers(self.folder)
+
+    @property
+    def folder(self) -> Path:
+        """Of the weights."""
+        return SHIPPED if self.weights is None else Path(self.weights)
+
+    @property
+    def model(self) -> GeoVerse:
+        """The model, on its device; kept from call to call."""
+        return _loaded(str(self.folder.resolve()), str(self._device()), self._times())
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should be told before a run."""
-        if self.weights is None or config_of(Path(self.weights)).trained:
+        if config_of(self.folder).trained:
             return ()
-        return (f"the weights in {self.weights} are untrained: what they complete is noise",)
+        return (f"the weights in {self.folder} are untrained: what they complete is noise",)
 
     @property
     def files(self) -> tuple[Path, ...]:
         """What decides the result beside the views: everything in the weights folder."""
-        folder = Path(self.weights or "")
-        return tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
+        return tuple(sorted(path for path in self.folder.rglob("*") if path.is_file()))
 
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
@@ -110,7 +128,7 @@ class GeoVerseCompleter:
         if not context:
             raise OptionError("completer geoverse needs at least one context view, and got none")
         device = self._device()
-        model = _loaded(str(Path(self.weights or "").resolve()), str(device), self._times())
+        model = self.model
         canvas = _Canvas(guidance)
         holes = [index for index in range(len(guidance)) if not guidance.valid[index].all()]
         views = self.views or model.config.views
@@ -126,7 +144,7 @@ class GeoVerseCompleter:
         spent = {
             "seconds": time.perf_counter() - start,
             "passes": float(passes),
-            "steps": float(len(self._bounds(model)) - 1),
+            "steps": float(max(len(self._bounds(model)) - 1, 0)),
         }
         return canvas.completion(spent)
 
@@ -160,11 +178,14 @@ class GeoVerseCompleter:
             part,
             cameras,
             context_depth(context, part, size),
-            self.alignment or model.config.alignment,
+            alignment=self.alignment or model.config.alignment,
+            color_alignment=self.color_alignment or model.config.color_alignment,
         )
 
     def _bounds(self, model: GeoVerse) -> tuple[float, ...]:
         flow = model.config.flow
+        if self.steps == 0:
+            return ()
         if self.steps is None or self.steps == len(flow.level1) - 1:
             return flow.level1
         return interval_bounds(self.steps)
@@ -281,7 +302,9 @@ def _brought_back(
     part: Guidance,
     cameras: Cameras,
     known: NDArray[np.float32],
+    *,
     alignment: str,
+    color_alignment: str,
 ) -> _Made:
     """Pictures, depth, confidence and rays of the targets at their own size, in scene units.
 
@@ -291,10 +314,14 @@ def _brought_back(
         cameras: of all views, at the model's size.
         known: (C, h, w) depth of the context at the model's size.
         alignment: see ``depth_scale``.
+        color_alignment: see ``color_field``.
     """
     geometry, context = made.decoded.geometry, len(known)
     full = (part.depth.shape[1], part.depth.shape[2])
     rgb = resampled(made.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
+    if color_alignment == "field":
+        hint = torch.from_numpy(part.rgb).permute(0, 3, 1, 2)
+        rgb = aligned_color(rgb, hint, torch.from_numpy(part.valid)[:, None])
     depth = resampled_depth(geometry.depth[0, context:].float().cpu(), full)
     certain = resampled(geometry.depth_confidence[0, context:, None].float().cpu(), full)[:, 0]
     world_from_cam = cameras.world_from_cam

@@ -201,7 +201,7 @@ def encode_hints(
     context = batch.context
     told[:, :context] = True
     # Only where it is asked for: with everything encoded jointly it is not.
-    alone = cache(lambda: _encode(network, batch, slice(0, context), config))
+    alone = cache(lambda: encode_views(network, batch, slice(0, context), cameras=config.cameras))
     shape = (*batch.images.shape[:2], 1 + grid[0] * grid[1], network.config.encoder.channels)
     dtype = network.encoder.cls_token.dtype
     joint = [batch.images.new_zeros(shape, dtype=dtype) for _ in range(2)]
@@ -212,7 +212,7 @@ def encode_hints(
                 level[samples, :context] = features[samples]
             continue
         views = pattern.nonzero()[:, 0]
-        part = _encode(network, batch.samples(samples), views, config)
+        part = encode_views(network, batch.samples(samples), views, cameras=config.cameras)
         for level, features in zip(joint, part, strict=True):
             level[samples[:, None], views] = features
     if config.encode == "alone":
@@ -224,7 +224,12 @@ def encode_hints(
         if bool(silent.any()):
             token[silent] = _silent_tokens(token, context)[silent]
     else:
-        first = alone() if context == 1 else _encode(network, batch, slice(0, 1), config)
+        single = slice(0, 1)
+        first = (
+            alone()
+            if context == 1
+            else encode_views(network, batch, single, cameras=config.cameras)
+        )
         token = first[1][:, :, 0].expand(-1, shape[1], -1)
 
     features = level1.normalise(_maps(joint[1], grid))
@@ -263,22 +268,29 @@ def encode_latents(
         Two (B, V, C, h, w) tensors, normalised.
     """
     grid = network.encoder.grid(*batch.size)
-    both = _encode(network, batch, slice(None), HintConfig(cameras=cameras))
+    both = encode_views(network, batch, slice(None), cameras=cameras)
     return level0.normalise(_maps(both[0], grid)), level1.normalise(_maps(both[1], grid))
 
 
-def _encode(
-    network: DepthAnything3, batch: ViewBatch, views: slice | Tensor, config: HintConfig
+def encode_views(
+    network: DepthAnything3, batch: ViewBatch, views: slice | Tensor, *, cameras: bool
 ) -> list[Tensor]:
-    """Raw levels 0 and 1 of some views; with known cameras relative to the batch's first view."""
+    """Raw levels 0 and 1 of some views, token 0 included; gradients reach the encoder.
+
+    Args:
+        network: the encoder.
+        batch: all views.
+        views: which of them are encoded.
+        cameras: see ``HintConfig.cameras``; they are relative to the batch's first view.
+    """
     images = batch.images[:, views]
-    if not config.cameras:
+    if not cameras:
         return network.encode(images, levels=2)
     # The camera encoder's unit has a floor, a tenth of a scene unit: in shares of the views' extent
     # it means the same in every scene.
     poses, _ = normalised_poses(torch.linalg.inv(batch.cam_from_world), reference=0)
-    cameras, _ = relative_cameras(torch.linalg.inv(poses))
-    return network.encode(images, levels=2, cam_from_world=cameras[:, views], K=batch.K[:, views])
+    relative, _ = relative_cameras(torch.linalg.inv(poses))
+    return network.encode(images, levels=2, cam_from_world=relative[:, views], K=batch.K[:, views])
 
 
 def _silent_tokens(token: Tensor, context: int) -> Tensor:

@@ -94,6 +94,8 @@ class GeoVerseConfig:
         camera: camera conventions.
         alignment: how generated depth gets the memory's scale, see ``depth_scale``: "centres" (the
             paper), "hint" or "field".
+        color_alignment: whether generated colours follow the memory's, see ``color_field``: "none"
+            (the paper) or "field".
         video: the video prior; None for a model without one.
         injection: how video features enter: "control", "shared" (MoT) or "none".
         control: of the control branch.
@@ -118,6 +120,7 @@ class GeoVerseConfig:
     flow: FlowConfig = field(default_factory=FlowConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     alignment: str = "centres"
+    color_alignment: str = "none"
     video: VideoPriorConfig | None = field(default_factory=VideoPriorConfig)
     injection: str = "control"
     control: ControlConfig = field(default_factory=ControlConfig)
@@ -131,6 +134,10 @@ class GeoVerseConfig:
         if self.injection not in ("control", "shared", "none"):
             raise OptionError(
                 f"injection = {self.injection!r}; expected 'control', 'shared' or 'none'"
+            )
+        if self.color_alignment not in ("none", "field"):
+            raise OptionError(
+                f"color_alignment = {self.color_alignment!r}; expected 'none' or 'field'"
             )
         if self.alignment not in ("centres", "hint", "field"):
             raise OptionError(

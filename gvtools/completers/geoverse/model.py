@@ -330,7 +330,8 @@ class GeoVerse(nn.Module):
             seed: of all noise.
             names: B rows of V names; a view's noise depends on the seed and its name alone. Its
                 index by default.
-            bounds: level-1 interval bounds; the configuration's by default.
+            bounds: level-1 interval bounds; the configuration's by default. Empty: nothing is
+                denoised, and the hints' own features stand for level 1.
             cascade_bounds: level-0 interval bounds; the configuration's by default.
             guidance: scale; the configuration's by default.
             video: features computed before, for the same views.
@@ -347,9 +348,11 @@ class GeoVerse(nn.Module):
         def noise(level: str) -> Tensor:
             return seeded_noise(like.shape, seeds(level), device=like.device)
 
-        level1 = self.sample1(
-            prepared, noise("level1"), bounds=bounds, guidance=guidance, clock=clock
-        )
+        level1 = prepared.hints.unmasked
+        if bounds is None or len(bounds):
+            level1 = self.sample1(
+                prepared, noise("level1"), bounds=bounds, guidance=guidance, clock=clock
+            )
         level0 = self.sample0(prepared, level1, noise("level0"), bounds=cascade_bounds, clock=clock)
         with clock(stages.DECODE):
             decoded = self.decode(prepared, level0, level1, clock=clock)

@@ -1,0 +1,38 @@
+"""Quality against steps: level 1 from 49 to 1 with one cascade step, and the cascade's own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gvtools.completers.base import Completer
+from gvtools.evaluation.perceptual_distance import SqueezeNetDistance
+from gvtools.evaluation.tables import Table
+from pipelines.experiments.cases import SIZE, held_out_cases
+from pipelines.experiments.judging import judge, records, table
+from pipelines.experiments.options import ExperimentOptions
+from pipelines.experiments.rows import geoverse
+
+LEVEL1 = (49, 24, 12, 6, 3, 2, 1)
+CASCADE = (1, 2, 4, 8, 24)
+
+
+def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
+    """Figures and tables; reads weights, teacher, scenes, size and seed."""
+    side = options.size or SIZE
+    models = {"student": options.weights} | (
+        {} if options.teacher is None else {"teacher": options.teacher}
+    )
+    found: dict[str, Any] = {"scenes": options.scenes, "size": side, "seed": options.seed}
+    tables = []
+    for name, folder in models.items():
+        sweeps: dict[str, dict[str, Completer]] = {
+            "level 1": {f"{n}+1": geoverse(folder, steps=n) for n in LEVEL1},
+            "cascade": {f"3+{n}": geoverse(folder, cascade_steps=n) for n in CASCADE},
+        }
+        for sweep, methods in sweeps.items():
+            cases = held_out_cases(options.scenes, seed=options.seed, size=side)
+            judged = judge(methods, cases, distance=SqueezeNetDistance(), seed=options.seed)
+            found[f"{name}, {sweep}"] = records(judged)
+            caption = f"{name}, sweep of the {sweep} steps, {options.scenes} held-out scenes"
+            tables.append(table(judged, caption=caption))
+    return found, tables

@@ -1,0 +1,103 @@
+"""Cameras that the ray head sees in pictures: true ones, and those that the model generated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
+from gvtools.completers.geoverse.depth_anything.rays import poses_least_squares
+from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.evaluation.tables import Column, Table
+from gvtools.training.batch import TrainingBatch
+from gvtools.training.encoder_stage import scene_unit
+from pipelines.experiments.cases import SIZE
+from pipelines.experiments.options import ExperimentOptions
+
+
+def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
+    """Figures and a table; reads weights, scenes, size and seed."""
+    side = options.size or SIZE
+    from gvtools.training.dataset import ProceduralViews
+    from gvtools.training.view_sample import collated
+    from pipelines.experiments.rows import geoverse
+
+    model = geoverse(options.weights).model  # type: ignore[attr-defined]
+    data = ProceduralViews(seed=options.seed, split="held-out", size=(side, side))
+    sources: dict[str, Callable[[GeoVerse, TrainingBatch], Geometry]] = {
+        "true pictures, cameras told": _of_truth,
+        "generated pictures, cameras told": lambda model, batch: (
+            model.generate(batch.views, seed=options.seed).decoded.geometry
+        ),
+    }
+    errors: dict[str, list[Tensor]] = {name: [] for name in sources}
+    for index in range(options.scenes):
+        batch = collated([data.sample(index)])
+        for name, source in sources.items():
+            errors[name].append(_errors(source(model, batch), batch))
+    found: dict[str, Any] = {"scenes": options.scenes, "seed": options.seed}
+    rows: list[tuple[Any, ...]] = []
+    for name, entries in errors.items():
+        rotation, centre, zero, constant = torch.cat(entries).numpy().T
+        figures = {
+            "rotation_deg_median": float(np.median(rotation)),
+            "centre_mean": float(centre.mean()),
+            "centre_if_first_view": float(zero.mean()),
+            "centre_if_mean_of_truth": float(constant.mean()),
+            "gain_over_first_view": float(zero.mean() / centre.mean()),
+            "gain_over_mean_of_truth": float(constant.mean() / centre.mean()),
+        }
+        found[name] = figures
+        rows.append((name, *figures.values()))
+    columns = (
+        Column("rays of"),
+        Column("rotation error", "deg, median", "lower", 2),
+        Column("centre error", "mean depths", "lower", 4),
+        Column("of the first view's place", "mean depths", None, 4),
+        Column("of the true centres' mean", "mean depths", None, 4),
+        Column("gain", "x", "higher", 1),
+        Column("gain over the mean", "x", "higher", 1),
+    )
+    return found, [
+        Table(columns, tuple(rows), f"Poses from rays, {options.scenes} held-out scenes")
+    ]
+
+
+@torch.no_grad()
+def _of_truth(model: GeoVerse, batch: TrainingBatch) -> Geometry:
+    """Geometry of the true pictures' own features."""
+    from gvtools.completers.geoverse.conditioning import encode_views
+
+    grid = model.geometry.encoder.grid(*batch.views.size)
+    levels = encode_views(
+        model.geometry, batch.true_views, slice(None), cameras=model.config.hints.cameras
+    )
+    return model.geometry.geometry(
+        [*levels, *model.geometry.encoder.propagate(levels[1], grid)], grid
+    )
+
+
+def _errors(geometry: Geometry, batch: TrainingBatch) -> Tensor:
+    """(V - 1, 4): degrees, and centre errors of the rays, the first view's place, the mean place.
+
+    Lengths are in mean context depths. The first view is the reference and is left out.
+    """
+    poses = poses_least_squares(
+        geometry.ray.float(), geometry.ray_confidence.float(), size=batch.views.size
+    ).world_from_cam[0]
+    cameras = batch.views.cam_from_world[0].double()
+    true = torch.linalg.inv(cameras @ torch.linalg.inv(cameras[:1]))
+    centres = true[:, :3, 3] / scene_unit(batch).double()
+    turn = poses[:, :3, :3].mT @ true[:, :3, :3]
+    cosine = (turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    columns = (
+        torch.rad2deg(torch.arccos(cosine.clamp(-1, 1))),
+        torch.linalg.norm(poses[:, :3, 3] - centres, dim=-1),
+        torch.linalg.norm(centres, dim=-1),
+        torch.linalg.norm(centres - centres.mean(0), dim=-1),
+    )
+    return torch.stack(columns, dim=-1)[1:]
