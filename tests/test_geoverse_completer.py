@@ -514,7 +514,7 @@ def test_a_folder_that_is_no_model_is_refused_in_one_line_at_creation(what, tmp_
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"steps": 0}, "completer.steps 0; expected at least 1"),
+        ({"steps": -1}, "completer.steps -1; expected at least 0"),
         ({"views": 1}, "completer.views 1; expected at least 2"),
         ({"context_views": 0}, "expected at least 1"),
         ({"guidance": -1.0}, "expected at least 0"),

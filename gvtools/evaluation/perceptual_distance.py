@@ -95,7 +95,8 @@ class SqueezeNetDistance(nn.Module):
                 f"distance of pictures {pictures.shape}; expected (N, H, W, 3), H and W at least "
                 f"{SMALLEST}"
             )
-        return list(self(torch.from_numpy(pictures).permute(0, 3, 1, 2).float()))
+        ordered = torch.from_numpy(np.ascontiguousarray(pictures))
+        return list(self(ordered.permute(0, 3, 1, 2).float()))
 
     @torch.inference_mode()
     def maps(

@@ -74,6 +74,7 @@ class ProceduralViews:
         paths: see PathOptions.
         faults: see CorruptionOptions; None for clean observations.
         hints: see HintOptions.
+        fill: of the model's configuration, ``hints.fill``.
         photographs: names that textures may be cut from; None for those of the split that are
             installed. They decide the samples.
     """
@@ -87,6 +88,7 @@ class ProceduralViews:
     paths: PathOptions = field(default_factory=PathOptions)
     faults: CorruptionOptions | None = field(default_factory=CorruptionOptions)
     hints: HintOptions = field(default_factory=HintOptions)
+    fill: str = "none"
     photographs: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -107,6 +109,7 @@ class ProceduralViews:
             rng=given.rng,
             strength=given.strength,
             hints=self.hints,
+            fill=self.fill,
         )
 
     def given(self, index: int) -> Given:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from gvtools.completers.geoverse.correction import composed
 from gvtools.completers.geoverse.depth_anything.rays import camera_centres
 from gvtools.completers.geoverse.flow import (
     clean_from_velocity,
@@ -14,6 +15,7 @@ from gvtools.completers.geoverse.flow import (
 )
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective.objective import Prediction, Reference, objective
+from gvtools.completers.geoverse.passes import Prepared
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 from gvtools.training.options import DenoiserStageOptions
@@ -65,18 +67,17 @@ class DenoiserStage(nn.Module):
 
         if draws.chance("decode", options.decode):
             found1 = clean_from_velocity(velocity1, state1, t1)
-            decoded = model.decode(prepared, found0, found1)
             context = batch.views.context
-            predicted |= {
-                "image": decoded.rgb.float(),
-                "depth": decoded.geometry.depth[:, context:],
-                "centers": camera_centres(decoded.geometry.ray, decoded.geometry.ray_confidence),
-            }
+            predicted |= self._decoded(prepared, found0, found1, batch)
             wanted |= {
                 "image": batch.images[:, context:],
                 "depth": batch.depth[:, context:, 0],
                 "centers": batch.centers,
             }
+            if model.config.composition == "correction":
+                # What memory knows is kept as it is.
+                holes = ~batch.views.valid[:, context:, 0]
+                wanted |= {"image_valid": holes, "depth_valid": holes}
         result = objective(
             Prediction(**predicted),
             Reference(**wanted),
@@ -85,6 +86,23 @@ class DenoiserStage(nn.Module):
             context_weight=options.context_weight,
         )
         return result.total, {**result.terms, **result.counts}
+
+    def _decoded(
+        self, prepared: Prepared, level0: Tensor, level1: Tensor, batch: TrainingBatch
+    ) -> dict[str, Tensor]:
+        """Target pictures and depth with all camera centres, composed as inference does."""
+        model = self.model
+        decoded = model.decode(prepared, level0, level1)
+        hint = None
+        if model.config.composition == "correction":
+            with torch.no_grad():
+                hint = model.decode(prepared, level0, prepared.hints.unmasked)
+        image, depth = composed(prepared.batch, decoded, hint)
+        centers = batch.centers
+        if hint is None:
+            # A correction has the scale of the projection; a decoding has that of its centres.
+            centers = camera_centres(decoded.geometry.ray, decoded.geometry.ray_confidence)
+        return {"image": image, "depth": depth, "centers": centers}
 
     def _time(self, draws: Draws, name: str, device: torch.device) -> Tensor:
         """(B,) times, uniform before the shift."""

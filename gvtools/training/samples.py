@@ -31,6 +31,7 @@ class TrainingSamples:
         self.config = config
         most = min(model.context, config.data.views - 1)
         self._context = ContextOptions(most=most)
+        self._fill = model.hints.fill
         self._loader: BatchLoader | None = None
         self._data = self._data_set("train")
 
@@ -80,6 +81,7 @@ class TrainingSamples:
             views=data.views,
             size=data.size,
             context=self._context,
+            fill=self._fill,
         )
         if not data.scenes or data.scene_share == 0 or split != "train":
             return rooms
@@ -94,5 +96,6 @@ class TrainingSamples:
             views=data.views,
             size=data.size,
             context=self._context,
+            fill=self._fill,
         )
         return MixedViews(rooms, recorded, data.scene_share, group=self._context.group)

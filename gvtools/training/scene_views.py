@@ -57,6 +57,7 @@ class SceneViews:
         context: how many views are given, and which.
         faults: see CorruptionOptions; None for none.
         hints: see HintOptions.
+        fill: of the model's configuration, ``hints.fill``.
     """
 
     scenes: tuple[Scene, ...]
@@ -72,6 +73,7 @@ class SceneViews:
         default_factory=lambda: CorruptionOptions(depth_noise=0.01, holes=0.05, flying=0.0)
     )
     hints: HintOptions = field(default_factory=HintOptions)
+    fill: str = "none"
     _kept: OrderedDict[tuple[int, int], _Reduced] = field(
         init=False, repr=False, default_factory=OrderedDict
     )
@@ -115,7 +117,9 @@ class SceneViews:
         strength = drawn(rng, self.faults or CorruptionOptions(clean=1.0))
         count = self.context.count([self.seed, RECORDED], index)
         context = self.context.chosen(rng, self.views, count)
-        return make_sample(clip, truth, context, rng=rng, strength=strength, hints=self.hints)
+        return make_sample(
+            clip, truth, context, rng=rng, strength=strength, hints=self.hints, fill=self.fill
+        )
 
     def clips(self, index: int) -> tuple[Clip, Clip]:
         """The window of a sample: as it is observed, and at the model's size."""
@@ -146,7 +150,7 @@ class SceneViews:
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides the samples, as plain data; scenes by folder and view names."""
-        plain = ("seed", "views", "size", "detail", "stride", "overlap")
+        plain = ("seed", "views", "size", "detail", "stride", "overlap", "fill")
         parts = ("context", "faults", "hints")
         return {
             "source": "recorded",

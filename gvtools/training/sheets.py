@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gvtools.completers.geoverse.conditioning import filled
+from gvtools.completers.geoverse.correction import composed
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.files import replaced_when_written
 from gvtools.training.batch import TrainingBatch
@@ -34,16 +36,19 @@ def write_sheet(model: GeoVerse, batch: TrainingBatch, path: Path, *, seed: int 
     made = model.generate(batch.views, seed=seed)
     model.train(training)
     context = batch.views.context
+    shown = filled(batch.views, model.config.hints)
+    rgb, found = composed(shown, made.decoded, made.hint)
     pictures = batch.images.clone()
-    pictures[:, context:] = made.decoded.rgb.float().clamp(0, 1)
+    pictures[:, context:] = rgb.clamp(0, 1)
     depth = made.decoded.geometry.depth[:, :, None].float()
+    depth[:, context:] = found[:, :, None]
     rows = []
     for index in range(len(batch)):
         rows += [
-            _band(batch.views.images[index]),
+            _band(shown.images[index]),
             _band(pictures[index]),
             _band(batch.images[index]),
-            _depth_band(batch.views.depth[index]),
+            _depth_band(shown.depth[index]),
             _depth_band(depth[index]),
             _depth_band(batch.depth[index]),
         ]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.model_views import view_batch
+from gvtools.completers.geoverse.surface_fill import surface_fill
 from gvtools.errors import ShapeError
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.corruption import NOTHING, CorruptionOptions
@@ -30,7 +31,7 @@ class Sample:
     Attributes:
         images: (V, 3, H, W) true pictures in [0, 1].
         depth: (V, 1, H, W) true z-depth; 0 = unknown.
-        hint: (V, 3, H, W): context pictures as given; projections on targets, holes at 0.
+        hint: (V, 3, H, W): context pictures as given; projections on targets, holes at 0 or filled.
         hint_depth: (V, 1, H, W): likewise; 0 = none.
         valid: (V, 1, H, W) bool: True on context; True where the projection knows a target.
         cam_from_world: (V, 4, 4).
@@ -58,6 +59,7 @@ def make_sample(
     rng: np.random.Generator,
     strength: CorruptionOptions = NOTHING,
     hints: HintOptions | None = None,
+    fill: str = "none",
 ) -> Sample:
     """A sample from views in the order of their path.
 
@@ -68,12 +70,14 @@ def make_sample(
         rng: draws the faults.
         strength: of this sample's faults.
         hints: see HintOptions.
+        fill: of the model's configuration, ``hints.fill``.
     """
     targets = [index for index in range(len(clip)) if index not in context]
     observation = observed(clip, context, strength, rng)
     guidance = projected(observation, clip.cameras[targets], hints)
     size = truth.depth.shape[1], truth.depth.shape[2]
-    views, cameras = view_batch(observation.views, guidance, size)
+    over = surface_fill(observation.views, guidance) if fill == "surfaces" else None
+    views, cameras = view_batch(observation.views, guidance, size, fill=over)
     order = [*context, *targets]
     true_depth = torch.from_numpy(truth.depth[order])[:, None]
     unit = _mean_known([_at_size(view.depth, size) for view in observation.views])

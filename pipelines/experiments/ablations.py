@@ -34,9 +34,8 @@ from pipelines.experiments.judging import Judged, judge, records, table
 from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.rows import geoverse
 
-TRAINING = "tiny"
-# Layers of level 1 that the video features enter, and a prior of as many taps.
-LAYERS = (0, 2, 4, 5)
+# The video prior has as many taps as layers of level 1 that its features enter.
+TAPS = 4
 VIDEO = VideoPriorConfig(taps=(0, 1, 2, 3), channels=48, prompt_rows=6, prompt="zeros")
 WHOLE = "as shipped: memory, no video prior"
 
@@ -109,7 +108,7 @@ def _trained(variant: Variant, options: ExperimentOptions) -> Path:
     weights = out / "denoiser" / "weights"
     if weights.is_dir():
         return weights
-    config, folder = shipped_or_read(TRAINING)
+    config, folder = shipped_or_read(options.training)
     model_config = _with_injection(config.model_config(folder), variant.injection)
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "model.json", to_json(model_config))
@@ -137,12 +136,14 @@ def _train(config: TrainingConfig, out: Path, start: Path) -> None:
 def _with_injection(config: GeoVerseConfig, injection: str) -> GeoVerseConfig:
     if injection == "none":
         return config
+    last = config.level1.depth - 1
+    layers = tuple(sorted({round(i * last / (TAPS - 1)) for i in range(TAPS)}))
     return replace(
         config,
-        video=VIDEO,
+        video=replace(VIDEO, taps=tuple(range(len(layers)))),
         injection=injection,
-        control=ControlConfig(layers=LAYERS),
-        shared=SharedAttentionConfig(layers=LAYERS, gated=config.shared.gated),
+        control=ControlConfig(layers=layers),
+        shared=SharedAttentionConfig(layers=layers, gated=config.shared.gated),
     )
 
 

@@ -21,6 +21,7 @@ class ExperimentOptions:
         steps: of a training within the experiment.
         out: folder of what a training within the experiment leaves.
         project: a recorded scene.
+        training: the configuration of a training within the experiment, see ``gvtools train``.
     """
 
     weights: Path | None = None
@@ -31,6 +32,7 @@ class ExperimentOptions:
     steps: int = 600
     out: Path | None = None
     project: Path | None = None
+    training: str = "tiny"
 
     def __post_init__(self) -> None:
         check_range("scenes", self.scenes, least=1)

@@ -102,7 +102,7 @@ def _tuned(options: ExperimentOptions) -> Path:
     """Weights after a fine-tuning on the context views."""
     assert options.out is not None
     assert options.project is not None
-    config, folder = shipped_or_read("tiny")
+    config, folder = shipped_or_read(options.training)
     config = with_settings(
         config,
         [

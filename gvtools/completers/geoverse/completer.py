@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
@@ -18,11 +18,14 @@ from torch import Tensor
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completion, ContextView
 from gvtools.completers.geoverse.color_field import COLOR_ALIGNMENTS, aligned_color
+from gvtools.completers.geoverse.correction import corrected_color, corrected_depth
 from gvtools.completers.geoverse.depth_scale import ALIGNMENTS, pass_scale, scaled_depth
+from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import Generated, GeoVerse
 from gvtools.completers.geoverse.model_views import context_depth, view_batch
 from gvtools.completers.geoverse.resampling import model_size, resampled, resampled_depth
+from gvtools.completers.geoverse.surface_fill import surface_fill
 from gvtools.completers.geoverse.weights.folder import from_pretrained
 from gvtools.completers.geoverse.weights.folder_check import check_headers
 from gvtools.completers.geoverse.weights.folder_parts import config_of
@@ -36,6 +39,9 @@ DEVICES = ("auto", "cpu", "cuda")
 SHIPPED = Path(__file__).parent / "pretrained" / "tiny"
 # Confidence of a generated pixel at most: below what was observed.
 GENERATED = 0.9
+# Confidence of a corrected pixel that the model's own depth has no scale at.
+UNSCALED = 0.1
+Fill = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,8 @@ class GeoVerseCompleter:
         alignment: how depth gets the memory's scale, see ``depth_scale``; None for the model's own.
         color_alignment: whether colours follow the memory's, see ``color_field``; None for the
             model's own.
+        composition: "decoded" shows the decoding itself where a model's form is "correction", see
+            ``correction``; None for the model's own.
         precision: "auto" is bfloat16 on a GPU and float32 on a CPU.
         device: "auto" takes a GPU where there is one.
     """
@@ -69,6 +77,7 @@ class GeoVerseCompleter:
     views: int | None = None
     alignment: str | None = None
     color_alignment: str | None = None
+    composition: str | None = None
     precision: str = "auto"
     device: str = "auto"
 
@@ -88,6 +97,10 @@ class GeoVerseCompleter:
                 raise OptionError(
                     f"completer.{name} = {value!r}; expected one of {', '.join(known)}"
                 )
+        if self.composition not in (None, "decoded", "correction"):
+            raise OptionError(
+                f"completer.composition = {self.composition!r}; expected 'decoded' or 'correction'"
+            )
         if self.device == "cuda" and not torch.cuda.is_available():
             raise OptionError("completer.device = 'cuda', and torch sees no CUDA device here")
         if self.weights is None and not self.folder.is_dir():
@@ -139,7 +152,10 @@ class GeoVerseCompleter:
             rows = holes[first : first + room]
             part = _rows(guidance, rows)
             chosen = nearest_views(context, part.cameras, most)
-            canvas.put(rows, self._pass(model, device, chosen, part, seed), part)
+            fill = None
+            if model.config.hints.fill == "surfaces":
+                fill = surface_fill(context, part)
+            canvas.put(rows, self._pass(model, device, chosen, part, fill, seed), part)
             passes += 1
         spent = {
             "seconds": time.perf_counter() - start,
@@ -154,12 +170,13 @@ class GeoVerseCompleter:
         device: torch.device,
         context: Sequence[ContextView],
         part: Guidance,
+        fill: Fill | None,
         seed: int,
     ) -> _Made:
         """One pass of the model over context views and a few targets."""
         full = part.depth.shape[1:]
         size = model_size(*full, longest=model.config.image_size, patch=model.config.patch)
-        batch, cameras = view_batch(context, part, size)
+        batch, cameras = view_batch(context, part, size, fill=fill)
         batch = batch.to(device)
         # A photograph and a target of one name must not start from the same noise.
         names = [f"context {view.name}" for view in context]
@@ -173,7 +190,7 @@ class GeoVerseCompleter:
                 cascade_bounds=self._cascade_bounds(model),
                 guidance=self.guidance,
             )
-        return _brought_back(
+        back = _brought_back(
             made,
             part,
             cameras,
@@ -181,6 +198,9 @@ class GeoVerseCompleter:
             alignment=self.alignment or model.config.alignment,
             color_alignment=self.color_alignment or model.config.color_alignment,
         )
+        if made.hint is None or self.composition == "decoded":
+            return back
+        return _corrected(back, made, part, fill or _averaged(part))
 
     def _bounds(self, model: GeoVerse) -> tuple[float, ...]:
         flow = model.config.flow
@@ -344,6 +364,46 @@ def _brought_back(
         rays = _plucker(geometry.ray[0, context:], world_from_cam[0], float(np.median(found)), full)
     picture = rgb.nan_to_num().permute(0, 2, 3, 1).numpy()
     return _Made(picture, scaled.depth, confidence, rays, scaled.scale, tuple(support))
+
+
+def _corrected(back: _Made, made: Generated, part: Guidance, fill: Fill) -> _Made:
+    """The filled projection with what the model changed, in views that memory tells of."""
+    assert made.hint is not None
+    full = (part.depth.shape[1], part.depth.shape[2])
+    targets = slice(-len(part), None)
+    filled = torch.from_numpy(fill[0]).permute(0, 3, 1, 2), torch.from_numpy(fill[1])
+    both = [
+        (
+            resampled(found.rgb[0].float().cpu(), full),
+            resampled_depth(found.geometry.depth[0, targets].float().cpu(), full)[:, None],
+        )
+        for found in (made.decoded, made.hint)
+    ]
+    valid = torch.from_numpy(part.valid)[:, None]
+    rgb = corrected_color(filled[0], both[0][0], both[1][0], valid)
+    rgb = rgb.clamp(0, 1).permute(0, 2, 3, 1)
+    depth = corrected_depth(filled[1][:, None], both[0][1], both[1][1], valid)[:, 0]
+    use = (filled[1] > 0) & rgb.isfinite().all(-1) & depth.isfinite()
+    known = use.numpy()
+    confidence = np.where(known & (back.confidence == 0), np.float32(UNSCALED), back.confidence)
+    return replace(
+        back,
+        rgb=np.where(known[..., None], rgb.numpy(), back.rgb),
+        depth=np.where(known, depth.numpy(), back.depth),
+        confidence=confidence,
+        support=tuple(
+            "the memory's surfaces" if view.any() else said
+            for view, said in zip(known, back.support, strict=True)
+        ),
+    )
+
+
+def _averaged(part: Guidance) -> Fill:
+    """Projections filled as the model fills them, at their own size."""
+    valid = torch.from_numpy(part.valid)[:, None]
+    color = push_pull(torch.from_numpy(part.rgb).permute(0, 3, 1, 2), valid)
+    depth = push_pull_depth(torch.from_numpy(part.depth)[:, None], valid)
+    return color.permute(0, 2, 3, 1).numpy(), depth[:, 0].numpy()
 
 
 def _plucker(

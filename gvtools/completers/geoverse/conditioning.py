@@ -23,6 +23,7 @@ from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.errors import OptionError, ShapeError
 
 LOG_DEPTH_LIMIT = 6.0
+FILLS = ("none", "push-pull", "surfaces")
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class HintConfig:
     """How projections become features; the defaults are the paper's form.
 
     Attributes:
-        fill: "none": holes are black; "push-pull": they are filled before encoding.
+        fill: "none": holes are black; "push-pull": they are filled before encoding; "surfaces":
+            likewise, and callers fill what they can along surfaces first (``surface_fill``).
         encode: "jointly": context and projections in one pass (Eq. 1); "alone": the context views
             by themselves, as GLD does, and the projections with them in a second pass.
         mask: features of a token count where at least this share of its pixels is valid; 0: the
@@ -51,7 +53,7 @@ class HintConfig:
 
     def __post_init__(self) -> None:
         for name, known in (
-            ("fill", ("none", "push-pull")),
+            ("fill", FILLS),
             ("encode", ("jointly", "alone")),
             ("cascade_context", ("alone", "jointly")),
             ("token", ("first-context", "own")),
@@ -70,7 +72,8 @@ class ViewBatch:
 
     Attributes:
         images: (B, V, 3, H, W) in [0, 1]: context pictures; projections on targets, holes at 0.
-        depth: (B, V, 1, H, W) z-depth in the unit of the sample's cameras; 0 = none.
+        depth: (B, V, 1, H, W) z-depth in the unit of the sample's cameras; 0 = none. A hole of a
+            projection that has depth was filled by the caller, its picture too.
         valid: (B, V, 1, H, W) bool: True on context; True where the projection knows a target.
         cam_from_world: (B, V, 4, 4).
         K: (B, V, 3, 3), px of ``images``, pixel centres at + 0.5.
@@ -166,10 +169,10 @@ def depth_condition(depth: Tensor, valid: Tensor, scale: Tensor) -> Tensor:
 
 
 def filled(batch: ViewBatch, config: HintConfig) -> ViewBatch:
-    """The batch with its holes filled as ``config.fill`` says."""
+    """The batch with its holes filled as ``config.fill`` says; what has depth is kept."""
     if config.fill == "none":
         return batch
-    flat = batch.valid.flatten(0, 1)
+    flat = (batch.valid | (batch.depth > 0)).flatten(0, 1)
     shape = batch.images.shape[:2]
     images = push_pull(batch.images.flatten(0, 1), flat).unflatten(0, shape)
     depth = push_pull_depth(batch.depth.flatten(0, 1), flat).unflatten(0, shape)

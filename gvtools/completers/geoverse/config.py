@@ -94,6 +94,8 @@ class GeoVerseConfig:
         camera: camera conventions.
         alignment: how generated depth gets the memory's scale, see ``depth_scale``: "centres" (the
             paper), "hint" or "field".
+        composition: the completion is the model's "decoded" pictures and depth (the paper), or a
+            "correction" of the filled projection, see ``correction``; it needs ``hints.fill``.
         color_alignment: whether generated colours follow the memory's, see ``color_field``: "none"
             (the paper) or "field".
         video: the video prior; None for a model without one.
@@ -121,6 +123,7 @@ class GeoVerseConfig:
     camera: CameraConfig = field(default_factory=CameraConfig)
     alignment: str = "centres"
     color_alignment: str = "none"
+    composition: str = "decoded"
     video: VideoPriorConfig | None = field(default_factory=VideoPriorConfig)
     injection: str = "control"
     control: ControlConfig = field(default_factory=ControlConfig)
@@ -135,6 +138,12 @@ class GeoVerseConfig:
             raise OptionError(
                 f"injection = {self.injection!r}; expected 'control', 'shared' or 'none'"
             )
+        if self.composition not in ("decoded", "correction"):
+            raise OptionError(
+                f"composition = {self.composition!r}; expected 'decoded' or 'correction'"
+            )
+        if self.composition == "correction" and self.hints.fill == "none":
+            raise OptionError("composition = 'correction' needs filled hints; set hints.fill")
         if self.color_alignment not in ("none", "field"):
             raise OptionError(
                 f"color_alignment = {self.color_alignment!r}; expected 'none' or 'field'"

@@ -356,7 +356,10 @@ class GeoVerse(nn.Module):
         level0 = self.sample0(prepared, level1, noise("level0"), bounds=cascade_bounds, clock=clock)
         with clock(stages.DECODE):
             decoded = self.decode(prepared, level0, level1, clock=clock)
-        return Generated(level1, level0, decoded)
+            hint = None
+            if self.config.composition == "correction":
+                hint = self.decode(prepared, level0, prepared.hints.unmasked, clock=clock)
+        return Generated(level1, level0, decoded, hint)
 
     def without_cameras(self, prepared: Prepared, drop: Tensor | None = None) -> Prepared:
         """Without cameras, as GLD's guidance has it: latents, hints and video are kept.

@@ -29,7 +29,11 @@ COINCIDENT = 1e-12
 
 
 def view_batch(
-    context: Sequence[ContextView], targets: Guidance, size: tuple[int, int]
+    context: Sequence[ContextView],
+    targets: Guidance,
+    size: tuple[int, int],
+    *,
+    fill: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
 ) -> tuple[ViewBatch, Cameras]:
     """One sample of the model.
 
@@ -37,6 +41,8 @@ def view_batch(
         context: at least one view.
         targets: the projections to complete.
         size: (H, W) of the model's pictures.
+        fill: (T, H, W, 3) colour and (T, H, W) depth of the targets with their holes filled; None
+            leaves holes at 0.
 
     Returns:
         The batch, in the first context view's frame and a unit in which the farthest view stands
@@ -50,6 +56,8 @@ def view_batch(
         depths.append(_nearest(observed, size))
         cameras.append(camera.resized(size[1], size[0]))
     rgb, projected, valid = _reduced(targets, size)
+    if fill is not None:
+        rgb, projected = _over(rgb, projected, valid, fill)
     cameras.append(targets.cameras.resized(size[1], size[0]))
     joined = concatenate(cameras)
     seen = torch.ones((len(context), 1, *size), dtype=torch.bool)
@@ -103,6 +111,21 @@ def _cropped(
     depth = np.zeros((height, width), np.float32) if view.depth is None else view.depth
     camera = view.camera.cropped(left, top, columns, rows)
     return view.rgb[window], depth[window], camera
+
+
+def _over(
+    rgb: Tensor,
+    depth: Tensor,
+    valid: Tensor,
+    fill: tuple[NDArray[np.float32], NDArray[np.float32]],
+) -> tuple[Tensor, Tensor]:
+    """Projections (T, 3, h, w) and (T, 1, h, w) over a fill of any size, where that has depth."""
+    size = (rgb.shape[-2], rgb.shape[-1])
+    color = resampled(torch.from_numpy(fill[0]).permute(0, 3, 1, 2).float(), size).clamp(0, 1)
+    lengths = torch.from_numpy(fill[1]).float()[:, None]
+    lengths = F.interpolate(lengths, size=size, mode="nearest-exact")
+    color = torch.where(lengths > 0, color, 0.0)
+    return torch.where(valid, rgb, color), torch.where(valid, depth, lengths)
 
 
 def _picture(picture: NDArray[np.float32], size: tuple[int, int]) -> Tensor:

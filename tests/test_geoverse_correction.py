@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import geoverse_models as micro
+import numpy as np
+import pytest
+import torch
+
+from gvtools.completers import Completion, create
+from gvtools.completers.geoverse.color_field import aligned_color
+from gvtools.completers.geoverse.correction import MOST, corrected_color, corrected_depth
+from gvtools.completers.geoverse.surface_fill import surface_fill
+from gvtools.errors import OptionError
+
+pytest.importorskip("safetensors", reason="weights are read with safetensors")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+HINTS = {"cameras": True, "fill": "surfaces", "mask": 0.0}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("micro")
+    return micro.weights_folder(folder, micro.config(hints=HINTS, composition="correction"))
+
+
+def complete(weights: Path, size: tuple[int, int], **options: Any) -> Completion:
+    completer = create("geoverse", weights=str(weights), device="cpu", **options)
+    return completer.complete(micro.context_views(2), micro.guidance(2, size=size), seed=1)
+
+
+def stripes(offset: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    hint = torch.rand(2, 3, 16, 24, generator=generator) + offset
+    valid = torch.zeros(2, 1, 16, 24, dtype=torch.bool)
+    valid[..., :12] = True
+    return hint, valid
+
+
+def test_a_model_that_changes_nothing_leaves_the_filled_projection():
+    filled, valid = stripes()
+    made = torch.rand(2, 3, 16, 24)
+    assert torch.equal(corrected_color(filled, made, made, valid), filled)
+    depth = filled[:, :1] + 1
+    assert torch.allclose(corrected_depth(depth, made[:, :1] + 1, made[:, :1] + 1, valid), depth)
+
+
+def test_a_change_of_everything_is_none_and_one_of_the_hole_is_whole():
+    filled, valid = stripes()
+    hint = torch.rand(2, 3, 16, 24)
+    assert torch.allclose(corrected_color(filled, hint + 0.2, hint, valid), filled, atol=1e-5)
+    change = torch.where(valid, 0.0, 0.3)
+    found = corrected_color(filled, hint + change, hint, valid)
+    assert torch.allclose(found, filled + change, atol=1e-5)
+    depth = filled[:, :1] + 1
+    grown = corrected_depth(depth, torch.where(valid, 1.0, 9.0), torch.ones_like(depth), valid)
+    assert torch.allclose(grown, torch.where(valid, depth, MOST * depth), rtol=1e-4)
+    assert (corrected_depth(torch.zeros_like(depth), depth, depth + 1, valid) == 0).all()
+
+
+def test_colours_follow_the_memory():
+    hint, valid = stripes()
+    made = hint - 0.1
+    found = aligned_color(made, hint.clamp(0, 1), valid)
+    assert torch.allclose(found, hint.clamp(0, 1), atol=1e-5)
+    broken = made.clone()
+    broken[0, :, 3, 3] = torch.nan
+    kept = aligned_color(broken, hint, valid)
+    assert kept[0, :, 3, 3].isnan().all() and kept[1].isfinite().all()
+
+
+def test_the_fill_keeps_memory_and_leaves_no_hole_where_memory_tells_anything():
+    known = micro.guidance(3, size=(30, 40))
+    known.valid[1], known.valid[2] = False, False
+    known.valid[1, 5, 7], known.depth[1, 5, 7] = True, 3.0
+    for values in (known.rgb, known.depth):
+        values[~known.valid] = 0
+    rgb, depth = surface_fill(micro.context_views(2), known)
+    assert (rgb[known.valid] == known.rgb[known.valid]).all()
+    assert (depth[known.valid] == known.depth[known.valid]).all()
+    assert (depth[:2] > 0).all() and not depth[2].any() and not rgb[2].any()
+    np.testing.assert_allclose(depth[1], known.depth[1, 5, 7], rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(30, 40), (24, 32), (100, 133)])
+def test_without_denoising_the_completion_is_the_fill(weights, size):
+    known = micro.guidance(2, size=size)
+    made = complete(weights, size, steps=0)
+    rgb, depth = surface_fill(micro.context_views(2), known)
+    np.testing.assert_allclose(made.rgb, rgb, atol=1e-5)
+    np.testing.assert_allclose(made.depth, depth, rtol=1e-5)
+    assert made.spent["steps"] == 0
+    assert set(made.support or ()) == {"the memory's surfaces"}
+
+
+def test_denoising_changes_holes_alone(weights):
+    size = (30, 40)
+    known = micro.guidance(2, size=size)
+    fill, made = (complete(weights, size, steps=steps) for steps in (0, 2))
+    hole = ~known.valid
+    assert made.rgb[known.valid].tobytes() == known.rgb[known.valid].tobytes()
+    assert np.abs(made.rgb - fill.rgb)[hole].max() > 1e-3
+    assert (made.confidence[hole] > 0).all() and (made.confidence[hole] < 1).all()
+    decoded = complete(weights, size, composition="decoded")
+    assert np.abs(decoded.rgb - made.rgb)[hole].max() > 1e-3
+
+
+def test_what_does_not_fit_is_refused(weights):
+    with pytest.raises(OptionError, match="expected 'decoded' or 'correction'"):
+        create("geoverse", weights=str(weights), composition="sum")
+    with pytest.raises(OptionError, match="needs filled hints"):
+        micro.config(composition="correction")
