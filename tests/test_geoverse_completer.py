@@ -13,9 +13,10 @@ import torch
 
 from gvtools.cameras import Cameras
 from gvtools.completers import Completion, ContextView, create
-from gvtools.completers.geoverse.completer import GENERATED, GeoVerseCompleter, nearest_views
+from gvtools.completers.geoverse.completer import GeoVerseCompleter, nearest_views
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.depth_scale import PassScale
+from gvtools.completers.geoverse.full_size import GENERATED
 from gvtools.completers.geoverse.model import Generated, GeoVerse
 from gvtools.completers.geoverse.model_views import view_batch
 from gvtools.completers.geoverse.resampling import model_size
@@ -327,7 +328,7 @@ def test_a_pass_that_went_wrong_leaves_holes_and_says_so(weights, monkeypatch):
 def test_without_any_support_for_a_scale_there_is_no_depth(weights, monkeypatch):
     """The requested cameras' rays stand where the predicted ones have no unit."""
     monkeypatch.setattr(
-        "gvtools.completers.geoverse.completer.pass_scale",
+        "gvtools.completers.geoverse.full_size.pass_scale",
         lambda *a: PassScale(float("nan"), "refused: nothing to go by"),
     )
     known = micro.guidance(2, share=-1.0)
@@ -389,7 +390,7 @@ def test_generated_depth_is_never_averaged_between_two_surfaces(weights, monkeyp
 
     monkeypatch.setattr(GeoVerse, "generate", stepped)
     monkeypatch.setattr(
-        "gvtools.completers.geoverse.completer.pass_scale", lambda *a: PassScale(2.0, "centres")
+        "gvtools.completers.geoverse.full_size.pass_scale", lambda *a: PassScale(2.0, "centres")
     )
     known = micro.guidance(1, size=size, share=-1.0)
     result = complete(weights, micro.context_views(1), known, alignment="centres")

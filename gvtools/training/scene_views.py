@@ -95,8 +95,8 @@ class SceneViews:
         for scene, views in zip(self.scenes, usable, strict=True):
             if len(views) < self.views:
                 raise ProjectError(
-                    f"{scene.root}: {len(views)} of {len(scene)} views are selected and have "
-                    "depth; samples need "
+                    f"{scene.root}: {len(views)} of {len(scene)} views have depth and are among "
+                    f"{self.select!r}; samples need "
                     f"{self.views}; give a scene with recorded depth, or fewer views a sample"
                 )
         if not usable:

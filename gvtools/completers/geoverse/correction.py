@@ -68,11 +68,10 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
         for value in (batch.images, batch.depth, batch.valid)
     )
     color = corrected_color(filled, rgb.flatten(0, 1), hint.rgb.float().flatten(0, 1), valid)
-    lengths = (
-        value[:, batch.context :].flatten(0, 1)[:, None]
-        for value in (made.geometry.depth, hint.geometry.depth)
+    first, second = (
+        found.geometry.depth[:, batch.context :].flatten(0, 1)[:, None] for found in (made, hint)
     )
-    length = corrected_depth(known, *lengths, valid)
+    length = corrected_depth(known, first, second, valid)
     told = (known > 0).unflatten(0, shape)
     color, length = color.unflatten(0, shape), length.unflatten(0, shape)
     return torch.where(told, color, rgb), torch.where(told[:, :, 0], length[:, :, 0], depth)

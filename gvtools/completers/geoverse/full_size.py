@@ -1,0 +1,151 @@
+"""A pass's result at the targets' own size, in the memory's scale and exposure.
+
+Decoded pictures are resampled, and their depth scaled to what is known; or, where the model's form
+is a correction, what it changed is added to the filled projection at full resolution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gvtools.cameras import Cameras
+from gvtools.completers.geoverse.color_field import aligned_color
+from gvtools.completers.geoverse.correction import corrected_color, corrected_depth
+from gvtools.completers.geoverse.depth_scale import pass_scale, scaled_depth
+from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
+from gvtools.completers.geoverse.passes import Generated
+from gvtools.completers.geoverse.resampling import resampled, resampled_depth
+from gvtools.guidance import Guidance
+
+# Confidence of a generated pixel at most: below what was observed.
+GENERATED = 0.9
+# Confidence of a corrected pixel that the model's own depth has no scale at.
+UNSCALED = 0.1
+Fill = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A pass's result at the targets' size and in scene units; no rays without a scale."""
+
+    rgb: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    rays: NDArray[np.float32] | None
+    scales: NDArray[np.float64]
+    support: tuple[str, ...]
+
+
+def brought_back(
+    made: Generated,
+    part: Guidance,
+    cameras: Cameras,
+    known: NDArray[np.float32],
+    *,
+    alignment: str,
+    color_alignment: str,
+) -> Completed:
+    """Pictures, depth, confidence and rays of the targets at their own size, in scene units.
+
+    Args:
+        made: of the pass.
+        part: its targets' projections.
+        cameras: of all views, at the model's size.
+        known: (C, h, w) depth of the context at the model's size.
+        alignment: see ``depth_scale``.
+        color_alignment: see ``color_field``.
+    """
+    geometry, context = made.decoded.geometry, len(known)
+    full = (part.depth.shape[1], part.depth.shape[2])
+    rgb = resampled(made.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
+    if color_alignment == "field":
+        hint = torch.from_numpy(part.rgb).permute(0, 3, 1, 2)
+        rgb = aligned_color(rgb, hint, torch.from_numpy(part.valid)[:, None])
+    depth = resampled_depth(geometry.depth[0, context:].float().cpu(), full)
+    certain = resampled(geometry.depth_confidence[0, context:, None].float().cpu(), full)[:, 0]
+    world_from_cam = cameras.world_from_cam
+    whole = pass_scale(geometry, world_from_cam, known)
+    # A pixel without a colour has no depth either: nothing of it enters the memory.
+    depth = torch.where(rgb.isfinite().all(1), depth, torch.nan)
+    scaled = scaled_depth(depth, part.depth, part.valid, centres=whole.scale, alignment=alignment)
+    confidence = (GENERATED * (1 - 1 / certain.clamp_min(1))).numpy().astype(np.float32)
+    confidence[~((scaled.depth > 0) & np.isfinite(confidence))] = 0
+    support = []
+    for method in scaled.method:
+        if method == "none":
+            reason = whole.by if whole.by.startswith("refused") else "refused: it contradicts"
+            support.append(f"{reason}; the memory gives no scale either")
+        else:
+            support.append(whole.by if method == "centres" else method)
+    found = scaled.scale[np.isfinite(scaled.scale)]
+    rays = None
+    if len(found):
+        rays = _plucker(geometry.ray[0, context:], world_from_cam[0], float(np.median(found)), full)
+    picture = rgb.nan_to_num().permute(0, 2, 3, 1).numpy()
+    return Completed(picture, scaled.depth, confidence, rays, scaled.scale, tuple(support))
+
+
+def corrected(back: Completed, made: Generated, part: Guidance, fill: Fill | None) -> Completed:
+    """The filled projection with what the model changed, in views that memory tells of.
+
+    Args:
+        back: the pass's own pictures, for views that memory tells nothing of.
+        made: with the hints' decoding.
+        part: the targets' projections.
+        fill: colour (T, H, W, 3) and depth (T, H, W) of the filled projections; None for averages.
+    """
+    assert made.hint is not None
+    fill = fill or _averaged(part)
+    full = (part.depth.shape[1], part.depth.shape[2])
+    targets = slice(-len(part), None)
+    filled = torch.from_numpy(fill[0]).permute(0, 3, 1, 2), torch.from_numpy(fill[1])
+    both = [
+        (
+            resampled(found.rgb[0].float().cpu(), full),
+            resampled_depth(found.geometry.depth[0, targets].float().cpu(), full)[:, None],
+        )
+        for found in (made.decoded, made.hint)
+    ]
+    valid = torch.from_numpy(part.valid)[:, None]
+    rgb = corrected_color(filled[0], both[0][0], both[1][0], valid)
+    rgb = rgb.clamp(0, 1).permute(0, 2, 3, 1)
+    depth = corrected_depth(filled[1][:, None], both[0][1], both[1][1], valid)[:, 0]
+    use = (filled[1] > 0) & rgb.isfinite().all(-1) & depth.isfinite()
+    known = use.numpy()
+    confidence = np.where(known & (back.confidence == 0), np.float32(UNSCALED), back.confidence)
+    return replace(
+        back,
+        rgb=np.where(known[..., None], rgb.numpy(), back.rgb),
+        depth=np.where(known, depth.numpy(), back.depth),
+        confidence=confidence,
+        support=tuple(
+            "the memory's surfaces" if view.any() else said
+            for view, said in zip(known, back.support, strict=True)
+        ),
+    )
+
+
+def _averaged(part: Guidance) -> Fill:
+    """Projections filled as the model fills them, at their own size."""
+    valid = torch.from_numpy(part.valid)[:, None]
+    color = push_pull(torch.from_numpy(part.rgb).permute(0, 3, 1, 2), valid)
+    depth = push_pull_depth(torch.from_numpy(part.depth)[:, None], valid)
+    return color.permute(0, 2, 3, 1).numpy(), depth[:, 0].numpy()
+
+
+def _plucker(
+    ray: Tensor, world_from_first: NDArray[np.float64], unit: float, full: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Predicted (T, h, w, 6) rays of the first view's frame as (T, H, W, 6) world Plücker rays."""
+    maps = resampled(ray.float().cpu().permute(0, 3, 1, 2), full).permute(0, 2, 3, 1).double()
+    rotation = torch.from_numpy(world_from_first[:3, :3].copy())
+    direction = torch.nn.functional.normalize(maps[..., :3] @ rotation.T, dim=-1)
+    origin = maps[..., 3:] * unit @ rotation.T
+    origin = origin + torch.from_numpy(world_from_first[:3, 3].copy())
+    moment = torch.linalg.cross(origin, direction)
+    return torch.cat((direction, moment), -1).numpy().astype(np.float32)
