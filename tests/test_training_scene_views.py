@@ -11,6 +11,7 @@ import torch
 from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.scenes.scene import Frame, Scene, View
+from gvtools.training.context_choice import ContextOptions
 from gvtools.training.dataset import ProceduralViews
 from gvtools.training.layouts import scene
 from gvtools.training.paths import PathOptions, camera_path
@@ -141,3 +142,16 @@ def test_real_frames(shared: Path) -> None:
     both = valid & (sample.depth[k:] > 0)
     ratio = sample.hint_depth[k:][both] / sample.depth[k:][both] - 1
     assert float(ratio.abs().median()) < 0.05
+
+
+def test_a_selection_limits_the_views(tmp_path):
+    place = _scene(count=20)
+    data = SceneViews(
+        scenes=(place,), select="every:4", views=4, size=(32, 32), overlap=0.0,
+        context=ContextOptions(most=2),
+    )  # fmt: skip
+    listed = data.describe()["scenes"][0]["views"]
+    assert listed == [view.name for view in place][::4]
+    assert data.sample(3).images.shape == (4, 3, 32, 32)
+    with pytest.raises(ProjectError, match="'every:10'"):
+        SceneViews(scenes=(place,), select="every:10", views=4, context=ContextOptions(most=2))

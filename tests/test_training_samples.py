@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gvtools.completers.geoverse.config import named
+from gvtools.errors import OptionError
+from gvtools.training.options import shipped_or_read, with_settings
+from gvtools.training.samples import TrainingSamples
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def samples(*settings: str) -> TrainingSamples:
+    config, folder = shipped_or_read("micro")
+    config = with_settings(config, list(settings))
+    return TrainingSamples(config, config.model_config(folder))
+
+
+def test_holes_reach_the_model_filled_and_marked():
+    batch = samples().held_out(2)
+    views = batch.views
+    holes = ~views.valid[:, views.context :]
+    assert holes.any()
+    told = views.valid[:, views.context :].flatten(2).any(2)
+    filled = views.depth[:, views.context :] > 0
+    assert filled[told].all() and not filled[~told].any()
+    # The fill is a guess at the truth, far better than none.
+    error = (views.images - batch.images)[:, views.context :].abs().mean(2, keepdim=True)
+    dark = batch.images[:, views.context :].mean(2, keepdim=True)
+    assert error[holes & filled].mean() < 0.6 * dark[holes & filled].mean()
+
+
+def test_without_projections_targets_are_black():
+    plain, blind = samples().held_out(2), samples("data.projections=false").held_out(2)
+    context = plain.views.context
+    assert torch.equal(plain.images, blind.images)
+    assert torch.equal(plain.views.images[:, :context], blind.views.images[:, :context])
+    assert torch.equal(plain.views.depth[:, :context], blind.views.depth[:, :context])
+    assert blind.views.valid[:, :context].all()
+    for values in (blind.views.images, blind.views.depth, blind.views.valid):
+        assert not values[:, context:].any()
+
+
+def test_the_same_numbers_give_the_same_samples_and_splits_differ():
+    first, again = (samples().batch(range(8, 10)) for _ in range(2))
+    assert torch.equal(first.images, again.images)
+    assert torch.equal(first.views.images, again.views.images)
+    assert not torch.equal(first.images, samples().held_out(2).images)
+    assert named("tiny").hints.fill == "surfaces"
+
+
+def test_settings_out_of_range_are_refused():
+    with pytest.raises(OptionError, match=r"data\.scene_overlap"):
+        samples("data.scene_overlap=1")
