@@ -1,4 +1,8 @@
-"""``gvtools train``: the generative core's stages, each resumable to the step after a kill."""
+"""``gvtools train``: the generative core's stages, each resumable to the step after a kill.
+
+Several processes train together: ``torchrun --nproc-per-node N --no-python gvtools train ...``;
+the setting ``parallel`` says what each of them holds.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,7 @@ SUMMARY = "train the generative core: encoder, denoisers, distillation"
 EXAMPLES = (
     "gvtools train tiny --stage all --out training/tiny",
     "gvtools train my_training.json --stage denoiser --out training/mine --resume",
+    "gvtools train base --init gld weights/base --out training/base",
 )
 
 
@@ -24,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from gvtools.training.names import STAGES
 
     parser.add_argument(
-        "config", metavar="CONFIG", help="a training that ships (tiny, micro), or a JSON file"
+        "config", metavar="CONFIG", help="a training that ships (tiny, base, micro), or a JSON file"
     )
     parser.add_argument(
         "--stage",
@@ -36,10 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the training")
     parser.add_argument(
         "--init",
-        type=Path,
-        metavar="DIR",
-        help="start from these weights: a GeoVerse folder, or GLD's published files; by default "
-        "from the stage before",
+        nargs="+",
+        metavar=("DIR|gld", "DIR"),
+        help="start from these weights: a GeoVerse folder, or one with GLD's published files; gld "
+        "DIR takes none but the latter. By default from the stage before. With published files, "
+        "--stage all leaves the encoder's stage out",
     )
     parser.add_argument(
         "--resume", action="store_true", help="continue the stage where its last state was saved"
@@ -74,12 +80,21 @@ def run(args: argparse.Namespace, console: Console) -> None:
     config = with_settings(config, args.set)
     if args.until is not None and args.until < 1:
         raise OptionError(f"--until {args.until}; expected at least step 1")
-    stages = STAGES if args.stage == "all" else (args.stage,)
+    init = _init_folder(args.init)
+    stages: tuple[str, ...] = STAGES if args.stage == "all" else (args.stage,)
+    if args.stage == "all" and init is not None and not _is_own(init):
+        # A published encoder has its training behind it.
+        stages = tuple(stage for stage in STAGES if stage != "encoder")
     figures: dict[str, dict[str, float]] = {}
     with started(args.device) as processes:
         for stage in stages:
             stage_run = StageRun(
-                config, stage, args.out, processes=processes, model_folder=folder, init=args.init
+                config,
+                stage,
+                args.out,
+                processes=processes,
+                model_folder=folder,
+                init=init if stage == stages[0] else None,
             )
             figures[stage] = stage_run.train(
                 resume=args.resume,
@@ -89,3 +104,30 @@ def run(args: argparse.Namespace, console: Console) -> None:
             )
         if args.json is not None and processes.first:
             args.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+def _init_folder(words: list[str] | None) -> Path | None:
+    """The folder of ``--init``.
+
+    Raises:
+        OptionError: other words than DIR or gld DIR, or a folder of one's own for the latter.
+    """
+    if words is None:
+        return None
+    if len(words) == 1:
+        return Path(words[0])
+    if len(words) != 2 or words[0] != "gld":
+        raise OptionError(f"--init {' '.join(words)}; expected --init DIR, or --init gld DIR")
+    folder = Path(words[1])
+    if _is_own(folder):
+        raise OptionError(
+            f"--init gld {folder}: a model of one's own is there; expected GLD's published files "
+            f"(gvtools weights list base), or --init {folder}"
+        )
+    return folder
+
+
+def _is_own(folder: Path) -> bool:
+    from gvtools.completers.geoverse.weights.published import WHOLE_FILE
+
+    return (folder / WHOLE_FILE).is_file()

@@ -1,6 +1,6 @@
 """``gvtools weights``: which checkpoints a configuration needs, whether a folder fits, making one.
 
-The actions: list, check, create, truncate-wan, empty-prompt.
+The actions: list, check, create, pack, truncate-wan, empty-prompt.
 """
 
 from __future__ import annotations
@@ -72,6 +72,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     create.add_argument("config", metavar="NAME", help="base, tiny or a config.json")
     create.add_argument("folder", type=Path, metavar="DIR", help="the folder to make")
     create.add_argument("--seed", type=int, default=0, metavar="N", help="of the numbers (0)")
+    pack = action(
+        "pack",
+        _pack,
+        "write a trained model in half precision, with its training's record",
+        "training/tiny weights/tiny",
+    )
+    pack.add_argument("source", type=Path, metavar="TRAINING", help="of gvtools train --out")
+    pack.add_argument("folder", type=Path, metavar="DIR", help="the folder to make or to renew")
     truncate = action(
         "truncate-wan",
         _truncate,
@@ -128,6 +136,13 @@ def _list(args: argparse.Namespace, console: Console) -> None:
         if number:
             console.line("")
         print_needed(entry, console)
+
+
+def _pack(args: argparse.Namespace, console: Console) -> None:
+    from pipelines.weights_pack import pack, packed_bytes
+
+    source = pack(args.source, args.folder)
+    console.line(f"{args.folder}: {size_text(packed_bytes(args.folder))}, from {source}")
 
 
 def _check(args: argparse.Namespace, console: Console) -> None:

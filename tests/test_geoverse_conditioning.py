@@ -264,7 +264,7 @@ def test_clean_latents_are_hints_of_which_everything_is_known(model):
     config = HintConfig(cascade_context="jointly")
     found = hints(model, batch, config)
     first, second = model.statistics
-    level0, level1 = encode_latents(model.geometry, first, second, batch)
+    level0, level1 = encode_latents(model.geometry, first, second, batch, HintConfig())
     close(found.level1, level1)
     close(found.level0[:, :2], level0[:, :2])
 

@@ -85,7 +85,7 @@ def test_a_training_is_not_mixed_with_another(trained, tmp_path, capsys):
     assert train(tmp_path / "new", "encoder", "--set", "encoder.optimizer.stepz=3") == 2
     assert "did you mean 'steps'" in capsys.readouterr().err
     assert main(["train", "huge", "--out", str(tmp_path / "x")]) == 2
-    assert "known: micro, tiny" in capsys.readouterr().err
+    assert "known: base, micro, tiny" in capsys.readouterr().err
 
 
 def test_a_torn_state_is_one_clear_line(trained, tmp_path, capsys):

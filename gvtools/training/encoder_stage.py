@@ -19,7 +19,7 @@ from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 from gvtools.training.options import EncoderStageOptions
 
-# Pull of the confidence towards certainty against the error that it weighs (DA3, VGGT).
+# Pull of the confidence towards certainty against the error (DA3, VGGT).
 CONFIDENCE_REWARD = 0.2
 
 
@@ -64,8 +64,7 @@ class EncoderStage(nn.Module):
         """Geometry and normed features of all views, from noised levels 0 and 1."""
         model, options = self.model, self.options
         views = self._shown(batch, draws)
-        cameras = model.config.hints.cameras
-        levels = encode_views(model.geometry, views, slice(None), cameras=cameras)
+        levels = encode_views(model.geometry, views, slice(None), model.config.hints)
         amount = options.noise * draws.uniform("noise", 1, 1, 1).to(views.images.device)
         noisy = []
         for index, level in enumerate(levels):
@@ -134,22 +133,25 @@ def true_rays(batch: TrainingBatch, unit: Tensor, grid: tuple[int, int]) -> Tens
 
 
 def ray_error(geometry: Geometry, batch: TrainingBatch, unit: Tensor) -> Tensor:
-    """Confidence-weighted L1 of directions and origins."""
+    """L1 of directions and origins, and the confidence's loss."""
     grid = (geometry.ray.shape[-3], geometry.ray.shape[-2])
     error = (geometry.ray - true_rays(batch, unit, grid)).abs()
     return _weighted(error.mean(-1), geometry.ray_confidence)
 
 
 def _depth_error(geometry: Geometry, depth: Tensor) -> Tensor:
-    """Confidence-weighted L1 of the logarithm, where depth is known."""
+    """L1 of the logarithm where depth is known, and the confidence's loss."""
     known = depth > 0
     error = (geometry.depth.log() - torch.where(known, depth, 1.0).log()).abs()
     return _weighted(error, geometry.depth_confidence, known)
 
 
 def _weighted(error: Tensor, confidence: Tensor, known: Tensor | None = None) -> Tensor:
-    """Mean over samples of each sample's mean over its known values."""
-    value = confidence * error - CONFIDENCE_REWARD * confidence.log()
+    """Error and its confidence's loss, mean over samples of each one's mean over known values."""
+    # The confidence learns from the error, and does not weigh it: small errors, whose confidence is
+    # high, would otherwise rule the gradient.
+    learned = confidence * error.detach() - CONFIDENCE_REWARD * confidence.log()
+    value = error + learned
     if known is None:
         return value.mean()
     return _masked_mean(value, known)
@@ -187,8 +189,7 @@ def measure_statistics(model: GeoVerse, batches: list[TrainingBatch]) -> None:
     squares = torch.zeros_like(sums)
     count = 0
     for batch in batches:
-        cameras = model.config.hints.cameras
-        levels = encode_views(model.geometry, batch.true_views, slice(None), cameras=cameras)
+        levels = encode_views(model.geometry, batch.true_views, slice(None), model.config.hints)
         for index, level in enumerate(levels):
             patches = level[:, :, 1:].double()
             sums[index] += patches.sum(dim=(0, 1, 2)).cpu()

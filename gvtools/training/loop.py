@@ -1,7 +1,8 @@
 """The training loop of any stage: batches in, optimiser steps, checkpoints, logs; exact to resume.
 
 A step's samples and draws follow from its number alone, so that a training continues after a kill
-as if nothing had been, and several processes see together what one would see.
+as if nothing had been, and several processes see together what one would see. What is saved does
+not depend on the processes either.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ import torch
 from torch import Tensor, nn
 
 from gvtools.training.batch import TrainingBatch
+from gvtools.training.copies import Copies
 from gvtools.training.draws import Draws
 from gvtools.training.ema import AveragedWeights
 from gvtools.training.options import OptimizerOptions
-from gvtools.training.processes import Processes
 from gvtools.training.state import Progress, StageState, load_state, save_state
 
 
@@ -38,6 +39,9 @@ class Stage(Protocol):
 
 Batches = Callable[[range], TrainingBatch]
 
+# Saving takes at most one part in so many of the time.
+SAVING_SHARE = 20
+
 
 @dataclass(frozen=True)
 class Reporting:
@@ -45,10 +49,10 @@ class Reporting:
 
     Attributes:
         log_every: steps between records.
-        save_seconds: seconds between checkpoints.
+        save_seconds: seconds between checkpoints; more where saving takes long.
         sheet_every: steps between sample sheets; 0 for none.
         record: gets (step, values).
-        sheet: gets the step; the averaged weights are in place meanwhile.
+        sheet: gets the step, in every process; the averaged weights are in place meanwhile.
     """
 
     log_every: int = 20
@@ -62,30 +66,28 @@ class Trainer:
     """One stage in training.
 
     Args:
-        stage: see Stage; what it leaves trainable is trained.
+        held: what this process holds of a stage (see Stage); what it leaves trainable is trained.
         options: of the optimiser.
         batches: gives the samples with these numbers.
         folder: of the state.
         seed: of the draws.
         identity: what may not change when a training is continued.
-        processes: this process and the others.
     """
 
     def __init__(
         self,
-        stage: nn.Module,
+        held: Copies,
         options: OptimizerOptions,
         batches: Batches,
         *,
         folder: Path,
         seed: int,
         identity: dict[str, Any],
-        processes: Processes,
     ) -> None:
-        self.stage, self.options, self.batches = stage, options, batches
+        self.held, self.stage, self.processes = held, held.stage, held.processes
+        self.options, self.batches = options, batches
         self.folder, self.seed, self.identity = folder, seed, identity
-        self.processes = processes
-        self.parameters = [(n, p) for n, p in stage.named_parameters() if p.requires_grad]
+        self.parameters = [(n, p) for n, p in self.stage.named_parameters() if p.requires_grad]
         matrices = [p for _, p in self.parameters if p.ndim > 1]
         others = [p for _, p in self.parameters if p.ndim <= 1]
         self.optimizer = torch.optim.AdamW(
@@ -101,34 +103,51 @@ class Trainer:
 
     def resume(self) -> bool:
         """Continue from the saved state; False where there is none."""
-        state = load_state(self.folder, self.identity)
+        state = load_state(self.folder, self.identity, mapped=self.held.together)
         if state is None:
             return False
         with torch.no_grad():
             for name, parameter in self.parameters:
-                parameter.copy_(state.model[name])
-        self.optimizer.load_state_dict(state.optimizer)
-        self.ema.load_state_dict(state.ema)
+                parameter.copy_(self.held.placed(state.model[name], parameter))
+        self.optimizer.load_state_dict(self._placed_moments(state.optimizer))
+        shadow = {
+            name: self.held.placed(state.ema["shadow"][name], value)
+            for name, value in self.ema.shadow.items()
+        }
+        self.ema.load_state_dict({**state.ema, "shadow": shadow})
         self.progress = state.progress
         return True
 
+    def _placed_moments(self, state: dict[str, Any]) -> dict[str, Any]:
+        """The optimiser's state with what this process holds of it."""
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        moments = {
+            index: {
+                name: value if name == "step" else self.held.placed(value, parameters[index])
+                for name, value in entry.items()
+            }
+            for index, entry in state["state"].items()
+        }
+        return {**state, "state": moments}
+
     def save(self) -> None:
-        """Write the state, from the first process."""
-        if not self.processes.first:
-            return
-        state = StageState(
-            self.identity,
-            self.progress,
-            {name: parameter.detach().cpu() for name, parameter in self.parameters},
-            self.optimizer.state_dict(),
-            self.ema.state_dict(),
+        """Write the state, from the first process; called by all of them."""
+        model, optimizer, ema = (
+            self.held.gathered(part)
+            for part in (
+                {name: parameter.detach() for name, parameter in self.parameters},
+                self.optimizer.state_dict(),
+                self.ema.state_dict(),
+            )
         )
-        save_state(state, self.folder)
+        if self.processes.first:
+            save_state(StageState(self.identity, self.progress, model, optimizer, ema), self.folder)
 
     def train(self, reporting: Reporting, *, until: int | None = None) -> None:
         """Make steps up to ``until`` (all of them by default) and save at the end."""
         last = min(until or self.options.steps, self.options.steps)
         saved = begun = time.monotonic()
+        pause = reporting.save_seconds
         before = self.progress.seconds
         kept: list[dict[str, float]] = []
         while self.progress.step < last:
@@ -145,12 +164,15 @@ class Trainer:
                 if self.processes.first:
                     reporting.record(step, values)
                 kept = []
-            if reporting.sheet_every and step % reporting.sheet_every == 0 and self.processes.first:
+            if reporting.sheet_every and step % reporting.sheet_every == 0:
                 with self.ema.swapped_in(), torch.no_grad():
                     reporting.sheet(step)
-            if time.monotonic() - saved > reporting.save_seconds:
+            # The clocks of the processes differ, and all of them save.
+            if self.processes.any(time.monotonic() - saved > pause):
+                now = time.monotonic()
                 self.save()
                 saved = time.monotonic()
+                pause = max(reporting.save_seconds, SAVING_SHARE * (saved - now))
         self.save()
 
     def step(self) -> dict[str, float]:
@@ -169,23 +191,22 @@ class Trainer:
                 loss, terms = self.stage(batch, draws)
             value = float(loss.detach())
             good &= math.isfinite(value) and value <= options.largest_loss
-            if not good:
-                break
+            # Of a bad loss, too: processes that share parameters out meet in the backward pass.
             (loss * (len(part) / len(mine))).backward()
             values.append({"loss": value} | {k: float(v.detach()) for k, v in terms.items()})
         trained = [parameter for _, parameter in self.parameters]
         bad = self.processes.any(not good)
         if not bad:
-            self.processes.average_gradients(trained)
-            norm = nn.utils.clip_grad_norm_(trained, options.clip)
-            bad = not bool(torch.isfinite(norm))
+            self.held.average_gradients(trained)
+            norm = self.held.number(nn.utils.clip_grad_norm_(trained, options.clip))
+            bad = not math.isfinite(norm)
         if bad:
             self.progress.skipped += 1
             values = []
         else:
             self.optimizer.step()
             self.ema.update()
-            values.append({"gradient_norm": float(norm)})
+            values.append({"gradient_norm": norm})
         self.optimizer.zero_grad(set_to_none=True)
         self.progress.step += 1
         return _averaged(values)

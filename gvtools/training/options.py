@@ -189,6 +189,9 @@ class TrainingConfig:
     Attributes:
         model: a configuration by name ("tiny", "base") or the path of its JSON file.
         seed: of everything random.
+        parallel: what several processes hold: "data", each of them everything; "sharded", a part
+            of all parameters, gradients, averages and moments each (FSDP2), for large models. The
+            result is the same, and a training may go on in the other way.
         data: see DataOptions.
         encoder: stage 0.
         denoiser: stage 1.
@@ -197,10 +200,15 @@ class TrainingConfig:
 
     model: str = "tiny"
     seed: int = 0
+    parallel: str = "data"
     data: DataOptions = field(default_factory=DataOptions)
     encoder: EncoderStageOptions = field(default_factory=EncoderStageOptions)
     denoiser: DenoiserStageOptions = field(default_factory=DenoiserStageOptions)
     reflow: ReflowStageOptions = field(default_factory=ReflowStageOptions)
+
+    def __post_init__(self) -> None:
+        if self.parallel not in ("data", "sharded"):
+            raise OptionError(f"parallel = {self.parallel!r}; expected data or sharded")
 
     def model_config(self, folder: Path | None = None) -> GeoVerseConfig:
         """The model's configuration; a relative path is looked up from ``folder``."""

@@ -85,6 +85,10 @@ class Processes:
         dist.all_reduce(value, op=dist.ReduceOp.MAX)
         return bool(value.item())
 
+    def wait(self) -> None:
+        """Until all processes are here."""
+        self.any(False)
+
 
 @contextmanager
 def started(device: str = "auto") -> Iterator[Processes]:

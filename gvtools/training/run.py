@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,12 @@ from torch import nn
 
 from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.video_prior.prior import VideoPrior
+from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
 from gvtools.errors import CheckpointError
+from gvtools.files import write_text
 from gvtools.training.batch import TrainingBatch
+from gvtools.training.copies import Copies, models_of
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.encoder_stage import EncoderStage, measure_statistics
 from gvtools.training.loop import Reporting, Trainer
@@ -27,6 +32,8 @@ from gvtools.training.sheets import write_sheet
 from gvtools.training.state import FILE
 
 WEIGHTS = "weights"
+# The whole training's settings, as the stage was last run with them.
+SETTINGS = "training.json"
 SHEET_SAMPLES = 3
 
 
@@ -58,6 +65,7 @@ class StageRun:
         self.model_config = config.model_config(model_folder)
         self.init = init
         self.options = getattr(config, stage)
+        self._source: Path | None = None
 
     def train(
         self,
@@ -81,20 +89,25 @@ class StageRun:
                 "choose another --out"
             )
         model = self._start(say)
-        module = self._module(model)
+        held = self._distributed(self._module(model), model.video)
+        if held.about:
+            say(f"{self.stage}: {held.about}")
         samples = TrainingSamples(self.config, self.model_config)
         trainer = Trainer(
-            module.to(self.processes.device),
+            held,
             self.options.optimizer,
             samples.batch,
             folder=self.folder,
             seed=self.config.seed,
             identity=self._identity(),
-            processes=self.processes,
         )
         resumed = trainer.resume() if resume else False
         if resumed:
             say(f"{self.stage}: goes on after step {trainer.progress.step}")
+        if self.processes.first:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            text = json.dumps(to_json(self.config), indent=2) + "\n"
+            write_text(self.folder / SETTINGS, text)
         samples.start(trainer, self.processes)
         log = TrainingLog(self.folder, step=trainer.progress.step) if self.processes.first else None
 
@@ -104,12 +117,18 @@ class StageRun:
             shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if "count" not in k)
             say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
 
-        held_out = samples.held_out(SHEET_SAMPLES) if sheet_every and self.processes.first else None
+        drawing = sheet_every and self.stage != "encoder" and (held.together or log is not None)
+        held_out = samples.held_out(SHEET_SAMPLES) if drawing else None
 
         def sheet(step: int) -> None:
-            if held_out is not None and self.stage != "encoder":
-                batch = held_out.to(self.processes.device)
-                write_sheet(model, batch, self.folder / "sheets" / f"step_{step:06d}.png")
+            if held_out is None:
+                return
+            batch = held_out.to(self.processes.device)
+            with held.usable():
+                if self.processes.first:
+                    write_sheet(model, batch, self.folder / "sheets" / f"step_{step:06d}.png")
+                else:
+                    model.generate(batch.views)
 
         try:
             trainer.train(
@@ -117,7 +136,7 @@ class StageRun:
             )
         finally:
             samples.close()
-        if trainer.progress.step >= self.options.optimizer.steps and self.processes.first:
+        if trainer.progress.step >= self.options.optimizer.steps:
             self._write_weights(model, trainer, samples)
             say(f"{self.stage}: weights in {self.folder / WEIGHTS}")
         records = read_log(self.folder)
@@ -132,6 +151,7 @@ class StageRun:
         for source in sources:
             if source is not None and (self.init or source.exists()):
                 say(f"{self.stage}: starts from {source}")
+                self._source = source
                 return from_pretrained(source, config=self.model_config)
         if before:
             raise CheckpointError(
@@ -148,6 +168,18 @@ class StageRun:
             return DenoiserStage(model, self.options)
         return ReflowStage(model, self.options)
 
+    def _distributed(self, module: nn.Module, video: VideoPrior | None) -> Copies:
+        """What this process holds of the stage."""
+        if video is not None:
+            for model in models_of(module):
+                # A teacher does without its copy: it is large, and never trained.
+                model.attach_video(video)
+        if self.config.parallel == "sharded" and self.processes.count > 1:
+            from gvtools.training.shards import Shards
+
+            return Shards(module, self.processes)
+        return Copies(module, self.processes)
+
     def _identity(self) -> dict[str, Any]:
         """What may not change between the parts of a stage."""
         data = to_json(self.config.data)
@@ -163,12 +195,28 @@ class StageRun:
     def _write_weights(self, model: GeoVerse, trainer: Trainer, samples: TrainingSamples) -> None:
         """The averaged weights; after stage 0 with the latents' statistics."""
         with trainer.ema.swapped_in():
-            if self.stage == "encoder":
-                batches: list[TrainingBatch] = [
-                    samples.aside(index, self.options.optimizer.batch).to(self.processes.device)
-                    for index in range(self.options.statistics)
-                ]
-                measure_statistics(model, batches)
-            # An encoder alone completes nothing.
-            model.config = replace(self.model_config, trained=self.stage != "encoder")
-            model.save_pretrained(self.folder / WEIGHTS)
+            whole = trainer.held.whole_model(model)
+            if whole is not None:
+                if self.stage == "encoder":
+                    device = self.processes.device
+                    batches: list[TrainingBatch] = [
+                        samples.aside(index, self.options.optimizer.batch).to(device)
+                        for index in range(self.options.statistics)
+                    ]
+                    measure_statistics(whole.to(device), batches)
+                # An encoder alone completes nothing.
+                whole.config = replace(self.model_config, trained=self.stage != "encoder")
+                whole.save_pretrained(self.folder / WEIGHTS)
+                self._link_video()
+        # The next stage starts from them, in every process.
+        self.processes.wait()
+
+    def _link_video(self) -> None:
+        """The video prior, which is not trained, lies where the stage's start has it."""
+        link = self.folder / WEIGHTS / VIDEO_FOLDER
+        if self.model_config.video is None or self._source is None:
+            return
+        if link.is_symlink():
+            link.unlink()
+        if not link.exists():
+            link.symlink_to((self._source / VIDEO_FOLDER).resolve(), target_is_directory=True)

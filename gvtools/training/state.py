@@ -56,8 +56,15 @@ def save_state(state: StageState, folder: Path) -> None:
     os.replace(part, folder / FILE)
 
 
-def load_state(folder: Path, identity: dict[str, Any]) -> StageState | None:
+def load_state(
+    folder: Path, identity: dict[str, Any], *, mapped: bool = False
+) -> StageState | None:
     """The saved state, or None where there is none.
+
+    Args:
+        folder: of the stage.
+        identity: what must not have changed.
+        mapped: leave tensors in the file until they are used; for processes that use a part each.
 
     Raises:
         CheckpointError: damaged, or of other settings (the first that differs is named).
@@ -66,7 +73,7 @@ def load_state(folder: Path, identity: dict[str, Any]) -> StageState | None:
     if not path.exists():
         return None
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
         state = StageState(**{**content, "progress": Progress(**content["progress"])})
     except Exception as error:
         raise CheckpointError(

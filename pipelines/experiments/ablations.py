@@ -7,7 +7,6 @@ prior would give.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -122,8 +121,6 @@ def _trained(variant: Variant, options: ExperimentOptions) -> Path:
     if variant.injection != "none":
         start = _start(options.weights, model_config, out / "start")
     _train(with_settings(config, settings), out, start)
-    if variant.injection != "none":
-        shutil.copytree(start / VIDEO_FOLDER, weights / VIDEO_FOLDER)
     return weights
 
 

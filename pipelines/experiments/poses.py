@@ -73,9 +73,7 @@ def _of_truth(model: GeoVerse, batch: TrainingBatch) -> Geometry:
     from gvtools.completers.geoverse.conditioning import encode_views
 
     grid = model.geometry.encoder.grid(*batch.views.size)
-    levels = encode_views(
-        model.geometry, batch.true_views, slice(None), cameras=model.config.hints.cameras
-    )
+    levels = encode_views(model.geometry, batch.true_views, slice(None), model.config.hints)
     return model.geometry.geometry(
         [*levels, *model.geometry.encoder.propagate(levels[1], grid)], grid
     )

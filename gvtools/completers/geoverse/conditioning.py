@@ -38,6 +38,8 @@ class HintConfig:
         mask: features of a token count where at least this share of its pixels is valid; 0: the
             features are not masked (of use with filled holes).
         cameras: known cameras go into the encoder's camera tokens.
+        camera_unit: of those cameras: "median", the median distance of the centres from the first
+            (DA3); or "depth", the mean known depth of the context, where any is known.
         cascade_context: level-0 features of the context come from the context "alone" (as GLD
             trains its cascade) or from the "jointly" encoded sequence.
         token: token 0 of generated features: "first-context" encoded alone and shared by all views
@@ -48,6 +50,7 @@ class HintConfig:
     encode: str = "jointly"
     mask: float = 0.5
     cameras: bool = False
+    camera_unit: str = "median"
     cascade_context: str = "alone"
     token: str = "first-context"
 
@@ -55,6 +58,7 @@ class HintConfig:
         for name, known in (
             ("fill", FILLS),
             ("encode", ("jointly", "alone")),
+            ("camera_unit", ("median", "depth")),
             ("cascade_context", ("alone", "jointly")),
             ("token", ("first-context", "own")),
         ):
@@ -204,7 +208,7 @@ def encode_hints(
     context = batch.context
     told[:, :context] = True
     # Only where it is asked for: with everything encoded jointly it is not.
-    alone = cache(lambda: encode_views(network, batch, slice(0, context), cameras=config.cameras))
+    alone = cache(lambda: encode_views(network, batch, slice(0, context), config))
     shape = (*batch.images.shape[:2], 1 + grid[0] * grid[1], network.config.encoder.channels)
     dtype = network.encoder.cls_token.dtype
     joint = [batch.images.new_zeros(shape, dtype=dtype) for _ in range(2)]
@@ -215,7 +219,7 @@ def encode_hints(
                 level[samples, :context] = features[samples]
             continue
         views = pattern.nonzero()[:, 0]
-        part = encode_views(network, batch.samples(samples), views, cameras=config.cameras)
+        part = encode_views(network, batch.samples(samples), views, config)
         for level, features in zip(joint, part, strict=True):
             level[samples[:, None], views] = features
     if config.encode == "alone":
@@ -228,11 +232,7 @@ def encode_hints(
             token[silent] = _silent_tokens(token, context)[silent]
     else:
         single = slice(0, 1)
-        first = (
-            alone()
-            if context == 1
-            else encode_views(network, batch, single, cameras=config.cameras)
-        )
+        first = alone() if context == 1 else encode_views(network, batch, single, config)
         token = first[1][:, :, 0].expand(-1, shape[1], -1)
 
     features = level1.normalise(_maps(joint[1], grid))
@@ -255,8 +255,7 @@ def encode_latents(
     level0: LatentStatistics,
     level1: LatentStatistics,
     batch: ViewBatch,
-    *,
-    cameras: bool = False,
+    config: HintConfig,
 ) -> tuple[Tensor, Tensor]:
     """Clean level-0 and level-1 latents of true pictures of all views, encoded jointly.
 
@@ -265,18 +264,18 @@ def encode_latents(
         level0: statistics of level 0.
         level1: statistics of level 1.
         batch: true pictures on all views.
-        cameras: see ``HintConfig.cameras``.
+        config: see ``HintConfig``.
 
     Returns:
         Two (B, V, C, h, w) tensors, normalised.
     """
     grid = network.encoder.grid(*batch.size)
-    both = encode_views(network, batch, slice(None), cameras=cameras)
+    both = encode_views(network, batch, slice(None), config)
     return level0.normalise(_maps(both[0], grid)), level1.normalise(_maps(both[1], grid))
 
 
 def encode_views(
-    network: DepthAnything3, batch: ViewBatch, views: slice | Tensor, *, cameras: bool
+    network: DepthAnything3, batch: ViewBatch, views: slice | Tensor, config: HintConfig
 ) -> list[Tensor]:
     """Raw levels 0 and 1 of some views, token 0 included; gradients reach the encoder.
 
@@ -284,16 +283,31 @@ def encode_views(
         network: the encoder.
         batch: all views.
         views: which of them are encoded.
-        cameras: see ``HintConfig.cameras``; they are relative to the batch's first view.
+        config: whether, and in which unit, it is told the cameras, relative to the first view.
     """
     images = batch.images[:, views]
-    if not cameras:
+    if not config.cameras:
         return network.encode(images, levels=2)
+    cameras = _told_cameras(batch, config.camera_unit)
+    return network.encode(images, levels=2, cam_from_world=cameras[:, views], K=batch.K[:, views])
+
+
+def _told_cameras(batch: ViewBatch, unit: str) -> Tensor:
+    """(B, V, 4, 4) cameras relative to the first view, as the encoder is told them."""
     # The camera encoder's unit has a floor, a tenth of a scene unit: in shares of the views' extent
     # it means the same in every scene.
-    poses, _ = normalised_poses(torch.linalg.inv(batch.cam_from_world), reference=0)
-    relative, _ = relative_cameras(torch.linalg.inv(poses))
-    return network.encode(images, levels=2, cam_from_world=relative[:, views], K=batch.K[:, views])
+    poses, scale = normalised_poses(torch.linalg.inv(batch.cam_from_world), reference=0)
+    normalised = torch.linalg.inv(poses)
+    cameras, _ = relative_cameras(normalised)
+    if unit == "median":
+        return cameras
+    depth = batch.depth[:, : batch.context].flatten(1)
+    known = (depth > 0) & torch.isfinite(depth)
+    mean = torch.where(known, depth, 0.0).sum(1) / known.sum(1).clamp_min(1)
+    in_depths = normalised.clone()
+    in_depths[..., :3, 3] /= (scale * mean).clamp_min(torch.finfo(mean.dtype).tiny)[:, None, None]
+    told = (mean > 0)[:, None, None, None]
+    return torch.where(told, in_depths, cameras.to(in_depths.dtype)).to(cameras.dtype)
 
 
 def _silent_tokens(token: Tensor, context: int) -> Tensor:

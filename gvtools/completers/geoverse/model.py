@@ -163,9 +163,7 @@ class GeoVerse(nn.Module):
     def clean_latents(self, batch: ViewBatch) -> tuple[Tensor, Tensor]:
         """Level-0 and level-1 latents, (B, V, C, h, w) each, of true pictures of all views."""
         level0, level1 = self.level_statistics
-        return encode_latents(
-            self.geometry, level0, level1, batch, cameras=self.config.hints.cameras
-        )
+        return encode_latents(self.geometry, level0, level1, batch, self.config.hints)
 
     def with_video(self, prepared: Prepared, features: VideoFeatures) -> Prepared:
         """``prepared`` with video features; gradients reach the adapters.

@@ -1,0 +1,70 @@
+"""``gvtools weights pack``: a trained model as it ships, with its training's record.
+
+What a reader needs to judge and to repeat the training lies beside the weights: the settings of
+each stage (``training_STAGE.json``) and its log, thinned (``log_STAGE.jsonl``).
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pretrained
+from gvtools.completers.geoverse.weights.published import CONFIG_FILE, WHOLE_FILE
+from gvtools.errors import ProjectError
+from gvtools.files import write_text
+from gvtools.training.names import STAGES
+from gvtools.training.records import read_log
+from gvtools.training.run import SETTINGS, WEIGHTS
+
+# Records of a stage's log that are kept.
+RECORDS = 150
+DTYPE = "float16"
+
+
+def pack(training: Path, out: Path) -> Path:
+    """Write the last stage's weights and every stage's record.
+
+    Args:
+        training: folder of a ``gvtools train --out``.
+        out: the folder to make or to renew; what else is in it stays.
+
+    Returns:
+        The stage's folder that the weights came from.
+
+    Raises:
+        ProjectError: no stage has finished, or ``out`` is within the training.
+    """
+    finished = [name for name in STAGES[1:] if (training / name / WEIGHTS).is_dir()]
+    if not finished:
+        raise ProjectError(
+            f"{training}: no finished denoiser; expected {training / 'denoiser' / WEIGHTS}; run "
+            "gvtools train first"
+        )
+    if out.resolve().is_relative_to(training.resolve()):
+        raise ProjectError(f"{out} lies within the training {training}; choose another folder")
+    source = training / finished[-1] / WEIGHTS
+    model = from_pretrained(source)
+    out.mkdir(parents=True, exist_ok=True)
+    save_pretrained(model, out, dtype=DTYPE)
+    for stage in STAGES:
+        records = read_log(training / stage)
+        if not records:
+            continue
+        step = max(1, len(records) // RECORDS)
+        kept = [*records[:-1][::step], records[-1]]
+        lines = (json.dumps({k: _short(v) for k, v in line.items()}) for line in kept)
+        write_text(out / f"log_{stage}.jsonl", "\n".join(lines) + "\n")
+        if (training / stage / SETTINGS).exists():
+            shutil.copyfile(training / stage / SETTINGS, out / f"training_{stage}.json")
+    return source
+
+
+def packed_bytes(folder: Path) -> int:
+    """Of the model's own files."""
+    return sum((folder / name).stat().st_size for name in (CONFIG_FILE, WHOLE_FILE))
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.5g}")

@@ -1,0 +1,212 @@
+"""``gvtools train --init``: GLD's published files as a start, and the training of ``base``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from published_folder import write_published
+from torch import Tensor
+
+from gvtools.completers.geoverse import GeoVerse, from_pretrained
+from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.config import GeoVerseConfig, named, read
+from gvtools.completers.geoverse.config_json import to_json
+from gvtools.completers.geoverse.denoiser import Conditions
+from gvtools.completers.geoverse.plucker import camera_condition
+from gvtools.training.options import SHIPPED, shipped_or_read
+from gvtools.training.samples import TrainingSamples
+from pipelines.cli import main
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+STAGES = ("encoder", "denoiser", "reflow")
+
+
+def small_base() -> GeoVerseConfig:
+    """The conventions of ``base`` with the sizes of ``micro``, and without the video prior."""
+    base, micro = named("base"), read(SHIPPED / "micro_model.json")
+    return replace(
+        base,
+        image_size=micro.image_size,
+        views=micro.views,
+        context=micro.context,
+        geometry=micro.geometry,
+        rgb=micro.rgb,
+        level1=micro.level1,
+        cascade=micro.cascade,
+        video=None,
+        injection="none",
+    )
+
+
+def random_model(config: GeoVerseConfig) -> GeoVerse:
+    """A model none of whose parameters is left at zero."""
+    torch.manual_seed(3)
+    model = GeoVerse(config)
+    for parameter in model.parameters():
+        if not parameter.any():
+            torch.nn.init.normal_(parameter, std=0.1)
+    for statistics in model.level_statistics:
+        statistics.mean.normal_()
+        statistics.var.uniform_(0.5, 2)
+    return model.eval()
+
+
+@pytest.fixture(scope="module")
+def gld() -> GeoVerse:
+    """What GLD has: no projected depth."""
+    config = small_base()
+    return random_model(replace(config, level1=replace(config.level1, depth_condition=False)))
+
+
+@pytest.fixture(scope="module")
+def published(gld, tmp_path_factory) -> Path:
+    """A folder as it is downloaded."""
+    folder = write_published(gld, tmp_path_factory.mktemp("gld"))
+    (folder / "config.json").unlink()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def training(tmp_path_factory) -> str:
+    """A training's file, its model's beside it."""
+    folder = tmp_path_factory.mktemp("config")
+    (folder / "model.json").write_text(json.dumps(to_json(small_base())))
+    data = json.loads((SHIPPED / "micro.json").read_text())
+    for stage in STAGES:
+        data[stage]["optimizer"]["steps"] = 1
+    (folder / "training.json").write_text(json.dumps({**data, "model": "model.json"}))
+    return str(folder / "training.json")
+
+
+def train(training: str, out: Path, stage: str, *more: str) -> int:
+    options = ["--device", "cpu", "--sheets", "0"]
+    return main(["train", training, "--stage", stage, "--out", str(out), *options, *more])
+
+
+def unseen_targets(training: str) -> ViewBatch:
+    """Real cameras and context views; nothing is projected into the targets."""
+    config, folder = shipped_or_read(training)
+    views = TrainingSamples(config, config.model_config(folder)).aside(0, 2).views
+    shown = torch.zeros_like(views.valid)
+    shown[:, : views.context] = views.valid[:, : views.context]
+    images, depth = views.images * (shown > 0), views.depth * (shown > 0)
+    return replace(views, images=images, depth=depth, valid=shown)
+
+
+@torch.no_grad()
+def gld_velocity(gld: GeoVerse, batch: ViewBatch, state: Tensor, t: Tensor) -> Tensor:
+    """As GLD calls its denoiser: the context's own latents, zeros on the targets."""
+    context, statistics = batch.context, gld.level_statistics[1]
+    level = gld.geometry.encode(batch.images[:, :context], levels=2)[1]
+    clean = statistics.normalise(level[:, :, 1:].transpose(2, 3).unflatten(3, state.shape[-2:]))
+    latents = torch.zeros_like(state)
+    latents[:, :context] = clean
+    camera = camera_condition(
+        torch.linalg.inv(batch.cam_from_world),
+        batch.K,
+        batch.size,
+        context=context,
+        reference=-1,
+        pixel_offset=(-0.5, 0.5),
+    )
+    return gld.level1(state, t, Conditions(latents, camera))
+
+
+@pytest.mark.parametrize("words", [(), ("gld",)])
+def test_a_training_that_learns_nothing_leaves_what_gld_is(
+    gld, published, training, tmp_path, words
+):
+    """Every batch is skipped, so that the weights written are those of the start."""
+    nothing = ["--set", "denoiser.optimizer.largest_loss=1e-9"]
+    init = ["--init", *words, str(published)]
+    assert train(training, tmp_path, "denoiser", *init, *nothing) == 0
+    start = from_pretrained(tmp_path / "denoiser" / "weights")
+    known = gld.state_dict()
+    for name, tensor in start.state_dict().items():
+        if name.startswith("level1.depth_embedder."):
+            assert not tensor.any(), name
+        else:
+            assert torch.equal(tensor, known[name]), name
+
+    batch = unseen_targets(training)
+    assert float(batch.valid[:, batch.context :].sum()) == 0
+    generator = torch.Generator().manual_seed(1)
+    state = torch.randn(2, 4, 64, 4, 4, generator=generator)
+    t = torch.tensor([0.9, 0.3])
+    with torch.no_grad():
+        found = start.velocity1(start.prepare(batch), state, t)
+    wanted = gld_velocity(gld, batch, state, t)
+    assert float(wanted.abs().mean()) > 0.1
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
+
+
+def test_a_training_goes_on_from_gld_without_the_encoders_stage(
+    published, training, tmp_path, capsys
+):
+    assert train(training, tmp_path, "all", "--init", "gld", str(published)) == 0
+    said = capsys.readouterr().out
+    assert not (tmp_path / "encoder").exists()
+    assert f"denoiser: starts from {published}" in said
+    # Not from where the stage before had started.
+    assert f"reflow: starts from {tmp_path / 'denoiser' / 'weights'}" in said
+    trained = from_pretrained(tmp_path / "denoiser" / "weights")
+    assert trained.config.trained
+    assert trained.level1.depth_embedder.proj.weight.any()
+
+
+def test_ones_own_start_is_that_of_the_first_stage(published, training, tmp_path, capsys):
+    own = tmp_path / "own"
+    from_pretrained(published, config=small_base()).save_pretrained(own)
+    few = ["--set", "encoder.statistics=1"]
+    assert train(training, tmp_path / "out", "all", "--init", str(own), *few) == 0
+    said = capsys.readouterr().out
+    assert f"encoder: starts from {own}" in said
+    assert f"denoiser: starts from {tmp_path / 'out' / 'encoder' / 'weights'}" in said
+
+
+def test_other_starts_are_one_clear_line(published, training, tmp_path, capsys):
+    own = tmp_path / "own"
+    from_pretrained(published, config=small_base()).save_pretrained(own)
+    part = tmp_path / "part"
+    (part / "checkpoints").mkdir(parents=True)
+    (part / "checkpoints" / "da3_level1.pt").symlink_to(published / "checkpoints/da3_level1.pt")
+    for words, expected in (
+        (["vggt", str(published)], "expected --init DIR, or --init gld DIR"),
+        (["gld", str(published), "more"], "expected --init DIR, or --init gld DIR"),
+        (["gld", str(own)], "a model of one's own is there"),
+        (["gld", str(tmp_path / "absent")], "absent does not exist"),
+        (["gld"], "gld does not exist"),
+        ([str(part)], "pretrained_models/da3/model.safetensors"),
+    ):
+        assert train(training, tmp_path / "out", "denoiser", "--init", *words) == 2
+        said = capsys.readouterr().err
+        assert expected in said
+        assert said.count("\n") == 1
+    # The files of a model of other sizes.
+    assert main(["train", "tiny", "--out", str(tmp_path / "out"), "--init", str(published)]) == 2
+    assert "expected" in capsys.readouterr().err
+
+
+def test_the_training_of_base_is_the_papers():
+    """Training details of the paper: 504 x 504, 8 views, 32 samples, 300k and 50k iterations."""
+    config, folder = shipped_or_read("base")
+    assert config.model_config(folder) == named("base")
+    assert config.parallel == "sharded"
+    assert (config.data.views, config.data.size) == (8, (504, 504))
+    for stage, steps, rate in ((config.denoiser, 300_000, 3e-5), (config.reflow, 50_000, 1e-5)):
+        options = stage.optimizer
+        assert (options.steps, options.rate, options.batch) == (steps, rate, 32)
+        assert (options.betas, options.clip, options.ema) == ((0.9, 0.95), 1.0, 0.9995)
+        assert options.precision == "bfloat16"
+        assert stage.context_weight == 0.25
+    assert config.reflow.bounds is None and config.model_config().flow.level1[0::3] == (1.0, 0.0)
+
+
+def test_an_unknown_way_of_sharing_is_refused(tmp_path, capsys):
+    assert main(["train", "micro", "--out", str(tmp_path), "--set", "parallel=fsdp"]) == 2
+    assert "parallel = 'fsdp'; expected data or sharded" in capsys.readouterr().err
