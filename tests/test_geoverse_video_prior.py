@@ -428,3 +428,10 @@ def test_importing_the_module_leaves_diffusers_alone() -> None:
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+def test_a_copied_model_shares_its_prior(network):
+    import copy
+
+    prior = tiny.prior(network)
+    assert copy.deepcopy([prior])[0] is prior

@@ -41,7 +41,7 @@ class DenoiserStage(nn.Module):
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
         model, options = self.model, self.options
-        prepared = model.prepare(batch.views)
+        prepared = model.prepare(batch.views, seed=draws.seeds("video", batch.images.shape[1]))
         clean0, clean1 = model.clean_latents(batch.true_views)
         device = clean1.device
         drop = draws.uniform("cameras", 1)[:, 0] < options.cameras

@@ -42,12 +42,14 @@ class Draws:
 
     def normal(self, name: str, shape: Sequence[int], device: torch.device | str) -> Tensor:
         """(B, V, ...) standard normal, every view by itself."""
-        views = int(shape[1])
-        seeds = [
+        return seeded_noise(shape, self.seeds(name, int(shape[1])), device=device)
+
+    def seeds(self, name: str, views: int) -> list[list[int]]:
+        """B rows of a seed for every view."""
+        return [
             [view_seed(self.seed, self.stage, name, sample, view) for view in range(views)]
             for sample in self.samples
         ]
-        return seeded_noise(shape, seeds, device=device)
 
     def _generators(self, name: str) -> list[torch.Generator]:
         return [

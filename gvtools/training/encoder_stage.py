@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from gvtools.completers.geoverse.conditioning import ViewBatch, encode_views, filled
 from gvtools.completers.geoverse.depth_anything.camera_token import encode_cameras
+from gvtools.completers.geoverse.depth_anything.encoder import patch_rays
 from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective.losses import high_gradient_loss
@@ -117,19 +118,11 @@ def true_rays(batch: TrainingBatch, unit: Tensor, grid: tuple[int, int]) -> Tens
 
     A ray belongs to the middle of its cell of the ray grid.
     """
-    height, width = batch.views.size
-    device = batch.images.device
-    y = (torch.arange(grid[0], device=device) + 0.5) * (height / grid[0])
-    x = (torch.arange(grid[1], device=device) + 0.5) * (width / grid[1])
-    pixel = torch.stack(
-        (x.expand(grid[0], -1), y[:, None].expand(-1, grid[1]), torch.ones(grid, device=device)), -1
-    )
     pose = batch.views.cam_from_world
     relative = (pose.double() @ torch.linalg.inv(pose[:, :1].double())).float()
-    turn = relative[..., :3, :3].mT @ torch.linalg.inv(batch.views.K)
-    direction = torch.einsum("bvij,hwj->bvhwi", turn, pixel)
-    origin = batch.centers / unit[:, None, None]
-    return torch.cat((direction, origin[:, :, None, None].expand_as(direction)), dim=-1)
+    rays = patch_rays(relative, batch.views.K, grid, batch.views.size)[..., :6]
+    direction, origin = rays.unflatten(2, grid).split(3, dim=-1)
+    return torch.cat((direction, origin / unit[:, None, None, None, None]), dim=-1)
 
 
 def ray_error(geometry: Geometry, batch: TrainingBatch, unit: Tensor) -> Tensor:

@@ -52,7 +52,8 @@ class ReflowStage(nn.Module):
         """The loss, and its terms for the log."""
         model, options = self.model, self.options
         teacher = self._teacher[0].to(batch.images.device)
-        prepared = model.prepare(batch.views)
+        seeds = draws.seeds("video", batch.images.shape[1])
+        prepared = model.prepare(batch.views, seed=seeds)
         _, clean = model.clean_latents(batch.true_views)
         device = clean.device
         context = batch.views.context
@@ -60,7 +61,7 @@ class ReflowStage(nn.Module):
         intervals, t = interval_times(
             draws.uniform("interval", 1)[:, 0], draws.uniform("t_inside", 1)[:, 0], self.bounds
         )
-        known = teacher.prepare(batch.views) if options.rho > 0 else prepared
+        known = teacher.prepare(batch.views, seed=seeds) if options.rho > 0 else prepared
         without = teacher.without_cameras(known) if options.guidance != 1 else known
         pair = reflow_pair(
             guided(

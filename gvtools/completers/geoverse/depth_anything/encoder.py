@@ -22,6 +22,10 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
+# Numbers of a ray: direction, origin, moment.
+RAY = 9
+
+
 @dataclass(frozen=True)
 class EncoderConfig:
     """Dimensions of the backbone; the defaults are Depth Anything 3 Base.
@@ -39,6 +43,8 @@ class EncoderConfig:
         taps: the blocks whose features are levels 0 to 3; all but none of them odd.
         boundary: the level at which features are generated (the paper's b1).
         norm_eps: of the LayerNorms within the blocks.
+        rays: the rays of known cameras are added to the patch tokens (not in Depth Anything 3,
+            which has a camera token alone).
     """
 
     width: int = 768
@@ -53,6 +59,7 @@ class EncoderConfig:
     taps: tuple[int, ...] = (5, 7, 9, 11)
     boundary: int = 1
     norm_eps: float = 1e-6
+    rays: bool = False
 
     @property
     def channels(self) -> int:
@@ -97,6 +104,7 @@ class Backbone(nn.Module):
             for index in range(config.depth)
         )
         self.norm = nn.LayerNorm(width)
+        self.ray_embed = nn.Linear(RAY, width) if config.rays else None
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Patches (rows, columns) of an image of this size.
@@ -114,7 +122,12 @@ class Backbone(nn.Module):
         return height // patch, width // patch
 
     def encode(
-        self, images: Tensor, *, levels: int | None = None, camera_token: Tensor | None = None
+        self,
+        images: Tensor,
+        *,
+        levels: int | None = None,
+        camera_token: Tensor | None = None,
+        rays: Tensor | None = None,
     ) -> list[Tensor]:
         """Features of the first levels, raw, token 0 included.
 
@@ -122,6 +135,7 @@ class Backbone(nn.Module):
             images: (B, V, 3, H, W), ImageNet-normalised.
             levels: how many levels; None for all. Blocks after the last tap are not run.
             camera_token: (B, V, width) from the camera encoder; the learned ones without.
+            rays: (B, V, N, 9) of ``patch_rays``, where the configuration has them.
 
         Returns:
             A (B, V, 1 + N, 2 width) tensor a level.
@@ -129,6 +143,8 @@ class Backbone(nn.Module):
         batch, views = images.shape[:2]
         grid = self.grid(images.shape[-2], images.shape[-1])
         x = self.patch_embed(images.flatten(0, 1))
+        if self.ray_embed is not None and rays is not None:
+            x = x + self.ray_embed(rays.flatten(0, 1).to(x.dtype))
         x = torch.cat((self.cls_token.expand(len(x), -1, -1), x), dim=1) + self._positions(grid)
         x = x.unflatten(0, (batch, views))
         taps = self.config.taps[:levels]
@@ -225,6 +241,27 @@ class Backbone(nn.Module):
         factor = [(side + 0.1) / base for side in grid]
         table = F.interpolate(table, scale_factor=factor, mode="bicubic", antialias=False)
         return torch.cat((token, table.flatten(2).transpose(1, 2)), dim=1).to(self.pos_embed.dtype)
+
+
+def patch_rays(
+    cam_from_world: Tensor, K: Tensor, grid: tuple[int, int], size: tuple[int, int]
+) -> Tensor:
+    """(B, V, N, 9): direction (z = 1 in the camera), origin and moment of the patches' middle rays.
+
+    Args:
+        cam_from_world: (B, V, 4, 4).
+        K: (B, V, 3, 3), pixels of the images.
+        grid: patches (rows, columns).
+        size: (H, W) of the images.
+    """
+    y = (torch.arange(grid[0], device=K.device, dtype=K.dtype) + 0.5) * (size[0] / grid[0])
+    x = (torch.arange(grid[1], device=K.device, dtype=K.dtype) + 0.5) * (size[1] / grid[1])
+    rows, columns = torch.meshgrid(y, x, indexing="ij")
+    pixel = torch.stack((columns, rows, torch.ones_like(rows)), dim=-1).flatten(0, 1)
+    turn = cam_from_world[..., :3, :3].mT
+    direction = pixel @ (turn @ torch.linalg.inv(K)).mT
+    origin = -(turn @ cam_from_world[..., :3, 3:])[..., 0][:, :, None].expand_as(direction)
+    return torch.cat((direction, origin, torch.linalg.cross(origin, direction)), dim=-1)
 
 
 def imagenet_normalised(images: Tensor) -> Tensor:

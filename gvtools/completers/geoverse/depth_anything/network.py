@@ -16,6 +16,7 @@ from gvtools.completers.geoverse.depth_anything.encoder import (
     Backbone,
     EncoderConfig,
     imagenet_normalised,
+    patch_rays,
 )
 from gvtools.completers.geoverse.depth_anything.geometry_head import (
     Geometry,
@@ -88,11 +89,14 @@ class DepthAnything3(nn.Module):
             cam_from_world: (B, V, 4, 4) cameras, when they are known; with ``K``.
             K: (B, V, 3, 3), px of ``images``.
         """
-        token = None
+        token = rays = None
         if cam_from_world is not None and K is not None:
-            token = self.cam_enc(cam_from_world, K, (images.shape[-2], images.shape[-1]))
+            size = (images.shape[-2], images.shape[-1])
+            token = self.cam_enc(cam_from_world, K, size)
+            if self.config.encoder.rays:
+                rays = patch_rays(cam_from_world, K, self.encoder.grid(*size), size)
         normalised = imagenet_normalised(images).to(self.encoder.cls_token.dtype)
-        return self.encoder.encode(normalised, levels=levels, camera_token=token)
+        return self.encoder.encode(normalised, levels=levels, camera_token=token, rays=rays)
 
     def geometry(
         self, levels: list[Tensor], grid: tuple[int, int], *, views_at_once: int = 8

@@ -99,6 +99,10 @@ class VideoPrior:
                 f"{self.config.channels} channels and blocks {self.config.taps}"
             )
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> VideoPrior:
+        """Itself: it is large, and nothing changes it."""
+        return self
+
     @classmethod
     def from_pretrained(
         cls,
