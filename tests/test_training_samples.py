@@ -53,3 +53,39 @@ def test_the_same_numbers_give_the_same_samples_and_splits_differ():
 def test_settings_out_of_range_are_refused():
     with pytest.raises(OptionError, match=r"data\.scene_overlap"):
         samples("data.scene_overlap=1")
+
+
+def test_a_pool_repeats_and_its_files_decide_nothing(tmp_path):
+    pool, cache = "data.pool=8", f"data.cache={tmp_path}"
+    fresh = samples(pool).batch(range(2))
+    made = samples(pool, cache).batch(range(2))
+    again = samples(pool, cache).batch(range(8, 10))
+    (folder,) = tmp_path.iterdir()
+    assert len(list(folder.glob("*.npz"))) == 2
+    for other in (made, again):
+        assert torch.equal(fresh.images, other.images)
+        assert torch.equal(fresh.depth, other.depth)
+        assert torch.equal(fresh.views.images, other.views.images)
+        assert torch.equal(fresh.views.valid, other.views.valid)
+    exact = samples().batch(range(2))
+    assert torch.equal(exact.images, fresh.images)
+    assert torch.allclose(exact.depth, fresh.depth, rtol=1e-3)
+    assert (exact.views.images - fresh.views.images).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_a_torn_file_of_a_pool_is_made_again_and_other_data_lie_elsewhere(tmp_path):
+    pool, cache = "data.pool=8", f"data.cache={tmp_path}"
+    whole = samples(pool, cache).batch(range(1))
+    (file,) = tmp_path.glob("*/*.npz")
+    file.write_bytes(file.read_bytes()[:1000])
+    assert torch.equal(samples(pool, cache).batch(range(1)).images, whole.images)
+    other = samples(pool, cache, "seed=1").batch(range(1))
+    assert not torch.equal(other.images, whole.images)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_pool_that_cannot_be_is_refused(tmp_path):
+    with pytest.raises(OptionError, match="multiple of 8, such as 16"):
+        samples("data.pool=12")
+    with pytest.raises(OptionError, match=r"needs data\.pool"):
+        samples(f"data.cache={tmp_path}")

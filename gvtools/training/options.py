@@ -159,6 +159,8 @@ class DataOptions:
         views: of a sample.
         size: (H, W) of the pictures, px.
         workers: processes that render; 0 renders in the training process.
+        pool: so many samples are made and seen again and again; 0: every sample is new.
+        cache: folder where a pool's samples are kept; None makes them anew each time.
         projections: False: nothing of the memory is projected into the targets.
         scenes: paths of projects that gvtools reads, mixed in by ``scene_share``.
         scene_share: share of samples from ``scenes``.
@@ -169,6 +171,8 @@ class DataOptions:
     views: int = 8
     size: tuple[int, int] = (96, 96)
     workers: int = 1
+    pool: int = 0
+    cache: str | None = None
     projections: bool = True
     scenes: tuple[str, ...] = ()
     scene_share: float = 0.0
@@ -178,6 +182,9 @@ class DataOptions:
     def __post_init__(self) -> None:
         check_range("data.views", self.views, least=2)
         check_range("data.workers", self.workers, least=0)
+        check_range("data.pool", self.pool, least=0)
+        if self.cache is not None and not self.pool:
+            raise OptionError("data.cache needs data.pool, the number of samples to keep")
         check_range("data.scene_share", self.scene_share, least=0, most=1)
         check_range("data.scene_overlap", self.scene_overlap, least=0, below=1)
 

@@ -183,7 +183,8 @@ class StageRun:
     def _identity(self) -> dict[str, Any]:
         """What may not change between the parts of a stage."""
         data = to_json(self.config.data)
-        data.pop("workers")
+        for name in ("workers", "cache"):
+            data.pop(name)
         return {
             "stage": self.stage,
             "seed": self.config.seed,

@@ -13,6 +13,7 @@ from gvtools.training.loader import BatchLoader
 from gvtools.training.loop import Trainer
 from gvtools.training.options import TrainingConfig
 from gvtools.training.processes import Processes
+from gvtools.training.sample_pool import PooledViews
 from gvtools.training.view_sample import collated
 
 # Numbers of samples that no training step sees: for statistics.
@@ -33,7 +34,7 @@ class TrainingSamples:
         self._context = ContextOptions(most=most)
         self._fill = model.hints.fill
         self._loader: BatchLoader | None = None
-        self._data = self._data_set("train")
+        self._data = self._pooled(self._data_set("train"))
 
     def start(self, trainer: Trainer, processes: Processes) -> None:
         """Make samples ahead, from the trainer's next step on."""
@@ -56,7 +57,8 @@ class TrainingSamples:
         """Training scenes that no step sees."""
         group = self._context.group
         first = ASIDE // group * group + index * group
-        return collated([self._data.sample(first + n) for n in range(min(count, group))])
+        data = self._data_set("train")
+        return collated([data.sample(first + n) for n in range(min(count, group))])
 
     def held_out(self, count: int) -> TrainingBatch:
         """Scenes of other photographs and layouts."""
@@ -69,6 +71,14 @@ class TrainingSamples:
         """End the processes that make samples."""
         if self._loader is not None:
             self._loader.close()
+
+    def _pooled(self, data: DataSet) -> DataSet:
+        options = self.config.data
+        if not options.pool:
+            return data
+        return PooledViews(
+            data, options.pool, None if options.cache is None else Path(options.cache)
+        )
 
     def _shown(self, batch: TrainingBatch) -> TrainingBatch:
         return batch if self.config.data.projections else batch.unprojected
