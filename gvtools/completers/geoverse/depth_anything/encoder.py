@@ -24,6 +24,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 # Numbers of a ray: direction, origin, moment.
 RAY = 9
+LENGTH_GAIN = 6.0
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class Backbone(nn.Module):
             for index in range(config.depth)
         )
         self.norm = nn.LayerNorm(width)
-        self.ray_embed = nn.Linear(RAY, width) if config.rays else None
+        self.ray_embed = _ray_embedder(width) if config.rays else None
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Patches (rows, columns) of an image of this size.
@@ -241,6 +242,18 @@ class Backbone(nn.Module):
         factor = [(side + 0.1) / base for side in grid]
         table = F.interpolate(table, scale_factor=factor, mode="bicubic", antialias=False)
         return torch.cat((token, table.flatten(2).transpose(1, 2)), dim=1).to(self.pos_embed.dtype)
+
+
+def _ray_embedder(width: int) -> nn.Linear:
+    """Rays as large as what pictures add to a token; what is smaller is learned hundreds of steps
+    later. Origins and moments are fractions of a mean depth.
+    """
+    embedder = nn.Linear(RAY, width)
+    with torch.no_grad():
+        nn.init.normal_(embedder.weight)
+        embedder.weight[:, 3:] *= LENGTH_GAIN
+        nn.init.zeros_(embedder.bias)
+    return embedder
 
 
 def patch_rays(

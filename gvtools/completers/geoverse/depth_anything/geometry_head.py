@@ -152,6 +152,7 @@ class GeometryHead(nn.Module):
             )
         )
         self.scratch = Scratch(config)
+        _initialise(self)
 
     def forward(
         self, levels: Sequence[Tensor], grid: tuple[int, int], *, views_at_once: int = 8
@@ -207,6 +208,29 @@ class GeometryHead(nn.Module):
             fusion = getattr(self.scratch, f"refinenet{index + 1}{suffix}")
             x = fusion(x, pyramid[index] if index < 3 else None, sizes[index])
         return x
+
+
+@torch.no_grad()
+def _initialise(head: GeometryHead) -> None:
+    """Weights to train from: what varies between pixels keeps its size through a dozen layers.
+
+    With torch's own, each of the convolutions in a row takes three quarters of the power and adds a
+    bias of that size, so that a constant is all that reaches the end, and training stays there long.
+    """
+    for module in head.modules():
+        if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
+            # Transposed: kernels do not overlap, so that a pixel has one input of each channel.
+            transposed = isinstance(module, nn.ConvTranspose2d)
+            fan = module.in_channels if transposed else module.weight[0].numel()
+            nn.init.normal_(module.weight, std=fan**-0.5)
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    for module in head.modules():
+        if isinstance(module, ResidualConv):
+            nn.init.zeros_(module.conv2.weight)
+    for output in (head.scratch.output_conv2, *head.scratch.output_conv2_aux):
+        last = output[-1]  # type: ignore[index]
+        last.weight *= 0.1  # type: ignore[union-attr]
 
 
 def _resized(x: Tensor, size: Sequence[int]) -> Tensor:
