@@ -48,6 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--steps", type=int, default=600, metavar="N", help="of its trainings (%(default)s)"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where its trainings go")
+    parser.add_argument(
+        "--pictures", type=Path, metavar="DIR", help="write context, hint, completion, truth there"
+    )
     parser.add_argument("--training", default="tiny", metavar="CONFIG", help="(%(default)s)")
     parser.add_argument("--project", type=Path, metavar="DIR", help="of real-frames: a scan")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
@@ -65,7 +68,18 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from pipelines.console import write_json
     from pipelines.experiments.options import ExperimentOptions
 
-    names = ("weights", "teacher", "scenes", "size", "seed", "steps", "out", "project", "training")
+    names = (
+        "weights",
+        "teacher",
+        "scenes",
+        "size",
+        "seed",
+        "steps",
+        "out",
+        "project",
+        "pictures",
+        "training",
+    )
     options = ExperimentOptions(**{name: getattr(args, name) for name in names})
     for path in (args.json, args.markdown):
         if path is not None and not path.parent.is_dir():

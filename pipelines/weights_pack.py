@@ -7,7 +7,6 @@ each stage (``training_STAGE.json``) and its log, thinned (``log_STAGE.jsonl``).
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pretrained
@@ -57,7 +56,10 @@ def pack(training: Path, out: Path) -> Path:
         lines = (json.dumps({k: _short(v) for k, v in line.items()}) for line in kept)
         write_text(out / f"log_{stage}.jsonl", "\n".join(lines) + "\n")
         if (training / stage / SETTINGS).exists():
-            shutil.copyfile(training / stage / SETTINGS, out / f"training_{stage}.json")
+            settings = json.loads((training / stage / SETTINGS).read_text(encoding="utf-8"))
+            # Where its samples were kept is of no use elsewhere.
+            settings["data"]["cache"] = None
+            write_text(out / f"training_{stage}.json", json.dumps(settings, indent=2) + "\n")
     return source
 
 

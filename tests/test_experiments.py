@@ -12,7 +12,8 @@ from gvtools.guidance import Guidance
 from pipelines.cli import main
 from pipelines.experiments.cases import held_out_cases
 from pipelines.experiments.classical import CLASSICAL, classical
-from pipelines.experiments.judging import best, judge, records, table
+from pipelines.experiments.judging import COLUMNS, best, judge, records, table
+from pipelines.experiments.rows import FILL, HINTS, INPAINT
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -79,10 +80,11 @@ def test_the_truth_wins_every_figure(cases):
     judged = judge({"nearest": classical("nearest"), "truth": Truth()}, cases, distance=None)
     for figure in ("psnr", "psnr_view", "depth", "energy"):
         assert best(judged, judged, figure) == "truth", figure
-    found = {row["method"]: row for row in records(judged, against="truth")}
+    against = dict.fromkeys(COLUMNS, "truth")
+    found = {row["method"]: row for row in records(judged, against=against)}
     assert found["truth"]["energy"] == pytest.approx(1)
-    assert found["nearest"]["difference"]["psnr"][2] < 0
-    shown = table(judged, caption="two", against="truth")
+    assert found["nearest"]["difference"]["psnr"]["by"][2] < 0
+    shown = table(judged, caption="two", against=against)
     assert [row[0] for row in shown.rows] == ["nearest", "truth"]
 
 
@@ -115,10 +117,14 @@ def test_completion_compares_fillers_student_and_teacher(weights, tmp_path):
     found = experiment(
         "completion", weights, tmp_path, "--teacher", teacher, "--markdown", str(tables)
     )
-    rows = {row["method"]: row for row in found["results"]}
-    assert {*CLASSICAL, "student 3+1", "teacher 24+1", "hint features, no denoiser"} < set(rows)
+    rows = {row["method"]: row for row in found["against_best_filler"]}
+    assert {*CLASSICAL, INPAINT, FILL, HINTS, "student 3+1", "teacher 24+1"} < set(rows)
     assert all(np.isfinite(row["psnr"]) for row in rows.values())
-    assert found["best_filler"]["psnr"] in CLASSICAL
+    assert rows["student 3+1"]["difference"]["depth"]["to"] in (*CLASSICAL, INPAINT)
+    others = {row["method"]: row for row in found["against_best_other_filler"]}
+    assert others["student 3+1"]["difference"]["depth"]["to"] in CLASSICAL
+    # Undenoised features are decoded, which the fill alone is not.
+    assert rows[HINTS]["psnr"] != rows[FILL]["psnr"]
     assert "| student 3+1 |" in tables.read_text()
 
 
@@ -161,3 +167,24 @@ def test_ablations_train_their_variants_and_test_them(weights, tmp_path):
     assert main([*arguments, "--training", "micro", "--quiet"]) == 0
     rows = json.loads(out.read_text())["results"]
     assert [row["method"] for row in rows] == list(VARIANTS)
+
+
+@pytest.mark.slow
+def test_a_scan_is_judged_with_and_without_fine_tuning(weights, shared, tmp_path):
+    """A real scan's few context views are enough to draw samples from."""
+    found = experiment(
+        "real-frames", weights, tmp_path, "--project", str(shared / "data" / "sevenscenes_reg"),
+        "--training", "micro", "--out", str(tmp_path / "tuned"), "--steps", "2",
+        "--pictures", str(tmp_path / "pictures"),
+    )  # fmt: skip
+    rows = [row["method"] for row in found["against_best_filler"]]
+    assert "fine-tuned 3+1" in rows and "biharmonic" not in rows
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 5
+
+
+@pytest.mark.slow
+def test_step_sweeps_say_which_bounds_they_take(weights, tmp_path):
+    found = experiment("few-steps", weights, tmp_path, "--scenes", "1")
+    rows = [row["method"] for row in found["student, level 1"]]
+    assert rows[0] == "3+1, own bounds" and "3+1, equal steps" in rows and len(rows) == 8
+    assert len(found["student, cascade"]) == 5

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from gvtools.errors import OptionError
+from gvtools.errors import DegenerateError, OptionError
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.dataset import ProceduralViews
@@ -106,4 +106,22 @@ def test_workers_and_shares(rank: int) -> None:
     for step, batch in enumerate(islice(loader, 2), start=1):
         numbers = range(4 * step + 2 * rank, 4 * step + 2 * rank + 2)
         assert _equal(batch, collated([DATA.sample(n) for n in numbers]))
+    loader.close()
+
+
+class Refusing:
+    """A data set without samples."""
+
+    def sample(self, index):
+        raise DegenerateError(f"sample {index} cannot be drawn")
+
+    def describe(self):
+        return {}
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_why_a_sample_is_missing_arrives_in_one_line(workers):
+    loader = BatchLoader(Refusing(), 2, workers=workers)
+    with pytest.raises(DegenerateError, match=r"^sample 0 cannot be drawn$"):
+        loader(range(2))
     loader.close()

@@ -71,7 +71,7 @@ def score(
     Raises:
         ShapeError: the shapes differ.
     """
-    if rgb.shape != true_rgb.shape or depth.shape != true_depth.shape != generated.shape:
+    if rgb.shape != true_rgb.shape or len({depth.shape, true_depth.shape, generated.shape}) > 1:
         raise ShapeError(
             f"completed {rgb.shape} and {depth.shape}, truth {true_rgb.shape} and "
             f"{true_depth.shape}, judged {generated.shape}; expected equal sizes"

@@ -23,7 +23,7 @@ class Draws:
         seed: of the training.
         stage: its name.
         step: number of the optimiser step.
-        samples: the samples' numbers, B of them; a sample is seen once in a training.
+        samples: the numbers of the step's samples, B of them; none occurs twice in a training.
     """
 
     seed: int

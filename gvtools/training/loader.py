@@ -13,14 +13,14 @@ import numba
 import torch
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError
+from gvtools.errors import GvError, OptionError
 from gvtools.options import check_range
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.dataset import Samples
 from gvtools.training.view_sample import Sample, collated
 
-# A sample on its way: its number, its context views, its tensors as arrays.
-_Made = tuple[int, int, dict[str, NDArray[Any]]]
+# A sample on its way: its number, its context views, its tensors as arrays; or why there is none.
+_Made = tuple[int, int, dict[str, NDArray[Any]] | GvError]
 
 
 class BatchLoader:
@@ -108,6 +108,8 @@ class BatchLoader:
         if self._stream is None or self._expected != number:
             self._stream = iter(self._loader(number))
         made, context, values = next(self._stream)
+        if isinstance(values, GvError):
+            raise values
         if made != number:
             # Outside this process's share nothing is made ahead.
             self._expected = -1
@@ -158,7 +160,11 @@ class _Numbered:
         self.data = data
 
     def __getitem__(self, number: int) -> _Made:
-        sample = self.data.sample(number)
+        try:
+            sample = self.data.sample(number)
+        except GvError as error:
+            # Raised in this process it would reach the user as a traceback.
+            return number, 0, error
         names = [entry.name for entry in fields(Sample) if entry.name != "context"]
         return number, sample.context, {name: getattr(sample, name).numpy() for name in names}
 

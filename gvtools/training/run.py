@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,6 +36,8 @@ WEIGHTS = "weights"
 # The whole training's settings, as the stage was last run with them.
 SETTINGS = "training.json"
 SHEET_SAMPLES = 3
+# Bytes at each end of a weights file that tell it from another.
+READ = 2**22
 
 
 class StageRun:
@@ -190,6 +193,7 @@ class StageRun:
             "seed": self.config.seed,
             "model": to_json(self.model_config),
             "options": to_json(self.options),
+            "start": None if self._source is None else _fingerprint(self._source),
             "data": data,
         }
 
@@ -221,3 +225,16 @@ class StageRun:
             link.unlink()
         if not link.exists():
             link.symlink_to((self._source / VIDEO_FOLDER).resolve(), target_is_directory=True)
+
+
+def _fingerprint(folder: Path) -> str:
+    """Of the weights that a stage starts from, the video prior's left out; ends of large files."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.glob("*") if path.is_file()):
+        size = path.stat().st_size
+        digest.update(f"{path.name} {size} ".encode())
+        with path.open("rb") as file:
+            digest.update(file.read(READ))
+            file.seek(max(0, size - READ))
+            digest.update(file.read(READ))
+    return digest.hexdigest()[:16]

@@ -10,6 +10,7 @@ import hashlib
 import json
 import zipfile
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+import gvtools
 from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written
 from gvtools.training.dataset import Samples
 from gvtools.training.view_sample import Sample
 
 COLORS, DEPTHS = ("images", "hint"), ("depth", "hint_depth")
+# Packages whose code makes samples.
+MAKERS = ("training", "memory", "completers", "completers/geoverse")
 GREATEST = float(np.finfo(np.float16).max)
 
 
@@ -33,8 +37,8 @@ class PooledViews:
     Attributes:
         data: the samples.
         count: a multiple of the data set's group, so that a batch stays within one.
-        folder: where they are kept, in a folder of their own named after what decides them; None
-            makes them anew each time.
+        folder: where they are kept, in a folder of their own named after what decides them, the
+            code included; None makes them anew each time.
     """
 
     data: Samples
@@ -70,7 +74,18 @@ class PooledViews:
     def _place(self) -> Path:
         text = json.dumps(self.data.describe(), sort_keys=True, default=str)
         assert self.folder is not None
-        return self.folder / hashlib.sha256(text.encode()).hexdigest()[:16]
+        return self.folder / hashlib.sha256(text.encode() + _code()).hexdigest()[:16]
+
+
+@cache
+def _code() -> bytes:
+    """Digest of the code that samples are made by."""
+    root = Path(gvtools.__file__).parent
+    digest = hashlib.sha256()
+    for folder in MAKERS:
+        for file in sorted((root / folder).glob("*.py")):
+            digest.update(file.read_bytes())
+    return digest.digest()
 
 
 def _packed(sample: Sample) -> dict[str, NDArray[Any]]:
@@ -106,5 +121,5 @@ def _read(path: Path) -> dict[str, NDArray[Any]] | None:
     try:
         with np.load(path) as stored:
             return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
         return None

@@ -19,7 +19,11 @@ from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.control import ControlConfig
 from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
 from gvtools.completers.geoverse.video_prior.prior import VideoPriorConfig
-from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pretrained
+from gvtools.completers.geoverse.weights.folder import (
+    config_of,
+    from_pretrained,
+    save_pretrained,
+)
 from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
 from gvtools.errors import OptionError
 from gvtools.evaluation.perceptual_distance import SqueezeNetDistance
@@ -29,14 +33,14 @@ from gvtools.training.processes import started
 from gvtools.training.run import StageRun
 from pipelines.console import Console, write_json
 from pipelines.experiments.cases import SIZE, Case, held_out_cases
-from pipelines.experiments.judging import Judged, judge, records, table
+from pipelines.experiments.judging import COLUMNS, Judged, judge, records, table
 from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.rows import geoverse
 
 # The video prior has as many taps as layers of level 1 that its features enter.
 TAPS = 4
 VIDEO = VideoPriorConfig(taps=(0, 1, 2, 3), channels=48, prompt_rows=6, prompt="zeros")
-WHOLE = "as shipped: memory, no video prior"
+WHOLE = "the shipped form: memory, no video prior"
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,8 @@ VARIANTS = {
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     """Train and test every variant; reads weights (the encoder's), scenes, seed, steps and out.
 
-    A variant that is trained already is only tested; one that was interrupted goes on.
+    A variant that is trained already is only tested; one that was interrupted goes on; one that was
+    trained with other settings is refused.
 
     Raises:
         OptionError: no folder, or no encoder to start from.
@@ -78,6 +83,11 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         raise OptionError(
             "experiment ablations needs --out DIR for its trainings and --weights DIR, the "
             "weights of a trained encoder (gvtools train tiny --stage encoder)"
+        )
+    if config_of(options.weights).trained:
+        raise OptionError(
+            f"{options.weights}: a trained denoiser; expected an encoder alone, so that all "
+            "variants start alike (training/tiny/encoder/weights)"
         )
     judged: dict[str, Judged] = {}
     distance = SqueezeNetDistance()
@@ -90,13 +100,13 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         "scenes": options.scenes,
         "seed": options.seed,
         "steps": options.steps,
-        "results": records(judged, against=WHOLE),
+        "results": records(judged, against=dict.fromkeys(COLUMNS, WHOLE)),
     }
     caption = (
         f"Ablations, {options.steps} denoiser steps each, undistilled 3+1, {options.scenes} "
         "held-out scenes"
     )
-    return found, [table(judged, caption=caption, against=WHOLE)]
+    return found, [table(judged, caption=caption, against=dict.fromkeys(COLUMNS, WHOLE))]
 
 
 def _trained(variant: Variant, options: ExperimentOptions) -> Path:
@@ -104,9 +114,6 @@ def _trained(variant: Variant, options: ExperimentOptions) -> Path:
     assert options.out is not None
     assert options.weights is not None
     out = options.out / variant.folder
-    weights = out / "denoiser" / "weights"
-    if weights.is_dir():
-        return weights
     config, folder = shipped_or_read(options.training)
     model_config = _with_injection(config.model_config(folder), variant.injection)
     out.mkdir(parents=True, exist_ok=True)
@@ -121,7 +128,7 @@ def _trained(variant: Variant, options: ExperimentOptions) -> Path:
     if variant.injection != "none":
         start = _start(options.weights, model_config, out / "start")
     _train(with_settings(config, settings), out, start)
-    return weights
+    return out / "denoiser" / "weights"
 
 
 def _train(config: TrainingConfig, out: Path, start: Path) -> None:

@@ -9,42 +9,45 @@ from gvtools.evaluation.perceptual_distance import NAME, SqueezeNetDistance
 from gvtools.evaluation.tables import Table
 from pipelines.experiments.cases import SIZE, held_out_cases
 from pipelines.experiments.classical import CLASSICAL
-from pipelines.experiments.judging import best, judge, records, table
+from pipelines.experiments.judging import COLUMNS, judge, peers, records, table
 from pipelines.experiments.options import ExperimentOptions
-from pipelines.experiments.rows import HINTS, classical_rows, geoverse
+from pipelines.experiments.pictures import write_pictures
+from pipelines.experiments.rows import FILLERS, HINTS, classical_rows, geoverse, undenoised_rows
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
-    """Figures and tables; reads weights, teacher, scenes, size and seed."""
+    """Figures and tables; reads weights, teacher, scenes, size, seed, pictures."""
     side = options.size or SIZE
-    methods: dict[str, Completer] = classical_rows()
-    methods[HINTS] = geoverse(options.weights, steps=0)
+    methods: dict[str, Completer] = classical_rows() | undenoised_rows(options.weights)
     methods["student 1+1"] = geoverse(options.weights, steps=1)
     methods["student 3+1"] = geoverse(options.weights)
+    methods["student 3+1, decoded"] = geoverse(options.weights, composition="decoded")
     if options.teacher is not None:
         methods["teacher 3+1, undistilled"] = geoverse(options.teacher)
         methods["teacher 24+1"] = geoverse(options.teacher, steps=24)
-    cases = held_out_cases(options.scenes, seed=options.seed, size=side)
+    cases = list(held_out_cases(options.scenes, seed=options.seed, size=side))
     judged = judge(methods, cases, distance=SqueezeNetDistance(), seed=options.seed)
-    peers = {figure: best(judged, CLASSICAL, figure) for figure in ("psnr", "depth", "distance")}
+    if options.pictures is not None:
+        write_pictures(options.pictures, cases, geoverse(options.weights), seed=options.seed)
     found = {
         "scenes": options.scenes,
         "size": side,
         "seed": options.seed,
         "perceptual_distance": NAME,
-        "best_filler": peers,
-        "results": records(judged, against=peers["psnr"]),
-        "against_hint_features": records(judged, against=HINTS),
+        "against_best_filler": records(judged, against=peers(judged, FILLERS)),
+        "against_best_other_filler": records(judged, against=peers(judged, CLASSICAL)),
+        "against_hint_features": records(judged, against=dict.fromkeys(COLUMNS, HINTS)),
     }
     if options.teacher is not None:
-        found["against_teacher"] = records(judged, against="teacher 24+1")
+        found["against_teacher"] = records(judged, against=dict.fromkeys(COLUMNS, "teacher 24+1"))
     caption = f"Generated pixels of {options.scenes} held-out scenes, {side}x{side}"
-    shown = table(judged, caption=caption, against=peers["psnr"], notes=(_note(),))
-    return found, [shown]
+    against = peers(judged, FILLERS)
+    return found, [table(judged, caption=caption, against=against, notes=(_note(),))]
 
 
 def _note() -> str:
     return (
         f"Perceptual distance: {NAME}, mean of its map over generated pixels. Depth: relative "
-        "error. Intervals: paired bootstrap over scenes."
+        "error. Differences: to the best filler of each figure, 95 % of the paired bootstrap over "
+        "scenes."
     )

@@ -26,8 +26,11 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     tables = []
     for name, folder in models.items():
         sweeps: dict[str, dict[str, Completer]] = {
-            "level 1": {f"{n}+1": geoverse(folder, steps=n) for n in LEVEL1},
-            "cascade": {f"3+{n}": geoverse(folder, cascade_steps=n) for n in CASCADE},
+            "level 1": {
+                "3+1, own bounds": geoverse(folder),
+                **{f"{n}+1, equal steps": geoverse(folder, steps=n) for n in LEVEL1},
+            },
+            "cascade": {f"3+{n}, own bounds": geoverse(folder, cascade_steps=n) for n in CASCADE},
         }
         for sweep, methods in sweeps.items():
             cases = held_out_cases(options.scenes, seed=options.seed, size=side)

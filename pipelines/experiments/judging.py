@@ -23,6 +23,8 @@ from pipelines.experiments.cases import Case
 
 # Figures whose smaller values are better.
 LOWER = ("depth", "depth_view", "distance", "distance_view")
+# Whose differences a table shows.
+COMPARED = ("psnr", "depth", "distance")
 COLUMNS = {
     "psnr": Column("PSNR", "dB, pooled", "higher", 2),
     "psnr_view": Column("PSNR", "dB, view mean", "higher", 2),
@@ -62,6 +64,8 @@ def judge(
 ) -> dict[str, Judged]:
     """Every method on every case; methods take turns, so that the machine's noise is shared.
 
+    Each method completes the first case once before its time counts.
+
     Args:
         methods: by the name of their row.
         cases: each is made once.
@@ -69,9 +73,11 @@ def judge(
         seed: of the completers.
     """
     judged = {name: Judged() for name in methods}
-    for case in cases:
+    for number, case in enumerate(cases):
         truth = None if distance is None else distance.features(case.rgb)
         for name, completer in methods.items():
+            if not number:
+                completer.complete(case.context, case.guidance, seed=seed)
             begun = time.perf_counter()
             made = completer.complete(case.context, case.guidance, seed=seed)
             judged[name].seconds += time.perf_counter() - begun
@@ -101,49 +107,56 @@ def table(
     judged: Mapping[str, Judged],
     *,
     caption: str,
-    against: str | None = None,
+    against: Mapping[str, str] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Table:
-    """One row a method; with ``against`` the PSNR's and the depth's paired interval to that row."""
+    """One row a method; with ``against`` the paired intervals to the rows that it names."""
     columns = [Column("method"), *COLUMNS.values(), Column("seconds", "a view", "lower", 3)]
+    compared = [] if against is None else [f for f in COMPARED if f in against]
+    columns += [Column(f"{COLUMNS[f].title}, difference", "95 %") for f in compared]
     rows: list[tuple[Any, ...]] = []
-    if against is not None:
-        columns += [
-            Column(f"PSNR - {against}", "dB, 95 %"),
-            Column(f"distance - {against}", "95 %"),
-        ]
     for name, entry in judged.items():
         found = entry.row()
         row: list[Any] = [name, *(found[key] for key in COLUMNS), found["seconds"]]
-        if against is not None:
-            row += [
-                _shown(entry, judged[against], "psnr"),
-                _shown(entry, judged[against], "distance"),
-            ]
+        row += [_shown(entry, judged[(against or {})[f]], f) for f in compared]
         rows.append(tuple(row))
     return Table(tuple(columns), tuple(rows), caption, notes)
 
 
-def records(judged: Mapping[str, Judged], against: str | None = None) -> list[dict[str, Any]]:
-    """Rows for JSON, with paired intervals of every figure to the row ``against``."""
+def records(
+    judged: Mapping[str, Judged], against: Mapping[str, str] | None = None
+) -> list[dict[str, Any]]:
+    """Rows for JSON, with paired intervals of each figure to the row that ``against`` names."""
     rows = []
     for name, entry in judged.items():
         row: dict[str, Any] = {"method": name, **entry.row()}
-        if against is not None and name != against:
-            row["against"] = against
+        if against is not None:
             row["difference"] = {
-                key: paired_interval(entry.scores, judged[against].scores, key)
-                for key in COLUMNS
-                if entry.row()[key] is not None and judged[against].row()[key] is not None
+                figure: {
+                    "to": peer,
+                    "by": paired_interval(entry.scores, judged[peer].scores, figure),
+                }
+                for figure, peer in against.items()
+                if peer != name
+                and entry.row()[figure] is not None
+                and judged[peer].row()[figure] is not None
             }
         rows.append(row)
     return rows
+
+
+def peers(judged: Mapping[str, Judged], names: Iterable[str]) -> dict[str, str]:
+    """The best of some rows in each figure."""
+    listed = list(names)
+    return {figure: best(judged, listed, figure) for figure in COLUMNS}
 
 
 def best(judged: Mapping[str, Judged], names: Iterable[str], figure: str) -> str:
     """The name with the best figure; gradient energy is best at 1."""
     found = {name: judged[name].row()[figure] for name in names}
     known = {name: value for name, value in found.items() if value is not None}
+    if not known:
+        return next(iter(found))
     if figure == "energy":
         return min(known, key=lambda name: abs(np.log(max(known[name], 1e-12))))
     sign = 1 if figure in LOWER else -1
@@ -153,5 +166,8 @@ def best(judged: Mapping[str, Judged], names: Iterable[str], figure: str) -> str
 def _shown(entry: Judged, other: Judged, figure: str) -> str:
     if entry is other or entry.row()[figure] is None or other.row()[figure] is None:
         return "-"
-    middle, low, high = paired_interval(entry.scores, other.scores, figure)
-    return f"{middle:+.2f} ({low:+.2f} .. {high:+.2f})"
+    digits = COLUMNS[figure].digits
+    middle, low, high = (
+        f"{value:+.{digits}f}" for value in paired_interval(entry.scores, other.scores, figure)
+    )
+    return f"{middle} ({low} .. {high})"

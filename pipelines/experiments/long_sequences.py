@@ -75,6 +75,11 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
             continue
         for arm in arms.values():
             _follow(arm, truth, context, probe, options.seed)
+    if skipped == options.scenes:
+        raise DegenerateError(
+            f"none of {skipped} scenes has photographs with features to recognise; give more "
+            "--scenes"
+        )
     found = {
         "scenes": options.scenes - skipped,
         "without_features": skipped,
@@ -147,7 +152,7 @@ def _figures(arm: _Arm, number: int) -> dict[str, Any]:
     """Of a round: a picture that is not located counts as standing at the nearest photograph."""
     located, nearest = arm.located[number], arm.constant[number]
     errors = [
-        constant if one.center_error is None else min(one.center_error, constant)
+        constant if one.center_error is None else one.center_error
         for one, constant in zip(located, nearest, strict=True)
     ]
     inside = [one.center_error for one in located if one.center_error is not None]

@@ -21,6 +21,7 @@ class ExperimentOptions:
         steps: of a training within the experiment.
         out: folder of what a training within the experiment leaves.
         project: a recorded scene.
+        pictures: folder for pictures side by side.
         training: the configuration of a training within the experiment, see ``gvtools train``.
     """
 
@@ -32,6 +33,7 @@ class ExperimentOptions:
     steps: int = 600
     out: Path | None = None
     project: Path | None = None
+    pictures: Path | None = None
     training: str = "tiny"
 
     def __post_init__(self) -> None:

@@ -14,6 +14,7 @@ from gvtools.completers.geoverse.depth_anything.rays import poses_least_squares
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.evaluation.tables import Column, Table
 from gvtools.training.batch import TrainingBatch
+from gvtools.training.context_choice import ContextOptions
 from gvtools.training.encoder_stage import scene_unit
 from pipelines.experiments.cases import SIZE
 from pipelines.experiments.options import ExperimentOptions
@@ -27,7 +28,14 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     from pipelines.experiments.rows import geoverse
 
     model = geoverse(options.weights).model  # type: ignore[attr-defined]
-    data = ProceduralViews(seed=options.seed, split="held-out", size=(side, side))
+    data = ProceduralViews(
+        seed=options.seed,
+        split="held-out",
+        size=(side, side),
+        context=ContextOptions(most=model.config.context),
+        fill=model.config.hints.fill,
+    )
+    device = next(model.parameters()).device
     sources: dict[str, Callable[[GeoVerse, TrainingBatch], Geometry]] = {
         "true pictures, cameras told": _of_truth,
         "generated pictures, cameras told": lambda model, batch: (
@@ -36,7 +44,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     }
     errors: dict[str, list[Tensor]] = {name: [] for name in sources}
     for index in range(options.scenes):
-        batch = collated([data.sample(index)])
+        batch = collated([data.sample(index)]).to(device)
         for name, source in sources.items():
             errors[name].append(_errors(source(model, batch), batch))
     found: dict[str, Any] = {"scenes": options.scenes, "seed": options.seed}
@@ -87,9 +95,9 @@ def _errors(geometry: Geometry, batch: TrainingBatch) -> Tensor:
     poses = poses_least_squares(
         geometry.ray.float(), geometry.ray_confidence.float(), size=batch.views.size
     ).world_from_cam[0]
-    cameras = batch.views.cam_from_world[0].double()
+    cameras = batch.views.cam_from_world[0].double().cpu()
     true = torch.linalg.inv(cameras @ torch.linalg.inv(cameras[:1]))
-    centres = true[:, :3, 3] / scene_unit(batch).double()
+    centres = true[:, :3, 3] / scene_unit(batch).double().cpu()
     turn = poses[:, :3, :3].mT @ true[:, :3, :3]
     cosine = (turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     columns = (

@@ -7,8 +7,11 @@ from pathlib import Path
 from gvtools.completers.base import Completer, create
 from pipelines.experiments.classical import CLASSICAL, classical
 
-HINTS = "hint features, no denoiser"
+HINTS = "hint features decoded, no denoiser"
+FILL = "filled projection alone"
 INPAINT = "inpaint (this project's planes)"
+# What the core has to beat.
+FILLERS = (*CLASSICAL, INPAINT)
 
 
 def classical_rows() -> dict[str, Completer]:
@@ -16,6 +19,14 @@ def classical_rows() -> dict[str, Completer]:
     rows: dict[str, Completer] = {name: classical(name) for name in CLASSICAL}
     rows[INPAINT] = create("inpaint")
     return rows
+
+
+def undenoised_rows(weights: Path | None) -> dict[str, Completer]:
+    """What the chain gives before any denoising, decoded and as a correction of nothing."""
+    return {
+        FILL: geoverse(weights, steps=0),
+        HINTS: geoverse(weights, steps=0, composition="decoded"),
+    }
 
 
 def geoverse(weights: Path | None, **options: object) -> Completer:

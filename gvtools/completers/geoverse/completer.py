@@ -97,10 +97,17 @@ class GeoVerseCompleter:
         if self.weights is None and not self.folder.is_dir():
             raise OptionError(
                 "completer geoverse: the weights that ship are absent from this installation; "
-                "give --set completer.weights=DIR, a folder as 'gvtools weights list' describes it"
+                "name a folder as 'gvtools weights list' describes it, with --weights DIR or --set "
+                "completer.weights=DIR"
             )
         # A folder that cannot be a model is refused before anything is computed.
         check_headers(self.folder)
+        form = config_of(self.folder).composition
+        if self.composition == "correction" and form != "correction":
+            raise OptionError(
+                f"completer.composition = 'correction', and the model in {self.folder} is of the "
+                f"form {form!r}; leave the option out"
+            )
 
     @property
     def folder(self) -> Path:
@@ -200,7 +207,7 @@ class GeoVerseCompleter:
         flow = model.config.flow
         if self.steps == 0:
             return ()
-        if self.steps is None or self.steps == len(flow.level1) - 1:
+        if self.steps is None:
             return flow.level1
         return interval_bounds(self.steps)
 
@@ -312,7 +319,7 @@ def _rows(guidance: Guidance, rows: Sequence[int]) -> Guidance:
     )
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def _loaded(folder: str, device: str, times: tuple[float, ...]) -> GeoVerse:
-    """The model of a folder; kept, since every round asks for it."""
+    """The model of a folder; kept, since every round asks for it. A student and its teacher fit."""
     return from_pretrained(folder, device=device)

@@ -245,8 +245,9 @@ class Backbone(nn.Module):
 
 
 def _ray_embedder(width: int) -> nn.Linear:
-    """Rays as large as what pictures add to a token; what is smaller is learned hundreds of steps
-    later. Origins and moments are fractions of a mean depth.
+    """Rays as large as what pictures add to a token: the smaller, the later they are learned.
+
+    Origins and moments are fractions of a mean depth.
     """
     embedder = nn.Linear(RAY, width)
     with torch.no_grad():

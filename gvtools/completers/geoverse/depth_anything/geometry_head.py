@@ -215,7 +215,7 @@ def _initialise(head: GeometryHead) -> None:
     """Weights to train from: what varies between pixels keeps its size through a dozen layers.
 
     With torch's own, each of the convolutions in a row takes three quarters of the power and adds a
-    bias of that size, so that a constant is all that reaches the end, and training stays there long.
+    bias of that size: a constant is all that reaches the end, and training stays there long.
     """
     for module in head.modules():
         if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
