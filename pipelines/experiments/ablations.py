@@ -17,6 +17,7 @@ import torch
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.control import ControlConfig
+from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
 from gvtools.completers.geoverse.video_prior.prior import VideoPriorConfig
 from gvtools.completers.geoverse.weights.folder import (
@@ -154,8 +155,12 @@ def _with_injection(config: GeoVerseConfig, injection: str) -> GeoVerseConfig:
 def _start(encoder: Path, config: GeoVerseConfig, folder: Path) -> Path:
     """The encoder's weights beside a video prior of random numbers."""
     if not (folder / VIDEO_FOLDER).is_dir():
-        save_pretrained(from_pretrained(encoder), folder)
-        write_json(folder / "config.json", to_json(replace(config, trained=False)))
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            model = GeoVerse(replace(config, trained=False))
+        # All but the injection's own layers, which start as they are made: without effect.
+        model.load_state_dict(from_pretrained(encoder).state_dict(), strict=False)
+        save_pretrained(model, folder)
         _save_random_prior(folder / VIDEO_FOLDER)
     return folder
 
