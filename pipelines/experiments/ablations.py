@@ -27,14 +27,13 @@ from gvtools.completers.geoverse.weights.folder import (
 )
 from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
 from gvtools.errors import OptionError
-from gvtools.evaluation.perceptual_distance import SqueezeNetDistance
 from gvtools.evaluation.tables import Table
 from gvtools.training.options import TrainingConfig, shipped_or_read, with_settings
 from gvtools.training.processes import started
 from gvtools.training.run import StageRun
 from pipelines.console import Console, write_json
 from pipelines.experiments.cases import SIZE, Case, held_out_cases
-from pipelines.experiments.judging import COLUMNS, Judged, judge, records, table
+from pipelines.experiments.judging import COLUMNS, Judged, judge, perceptual, records, table
 from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.rows import geoverse
 
@@ -91,7 +90,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
             "variants start alike (training/tiny/encoder/weights)"
         )
     judged: dict[str, Judged] = {}
-    distance = SqueezeNetDistance()
+    distance, said = perceptual()
     for name, variant in VARIANTS.items():
         weights = _trained(variant, options)
         cases = held_out_cases(options.scenes, seed=options.seed, size=options.size or SIZE)
@@ -101,6 +100,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         "scenes": options.scenes,
         "seed": options.seed,
         "steps": options.steps,
+        "perceptual_distance": said,
         "results": records(judged, against=dict.fromkeys(COLUMNS, WHOLE)),
     }
     caption = (

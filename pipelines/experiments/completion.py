@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from gvtools.completers.base import Completer
-from gvtools.evaluation.perceptual_distance import NAME, SqueezeNetDistance
 from gvtools.evaluation.tables import Table
 from pipelines.experiments.cases import SIZE, held_out_cases
 from pipelines.experiments.classical import CLASSICAL
-from pipelines.experiments.judging import COLUMNS, judge, peers, records, table
+from pipelines.experiments.judging import COLUMNS, judge, peers, perceptual, records, table
 from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.pictures import write_pictures
 from pipelines.experiments.rows import FILLERS, HINTS, classical_rows, geoverse, undenoised_rows
@@ -25,15 +24,16 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     if options.teacher is not None:
         methods["teacher 3+1, undistilled"] = geoverse(options.teacher)
         methods["teacher 24+1"] = geoverse(options.teacher, steps=24)
+    distance, said = perceptual()
     cases = list(held_out_cases(options.scenes, seed=options.seed, size=side))
-    judged = judge(methods, cases, distance=SqueezeNetDistance(), seed=options.seed)
+    judged = judge(methods, cases, distance=distance, seed=options.seed)
     if options.pictures is not None:
         write_pictures(options.pictures, cases, geoverse(options.weights), seed=options.seed)
     found = {
         "scenes": options.scenes,
         "size": side,
         "seed": options.seed,
-        "perceptual_distance": NAME,
+        "perceptual_distance": said,
         "against_best_filler": records(judged, against=peers(judged, FILLERS)),
         "against_best_other_filler": records(judged, against=peers(judged, CLASSICAL)),
         "against_hint_features": records(judged, against=dict.fromkeys(COLUMNS, HINTS)),
@@ -42,12 +42,12 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         found["against_teacher"] = records(judged, against=dict.fromkeys(COLUMNS, "teacher 24+1"))
     caption = f"Generated pixels of {options.scenes} held-out scenes, {side}x{side}"
     against = peers(judged, FILLERS)
-    return found, [table(judged, caption=caption, against=against, notes=(_note(),))]
+    return found, [table(judged, caption=caption, against=against, notes=(_note(said),))]
 
 
-def _note() -> str:
+def _note(distance: str) -> str:
     return (
-        f"Perceptual distance: {NAME}, mean of its map over generated pixels. Depth: relative "
+        f"Perceptual distance: {distance}; mean of its map over generated pixels. Depth: relative "
         "error. Differences: to the best filler of each figure, 95 % of the paired bootstrap over "
         "scenes."
     )

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from gvtools.completers.base import Completer
-from gvtools.evaluation.perceptual_distance import SqueezeNetDistance
 from gvtools.evaluation.tables import Table
 from pipelines.experiments.cases import SIZE, held_out_cases
-from pipelines.experiments.judging import judge, records, table
+from pipelines.experiments.judging import judge, perceptual, records, table
 from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.rows import geoverse
 
@@ -24,6 +23,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     )
     found: dict[str, Any] = {"scenes": options.scenes, "size": side, "seed": options.seed}
     tables = []
+    distance, found["perceptual_distance"] = perceptual()
     for name, folder in models.items():
         sweeps: dict[str, dict[str, Completer]] = {
             "level 1": {
@@ -34,7 +34,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         }
         for sweep, methods in sweeps.items():
             cases = held_out_cases(options.scenes, seed=options.seed, size=side)
-            judged = judge(methods, cases, distance=SqueezeNetDistance(), seed=options.seed)
+            judged = judge(methods, cases, distance=distance, seed=options.seed)
             found[f"{name}, {sweep}"] = records(judged)
             caption = f"{name}, sweep of the {sweep} steps, {options.scenes} held-out scenes"
             tables.append(table(judged, caption=caption))

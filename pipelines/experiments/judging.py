@@ -11,13 +11,14 @@ import numpy as np
 from torch import Tensor
 
 from gvtools.completers.base import Completer, Completion
+from gvtools.errors import CheckpointError
 from gvtools.evaluation.generated_pixels import (
     GeneratedScore,
     figures,
     paired_interval,
     score,
 )
-from gvtools.evaluation.perceptual_distance import SqueezeNetDistance
+from gvtools.evaluation.perceptual_distance import NAME, SqueezeNetDistance
 from gvtools.evaluation.tables import Column, Table
 from pipelines.experiments.cases import Case
 
@@ -84,6 +85,14 @@ def judge(
             judged[name].views += len(case.guidance)
             judged[name].scores.append(scored(case, made, distance, truth))
     return judged
+
+
+def perceptual() -> tuple[SqueezeNetDistance | None, str]:
+    """The perceptual distance and its name; None and the reason where its weights are absent."""
+    try:
+        return SqueezeNetDistance(), NAME
+    except CheckpointError as error:
+        return None, str(error)
 
 
 def scored(

@@ -17,7 +17,6 @@ from gvtools.cameras import concatenate
 from gvtools.completers.base import Completer, ContextView
 from gvtools.completers.geoverse.completer import SHIPPED
 from gvtools.errors import OptionError
-from gvtools.evaluation.perceptual_distance import NAME, SqueezeNetDistance
 from gvtools.evaluation.tables import Table
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import select
@@ -27,7 +26,7 @@ from gvtools.training.processes import started
 from gvtools.training.run import StageRun
 from pipelines.console import Console
 from pipelines.experiments.cases import Case
-from pipelines.experiments.judging import judge, peers, records, table
+from pipelines.experiments.judging import judge, peers, perceptual, records, table
 from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.pictures import write_pictures
 from pipelines.experiments.rows import FILLERS, classical_rows, geoverse, undenoised_rows
@@ -60,8 +59,9 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         tuned = _tuned(options)
         methods["fine-tuned 1+1"] = geoverse(tuned, steps=1)
         methods["fine-tuned 3+1"] = geoverse(tuned)
+    distance, said = perceptual()
     cases = list(_cases(scene))
-    judged = judge(methods, cases, distance=SqueezeNetDistance(), seed=options.seed)
+    judged = judge(methods, cases, distance=distance, seed=options.seed)
     if options.pictures is not None:
         write_pictures(options.pictures, cases, geoverse(options.weights), seed=options.seed)
     fillers = [name for name in FILLERS if name != SLOW]
@@ -69,7 +69,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         "project": options.project.name,
         "context": CONTEXT,
         "targets": TARGETS,
-        "perceptual_distance": NAME,
+        "perceptual_distance": said,
         "fine_tuning_steps": options.steps if options.out is not None else None,
         "against_best_filler": records(judged, against=peers(judged, fillers)),
         "against_best_other_filler": records(judged, against=peers(judged, fillers[:-1])),
