@@ -123,3 +123,22 @@ def test_two_processes_see_what_one_would(tmp_path):
     one, two = (read_log(tmp_path / name / "encoder")[-1] for name in ("one", "two"))
     for name in ("loss", "depth", "rgb", "ray", "pose"):
         assert two[name] == pytest.approx(one[name], rel=1e-4), json.dumps([one, two])
+
+
+def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
+    out = tmp_path / "packed"
+    assert main(["weights", "pack", str(trained), str(out)]) == 0
+    assert str(trained / "reflow" / "weights") in capsys.readouterr().out
+    student, packed = weights_of(trained / "reflow"), from_pretrained(out).state_dict()
+    for name, tensor in student.items():
+        assert torch.allclose(packed[name], tensor, rtol=2e-3, atol=1e-5), name
+    whole = (trained / "reflow" / "weights" / "geoverse.safetensors").stat().st_size
+    assert (out / "geoverse.safetensors").stat().st_size < 0.6 * whole
+    settings = json.loads((out / "training_encoder.json").read_text())
+    assert settings["encoder"]["optimizer"]["steps"] == 24 and settings["data"]["cache"] is None
+    last = json.loads((out / "log_reflow.jsonl").read_text().splitlines()[-1])
+    assert last["step"] == 3
+    assert main(["weights", "pack", str(tmp_path / "nothing"), str(out)]) == 2
+    assert "no finished denoiser" in capsys.readouterr().err
+    assert main(["weights", "pack", str(trained), str(trained / "inside")]) == 2
+    assert "choose another folder" in capsys.readouterr().err
