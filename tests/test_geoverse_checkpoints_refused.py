@@ -11,11 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import geoverse_models as micro
 import published_folder as published
 import pytest
 import torch
-from geoverse_folders import PLAIN, refused, report, write_source
+from geoverse_folders import refused, report
 from published_folder import CASCADE, GEOMETRY, LEVEL1, RGB_HEAD, STATISTICS
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -25,30 +24,7 @@ from gvtools.completers.geoverse.weights.published import WHOLE_FILE
 from gvtools.errors import CheckpointError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of published files."""
-    return write_source(tmp_path_factory.mktemp("published"))
-
-
-@pytest.fixture(scope="module")
-def own_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of one's own."""
-    return micro.weights_folder(tmp_path_factory.mktemp("own"), PLAIN)
-
-
-@pytest.fixture
-def folder(source: Path, tmp_path: Path) -> Path:
-    """Published files to be damaged."""
-    return Path(shutil.copytree(source, tmp_path / "published"))
-
-
-@pytest.fixture
-def own(own_source: Path, tmp_path: Path) -> Path:
-    """A folder of one's own to be damaged."""
-    return Path(shutil.copytree(own_source, tmp_path / "own"))
+pytest_plugins = ("geoverse_folder_fixtures",)
 
 
 def tensors_changed(file: Path, change: Callable[[dict[str, Tensor]], Any]) -> None:

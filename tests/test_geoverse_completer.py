@@ -18,8 +18,6 @@ from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.depth_scale import PassScale
 from gvtools.completers.geoverse.full_size import GENERATED
 from gvtools.completers.geoverse.model import Generated, GeoVerse
-from gvtools.completers.geoverse.model_views import view_batch
-from gvtools.completers.geoverse.resampling import model_size
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.guidance import Guidance
 
@@ -205,93 +203,6 @@ def test_cameras_that_only_turn_have_no_unit_but_that_of_depth(weights):
         np.testing.assert_allclose(found.depth, results[0].depth * scale, rtol=5e-4)
 
 
-def blob(camera: Cameras, point: np.ndarray, sigma: float) -> np.ndarray:
-    """A picture of a soft dot where a camera sees a point."""
-    (((x, y),),), _ = camera.project(point[None])
-    columns = np.arange(int(camera.width[0])) + 0.5
-    rows = np.arange(int(camera.height[0]))[:, None] + 0.5
-    dot = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
-    return np.repeat(dot[..., None], 3, axis=2).astype(np.float32)
-
-
-@pytest.mark.parametrize(
-    ("context_size", "target_size"),
-    [
-        ((120, 160), (120, 160)),
-        ((200, 90), (120, 160)),
-        ((150, 150), (160, 100)),
-        ((61, 83), (77, 77)),
-    ],
-)  # fmt: skip
-def test_cameras_follow_pictures_that_are_cropped_and_resized(context_size, target_size):
-    """A dot drawn where a 3-D point is seen is found where the batch's camera puts the point."""
-    point = np.array([0.05, -0.1, 3.2])
-    views = []
-    for seed in range(2):
-        camera = micro.cameras(1, size=context_size, seed=seed)
-        rgb = blob(camera, point, max(context_size) / 20)
-        views.append(ContextView(f"photo_{seed}", camera, rgb))
-    cameras = micro.cameras(2, size=target_size, seed=5)
-    known = micro.guidance(2, size=target_size, share=1.1)
-    dots = np.stack([blob(camera, point, max(target_size) / 20) for camera in cameras])
-    known = replace(known, cameras=cameras, rgb=dots)
-    size = model_size(*target_size, longest=96, patch=8)
-    batch, joined = view_batch(views, known, size)
-    assert (
-        batch.size == size and (joined.height == size[0]).all() and (joined.width == size[1]).all()
-    )
-    local = joined.cam_from_world[0] @ np.append(point, 1)
-    unit = np.linalg.norm(joined.centers - joined.centers[0], axis=1).max()
-    world = torch.from_numpy(np.append(local[:3] / unit, 1)).float()
-    seen = (batch.cam_from_world[0] @ world)[:, :3]
-    pixel = torch.einsum("vij,vj->vi", batch.K[0], seen / seen[:, 2:])[:, :2].numpy()
-    expected, _ = joined.project(point[None])
-    np.testing.assert_allclose(pixel, expected[:, 0], atol=1e-3)
-    y, x = np.mgrid[: size[0], : size[1]] + 0.5
-    for view in range(4):
-        dot = batch.images[0, view, 0].double().numpy() ** 2  # the tails are cut off at the rim
-        centroid = np.array([(dot * x).sum(), (dot * y).sum()]) / dot.sum()
-        np.testing.assert_allclose(centroid, pixel[view], atol=0.15)
-
-
-@pytest.mark.parametrize("size", [(24, 32), (16, 24), (48, 64), (72, 40)])
-def test_projected_depth_is_never_averaged_between_two_surfaces(size):
-    rng = np.random.default_rng(0)
-    known = micro.guidance(2, share=0.7)
-    depth = np.where(rng.random(known.depth.shape) < 0.5, 1.0, 5.0).astype(np.float32)
-    depth *= known.valid
-    context = micro.context_views(1)
-    wall = np.where(rng.random((30, 40)) < 0.5, 2.0, 8.0).astype(np.float32)
-    context = [replace(context[0], depth=wall)]
-    batch, joined = view_batch(context, replace(known, depth=depth), size)
-    unit = np.linalg.norm(joined.centers - joined.centers[0], axis=1).max()
-    found = batch.depth[0].numpy() * unit
-    for views, surfaces in ((found[:1], (2, 8)), (found[1:], (0, 1, 5))):
-        gap = np.min([np.abs(views - surface) for surface in surfaces], axis=0)
-        assert gap.max() < 1e-5
-        assert all((np.abs(views - surface) < 1e-5).any() for surface in surfaces)
-    assert torch.equal(batch.valid[0, 1:], batch.depth[0, 1:] > 0)
-    assert batch.valid[0, 0].all()
-
-
-def test_a_projections_colour_is_that_of_its_valid_pixels_alone():
-    known = micro.guidance(1, size=(48, 64), share=0.8)
-    red = np.zeros_like(known.rgb)
-    red[..., 0] = 0.75
-    damaged = replace(
-        known,
-        rgb=np.where(known.valid[..., None], red, np.float32(np.nan)),
-        depth=np.where(known.valid, known.depth, np.float32(np.nan)),
-    )
-    batch, _ = view_batch(micro.context_views(1), damaged, (24, 32))
-    seen = batch.valid[0, 1, 0]
-    assert 0.5 < seen.float().mean() < 1
-    colour = batch.images[0, 1]
-    torch.testing.assert_close(colour[0][seen], torch.full_like(colour[0][seen], 0.75))
-    assert not colour[1:].any() and not colour[:, ~seen].any()
-    assert batch.depth.isfinite().all()
-
-
 def test_what_stands_in_holes_does_not_matter(weights):
     context, known = micro.context_views(1), micro.guidance(1)
     hole = ~known.valid
@@ -395,59 +306,6 @@ def test_generated_depth_is_never_averaged_between_two_surfaces(weights, monkeyp
     known = micro.guidance(1, size=size, share=-1.0)
     result = complete(weights, micro.context_views(1), known, alignment="centres")
     np.testing.assert_allclose(np.unique(result.depth[~known.valid].round(4)), [2, 3])
-
-
-def looking(centre: tuple[float, float, float], angle: float, name: str) -> Cameras:
-    """A camera in a place, turned about y."""
-    pose = np.eye(4)
-    pose[:3, :3] = micro.rotation((0, 1, 0), angle).T
-    pose[:3, 3] = -pose[:3, :3] @ np.array(centre)
-    K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
-    return Cameras(K[None], pose[None], np.array([40]), np.array([30]), (name,))
-
-
-def photographs(*cameras: Cameras) -> list[ContextView]:
-    return [ContextView(c.names[0], c, np.zeros((30, 40, 3), np.float32)) for c in cameras]
-
-
-@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-@pytest.mark.parametrize("shift", [0.0, 1e4])
-def test_the_nearest_views_stand_and_look_like_the_targets(scale, shift):
-    def place(x: float, angle: float, name: str) -> Cameras:
-        return looking((scale * (x + shift), 0, 0), angle, name)
-
-    context = photographs(
-        place(0, 0, "left"),
-        place(10, 0, "right"),
-        place(1, np.pi, "behind"),
-        place(4, 0, "middle"),
-        place(1, 0.1, "beside"),
-    )
-
-    def chosen(count: int, *targets: Cameras) -> list[str]:
-        joined = micro.concatenate(list(targets))
-        return [view.name for view in nearest_views(context, joined, count)]
-
-    near = place(1, 0, "target")
-    assert chosen(1, near) == ["beside"]
-    assert chosen(2, near) == ["beside", "left"]
-    assert chosen(1, place(1, np.pi, "turned")) == ["behind"]
-    assert chosen(1, place(9, 0, "target")) == ["right"]
-    # The first serves all targets; each then has its own: not the three that are best for one.
-    assert chosen(1, near, place(9.5, 0, "far")) == ["middle"]
-    assert set(chosen(3, near, place(9.5, 0, "far"))) == {"middle", "beside", "right"}
-    everything = chosen(9, near)
-    assert sorted(everything) == sorted(view.name for view in context)
-    assert everything[0] == "beside" and everything[-1] == "behind"
-
-
-@pytest.mark.parametrize("shift", [0.0, 3e6])
-def test_from_one_place_the_nearest_view_is_the_one_that_looks_the_same_way(shift):
-    centre = (shift, -shift, shift / 3)
-    context = photographs(*(looking(centre, angle, f"{angle}") for angle in (0.0, 1.0, 2.0, 3.0)))
-    for angle in (0.1, 1.1, 2.1, 2.9):
-        (found,) = nearest_views(context, looking(centre, angle, "target"), 1)
-        assert found.name == f"{round(angle)}.0"
 
 
 def test_steps_and_guidance_are_the_options(weights, monkeypatch):

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import geoverse_models as micro
 import pytest
-from geoverse_folders import CONTROL, PLAIN, load, refused, report, write_source
+from geoverse_folders import CONTROL, PLAIN, load, refused, report
 
 from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.weights.folder import check_folder, from_pretrained
@@ -18,30 +17,7 @@ from gvtools.completers.geoverse.weights.published import WHOLE_FILE
 from gvtools.errors import CheckpointError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of published files."""
-    return write_source(tmp_path_factory.mktemp("published"))
-
-
-@pytest.fixture(scope="module")
-def own_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of one's own."""
-    return micro.weights_folder(tmp_path_factory.mktemp("own"), PLAIN)
-
-
-@pytest.fixture
-def folder(source: Path, tmp_path: Path) -> Path:
-    """Published files to be damaged."""
-    return Path(shutil.copytree(source, tmp_path / "published"))
-
-
-@pytest.fixture
-def own(own_source: Path, tmp_path: Path) -> Path:
-    """A folder of one's own to be damaged."""
-    return Path(shutil.copytree(own_source, tmp_path / "own"))
+pytest_plugins = ("geoverse_folder_fixtures",)
 
 
 def test_what_is_no_folder_is_refused(tmp_path: Path, own: Path) -> None:

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from seen_surfaces import seen_by_context
 
 from gvtools.errors import OptionError, ShapeError
 from gvtools.training.context_choice import ContextOptions
@@ -21,7 +22,6 @@ from gvtools.training.dataset import MixedViews, ProceduralViews
 from gvtools.training.hints import Clip, observed, projected
 from gvtools.training.photographs import photograph_names
 from gvtools.training.view_sample import Sample, collated
-from gvtools.training.visibility import seen_by_context
 
 CLEAN = ProceduralViews(faults=None)
 COUNT = 24

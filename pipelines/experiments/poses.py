@@ -9,24 +9,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gvtools.completers.geoverse.conditioning import encode_views
 from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
 from gvtools.completers.geoverse.depth_anything.rays import poses_least_squares
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.evaluation.tables import Column, Table
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.context_choice import ContextOptions
+from gvtools.training.dataset import ProceduralViews
 from gvtools.training.encoder_stage import scene_unit
+from gvtools.training.view_sample import collated
 from pipelines.experiments.cases import SIZE
 from pipelines.experiments.options import ExperimentOptions
+from pipelines.experiments.rows import geoverse
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     """Figures and a table; reads weights, scenes, size and seed."""
     side = options.size or SIZE
-    from gvtools.training.dataset import ProceduralViews
-    from gvtools.training.view_sample import collated
-    from pipelines.experiments.rows import geoverse
-
     model = geoverse(options.weights).model  # type: ignore[attr-defined]
     data = ProceduralViews(
         seed=options.seed,
@@ -78,8 +78,6 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
 @torch.no_grad()
 def _of_truth(model: GeoVerse, batch: TrainingBatch) -> Geometry:
     """Geometry of the true pictures' own features."""
-    from gvtools.completers.geoverse.conditioning import encode_views
-
     grid = model.geometry.encoder.grid(*batch.views.size)
     levels = encode_views(model.geometry, batch.true_views, slice(None), model.config.hints)
     return model.geometry.geometry(

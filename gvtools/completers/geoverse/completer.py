@@ -48,9 +48,10 @@ class GeoVerseCompleter:
         guidance: classifier-free guidance scale; None for the model's own.
         context_views: most photographs in a pass; None for the model's own.
         views: most views in a pass, photographs and targets; None for the model's own.
-        alignment: how depth gets the memory's scale, see ``depth_scale``; None for the model's own.
-        color_alignment: whether colours follow the memory's, see ``color_field``; None for the
-            model's own.
+        alignment: how decoded depth gets the memory's scale, see ``depth_scale``; None for the
+            model's own. A correction has the memory's scale already.
+        color_alignment: whether decoded colours follow the memory's, see ``color_field``; None for
+            the model's own. A correction follows them already.
         composition: "decoded" shows the decoding itself where a model's form is "correction", see
             ``correction``; None for the model's own.
         precision: "auto" is bfloat16 on a GPU and float32 on a CPU.
@@ -191,17 +192,18 @@ class GeoVerseCompleter:
                 cascade_bounds=self._cascade_bounds(model),
                 guidance=self.guidance,
             )
+        decoded = made.hint is None or self.composition == "decoded"
+        color_alignment = self.color_alignment or model.config.color_alignment
         back = brought_back(
             made,
             part,
             cameras,
             context_depth(context, part, size),
             alignment=self.alignment or model.config.alignment,
-            color_alignment=self.color_alignment or model.config.color_alignment,
+            # A correction decodes only views that memory tells nothing of.
+            color_alignment=color_alignment if decoded else "none",
         )
-        if made.hint is None or self.composition == "decoded":
-            return back
-        return corrected(back, made, part, fill)
+        return back if decoded else corrected(back, made, part, fill)
 
     def _bounds(self, model: GeoVerse) -> tuple[float, ...]:
         flow = model.config.flow
@@ -258,7 +260,8 @@ class _Canvas:
                 self.rays[row][hole] = made.rays[position][hole]
             self.support[row] = made.support[position]
             self.spent["unfilled"] += float((made.depth[position][hole] <= 0).sum())
-            self.spent["views_without_scale"] += float(not np.isfinite(made.scales[position]))
+            placed = np.isfinite(made.scales[position]) or bool((made.depth[position] > 0).any())
+            self.spent["views_without_scale"] += float(not placed)
 
     def completion(self, spent: dict[str, float]) -> Completion:
         """The result."""

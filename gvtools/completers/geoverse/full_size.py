@@ -31,7 +31,16 @@ Fill = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class Completed:
-    """A pass's result at the targets' size and in scene units; no rays without a scale."""
+    """A pass's result at the targets' size and in scene units.
+
+    Attributes:
+        rgb: (T, H, W, 3) in [0, 1].
+        depth: (T, H, W) z-depth; 0 = none.
+        confidence: (T, H, W) in [0, 1]; 0 where there is no depth.
+        rays: (T, H, W, 6) Plücker rays, world frame; None without a scale.
+        scales: (T,) scene units per unit of the model; NaN where refused.
+        support: what each view's depth stands on.
+    """
 
     rgb: NDArray[np.float32]
     depth: NDArray[np.float32]

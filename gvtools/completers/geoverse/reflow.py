@@ -41,22 +41,6 @@ class ReflowPair:
     velocity: Tensor
 
 
-def interval_of(t: Tensor, bounds: Sequence[float]) -> Tensor:
-    """The interval a (B,) int64 with tau_{a+1} < t <= tau_a; the last one includes its lower end.
-
-    Raises:
-        OptionError: a time outside the bounds.
-    """
-    tau = torch.tensor(check_bounds(bounds), dtype=t.dtype, device=t.device)
-    if t.numel() and not bool(((t <= tau[0]) & (t >= tau[-1])).all()):
-        raise OptionError(
-            f"times from {float(t.min()):g} to {float(t.max()):g}; expected within "
-            f"{float(tau[-1]):g} and {float(tau[0]):g}"
-        )
-    above = torch.searchsorted(tau.flip(0), t.contiguous(), right=False)
-    return (len(tau) - 1 - above).clamp(max=len(tau) - 2)
-
-
 def interval_ends(intervals: Tensor, bounds: Sequence[float]) -> tuple[Tensor, Tensor]:
     """tau_a and tau_{a+1} of each interval (B,) int64: two (B,) float64 on the CPU."""
     tau = torch.tensor(check_bounds(bounds), dtype=torch.float64)

@@ -1,0 +1,34 @@
+"""Weights folders to read, and copies of them to damage."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import geoverse_models as micro
+import pytest
+from geoverse_folders import PLAIN, write_source
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of published files."""
+    return write_source(tmp_path_factory.mktemp("published"))
+
+
+@pytest.fixture(scope="module")
+def own_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of one's own."""
+    return micro.weights_folder(tmp_path_factory.mktemp("own"), PLAIN)
+
+
+@pytest.fixture
+def folder(source: Path, tmp_path: Path) -> Path:
+    """Published files to be damaged."""
+    return Path(shutil.copytree(source, tmp_path / "published"))
+
+
+@pytest.fixture
+def own(own_source: Path, tmp_path: Path) -> Path:
+    """A folder of one's own to be damaged."""
+    return Path(shutil.copytree(own_source, tmp_path / "own"))
