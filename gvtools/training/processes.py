@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,6 +14,10 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from gvtools.errors import OptionError
+
+# More rounds than a group has threads.
+SETTLING_ROUNDS = 4
+SETTLING_SECONDS = 0.1
 
 
 @dataclass(frozen=True)
@@ -112,8 +118,22 @@ def started(device: str = "auto") -> Iterator[Processes]:
         return
     if use_cuda:
         torch.cuda.set_device(place)
+    # Imported later, it would keep the group, and so the group's threads, to the process's end.
+    importlib.import_module("torch.distributed.fsdp")
     dist.init_process_group("nccl" if use_cuda else "gloo")
     try:
         yield Processes(rank, count, place)
+        _settle()
     finally:
         dist.destroy_process_group()
+
+
+def _settle() -> None:
+    """Let the group's threads drop the last tensors.
+
+    Caches of sharded tensors keep the group beyond its end. A thread of it that drops a tensor
+    while the interpreter shuts down aborts the process.
+    """
+    for _ in range(SETTLING_ROUNDS):
+        dist.barrier()
+    time.sleep(SETTLING_SECONDS)
