@@ -11,6 +11,7 @@ import torch
 from gvtools.completers import Completion, create
 from gvtools.completers.geoverse.color_field import aligned_color
 from gvtools.completers.geoverse.correction import MOST, corrected_color, corrected_depth
+from gvtools.completers.geoverse.full_size import depth_ratios
 from gvtools.completers.geoverse.surface_fill import surface_fill
 from gvtools.errors import OptionError
 
@@ -105,6 +106,34 @@ def test_denoising_changes_holes_alone(weights):
     assert (made.confidence[hole] > 0).all() and (made.confidence[hole] < 1).all()
     decoded = complete(weights, size, composition="decoded")
     assert np.abs(decoded.rgb - made.rgb)[hole].max() > 1e-3
+
+
+def test_a_view_that_memory_tells_nothing_of_leaves_the_others_as_they_are(weights):
+    size = (30, 40)
+    known = micro.guidance(2, size=size)
+    completer = create("geoverse", weights=str(weights), device="cpu", context_views=2)
+    both = completer.complete(micro.context_views(2), known, seed=1)
+    for values in (known.valid, known.rgb, known.depth):
+        values[1] = 0
+    one = completer.complete(micro.context_views(2), known, seed=1)
+    assert one.support is not None and one.support[0] == "the memory's surfaces"
+    assert one.support[1] != one.support[0]
+    assert one.rays is not None and np.isfinite(one.rays).all()
+    assert (one.confidence[0] > 0).all() and (one.depth[0] > 0).all()
+    # The empty view is seen by the model too, so that only the form is the same.
+    hole = ~known.valid[0]
+    np.testing.assert_allclose(one.depth[0][hole], both.depth[0][hole], rtol=0.5)
+
+
+def test_a_views_unit_is_its_ratio_to_memory_and_none_where_they_disagree():
+    known = micro.guidance(2, size=(30, 40))
+    made = known.depth / np.array([4.0, 0.5], np.float32)[:, None, None]
+    made[0, :3] = np.nan
+    np.testing.assert_allclose(depth_ratios(known, made), [4.0, 0.5], rtol=1e-5)
+    made[1] *= np.exp(np.random.default_rng(0).normal(0, 1, made[1].shape)).astype(np.float32)
+    assert np.isnan(depth_ratios(known, made)[1])
+    known.valid[0] = False
+    assert np.isnan(depth_ratios(known, made)).all()
 
 
 def test_what_does_not_fit_is_refused(weights):

@@ -242,6 +242,10 @@ def test_decoded_clean_latents_are_what_the_frozen_model_sees():
         torch.testing.assert_close(
             getattr(decoded.geometry, name), getattr(whole, name), rtol=1e-4, atol=1e-4
         )
+    alone = model.decode(prepared, level0, level1, targets_alone=True)
+    torch.testing.assert_close(alone.geometry.depth, decoded.geometry.depth[:, 2:])
+    torch.testing.assert_close(alone.geometry.ray, decoded.geometry.ray[:, 2:])
+    assert torch.equal(alone.rgb, decoded.rgb)
     pyramid = model.geometry.encode(batch.images)
     normed = [model.geometry.encoder.normed(level[:, 2:, 1:]) for level in pyramid]
     rgb = model.rgb_head(torch.cat(normed, -1).flatten(0, 1), micro.GRID).unflatten(0, (2, 2))

@@ -92,11 +92,13 @@ class DenoiserStage(nn.Module):
     ) -> dict[str, Tensor]:
         """Target pictures and depth with all camera centres, composed as inference does."""
         model = self.model
-        decoded = model.decode(prepared, level0, level1)
+        correction = model.config.composition == "correction"
+        decoded = model.decode(prepared, level0, level1, targets_alone=correction)
         hint = None
-        if model.config.composition == "correction":
+        if correction:
             with torch.no_grad():
-                hint = model.decode(prepared, level0, prepared.hints.unmasked)
+                unmasked = prepared.hints.unmasked
+                hint = model.decode(prepared, level0, unmasked, targets_alone=True)
         image, depth = composed(prepared.batch, decoded, hint)
         centers = batch.centers
         if hint is None:

@@ -157,7 +157,7 @@ class Trainer:
             if step % reporting.log_every == 0 or step == last:
                 values = self.processes.mean(_averaged(kept))
                 values |= {
-                    "rate": self.rate(step - 1),
+                    "rate": self.options.rate_at(step - 1),
                     "skipped": float(self.progress.skipped),
                     "seconds": self.progress.seconds,
                 }
@@ -179,7 +179,7 @@ class Trainer:
         """One optimiser step; returns what it logs. A bad batch is skipped and counted."""
         options, number = self.options, self.progress.step
         for group in self.optimizer.param_groups:
-            group["lr"] = self.rate(number)
+            group["lr"] = self.options.rate_at(number)
         start = number * options.batch
         mine = self.processes.share(range(start, start + options.batch))
         values: list[dict[str, float]] = []
@@ -210,18 +210,6 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         self.progress.step += 1
         return _averaged(values)
-
-    def rate(self, step: int) -> float:
-        """The learning rate of a step."""
-        options = self.options
-        warm = max(1, round(options.warmup * options.steps))
-        if step < warm:
-            return options.rate * (step + 1) / warm
-        if options.schedule == "constant":
-            return options.rate
-        share = (step - warm) / max(1, options.steps - warm)
-        cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, share)))
-        return options.rate * (options.final + (1 - options.final) * cosine)
 
     def _precision(self):  # type: ignore[no-untyped-def]
         if self.options.precision == "float32":

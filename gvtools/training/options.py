@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +31,8 @@ class OptimizerOptions:
         warmup: share of the steps with a rising rate.
         schedule: "cosine" falls to ``final`` x rate, "constant" does not.
         final: see ``schedule``.
+        cycles: how often the schedule runs within the steps, warm-up included (warm restarts,
+            Loshchilov and Hutter 2017).
         betas: of AdamW.
         weight_decay: of AdamW, on matrices and kernels alone.
         clip: largest norm of the gradient.
@@ -45,6 +48,7 @@ class OptimizerOptions:
     warmup: float = 0.03
     schedule: str = "cosine"
     final: float = 0.05
+    cycles: int = 1
     betas: tuple[float, float] = (0.9, 0.95)
     weight_decay: float = 0.02
     clip: float = 1.0
@@ -59,6 +63,7 @@ class OptimizerOptions:
         check_range("optimizer.rate", self.rate, above=0)
         check_range("optimizer.warmup", self.warmup, least=0, most=1)
         check_range("optimizer.final", self.final, least=0, most=1)
+        check_range("optimizer.cycles", self.cycles, least=1, most=self.steps)
         check_range("optimizer.weight_decay", self.weight_decay, least=0)
         check_range("optimizer.clip", self.clip, above=0)
         check_range("optimizer.ema", self.ema, least=0, below=1)
@@ -69,6 +74,19 @@ class OptimizerOptions:
         ):
             if value not in known:
                 raise OptionError(f"optimizer.{name} = {value!r}; expected {' or '.join(known)}")
+
+    def rate_at(self, step: int) -> float:
+        """The learning rate of a step, from 0."""
+        cycle = -(-self.steps // self.cycles)
+        step = step % cycle
+        warm = max(1, round(self.warmup * cycle))
+        if step < warm:
+            return self.rate * (step + 1) / warm
+        if self.schedule == "constant":
+            return self.rate
+        share = (step - warm) / max(1, cycle - warm)
+        cosine = 0.5 * (1 + math.cos(math.pi * share))
+        return self.rate * (self.final + (1 - self.final) * cosine)
 
 
 @dataclass(frozen=True, kw_only=True)

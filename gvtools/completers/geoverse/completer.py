@@ -18,7 +18,7 @@ from gvtools.completers.base import Completion, ContextView
 from gvtools.completers.geoverse.color_field import COLOR_ALIGNMENTS
 from gvtools.completers.geoverse.depth_scale import ALIGNMENTS
 from gvtools.completers.geoverse.flow import interval_bounds
-from gvtools.completers.geoverse.full_size import Completed, Fill, brought_back, corrected
+from gvtools.completers.geoverse.full_size import Completed, Fill, averaged, brought_back, corrected
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.model_views import context_depth, view_batch
 from gvtools.completers.geoverse.resampling import model_size
@@ -183,6 +183,11 @@ class GeoVerseCompleter:
         # A photograph and a target of one name must not start from the same noise.
         names = [f"context {view.name}" for view in context]
         names += [f"target {name}" for name in part.cameras.names]
+        filled = None
+        if model.config.composition == "correction" and self.composition != "decoded":
+            filled = averaged(part) if fill is None else fill
+        # Where memory tells of every pixel, the model's own scale is of no use.
+        told = filled is not None and bool((filled[1] > 0).all())
         with self._precision(device):
             made = model.generate(
                 batch,
@@ -191,19 +196,19 @@ class GeoVerseCompleter:
                 bounds=self._bounds(model),
                 cascade_bounds=self._cascade_bounds(model),
                 guidance=self.guidance,
+                targets_alone=told,
             )
-        decoded = made.hint is None or self.composition == "decoded"
-        color_alignment = self.color_alignment or model.config.color_alignment
-        back = brought_back(
-            made,
-            part,
-            cameras,
-            context_depth(context, part, size),
-            alignment=self.alignment or model.config.alignment,
-            # A correction decodes only views that memory tells nothing of.
-            color_alignment=color_alignment if decoded else "none",
-        )
-        return back if decoded else corrected(back, made, part, fill)
+
+        def brought(color_alignment: str) -> Completed:
+            known = context_depth(context, part, size)
+            alignment = self.alignment or model.config.alignment
+            return brought_back(
+                made, part, cameras, known, alignment=alignment, color_alignment=color_alignment
+            )
+
+        if filled is None:
+            return brought(self.color_alignment or model.config.color_alignment)
+        return corrected(made, part, cameras, filled, back=None if told else brought("none"))
 
     def _bounds(self, model: GeoVerse) -> tuple[float, ...]:
         flow = model.config.flow

@@ -59,7 +59,8 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
         made: decoded from generated features.
         hint: decoded from the filled projections' features; None for the decoding itself.
     """
-    rgb, depth = made.rgb.float(), made.geometry.depth[:, batch.context :]
+    targets = slice(-made.rgb.shape[1], None)
+    rgb, depth = made.rgb.float(), made.geometry.depth[:, targets]
     if hint is None:
         return rgb, depth
     shape = rgb.shape[:2]
@@ -69,7 +70,7 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
     )
     color = corrected_color(filled, rgb.flatten(0, 1), hint.rgb.float().flatten(0, 1), valid)
     first, second = (
-        found.geometry.depth[:, batch.context :].flatten(0, 1)[:, None] for found in (made, hint)
+        found.geometry.depth[:, targets].flatten(0, 1)[:, None] for found in (made, hint)
     )
     length = corrected_depth(known, first, second, valid)
     told = (known > 0).unflatten(0, shape)

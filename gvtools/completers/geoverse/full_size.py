@@ -16,7 +16,7 @@ from torch import Tensor
 from gvtools.cameras import Cameras
 from gvtools.completers.geoverse.color_field import aligned_color
 from gvtools.completers.geoverse.correction import corrected_color, corrected_depth
-from gvtools.completers.geoverse.depth_scale import pass_scale, scaled_depth
+from gvtools.completers.geoverse.depth_scale import MAX_FACTOR, pass_scale, scaled_depth
 from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
 from gvtools.completers.geoverse.passes import Generated
 from gvtools.completers.geoverse.resampling import resampled, resampled_depth
@@ -24,8 +24,10 @@ from gvtools.guidance import Guidance
 
 # Confidence of a generated pixel at most: below what was observed.
 GENERATED = 0.9
-# Confidence of a corrected pixel that the model's own depth has no scale at.
+# Confidence of a corrected view whose decoded depth is far from the memory's.
 UNSCALED = 0.1
+# A view's scale is taken from at least so many pixels, and from about so many at most.
+LEAST, LOOKED_AT = 50, 5_000
 Fill = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
@@ -76,13 +78,12 @@ def brought_back(
         hint = torch.from_numpy(part.rgb).permute(0, 3, 1, 2)
         rgb = aligned_color(rgb, hint, torch.from_numpy(part.valid)[:, None])
     depth = resampled_depth(geometry.depth[0, context:].float().cpu(), full)
-    certain = resampled(geometry.depth_confidence[0, context:, None].float().cpu(), full)[:, 0]
     world_from_cam = cameras.world_from_cam
     whole = pass_scale(geometry, world_from_cam, known)
     # A pixel without a colour has no depth either: nothing of it enters the memory.
     depth = torch.where(rgb.isfinite().all(1), depth, torch.nan)
     scaled = scaled_depth(depth, part.depth, part.valid, centres=whole.scale, alignment=alignment)
-    confidence = (GENERATED * (1 - 1 / certain.clamp_min(1))).numpy().astype(np.float32)
+    confidence = _certainty(geometry.depth_confidence[0, context:], full)
     confidence[~((scaled.depth > 0) & np.isfinite(confidence))] = 0
     support = []
     for method in scaled.method:
@@ -99,19 +100,22 @@ def brought_back(
     return Completed(picture, scaled.depth, confidence, rays, scaled.scale, tuple(support))
 
 
-def corrected(back: Completed, made: Generated, part: Guidance, fill: Fill | None) -> Completed:
+def corrected(
+    made: Generated, part: Guidance, cameras: Cameras, fill: Fill, *, back: Completed | None = None
+) -> Completed:
     """The filled projection with what the model changed, in views that memory tells of.
 
     Args:
-        back: the pass's own pictures, for views that memory tells nothing of.
         made: with the hints' decoding.
         part: the targets' projections.
-        fill: colour (T, H, W, 3) and depth (T, H, W) of the filled projections; None for averages.
+        cameras: of all views, at the model's size.
+        fill: colour (T, H, W, 3) and depth (T, H, W) of the filled projections.
+        back: what stands where the fill has no depth; None where it has depth everywhere.
     """
     assert made.hint is not None
-    fill = fill or _averaged(part)
     full = (part.depth.shape[1], part.depth.shape[2])
     targets = slice(-len(part), None)
+    geometry = made.decoded.geometry
     filled = torch.from_numpy(fill[0]).permute(0, 3, 1, 2), torch.from_numpy(fill[1])
     both = [
         (
@@ -126,12 +130,31 @@ def corrected(back: Completed, made: Generated, part: Guidance, fill: Fill | Non
     depth = corrected_depth(filled[1][:, None], both[0][1], both[1][1], valid)[:, 0]
     use = (filled[1] > 0) & rgb.isfinite().all(-1) & depth.isfinite()
     known = use.numpy()
-    confidence = np.where(known & (back.confidence == 0), np.float32(UNSCALED), back.confidence)
+    scales = depth_ratios(part, both[0][1][:, 0].numpy())
+    if back is None:
+        unit = scales[np.isfinite(scales)]
+        rays = None
+        if len(unit):
+            world_from_first = cameras.world_from_cam[0]
+            ray = geometry.ray[0, targets]
+            rays = _plucker(ray, world_from_first, float(np.median(unit)), full)
+        nothing = np.zeros(known.shape, np.float32)
+        back = Completed(
+            np.zeros((*known.shape, 3), np.float32),
+            nothing,
+            nothing,
+            rays,
+            scales,
+            ("none",) * len(part),
+        )
+    certain = _certainty(geometry.depth_confidence[0, targets], full)
+    certain[~np.isfinite(scales)] = UNSCALED
+    certain[~np.isfinite(certain)] = 0
     return replace(
         back,
         rgb=np.where(known[..., None], rgb.numpy(), back.rgb),
         depth=np.where(known, depth.numpy(), back.depth),
-        confidence=confidence,
+        confidence=np.where(known, certain, back.confidence),
         support=tuple(
             "the memory's surfaces" if view.any() else said
             for view, said in zip(known, back.support, strict=True)
@@ -139,7 +162,32 @@ def corrected(back: Completed, made: Generated, part: Guidance, fill: Fill | Non
     )
 
 
-def _averaged(part: Guidance) -> Fill:
+def depth_ratios(part: Guidance, made: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(T,) scene units per unit of the model; NaN where its depth is not the memory's by a factor.
+
+    Args:
+        part: the targets' projections.
+        made: (T, H, W) depth in the model's unit.
+    """
+    found = np.full(len(part), np.nan)
+    for index, (view, known, valid) in enumerate(zip(made, part.depth, part.valid, strict=True)):
+        both = valid & (known > 0) & (view > 0) & np.isfinite(known) & np.isfinite(view)
+        ratio = np.log(known[both] / view[both])[:: max(1, int(both.sum()) // LOOKED_AT)]
+        if len(ratio) < LEAST:
+            continue
+        middle = float(np.median(ratio))
+        if float(np.median(np.abs(ratio - middle))) <= np.log(MAX_FACTOR):
+            found[index] = np.exp(middle)
+    return found
+
+
+def _certainty(confidence: Tensor, full: tuple[int, int]) -> NDArray[np.float32]:
+    """(T, h, w) confidence of a head, from 1, as (T, H, W) in [0, ``GENERATED``]."""
+    certain = resampled(confidence.float().cpu()[:, None], full)[:, 0]
+    return (GENERATED * (1 - 1 / certain.clamp_min(1))).numpy().astype(np.float32)
+
+
+def averaged(part: Guidance) -> Fill:
     """Projections filled as the model fills them, at their own size."""
     valid = torch.from_numpy(part.valid)[:, None]
     color = push_pull(torch.from_numpy(part.rgb).permute(0, 3, 1, 2), valid)

@@ -281,19 +281,36 @@ class GeoVerse(nn.Module):
         return sample(velocity, noise, bounds or self.config.flow.cascade)
 
     def decode(
-        self, prepared: Prepared, level0: Tensor, level1: Tensor, *, clock: Clock = no_clock
+        self,
+        prepared: Prepared,
+        level0: Tensor,
+        level1: Tensor,
+        *,
+        targets_alone: bool = False,
+        clock: Clock = no_clock,
     ) -> Decoded:
-        """Pictures of the targets and geometry of all views; gradients reach the latents."""
+        """Pictures of the targets and geometry of all views; gradients reach the latents.
+
+        Args:
+            prepared: of the pass.
+            level0: (B, V, C, h, w) normalised latents.
+            level1: (B, V, C, h, w) normalised latents.
+            targets_alone: geometry of the targets only; the same numbers in less time.
+            clock: receives the stages' names.
+        """
         grid = (level1.shape[-2], level1.shape[-1])
         encoder = self.geometry.encoder
+        context = prepared.batch.context
         with clock(stages.BLOCKS):
             pyramid = self.pyramid(level0, level1, prepared.hints.token)
             normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
+        targets = [level[:, context:] for level in normed]
         with clock(stages.GEOMETRY):
-            geometry = self.geometry.head(normed, grid, views_at_once=self.config.decode_views)
+            geometry = self.geometry.head(
+                targets if targets_alone else normed, grid, views_at_once=self.config.decode_views
+            )
         with clock(stages.RGB):
-            context = prepared.batch.context
-            features = torch.cat([level[:, context:] for level in normed], dim=-1)
+            features = torch.cat(targets, dim=-1)
             shape = features.shape[:2]
             rgb = self.rgb_head(features.flatten(0, 1), grid, chunk=self.config.decode_views)
             rgb = rgb.unflatten(0, shape)
@@ -319,6 +336,7 @@ class GeoVerse(nn.Module):
         cascade_bounds: Sequence[float] | None = None,
         guidance: float | None = None,
         video: VideoFeatures | None = None,
+        targets_alone: bool = False,
         clock: Clock = no_clock,
     ) -> Generated:
         """One pass: prepare, sample level 1 and level 0, decode.
@@ -333,6 +351,7 @@ class GeoVerse(nn.Module):
             cascade_bounds: level-0 interval bounds; the configuration's by default.
             guidance: scale; the configuration's by default.
             video: features computed before, for the same views.
+            targets_alone: geometry of the targets only; the same numbers in less time.
             clock: receives the stages' names.
         """
         rows = names or [list(range(batch.images.shape[1]))] * len(batch.images)
@@ -353,10 +372,13 @@ class GeoVerse(nn.Module):
             )
         level0 = self.sample0(prepared, level1, noise("level0"), bounds=cascade_bounds, clock=clock)
         with clock(stages.DECODE):
-            decoded = self.decode(prepared, level0, level1, clock=clock)
+            decoded = self.decode(
+                prepared, level0, level1, targets_alone=targets_alone, clock=clock
+            )
             hint = None
             if self.config.composition == "correction":
-                hint = self.decode(prepared, level0, prepared.hints.unmasked, clock=clock)
+                unmasked = prepared.hints.unmasked
+                hint = self.decode(prepared, level0, unmasked, targets_alone=True, clock=clock)
         return Generated(level1, level0, decoded, hint)
 
     def without_cameras(self, prepared: Prepared, drop: Tensor | None = None) -> Prepared:

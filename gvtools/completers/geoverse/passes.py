@@ -42,7 +42,8 @@ class Decoded:
 
     Attributes:
         rgb: (B, T, 3, H, W) of the target views, not clipped to [0, 1].
-        geometry: of all V views, in the frame of the first view and the model's unit.
+        geometry: of all V views, or of the T target views alone, in the frame of the first view
+            and the model's unit.
     """
 
     rgb: Tensor
