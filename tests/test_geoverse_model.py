@@ -21,7 +21,7 @@ from gvtools.completers.geoverse.objective.losses import depth_loss, rgb_loss
 from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
-from gvtools.errors import CheckpointError, OptionError
+from gvtools.errors import CheckpointError, OptionError, ShapeError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -243,8 +243,10 @@ def test_decoded_clean_latents_are_what_the_frozen_model_sees():
             getattr(decoded.geometry, name), getattr(whole, name), rtol=1e-4, atol=1e-4
         )
     alone = model.decode(prepared, level0, level1, targets_alone=True)
-    torch.testing.assert_close(alone.geometry.depth, decoded.geometry.depth[:, 2:])
-    torch.testing.assert_close(alone.geometry.ray, decoded.geometry.ray[:, 2:])
+    with pytest.raises(ShapeError, match="the targets' depth alone"):
+        _ = alone.geometry
+    torch.testing.assert_close(alone.depth, decoded.geometry.depth[:, 2:])
+    torch.testing.assert_close(alone.depth_confidence, decoded.geometry.depth_confidence[:, 2:])
     assert torch.equal(alone.rgb, decoded.rgb)
     pyramid = model.geometry.encode(batch.images)
     normed = [model.geometry.encoder.normed(level[:, 2:, 1:]) for level in pyramid]

@@ -101,7 +101,7 @@ class DenoiserStage(nn.Module):
                 hint = model.decode(prepared, level0, unmasked, targets_alone=True)
         image, depth = composed(prepared.batch, decoded, hint)
         centers = batch.centers
-        if hint is None:
+        if not correction:
             # A correction has the scale of the projection; a decoding has that of its centres.
             centers = camera_centres(decoded.geometry.ray, decoded.geometry.ray_confidence)
         return {"image": image, "depth": depth, "centers": centers}

@@ -208,7 +208,7 @@ class GeoVerseCompleter:
 
         if filled is None:
             return brought(self.color_alignment or model.config.color_alignment)
-        return corrected(made, part, cameras, filled, back=None if told else brought("none"))
+        return corrected(made, part, filled, back=None if told else brought("none"))
 
     def _bounds(self, model: GeoVerse) -> tuple[float, ...]:
         flow = model.config.flow

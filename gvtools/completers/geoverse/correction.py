@@ -59,8 +59,7 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
         made: decoded from generated features.
         hint: decoded from the filled projections' features; None for the decoding itself.
     """
-    targets = slice(-made.rgb.shape[1], None)
-    rgb, depth = made.rgb.float(), made.geometry.depth[:, targets]
+    rgb, depth = made.rgb.float(), made.depth
     if hint is None:
         return rgb, depth
     shape = rgb.shape[:2]
@@ -69,9 +68,7 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
         for value in (batch.images, batch.depth, batch.valid)
     )
     color = corrected_color(filled, rgb.flatten(0, 1), hint.rgb.float().flatten(0, 1), valid)
-    first, second = (
-        found.geometry.depth[:, targets].flatten(0, 1)[:, None] for found in (made, hint)
-    )
+    first, second = (found.depth.flatten(0, 1)[:, None] for found in (made, hint))
     length = corrected_depth(known, first, second, valid)
     told = (known > 0).unflatten(0, shape)
     color, length = color.unflatten(0, shape), length.unflatten(0, shape)

@@ -39,7 +39,8 @@ class Completed:
         rgb: (T, H, W, 3) in [0, 1].
         depth: (T, H, W) z-depth; 0 = none.
         confidence: (T, H, W) in [0, 1]; 0 where there is no depth.
-        rays: (T, H, W, 6) Plücker rays, world frame; None without a scale.
+        rays: (T, H, W, 6) predicted Plücker rays, world frame; None without a scale, and where
+            they were not asked for.
         scales: (T,) scene units per unit of the model; NaN where refused.
         support: what each view's depth stands on.
     """
@@ -77,13 +78,13 @@ def brought_back(
     if color_alignment == "field":
         hint = torch.from_numpy(part.rgb).permute(0, 3, 1, 2)
         rgb = aligned_color(rgb, hint, torch.from_numpy(part.valid)[:, None])
-    depth = resampled_depth(geometry.depth[0, context:].float().cpu(), full)
+    depth = resampled_depth(made.decoded.depth[0].float().cpu(), full)
     world_from_cam = cameras.world_from_cam
     whole = pass_scale(geometry, world_from_cam, known)
     # A pixel without a colour has no depth either: nothing of it enters the memory.
     depth = torch.where(rgb.isfinite().all(1), depth, torch.nan)
     scaled = scaled_depth(depth, part.depth, part.valid, centres=whole.scale, alignment=alignment)
-    confidence = _certainty(geometry.depth_confidence[0, context:], full)
+    confidence = _certainty(made.decoded.depth_confidence[0], full)
     confidence[~((scaled.depth > 0) & np.isfinite(confidence))] = 0
     support = []
     for method in scaled.method:
@@ -101,26 +102,23 @@ def brought_back(
 
 
 def corrected(
-    made: Generated, part: Guidance, cameras: Cameras, fill: Fill, *, back: Completed | None = None
+    made: Generated, part: Guidance, fill: Fill, *, back: Completed | None = None
 ) -> Completed:
     """The filled projection with what the model changed, in views that memory tells of.
 
     Args:
         made: with the hints' decoding.
         part: the targets' projections.
-        cameras: of all views, at the model's size.
         fill: colour (T, H, W, 3) and depth (T, H, W) of the filled projections.
         back: what stands where the fill has no depth; None where it has depth everywhere.
     """
     assert made.hint is not None
     full = (part.depth.shape[1], part.depth.shape[2])
-    targets = slice(-len(part), None)
-    geometry = made.decoded.geometry
     filled = torch.from_numpy(fill[0]).permute(0, 3, 1, 2), torch.from_numpy(fill[1])
     both = [
         (
             resampled(found.rgb[0].float().cpu(), full),
-            resampled_depth(found.geometry.depth[0, targets].float().cpu(), full)[:, None],
+            resampled_depth(found.depth[0].float().cpu(), full)[:, None],
         )
         for found in (made.decoded, made.hint)
     ]
@@ -132,22 +130,16 @@ def corrected(
     known = use.numpy()
     scales = depth_ratios(part, both[0][1][:, 0].numpy())
     if back is None:
-        unit = scales[np.isfinite(scales)]
-        rays = None
-        if len(unit):
-            world_from_first = cameras.world_from_cam[0]
-            ray = geometry.ray[0, targets]
-            rays = _plucker(ray, world_from_first, float(np.median(unit)), full)
         nothing = np.zeros(known.shape, np.float32)
         back = Completed(
             np.zeros((*known.shape, 3), np.float32),
             nothing,
             nothing,
-            rays,
+            None,
             scales,
             ("none",) * len(part),
         )
-    certain = _certainty(geometry.depth_confidence[0, targets], full)
+    certain = _certainty(made.decoded.depth_confidence[0], full)
     certain[~np.isfinite(scales)] = UNSCALED
     certain[~np.isfinite(certain)] = 0
     return replace(

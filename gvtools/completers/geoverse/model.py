@@ -289,13 +289,13 @@ class GeoVerse(nn.Module):
         targets_alone: bool = False,
         clock: Clock = no_clock,
     ) -> Decoded:
-        """Pictures of the targets and geometry of all views; gradients reach the latents.
+        """Pictures and depth of the targets, geometry of all views; gradients reach the latents.
 
         Args:
             prepared: of the pass.
             level0: (B, V, C, h, w) normalised latents.
             level1: (B, V, C, h, w) normalised latents.
-            targets_alone: geometry of the targets only; the same numbers in less time.
+            targets_alone: without all views' geometry; the same pictures and depth, sooner.
             clock: receives the stages' names.
         """
         grid = (level1.shape[-2], level1.shape[-1])
@@ -305,16 +305,21 @@ class GeoVerse(nn.Module):
             pyramid = self.pyramid(level0, level1, prepared.hints.token)
             normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
         targets = [level[:, context:] for level in normed]
+        head, together, all_views = self.geometry.head, self.config.decode_views, None
         with clock(stages.GEOMETRY):
-            geometry = self.geometry.head(
-                targets if targets_alone else normed, grid, views_at_once=self.config.decode_views
-            )
+            if targets_alone:
+                depth, confidence = head.depth(targets, grid, views_at_once=together)
+            else:
+                all_views = head(normed, grid, views_at_once=together)
+                depth, confidence = (
+                    value[:, context:] for value in (all_views.depth, all_views.depth_confidence)
+                )
         with clock(stages.RGB):
             features = torch.cat(targets, dim=-1)
             shape = features.shape[:2]
-            rgb = self.rgb_head(features.flatten(0, 1), grid, chunk=self.config.decode_views)
+            rgb = self.rgb_head(features.flatten(0, 1), grid, chunk=together)
             rgb = rgb.unflatten(0, shape)
-        return Decoded(rgb, geometry)
+        return Decoded(rgb, depth, confidence, all_views)
 
     def pyramid(self, level0: Tensor, level1: Tensor, token: Tensor) -> list[Tensor]:
         """Four raw (B, V, 1 + N, C) levels of two (B, V, C, h, w) latents and token 0 (B, V, C)."""
@@ -351,7 +356,7 @@ class GeoVerse(nn.Module):
             cascade_bounds: level-0 interval bounds; the configuration's by default.
             guidance: scale; the configuration's by default.
             video: features computed before, for the same views.
-            targets_alone: geometry of the targets only; the same numbers in less time.
+            targets_alone: without all views' geometry; the same pictures and depth, sooner.
             clock: receives the stages' names.
         """
         rows = names or [list(range(batch.images.shape[1]))] * len(batch.images)

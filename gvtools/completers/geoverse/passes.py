@@ -11,6 +11,7 @@ from gvtools.completers.geoverse.denoiser import Conditions, Positions
 from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
 from gvtools.completers.geoverse.shared_attention import VideoKeys
 from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
+from gvtools.errors import ShapeError
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,26 @@ class Decoded:
 
     Attributes:
         rgb: (B, T, 3, H, W) of the target views, not clipped to [0, 1].
-        geometry: of all V views, or of the T target views alone, in the frame of the first view
-            and the model's unit.
+        depth: (B, T, H, W) z-depth of the target views, in the model's unit.
+        depth_confidence: (B, T, H, W) > 1.
+        all_views: the geometry of all V views; None where the targets' depth alone was decoded.
     """
 
     rgb: Tensor
-    geometry: Geometry
+    depth: Tensor
+    depth_confidence: Tensor
+    all_views: Geometry | None = None
+
+    @property
+    def geometry(self) -> Geometry:
+        """Of all V views, in the frame of the first view.
+
+        Raises:
+            ShapeError: it was not decoded.
+        """
+        if self.all_views is None:
+            raise ShapeError("the targets' depth alone was decoded, not the geometry of all views")
+        return self.all_views
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ coarse to fine, one for depth, one for rays. Rays come at 8/patch of the image's
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -164,17 +164,7 @@ class GeometryHead(nn.Module):
             grid: patches (rows, columns).
             views_at_once: views that are decoded together; bounds the memory.
         """
-        batch, views = levels[0].shape[:2]
-        dtype = self.norm.weight.dtype
-        parts = []
-        with torch.autocast(levels[0].device.type, enabled=False):
-            flat = [level.to(dtype).flatten(0, 1) for level in levels]
-            for start in range(0, batch * views, views_at_once):
-                chunk = [level[start : start + views_at_once] for level in flat]
-                parts.append(self._decode(chunk, grid))
-        depth, ray = (
-            torch.cat(part).unflatten(0, (batch, views)) for part in zip(*parts, strict=True)
-        )
+        depth, ray = self._outputs(levels, grid, (self._depth, self._ray), views_at_once)
         return Geometry(
             depth=depth[:, :, 0].exp(),
             depth_confidence=depth[:, :, 1].exp() + 1,
@@ -182,22 +172,56 @@ class GeometryHead(nn.Module):
             ray_confidence=ray[:, :, 6].exp() + 1,
         )
 
-    def _decode(self, levels: list[Tensor], grid: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        """The two linear outputs, (B', 2, H, W) and (B', 7, h, w)."""
-        scratch = self.scratch
+    def depth(
+        self, levels: Sequence[Tensor], grid: tuple[int, int], *, views_at_once: int = 8
+    ) -> tuple[Tensor, Tensor]:
+        """Depth and its confidence alone, as ``forward`` gives them, in half the time."""
+        (depth,) = self._outputs(levels, grid, (self._depth,), views_at_once)
+        return depth[:, :, 0].exp(), depth[:, :, 1].exp() + 1
+
+    def _outputs(
+        self,
+        levels: Sequence[Tensor],
+        grid: tuple[int, int],
+        chains: Sequence[Callable[[list[Tensor], tuple[int, int]], Tensor]],
+        views_at_once: int,
+    ) -> list[Tensor]:
+        """(B, V, ...) of each chain."""
+        batch, views = levels[0].shape[:2]
+        dtype = self.norm.weight.dtype
         image = (grid[0] * self.config.patch, grid[1] * self.config.patch)
+        parts = []
+        with torch.autocast(levels[0].device.type, enabled=False):
+            flat = [level.to(dtype).flatten(0, 1) for level in levels]
+            for start in range(0, batch * views, views_at_once):
+                chunk = [level[start : start + views_at_once] for level in flat]
+                pyramid = self._pyramid(chunk, grid, image)
+                parts.append([chain(pyramid, image) for chain in chains])
+        return [torch.cat(part).unflatten(0, (batch, views)) for part in zip(*parts, strict=True)]
+
+    def _pyramid(
+        self, levels: list[Tensor], grid: tuple[int, int], image: tuple[int, int]
+    ) -> list[Tensor]:
+        """Four maps of the levels (B', N, channels), from fine to coarse."""
         pyramid = []
         for index, level in enumerate(levels):
             x = self.norm(level).transpose(1, 2).unflatten(2, grid)
             x = _with_positions(self.projects[index](x), image)
             x = self.resize_layers[index](x)
-            pyramid.append(getattr(scratch, f"layer{index + 1}_rn")(x))
+            pyramid.append(getattr(self.scratch, f"layer{index + 1}_rn")(x))
+        return pyramid
 
-        depth = scratch.output_conv1(self._fused(pyramid, ""))
+    def _depth(self, pyramid: list[Tensor], image: tuple[int, int]) -> Tensor:
+        """(B', 2, H, W) before the exponential."""
+        depth = self.scratch.output_conv1(self._fused(pyramid, ""))
         depth = _with_positions(_resized(depth, image), image)
-        ray = scratch.output_conv1_aux[-1](self._fused(pyramid, "_aux"))
+        return self.scratch.output_conv2(depth)  # type: ignore[no-any-return]
+
+    def _ray(self, pyramid: list[Tensor], image: tuple[int, int]) -> Tensor:
+        """(B', 7, h, w)."""
+        ray = self.scratch.output_conv1_aux[-1](self._fused(pyramid, "_aux"))
         ray = _with_positions(ray, image)
-        return scratch.output_conv2(depth), scratch.output_conv2_aux[-1](ray)
+        return self.scratch.output_conv2_aux[-1](ray)  # type: ignore[no-any-return]
 
     def _fused(self, pyramid: list[Tensor], suffix: str) -> Tensor:
         """One RefineNet chain from the coarsest level to twice the finest one's resolution."""
