@@ -18,6 +18,8 @@ COLLINEAR = 1e-3
 COINCIDENT = 1e-13
 # Squares below this share of the spread's are sums of cancelling terms.
 ROUNDING = 1e-12
+# Below it float64 loses digits.
+TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,7 @@ class SimilarityFit:
         return self.scale * centered @ self.rotation.T + self.target_center
 
 
+@np.errstate(over="ignore", under="ignore", invalid="ignore")
 def fit_similarity(
     source: ArrayLike,
     target: ArrayLike,
@@ -74,7 +77,8 @@ def fit_similarity(
     patterns", PAMI 13(4), 1991; equation numbers are its own. Without weights the solution is
     pycolmap's, about the centroids, wherever it gives one; whether the points determine a solution
     is found out here. Camera centres on a line (a straight dolly) leave the rotation about that
-    line open and are reported as degenerate.
+    line open and are reported as degenerate; so are mirror images that several rotations fit alike
+    and scales that float64 does not hold. The unit of the coordinates changes no digit.
 
     Args:
         source: (N, 3).
@@ -98,39 +102,66 @@ def fit_similarity(
     used = int((weight > 0).sum())
     if used < 3:
         return _degenerate(len(source), f"{used} point pair(s), at least 3 are needed")
-    weight = weight / weight.sum()
+    row = weight > 0
+    weight = weight[row] / weight.max()
+    weight /= weight.sum()
 
-    source_center = _centroid(source, weight)  # (34), about a point of the set: exact far out
-    target_center = _centroid(target, weight)  # (35)
-    x, y = source - source_center, target - target_center
-    for name, points, raw in (("source", x, source), ("target", y, target)):
-        reason = _spread_defect(points, weight, np.abs(raw).max())
-        if reason:
-            return _degenerate(len(source), f"{reason} {name} points")
-    variance = float(weight @ (x**2).sum(axis=1))  # (36)
-    covariance = (y * weight[:, None]).T @ x  # (38)
+    x, x_power, source_center, x_defect = _centered(source, row, weight)  # (34)
+    y, y_power, target_center, y_defect = _centered(target, row, weight)  # (35)
+    for name, defect in (("source", x_defect), ("target", y_defect)):
+        if defect:
+            return _degenerate(len(source), f"{defect} {name} points")
+    variance = float(weight @ (x[row] ** 2).sum(axis=1))  # (36)
+    size = float(weight @ (y[row] ** 2).sum(axis=1))
+    covariance = (y[row] * weight[:, None]).T @ x[row]  # (38)
     u, d, vt = np.linalg.svd(covariance)
-    if d[1] < COLLINEAR**2 * d[0]:
+    if d[1] < COLLINEAR**2 * d[0] or d[0] <= ROUNDING * np.sqrt(variance * size):
         return _degenerate(len(source), "source and target do not correspond in two directions")
     sign = np.ones(3)
     sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0  # (39), (43)
+    if d[1] + sign[2] * d[2] < COLLINEAR**2 * d[0]:
+        return _degenerate(len(source), "a mirror image, which several rotations fit alike")
     rotation = (u * sign) @ vt  # (40)
-    scale = float((d * sign).sum() / variance) if with_scale else 1.0  # (42)
+    kept = float(np.ldexp(1.0, x_power - y_power))
+    scale = float((d * sign).sum() / variance) if with_scale else kept  # (42)
     if weights is None:
-        rotation, scale = _by_pycolmap(x, y, with_scale=with_scale) or (rotation, scale)
-    translation = target_center - scale * rotation @ source_center  # (41)
+        rotation, free = _by_pycolmap(x, y, with_scale=with_scale) or (rotation, scale)
+        scale = free if with_scale else kept
     residuals = np.linalg.norm(y - scale * x @ rotation.T, axis=1)
-    rmse = float(np.sqrt(weight @ residuals**2))
+    square = float(weight @ residuals[row] ** 2)
     mirrored = False
     if sign[2] < 0:
-        size = float(weight @ (y**2).sum(axis=1))
-        best = d.sum() / variance if with_scale else 1.0
-        square = size - 2 * best * d.sum() + best**2 * variance  # (33), of the reflection
-        mirrored = bool(square < rmse**2 / 4 and rmse**2 > ROUNDING * size)
+        best = d.sum() / variance if with_scale else kept
+        other = size - 2 * best * d.sum() + best**2 * variance  # (33), of the reflection
+        mirrored = bool(other < square / 4 and square > ROUNDING * size)
+    residuals, rmse = np.ldexp(residuals, y_power), float(np.ldexp(np.sqrt(square), y_power))
+    scale = float(np.ldexp(scale, y_power - x_power))
+    translation = target_center - scale * rotation @ source_center  # (41)
+    if not (np.isfinite([rmse, *translation]).all() and TINY <= scale < np.inf):
+        return _degenerate(len(source), "units whose ratio float64 does not hold")
     return SimilarityFit(
         "aligned", scale, rotation, translation, residuals, rmse, source_center, target_center,
         mirrored,
     )  # fmt: skip
+
+
+def _centered(
+    points: Float64, row: NDArray[np.bool_], weight: Float64
+) -> tuple[Float64, int, Float64, str]:
+    """Points about their centroid, a power of two divided out so that no square leaves float64.
+
+    Returns:
+        The points (N, 3), the power, the centroid in the points' own unit, and what is wrong with
+        the spread of those in ``row``, see ``_spread_defect``.
+    """
+    center = _centroid(points[row], weight)
+    moved = points - center
+    if not np.isfinite(moved[row]).all():
+        return moved, 0, center, "overflowing"
+    power = int(np.frexp(np.abs(moved[row]).max())[1])
+    moved = np.ldexp(moved, -power)
+    magnitude = float(np.ldexp(np.abs(points[row]).max(), -power))
+    return moved, power, center, _spread_defect(moved[row], weight, magnitude)
 
 
 def _by_pycolmap(
@@ -157,7 +188,7 @@ def _centroid(points: Float64, weight: Float64) -> Float64:
 def _spread_defect(centered: Float64, weight: Float64, magnitude: float) -> str:
     """Why points do not determine a rotation: "coincident", "collinear", or ""."""
     spread = np.linalg.svd(centered * np.sqrt(weight)[:, None], compute_uv=False)
-    if spread[0] <= COINCIDENT * max(magnitude, np.finfo(np.float64).tiny):
+    if spread[0] <= COINCIDENT * magnitude:
         return "coincident"
     return "collinear" if spread[1] < COLLINEAR * spread[0] else ""
 
@@ -244,13 +275,14 @@ def align_depth_scale(
         mask = mask & np.isfinite(depth) & np.isfinite(reference) & (depth > 0) & (reference > 0)
         mask &= np.isfinite(weight) & (weight > 0)
     support = int(mask.sum())
-    if support < min_support:
+    if support < max(min_support, 1):
         return ScaleFit(
-            f"unsupported: {support} common pixels, at least {min_support} are needed",
+            f"unsupported: {support} common pixels, at least {max(min_support, 1)} are needed",
             np.nan, 0, 0.0, np.nan, support,
         )  # fmt: skip
     ratio = np.log(reference[mask]) - np.log(depth[mask])
-    weight = weight[mask] / weight[mask].sum()
+    weight = weight[mask] / weight[mask].max()
+    weight /= weight.sum()
     center = _weighted_median(ratio, weight)
     for _ in range(20):
         gap = np.abs(ratio - center)
@@ -262,7 +294,8 @@ def align_depth_scale(
         moved, center = abs(update - center), update
         if moved < 1e-9:
             break
-    deviation = np.abs(np.expm1(ratio - center))
+    with np.errstate(over="ignore", under="ignore"):
+        deviation, scale = np.abs(np.expm1(ratio - center)), float(np.exp(center))
     inlier = deviation <= inlier_band
     share = float(weight[inlier].sum())
     residual = _weighted_median(deviation, weight)
@@ -273,9 +306,11 @@ def align_depth_scale(
         )
     elif residual > max_residual:
         reason = f"median deviation {residual:.1%}, at most {max_residual:.1%} is accepted"
+    elif not TINY <= scale < np.inf:
+        reason = f"the scale is exp({center:.1f}), which float64 does not hold"
     return ScaleFit(
         f"unsupported: {reason}" if reason else "aligned",
-        float(np.nan if reason else np.exp(center)),
+        np.nan if reason else scale,
         int(inlier.sum()),
         share,
         residual,

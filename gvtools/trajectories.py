@@ -11,8 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.errors import DegenerateError, OptionError
+from gvtools.options import check_range
 
 Float64 = NDArray[np.float64]
+
+# Centres nearer than this share of their coordinates' magnitude differ by rounding alone.
+ROUNDING = 1e-13
+# A step below this share of the others is none.
+STEP = 1e-9
+# Squares of coordinates beyond it leave float64.
+FARTHEST = 1e150
 
 
 def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Cameras:
@@ -31,7 +39,7 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
 
     Raises:
         OptionError: fewer than two keys or cameras asked for.
-        DegenerateError: all keys are the same camera.
+        DegenerateError: all keys are the same camera, or one has no finite pose.
     """
     from scipy.interpolate import PchipInterpolator
     from scipy.spatial.transform import Rotation, Slerp
@@ -40,6 +48,7 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
         raise OptionError(
             f"interpolate: {len(cameras)} key camera(s), {count} asked for; expected 2 or more each"
         )
+    _check_poses("interpolate", cameras)
     rows = list(range(len(cameras)))
     if closed:
         # One key more at either end makes the spline's slopes there those of a loop.
@@ -48,12 +57,17 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
     rotation = Rotation.from_matrix(world[:, :3, :3])
     moved = np.linalg.norm(np.diff(world[:, :3, 3], axis=0), axis=1)
     turned = (rotation[:-1].inv() * rotation[1:]).magnitude()
-    unit = float(np.median(moved[moved > 0])) if (moved > 0).any() else 1.0
+    real = moved > max(STEP * moved.max(), ROUNDING * np.abs(world[:, :3, 3]).max())
+    unit = float(np.median(moved[real])) if real.any() else 1.0
     steps = moved + unit * turned
     # Keys that repeat their predecessor would give the spline two values at one place.
-    keep = np.concatenate([[True], steps > 1e-9 * steps.sum()])
+    steps[steps <= STEP * steps.sum()] = 0
+    keep = np.concatenate([[True], steps > 0])
     if keep.sum() < 2:
         raise DegenerateError("interpolate: all key cameras are the same; give cameras that differ")
+    # A power of two is divided out, so that no cube of a length leaves float64.
+    power = np.frexp(steps.sum())[1]
+    steps = np.ldexp(steps, -power)
     index = np.array(rows)[keep]
     length = np.concatenate([[0.0], np.cumsum(steps)])
     first, last = (length[1], length[-2]) if closed else (0.0, length[-1])
@@ -62,7 +76,8 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
     # PCHIP has no cross-talk between coordinates: centred first for large offsets.
     origin = world[0, :3, 3]
     pose = np.tile(np.eye(4), (count, 1, 1))
-    pose[:, :3, 3] = PchipInterpolator(length, world[keep, :3, 3] - origin)(at) + origin
+    centers = np.ldexp(world[keep, :3, 3] - origin, -power)
+    pose[:, :3, 3] = np.ldexp(PchipInterpolator(length, centers)(at), power) + origin
     pose[:, :3, :3] = Slerp(length, rotation[keep])(at).as_matrix()
     segment = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(length) - 2)
     share = (at - length[segment]) / (length[segment + 1] - length[segment])
@@ -84,6 +99,7 @@ def focus_point(cameras: Cameras) -> Float64:
     Raises:
         DegenerateError: the axes are parallel or there is one only.
     """
+    _check_poses("focus point", cameras)
     world = cameras.world_from_cam
     origin = cameras.centers.mean(axis=0)
     axes, centers = world[:, :3, 2], world[:, :3, 3] - origin
@@ -118,23 +134,31 @@ def look_at(centers: ArrayLike, target: ArrayLike, *, up: ArrayLike) -> Float64:
     Args:
         centers: (V, 3), world frame.
         target: (3,) or (V, 3), world frame; it appears on the optical axis.
-        up: (3,), world frame.
+        up: (3,), world frame, of any length.
 
     Returns:
         (V, 4, 4) float64.
 
     Raises:
-        DegenerateError: a centre lies on the target, or the view is along ``up``.
+        OptionError: ``up`` has no direction.
+        DegenerateError: a centre lies on the target, the view is along ``up``, or a value is not
+            finite.
     """
-    centers = np.asarray(centers, np.float64)
-    forward = np.asarray(target, np.float64) - centers
+    centers, target = np.asarray(centers, np.float64), np.asarray(target, np.float64)
+    up = _direction(up)
+    magnitude = float(np.abs(np.concatenate([centers.ravel(), target.ravel()])).max())
+    if not magnitude < FARTHEST:
+        raise DegenerateError(
+            f"look at: coordinates up to {magnitude:g}; expected finite ones below {FARTHEST:g}"
+        )
+    forward = target - centers
     distance = np.linalg.norm(forward, axis=1, keepdims=True)
-    if (distance <= 1e-12 * np.maximum(1, np.abs(centers).max())).any():
+    if (distance <= 1e-12 * magnitude).any():
         raise DegenerateError("look at: a camera centre lies on the point that it looks at")
     forward = forward / distance
-    right = np.cross(forward, np.asarray(up, np.float64))
+    right = np.cross(forward, up)
     norm = np.linalg.norm(right, axis=1, keepdims=True)
-    if (norm < 1e-6 * np.linalg.norm(up)).any():
+    if (norm < 1e-6).any():
         raise DegenerateError("look at: a camera looks along the up vector; choose another up")
     right /= norm
     pose = np.tile(np.eye(4), (len(centers), 1, 1))
@@ -168,7 +192,8 @@ def orbit(
         degrees: how far to turn, counter-clockwise as seen from above.
 
     Raises:
-        OptionError: no camera given or asked for, or a radius that is not positive.
+        OptionError: no camera given or asked for, a radius that is not positive, or a number that
+            is not finite.
         DegenerateError: no focus point or no up vector can be found, or the first camera stands
             on the axis.
     """
@@ -177,14 +202,16 @@ def orbit(
             f"orbit: {len(cameras)} camera(s) given, {count} asked for, radius {radius}; "
             "expected 1 or more, and a positive radius"
         )
+    for name, value in (("radius", radius), ("height", height), ("degrees", degrees)):
+        check_range(f"orbit: {name}", value, above=-FARTHEST, below=FARTHEST)
+    _check_poses("orbit", cameras)
     middle = focus_point(cameras) if center is None else np.asarray(center, np.float64)
-    axis = mean_up(cameras) if up is None else np.asarray(up, np.float64)
-    axis = axis / np.linalg.norm(axis)
+    axis = _direction(mean_up(cameras) if up is None else up)
     offset = cameras.centers - middle
     above = offset @ axis
     flat = offset - above[:, None] * axis
     distance = np.linalg.norm(flat, axis=1)
-    if distance[0] <= 1e-9 * max(1.0, float(np.abs(offset).max())):
+    if distance[0] <= 1e-9 * float(np.abs(offset).max()):
         raise DegenerateError("orbit: the first camera stands on the axis; give another center=")
     radius = float(np.median(distance)) if radius is None else radius
     height = float(np.median(above)) if height is None else height
@@ -219,20 +246,24 @@ def spiral(
             ``focus_point``, or ten times the extent where the axes are parallel or diverge.
 
     Raises:
-        OptionError: fewer than two cameras, none asked for, or a focus that is not in front.
+        OptionError: fewer than two cameras, none asked for, a focus that is not in front, or a
+            number that is not finite.
         DegenerateError: the cameras' viewing directions or up vectors cancel out.
     """
     if len(cameras) < 2 or count < 1:
         raise OptionError(
             f"spiral: {len(cameras)} camera(s) given, {count} asked for; expected 2 and 1 or more"
         )
+    for name, value in (("turns", turns), ("spread", spread), ("focus_distance", focus_distance)):
+        check_range(f"spiral: {name}", value, above=-FARTHEST, below=FARTHEST)
+    _check_poses("spiral", cameras)
     middle = cameras.centers.mean(axis=0)
     forward = cameras.world_from_cam[:, :3, 2].mean(axis=0)
     if np.linalg.norm(forward) < 1e-3:
         raise DegenerateError("spiral: the viewing directions cancel out; use orbit instead")
     forward /= np.linalg.norm(forward)
     up = mean_up(cameras)
-    frame = look_at(middle[None], middle + forward, up=up)[0, :3, :3]
+    frame = look_at(np.zeros((1, 3)), forward, up=up)[0, :3, :3]
     extent = np.percentile(np.abs((cameras.centers - middle) @ frame), 90, axis=0) * spread
     if focus_distance is None:
         try:
@@ -251,6 +282,26 @@ def spiral(
     offset = np.stack([np.cos(angle), -np.sin(angle), -np.sin(0.5 * angle)], axis=1) * extent
     pose = look_at(middle + offset @ frame.T, middle + focus_distance * forward, up=up)
     return _like_first(cameras, pose, "spiral")
+
+
+def _check_poses(what: str, cameras: Cameras) -> None:
+    largest = np.abs(cameras.world_from_cam).max(axis=(1, 2), initial=0)
+    wrong = np.flatnonzero(~(largest < FARTHEST))
+    if len(wrong):
+        raise DegenerateError(
+            f"{what}: the pose of camera {cameras.names[wrong[0]]} holds {largest[wrong[0]]:g}; "
+            f"expected finite values below {FARTHEST:g}"
+        )
+
+
+def _direction(vector: ArrayLike) -> Float64:
+    """(3,) of length 1."""
+    values = np.asarray(vector, np.float64)
+    largest = float(np.abs(values).max(initial=0))
+    if values.shape != (3,) or not 0 < largest < np.inf:
+        raise OptionError(f"up {values.tolist()}; expected three finite numbers, not all 0")
+    values = values / largest
+    return np.asarray(values / np.linalg.norm(values))
 
 
 def _like_first(cameras: Cameras, world_from_cam: Float64, prefix: str) -> Cameras:

@@ -68,17 +68,17 @@ def test_views_decoded_at_once_change_the_memory_alone(monkeypatch):
     whole = micro.model(micro.config(decode_views=100)).generate(batch).decoded
     model = micro.model(micro.config(decode_views=2))
     sizes: dict[str, list[int]] = {"geometry": [], "rgb": []}
-    decode, views = model.geometry.head._decode, model.rgb_head._views
+    pyramid, views = model.geometry.head._pyramid, model.rgb_head._views
 
-    def geometry_chunk(levels, grid):
+    def geometry_chunk(levels, *where):
         sizes["geometry"].append(len(levels[0]))
-        return decode(levels, grid)
+        return pyramid(levels, *where)
 
     def rgb_chunk(features, position):
         sizes["rgb"].append(len(features))
         return views(features, position)
 
-    monkeypatch.setattr(model.geometry.head, "_decode", geometry_chunk)
+    monkeypatch.setattr(model.geometry.head, "_pyramid", geometry_chunk)
     monkeypatch.setattr(model.rgb_head, "_views", rgb_chunk)
     parts = model.generate(batch).decoded
     assert sizes == {"geometry": [2] * 5, "rgb": [2] * 3}

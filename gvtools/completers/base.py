@@ -116,6 +116,35 @@ class Completer(Protocol):
         ...
 
 
+def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
+    """Refuse views whose numbers would spread from a pixel over all that is generated.
+
+    Args:
+        context: their colours have to be finite; depth that is not finite counts as none.
+        guidance: colour, depth and confidence have to be finite where it is valid.
+
+    Raises:
+        ShapeError: they are not, or the guidance's arrays do not fit each other.
+    """
+    shape = guidance.valid.shape
+    if len(shape) != 3 or guidance.rgb.shape != (*shape, 3) or guidance.depth.shape != shape:
+        raise ShapeError(
+            f"guidance: rgb {guidance.rgb.shape}, depth {guidance.depth.shape}, valid {shape}; "
+            "expected (V, H, W, 3), (V, H, W) and (V, H, W)"
+        )
+    wrong = {view.name: int((~np.isfinite(view.rgb)).any(-1).sum()) for view in context}
+    finite = np.isfinite(guidance.rgb).all(-1)
+    finite &= np.isfinite(guidance.depth) & np.isfinite(guidance.confidence)
+    spoilt = (guidance.valid & ~finite).sum(axis=(1, 2)).tolist()
+    wrong |= dict(zip(guidance.cameras.names, spoilt, strict=True))
+    for name, count in wrong.items():
+        if count:
+            raise ShapeError(
+                f"view {name}: {count} pixel(s) hold NaN or infinity; expected finite colours, and "
+                "depth and confidence where memory is valid"
+            )
+
+
 _FACTORIES: dict[str, Callable[..., Completer] | str] = {
     "none": "gvtools.completers.none:NoneCompleter",
     "inpaint": "gvtools.completers.inpaint:InpaintCompleter",

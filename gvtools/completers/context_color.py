@@ -152,7 +152,8 @@ def _visible(
     if view.depth is not None:
         pixel = np.floor(np.where(inside[:, None], xy, 0)).astype(np.int64)
         seen = view.depth[pixel[:, 1], pixel[:, 0]]
-        other = (seen > 0) & (np.abs(local_z / np.where(seen > 0, seen, 1) - 1) > SAME_DEPTH)
+        known = np.isfinite(seen) & (seen > 0)
+        other = known & (np.abs(local_z / np.where(known, seen, 1) - 1) > SAME_DEPTH)
         weight[other] = 0
     return xy, inside, weight
 

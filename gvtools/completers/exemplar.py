@@ -120,9 +120,10 @@ def _as_source(view: ContextView, hole: Hole) -> Source:
         columns = ((np.arange(int(rgb.shape[1] * factor)) + 0.5) / factor).astype(np.int64)
         rgb, depth = rgb[np.ix_(rows, columns)], depth[np.ix_(rows, columns)]
     inverse = np.zeros(depth.shape)
-    inverse[depth > 0] = 1.0 / depth[depth > 0]
+    known = np.isfinite(depth) & (depth > 0)
+    inverse[known] = 1.0 / depth[known]
     # Without any depth, every pixel may be copied; with some, only those that have it.
-    usable = depth > 0 if view.depth is not None else np.ones(depth.shape, bool)
+    usable = known if known.any() else np.ones(depth.shape, bool)
     return rgb, inverse, usable
 
 

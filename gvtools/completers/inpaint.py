@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, Float64
-from gvtools.completers.base import Completion, ContextView
+from gvtools.completers.base import Completion, ContextView, check_views
 from gvtools.completers.context_color import depth_error, look_up
 from gvtools.completers.hole_color import fill_color
 from gvtools.completers.hole_depth import HoleDepth, fill_depth
@@ -107,6 +107,7 @@ def complete_views(
 ) -> Completion:
     """Fill every view: depth first, then photographs, then ``color``, then confidence."""
     start = time.perf_counter()
+    check_views(context, guidance)
     rgb = np.where(guidance.valid[..., None], guidance.rgb, np.float32(0))
     depth = np.where(guidance.valid, guidance.depth, np.float32(0))
     confidence = np.where(guidance.valid, np.minimum(guidance.confidence, 1), 0).astype(np.float32)

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from gvtools.completers.base import Completion, ContextView
+from gvtools.completers.base import Completion, ContextView, check_views
 from gvtools.guidance import Guidance
 
 
@@ -22,6 +22,7 @@ class NoneCompleter:
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:
         """Pass the valid pixels through; see ``Completer.complete``."""
+        check_views(context, guidance)
         valid = guidance.valid
         return Completion(
             np.where(valid[..., None], guidance.rgb, np.float32(0)),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import ShapeError
+from gvtools.errors import OptionError, ShapeError
 
 Float32 = NDArray[np.float32]
 # Relative depth errors are counted in bins of equal ratio; the median is exact to one of them.
@@ -34,7 +34,8 @@ class GeneratedScore:
     Attributes:
         pixels: how many.
         squared: sum of the squared colour error, mean over the channels.
-        depth_counts: (len(EDGES),) relative depth errors by bin; no depth counts as infinite.
+        depth_counts: (len(EDGES),) relative depth errors by bin; no depth counts as infinite, and
+            errors below the first edge as that.
         distance: sum of the perceptual distance's map; None where it was not measured.
         energy: sum of the squared gradient of the luminance, of the picture and of the truth.
         views: (V, 3) PSNR, median relative depth error and mean distance of each view; NaN where
@@ -62,25 +63,31 @@ def score(
 
     Args:
         rgb: (V, H, W, 3) in [0, 1], observed pixels in place.
-        depth: (V, H, W) z-depth; 0 = none.
+        depth: (V, H, W) z-depth; 0 or not finite = none.
         true_rgb: (V, H, W, 3) in [0, 1].
-        true_depth: (V, H, W); 0 = unknown, not compared.
+        true_depth: (V, H, W); 0 or not finite = unknown, not compared.
         generated: (V, H, W) which pixels are judged.
         distance: (V, H, W) map of a perceptual distance.
 
     Raises:
-        ShapeError: the shapes differ.
+        ShapeError: the shapes differ, or a colour or distance that is judged is not finite.
     """
     if rgb.shape != true_rgb.shape or len({depth.shape, true_depth.shape, generated.shape}) > 1:
         raise ShapeError(
             f"completed {rgb.shape} and {depth.shape}, truth {true_rgb.shape} and "
             f"{true_depth.shape}, judged {generated.shape}; expected equal sizes"
         )
+    for name, values in (("completed", rgb), ("true", true_rgb), ("distance", distance)):
+        if values is not None and not np.isfinite(values[generated]).all():
+            raise ShapeError(
+                f"{name}: NaN or infinity among the judged pixels of {generated.shape[0]} view(s); "
+                "expected finite values"
+            )
     squares = np.square(np.clip(rgb, 0, 1).astype(np.float64) - true_rgb).mean(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.abs(depth.astype(np.float64) / true_depth - 1)
-    relative[~(depth > 0)] = np.inf
-    judged = generated & (true_depth > 0)
+    relative[~((depth > 0) & np.isfinite(depth))] = np.inf
+    judged = generated & (true_depth > 0) & np.isfinite(true_depth)
     views = np.full((len(rgb), 3), np.nan)
     for index, where in enumerate(generated):
         if where.sum() < FEWEST:
@@ -121,9 +128,12 @@ def gradient_energy(rgb: Float32, where: NDArray[np.bool_]) -> float:
 def figures(scores: Sequence[GeneratedScore]) -> dict[str, float | None]:
     """FIGURES by name; None where nothing was measured.
 
-    PSNR in dB; relative depth errors are medians; ``energy`` is the picture's gradient energy as
-    a share of the truth's.
+    PSNR in dB, 100 at most; relative depth errors are medians, the pooled one None where most
+    pixels have no depth; ``energy`` is the picture's gradient energy as a share of the truth's,
+    None for a truth without any.
     """
+    if not scores:
+        return dict.fromkeys(FIGURES)
     return _figures(_Stacked(scores), np.ones((1, len(scores))))[0]
 
 
@@ -143,10 +153,19 @@ def paired_interval(
         seed: of the resampling.
 
     Returns:
-        The difference, and the ends of the 95 % interval of the percentile bootstrap over scenes.
+        The difference, and the ends of the 95 % interval of the percentile bootstrap over scenes;
+        NaN where either method has no such figure.
+
+    Raises:
+        ShapeError: not as many scenes, or none.
+        OptionError: no such figure.
     """
-    if len(scores) != len(others):
-        raise ShapeError(f"{len(scores)} scenes against {len(others)}; expected the same")
+    if len(scores) != len(others) or not scores:
+        raise ShapeError(
+            f"{len(scores)} scenes against {len(others)}; expected the same, at least one"
+        )
+    if figure not in FIGURES:
+        raise OptionError(f"figure {figure!r}; expected one of {', '.join(FIGURES)}")
     rng = np.random.default_rng(seed)
     drawn = rng.integers(0, len(scores), (RESAMPLES, len(scores)))
     counts = np.stack([np.bincount(row, minlength=len(scores)) for row in drawn])
@@ -156,6 +175,8 @@ def paired_interval(
         np.nan if a[figure] is None or b[figure] is None else a[figure] - b[figure]  # type: ignore[operator]
         for a, b in zip(*both, strict=True)
     ]
+    if np.isnan(apart[1:]).all():
+        return float(apart[0]), float("nan"), float("nan")
     low, high = np.nanquantile(apart[1:], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(apart[0]), float(low), float(high)
 

@@ -17,6 +17,8 @@ from gvtools.evaluation.ssim_map import RADIUS, SIDE, ssim_map
 
 # Nearer to the border, windows would see pixels that are not there.
 SSIM_BORDER = RADIUS
+# Colours may lie outside [0, 1], as noise does, but not by more than the data range.
+LOWEST, HIGHEST = -1.0, 2.0
 
 
 def psnr(image: ArrayLike, truth: ArrayLike, *, mask: ArrayLike | None = None) -> float | None:
@@ -31,7 +33,7 @@ def psnr(image: ArrayLike, truth: ArrayLike, *, mask: ArrayLike | None = None) -
         The ratio; infinity when the compared pixels are equal; None when there are none.
 
     Raises:
-        ShapeError: shapes or types that do not fit.
+        ShapeError: shapes, types or values that do not fit.
     """
     first, second, where = _pair(image, truth, mask)
     if where is not None:
@@ -62,7 +64,7 @@ def ssim(
         The mean over pixels and channels; None when no pixel is compared.
 
     Raises:
-        ShapeError: shapes or types that do not fit, or images below 11 x 11 pixels.
+        ShapeError: shapes, types or values that do not fit, or images below 11 x 11 pixels.
     """
     first, second, where = _pair(image, truth, mask)
     if min(first.shape[:2]) < SIDE:
@@ -92,7 +94,7 @@ def image_figures(
         below 11 x 11 pixels is None.
 
     Raises:
-        ShapeError: shapes or types that do not fit.
+        ShapeError: shapes, types or values that do not fit.
     """
     first, second, _ = _pair(image, truth, None)
     square = ((first - second) ** 2).mean(axis=-1)
@@ -168,6 +170,10 @@ def _unit(image: ArrayLike) -> NDArray[np.float64]:
         return array / 255.0
     if not np.issubdtype(array.dtype, np.floating):
         raise ShapeError(f"an image of {array.dtype}; expected uint8 or floats in [0, 1]")
+    low, high = (float(array.min()), float(array.max())) if array.size else (0.0, 1.0)
+    # NaN fails both.
+    if not (low >= LOWEST and high <= HIGHEST):
+        raise ShapeError(f"an image of values from {low:g} to {high:g}; expected floats in [0, 1]")
     return array.astype(np.float64)
 
 

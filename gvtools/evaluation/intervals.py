@@ -20,7 +20,7 @@ class Interval:
     """A mean and where 95 % of resampled means lie.
 
     Attributes:
-        mean: of the values; None without any, infinite when one is.
+        mean: of the values; None without any, infinite when one is, None for both infinities.
         low: lower end; None for fewer than two values, or infinite ones.
         high: upper end, likewise.
         n: how many values; those that are None are left out.
@@ -42,6 +42,8 @@ def mean_interval(values: Iterable[float | None], *, seed: int = 0) -> Interval:
     kept = np.array([value for value in values if value is not None and value == value])
     if not len(kept):
         return Interval(None, None, None, 0)
+    if {np.inf, -np.inf} <= set(kept.tolist()):
+        return Interval(None, None, None, len(kept))
     mean = float(kept.mean())
     if len(kept) < 2 or not np.isfinite(kept).all():
         return Interval(mean, None, None, len(kept))

@@ -88,13 +88,15 @@ class SqueezeNetDistance(nn.Module):
         """The feature maps of (N, H, W, 3) pictures in [0, 1].
 
         Raises:
-            ShapeError: another shape, or pictures below 48 x 48 pixels.
+            ShapeError: another shape, pictures below 48 x 48 pixels, or NaN.
         """
         if pictures.ndim != 4 or pictures.shape[3] != 3 or min(pictures.shape[1:3]) < SMALLEST:
             raise ShapeError(
                 f"distance of pictures {pictures.shape}; expected (N, H, W, 3), H and W at least "
                 f"{SMALLEST}"
             )
+        if not np.isfinite(pictures).all():
+            raise ShapeError("distance of pictures that hold NaN or infinity; expected [0, 1]")
         ordered = torch.from_numpy(np.ascontiguousarray(pictures))
         return list(self(ordered.permute(0, 3, 1, 2).float()))
 

@@ -42,3 +42,5 @@ class PosedPicture:
                 raise ShapeError(
                     f"picture {self.name}: {what} {value.shape}; expected {size} like rgb"
                 )
+        if self.mask is not None and self.mask.dtype != np.bool_:
+            raise ShapeError(f"picture {self.name}: mask {self.mask.dtype}; expected bool")

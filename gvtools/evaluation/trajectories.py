@@ -15,8 +15,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.errors import OptionError, ShapeError
-from gvtools.similarity import SimilarityFit, fit_similarity
+from gvtools.cameras import ROTATION_TOLERANCE
+from gvtools.errors import DegenerateError, OptionError, ShapeError
+from gvtools.options import check_range
+from gvtools.similarity import COINCIDENT, SimilarityFit, fit_similarity
 
 Float64 = NDArray[np.float64]
 
@@ -25,6 +27,10 @@ AUC_THRESHOLDS = (3.0, 5.0, 10.0, 30.0)
 AUC_BINS = 1000
 ALIGNED = "aligned"
 UNALIGNED = "not aligned"
+# Scene units whose squares float64 holds.
+SMALLEST, LARGEST = 1e-150, 1e150
+# A step below this share of the extent is none.
+STILL = 1e-12
 
 
 @dataclass(frozen=True)
@@ -114,7 +120,7 @@ def absolute_errors(
             No rotation mends that, so the best one is reported with False.
 
     Raises:
-        ShapeError: wrong shapes, or values that are not finite.
+        ShapeError: wrong shapes, no rotations, or values that are not finite or beyond LARGEST.
         OptionError: an unknown alignment.
     """
     first, second = _poses(reference, estimate)
@@ -154,7 +160,7 @@ def relative_errors(
         refuse_mirrored: as of ``absolute_errors``.
 
     Raises:
-        ShapeError: wrong shapes, or values that are not finite.
+        ShapeError: wrong shapes, no rotations, or values that are not finite or beyond LARGEST.
         OptionError: an unknown alignment, or a delta below 1.
     """
     if delta < 1:
@@ -188,8 +194,8 @@ class PoseAuc:
         pairs: how many.
         median_rotation_deg: median angle between relative rotations.
         median_direction_deg: median angle between directions of translation.
-        still: pairs whose reference centres coincide: they have no direction, and count by their
-            rotation alone.
+        still: pairs whose reference centres coincide, up to rounding: they have no direction, and
+            count by their rotation alone.
     """
 
     status: str
@@ -209,16 +215,20 @@ def pose_auc(
     """Area under the recall of pairwise pose errors: no alignment, no scale, no unit.
 
     All pairs of poses count once. The area is a sum of trapezoids over AUC_BINS bins, as GLD's
-    evaluation takes it.
+    evaluation takes it; poses without any error have 1 - 0.5 / AUC_BINS. Where the estimate stands
+    still and the reference does not, the direction is off by 90 degrees.
 
     Args:
         reference: (N, 4, 4) world_from_cam.
         estimate: (N, 4, 4), row by row the same cameras.
-        thresholds: degrees.
+        thresholds: degrees, above 0.
 
     Raises:
-        ShapeError: wrong shapes, or values that are not finite.
+        ShapeError: wrong shapes, no rotations, or values that are not finite.
+        OptionError: a threshold that is not above 0.
     """
+    for threshold in thresholds:
+        check_range("AUC threshold", threshold, above=0, below=np.inf)
     first, second = _poses(reference, estimate)
     if len(first) < 2:
         reason = f"degenerate: {len(first)} pose(s), at least 2 are needed"
@@ -227,7 +237,8 @@ def pose_auc(
     motion, rotation = _motions(first, i, j)
     other_motion, other_rotation = _motions(second, i, j)
     turned = _angles_deg(np.swapaxes(rotation, 1, 2) @ other_rotation)
-    moves = np.linalg.norm(motion, axis=1) > 1e-12 * max(_extent(first), 1e-300)
+    moves, other_moves = _moves(first, motion), _moves(second, other_motion)
+    other_motion = np.where(other_moves[:, None], other_motion, 0.0)
     direction = np.where(moves, _between_deg(motion, other_motion), 0.0)
     error = np.maximum(turned, direction)
     return PoseAuc(
@@ -241,7 +252,15 @@ def pose_auc(
 
 
 def area_under_recall(errors: ArrayLike, threshold: float, *, bins: int = AUC_BINS) -> float:
-    """Area under the share of errors below x, for x from 0 to ``threshold``, over the threshold."""
+    """Area under the share of errors below x, for x from 0 to ``threshold``, over the threshold.
+
+    Raises:
+        OptionError: a threshold that is not above 0.
+        DegenerateError: no errors.
+    """
+    check_range("AUC threshold", threshold, above=0, below=np.inf)
+    if not np.size(errors):
+        raise DegenerateError("area under recall: no errors; give at least one")
     edges = np.linspace(0, threshold, bins + 1)
     values = np.sort(np.asarray(errors, np.float64))
     share = np.searchsorted(values, edges, side="left") / len(values)
@@ -256,7 +275,29 @@ def _poses(reference: ArrayLike, estimate: ArrayLike) -> tuple[Float64, Float64]
         )
     if not (np.isfinite(first).all() and np.isfinite(second).all()):
         raise ShapeError("poses: NaN or infinity; leave those frames out and say so")
+    for name, poses in (("reference", first), ("estimate", second)):
+        _check_poses(name, poses)
     return first, second
+
+
+def _check_poses(name: str, poses: Float64) -> None:
+    rotation = poses[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        defect = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2))
+        determinant = np.linalg.det(rotation)
+    wrong = np.flatnonzero(~(defect <= ROTATION_TOLERANCE) | (determinant < 0))
+    if len(wrong):
+        raise ShapeError(
+            f"poses: the 3x3 part of {name} pose {wrong[0]} is no rotation (R Rᵀ is off I by "
+            f"{defect[wrong[0]]:.3g}, determinant {determinant[wrong[0]]:.3g}); divide a scale "
+            "out, mend a mirror, or leave the frame out"
+        )
+    largest = float(np.abs(poses[:, :3, 3]).max(initial=0))
+    if largest and not SMALLEST <= largest <= LARGEST:
+        raise ShapeError(
+            f"poses: {name} centres up to {largest:g}; expected scene units in which they lie "
+            f"between {SMALLEST:g} and {LARGEST:g}"
+        )
 
 
 def _aligned(
@@ -281,6 +322,12 @@ def _extent(poses: Float64) -> float:
     return float(2 * np.linalg.norm(centered - centered.mean(axis=0), axis=1).max())
 
 
+def _moves(poses: Float64, motion: Float64) -> NDArray[np.bool_]:
+    """(P,) whether motions (P, 3) are more than the rounding of the centres."""
+    rounding = COINCIDENT * float(np.abs(poses[:, :3, 3]).max())
+    return np.linalg.norm(motion, axis=1) > max(STILL * _extent(poses), rounding)
+
+
 def _motions(poses: Float64, i: NDArray[np.int64], j: NDArray[np.int64]) -> tuple[Float64, Float64]:
     """Translation (P, 3) and rotation (P, 3, 3) of camera j in camera i's frame."""
     back = np.swapaxes(poses[i, :3, :3], 1, 2)
@@ -296,7 +343,8 @@ def _angles_deg(rotations: Float64) -> Float64:
 
 
 def _between_deg(a: Float64, b: Float64) -> Float64:
-    """(P,) angles between vectors; 90 degrees where one of them is 0."""
+    """(P,) angles between vectors of any lengths; 90 degrees where one of them is 0."""
+    a, b = (np.ldexp(x, -np.frexp(np.abs(x).max(axis=1, keepdims=True))[1]) for x in (a, b))
     cross = np.linalg.norm(np.cross(a, b), axis=1)
     dot = np.einsum("pi,pi->p", a, b)
     angle = np.degrees(np.arctan2(cross, dot))

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gvtools.cameras import Cameras
-from gvtools.completers.base import Completion, ContextView
+from gvtools.completers.base import Completion, ContextView, check_views
 from gvtools.completers.geoverse.color_field import COLOR_ALIGNMENTS
 from gvtools.completers.geoverse.depth_scale import ALIGNMENTS
 from gvtools.completers.geoverse.flow import interval_bounds
@@ -139,6 +139,7 @@ class GeoVerseCompleter:
         start = time.perf_counter()
         if not context:
             raise OptionError("completer geoverse needs at least one context view, and got none")
+        check_views(context, guidance)
         device = self._device()
         model = self.model
         canvas = _Canvas(guidance)

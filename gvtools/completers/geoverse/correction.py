@@ -26,6 +26,8 @@ MOST = 1.5
 def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
     """The filled projection plus what the model changed; not clipped to [0, 1].
 
+    A pixel that is not finite in either decoding stays so, alone.
+
     Args:
         filled: (N, 3, H, W) the filled projection.
         made: likewise, decoded from generated features.
@@ -33,11 +35,14 @@ def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -
         valid: (N, 1, H, W) bool, where the memory knows.
     """
     change = made - hint
-    return filled + change - push_pull(change, valid)
+    known = valid & change.isfinite().all(1, keepdim=True)
+    return filled + change - push_pull(change, known)
 
 
 def corrected_depth(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
     """The filled projection's depth by the ratio of two decodings, within ``MOST``.
+
+    A pixel without a ratio (NaN, or 0 in both) is NaN, alone.
 
     Args:
         filled: (N, 1, H, W) z-depth, scene units; 0 = none, and stays so.
@@ -46,7 +51,7 @@ def corrected_depth(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -
         valid: (N, 1, H, W) bool, where the memory knows.
     """
     change = made.log() - hint.log()
-    change = change - push_pull(change, valid)
+    change = change - push_pull(change, valid & change.isfinite())
     limit = math.log(MOST)
     return filled * change.clamp(-limit, limit).exp()
 

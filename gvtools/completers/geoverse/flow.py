@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import TypeVar
 
 import torch
@@ -22,17 +23,24 @@ Velocity = Callable[[Tensor, Tensor], Tensor]
 
 # Geometric Latent Diffusion stops here, before its shift.
 GLD_END = 0.001
+# A shift beyond it, or below its inverse, puts all times within rounding of an end.
+MOST_SHIFT = 1e6
 
 
 def shift_time(t: Time, shift: float) -> Time:
-    """Uniform time to shifted time; 0 and 1 stay, ``shift`` 1 changes nothing."""
-    check_range("time shift", shift, above=0, below=math.inf)
-    return shift * t / (1 + (shift - 1) * t)
+    """Uniform time to shifted time; 0 and 1 stay, ``shift`` 1 changes nothing.
+
+    Raises:
+        OptionError: a shift beyond MOST_SHIFT or below its inverse.
+    """
+    check_range("time shift", shift, least=1 / MOST_SHIFT, most=MOST_SHIFT)
+    # 1 + (s - 1) t, written so that nothing cancels and t = 1 gives s to the last digit.
+    return shift * t / (1 if shift == 1 else (1 - t) + shift * t)
 
 
 def unshift_time(t: Time, shift: float) -> Time:
     """The inverse of ``shift_time``."""
-    check_range("time shift", shift, above=0, below=math.inf)
+    check_range("time shift", shift, least=1 / MOST_SHIFT, most=MOST_SHIFT)
     return shift_time(t, 1 / shift)
 
 
@@ -52,13 +60,22 @@ def time_grid(
         shift: see ``shift_time``.
         start: first and
         end: last time, both after the shift.
+
+    Raises:
+        OptionError: a value out of its range, or more steps than float64 tells apart.
     """
     check_range("steps", steps, least=1)
     check_range("time grid's start", start, above=0, most=1)
     check_range("time grid's end", end, least=0, below=start)
     first, last = unshift_time(start, shift), unshift_time(end, shift)
     inner = (first + (last - first) * k / steps for k in range(1, steps))
-    return (start, *(shift_time(u, shift) for u in inner), end)
+    times = (start, *(shift_time(u, shift) for u in inner), end)
+    if not all(later < earlier for earlier, later in pairwise(times)):
+        raise OptionError(
+            f"time grid: {steps} steps from {start} to {end} at shift {shift} lie nearer to each "
+            "other than rounding; take fewer, or a shift nearer to 1"
+        )
+    return times
 
 
 def gld_time_grid(points: int, *, shift: float) -> tuple[float, ...]:
@@ -193,14 +210,20 @@ def integrate(
         callback: receives the number of steps made, their time (B,) and the state (B, ...).
 
     Returns:
-        The state at the last time, dtype of ``state``.
+        The state at the last time, dtype of ``state``; infinite where that dtype ends (float16 at
+        65504).
+
+    Raises:
+        ShapeError: no times, times that are not finite, or shapes that do not fit.
     """
     wide = torch.promote_types(state.dtype, torch.float32)
     grid = torch.as_tensor(times, dtype=torch.float64, device="cpu")
-    if grid.ndim not in (1, 2) or (grid.ndim == 2 and grid.shape[1] != len(state)):
+    if grid.ndim not in (1, 2) or not len(grid) or (grid.ndim == 2 and grid.shape[1] != len(state)):
         raise ShapeError(
             f"times {tuple(grid.shape)}; expected (S + 1,) or (S + 1, {len(state)}), one a sample"
         )
+    if not bool(grid.isfinite().all()):
+        raise ShapeError(f"times {grid.flatten()[:8].tolist()}; expected finite ones")
     grid = grid.reshape(len(grid), -1).expand(-1, len(state))
     strides = grid.diff(dim=0).to(wide).to(state.device)
     at = grid.to(wide).to(state.device)

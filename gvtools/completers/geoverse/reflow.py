@@ -25,6 +25,9 @@ from gvtools.completers.geoverse.flow import (
 from gvtools.errors import OptionError
 from gvtools.options import check_range
 
+# Over a shorter interval, the displacement of float32 states is mostly rounding.
+SHORTEST = 1e-4
+
 
 @dataclass(frozen=True, eq=False)
 class ReflowPair:
@@ -114,11 +117,22 @@ def reflow_pair(
         bounds: tau_0 .. tau_K.
         steps: of the teacher in each interval.
         shift: of the teacher's time, see ``flow.shift_time``.
+
+    Raises:
+        OptionError: a time outside its interval, or an interval shorter than ``SHORTEST``.
     """
     upper, lower = interval_ends(intervals, bounds)
+    if bool((upper - lower < SHORTEST).any()):
+        raise OptionError(
+            f"reflow over intervals of length {(upper - lower).tolist()}; expected at least "
+            f"{SHORTEST:g} each"
+        )
     eta = interval_share(t.to("cpu", torch.float64), upper=upper, lower=lower)
-    if bool(((eta < -1e-6) | (eta > 1 + 1e-6)).any()):
+    # A time is rounded to float32, which is much of a short interval.
+    rounding = 1e-6 + torch.finfo(torch.float32).eps / (upper - lower)
+    if not bool(((eta >= -rounding) & (eta <= 1 + rounding)).all()):
         raise OptionError(f"times {t.tolist()} outside their intervals {intervals.tolist()}")
+    eta = eta.clamp(0, 1)
     times = teacher_times(upper, lower, steps=steps, shift=shift)
     wide = torch.promote_types(clean.dtype, torch.float32)
     upper, lower, eta = (x.to(wide).to(clean.device) for x in (upper, lower, eta))

@@ -20,9 +20,12 @@ DEFECTS = (
     "coincident predicted centres",
     "coincident reference centres",
     "unrelated centres",
+    "a scale that the type does not hold",
 )
 # Spreads below this many roundings of the coordinates' magnitude are no geometry.
 ROUNDINGS = 4
+# Differences of larger coordinates leave float64.
+FARTHEST = 1e300
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +71,8 @@ def center_similarity(
     Args:
         predicted: (B, V, 3) camera centres o^.
         reference: (B, V, 3) camera centres o, any other frame and unit.
-        valid: (B, V) bool; None takes all. Centres that are not finite are left out as well;
-            ``used`` says how many were left.
+        valid: (B, V) bool; None takes all. Centres that are not finite, or beyond ``FARTHEST``,
+            are left out as well; ``used`` says how many were left.
     """
     if predicted.ndim != 3 or predicted.shape[-1] != 3 or predicted.shape != reference.shape:
         raise ShapeError(
@@ -82,11 +85,12 @@ def center_similarity(
             f"{tuple(predicted.shape[:2])}"
         )
     x, y = (z.to("cpu").to(torch.float64) for z in (predicted, reference.detach()))
-    use = x.detach().isfinite().all(-1) & y.isfinite().all(-1)
+    use = ((x.detach().abs() < FARTHEST) & (y.abs() < FARTHEST)).all(-1)
     use = use if valid is None else use & valid.cpu()
     count = use.sum(1)
-    x, x_center, x_spread, x_flat = _centered(x, use, torch.finfo(predicted.dtype).eps)
-    y, y_center, y_spread, y_flat = _centered(y, use, torch.finfo(reference.dtype).eps)
+    x, x_center, x_power, x_flat = _centered(x, use, torch.finfo(predicted.dtype).eps)
+    y, y_center, y_power, y_flat = _centered(y, use, torch.finfo(reference.dtype).eps)
+    x_spread, y_spread = (x**2).sum((1, 2)), (y**2).sum((1, 2))
 
     covariance = y.mT @ x
     u, _, vt = torch.linalg.svd(covariance.detach())
@@ -102,11 +106,13 @@ def center_similarity(
     for index, holds in ((4, unrelated), (3, y_flat), (2, x_flat), (1, count < 2)):
         defect = torch.where(holds, index, defect)
     ok = defect == 0
-    scale = matched / torch.where(ok, x_spread, 1.0)
-    translation = y_center - scale[:, None] * (rotation @ x_center[..., None])[..., 0]
-    correlation = (matched.detach() / torch.where(ok, size.detach(), 1.0)).clamp(max=1)
-
+    scale = _by_power(matched / torch.where(ok, x_spread, 1.0), y_power - x_power)
     wide = torch.promote_types(predicted.dtype, torch.float32)
+    translation = y_center - scale[:, None] * (rotation @ x_center[..., None])[..., 0]
+    held = torch.cat((scale[:, None], translation), 1).detach().to(wide)
+    ok = ok & held.isfinite().all(1) & (held[:, 0] > 0)
+    defect = torch.where((defect == 0) & ~ok, 5, defect)
+    correlation = (matched.detach() / torch.where(ok, size.detach(), 1.0)).clamp(max=1)
 
     def given(value: Tensor) -> Tensor:
         mask = ok.reshape(-1, *(1,) * (value.ndim - 1))
@@ -124,11 +130,22 @@ def center_similarity(
 
 
 def _centered(points: Tensor, use: Tensor, eps: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points about their centroid (0 where unused), the centroid, the spread, and if it is none."""
+    """Points about their centroid (0 where unused), the centroid, a power, and if they coincide.
+
+    The power of two is divided out of the points, so that no square leaves float64.
+    """
     points = torch.where(use[..., None], points, 0.0)
     share = use.to(points.dtype) / use.sum(1, keepdim=True).clamp(min=1)
     center = (share[..., None] * points).sum(1)
     moved = torch.where(use[..., None], points - center[:, None], 0.0)
-    spread = (moved**2).sum((1, 2))
-    rms = (spread.detach() / use.sum(1).clamp(min=1)).sqrt()
-    return moved, center, spread, rms <= ROUNDINGS * eps * points.detach().abs().amax((1, 2))
+    power = torch.frexp(moved.detach().abs().amax((1, 2))).exponent
+    moved = _by_power(moved, -power[:, None, None])
+    magnitude = _by_power(points.detach().abs().amax((1, 2)), -power)
+    rms = (moved.detach().square().sum((1, 2)) / use.sum(1).clamp(min=1)).sqrt()
+    return moved, center, power, rms <= ROUNDINGS * eps * magnitude
+
+
+def _by_power(x: Tensor, power: Tensor) -> Tensor:
+    """Times 2^power, in two halves, since the power itself may leave float64."""
+    half = power // 2
+    return x * torch.exp2(half.to(x.dtype)) * torch.exp2((power - half).to(x.dtype))

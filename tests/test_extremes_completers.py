@@ -1,0 +1,291 @@
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import geoverse_models as micro
+import numpy as np
+import pytest
+import torch
+
+from gvtools.completers import Completion, ContextView, create
+from gvtools.completers.geoverse.correction import MOST, corrected_color, corrected_depth
+from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
+from gvtools.errors import OptionError, ShapeError
+from gvtools.guidance import Guidance
+
+pytest.importorskip("safetensors", reason="weights are read with safetensors")
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.filterwarnings("error")]
+
+NAMES = ("none", "inpaint", "exemplar", "decoded", "correction")
+GENERATIVE = ("decoded", "correction")
+SIZE = (24, 32)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Micro models of both compositions."""
+    place = tmp_path_factory.mktemp("models")
+    fills = {"decoded": "push-pull", "correction": "surfaces"}
+    return {
+        name: micro.weights_folder(
+            place / name,
+            micro.config(hints={"cameras": True, "fill": fill, "mask": 0.0}, composition=name),
+        )
+        for name, fill in fills.items()
+    }
+
+
+def complete(
+    folders: dict[str, Path], name: str, context: Sequence[ContextView], known: Guidance
+) -> Completion:
+    if name in GENERATIVE:
+        completer = create("geoverse", weights=str(folders[name]), device="cpu", alignment="hint")
+    else:
+        completer = create(name, **({} if name == "none" else {"min_support": 1}))
+    with np.errstate(all="raise", under="ignore"):
+        return completer.complete(context, known, seed=1)
+
+
+def flat(valid: np.ndarray, *, color: float = 0.4, depth: float = 3.0) -> Guidance:
+    """One view of one colour and depth where ``valid`` (H, W)."""
+    plain = micro.guidance(1, size=valid.shape)
+    known = valid[None]
+    return replace(
+        plain,
+        rgb=np.repeat(np.where(known, color, 0)[..., None], 3, -1).astype(np.float32),
+        depth=np.where(known, depth, 0).astype(np.float32),
+        valid=known,
+        confidence=known.astype(np.float32),
+        generated=np.zeros_like(known),
+    )
+
+
+def check(made: Completion, known: Guidance) -> None:
+    """What any completion promises, whatever went in."""
+    for values in (made.rgb, made.depth, made.confidence):
+        assert np.isfinite(values).all()
+    assert made.rgb.min() >= 0 and made.rgb.max() <= 1
+    assert made.depth.min() >= 0
+    assert made.confidence.min() >= 0 and made.confidence.max() <= 1
+    assert not made.confidence[made.depth == 0].any()
+    np.testing.assert_array_equal(made.rgb[known.valid], known.rgb[known.valid])
+    np.testing.assert_array_equal(made.depth[known.valid], known.depth[known.valid])
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 2), (1, 40), SIZE])
+def test_masks_of_nothing_everything_and_a_half_at_any_size(folders, name, size):
+    half = np.zeros(size, np.bool_)
+    half[:, : max(1, size[1] // 2)] = True
+    context = micro.context_views(2)
+    for valid in (np.zeros(size, np.bool_), np.ones(size, np.bool_), half):
+        known = flat(valid)
+        made = complete(folders, name, context, known)
+        check(made, known)
+        assert made.spent["holes"] == (~valid).sum()
+        if valid.all():
+            assert made.spent.get("passes", 0) == made.spent.get("filled", 0) == 0
+        elif name in GENERATIVE:
+            # The context's own depth gives the scale where memory tells nothing.
+            assert made.spent["unfilled"] == 0
+        elif name == "none" or not valid.any():
+            assert not made.depth[~known.valid].any()
+
+
+@pytest.mark.parametrize("name", ["inpaint", "exemplar"])
+def test_a_constant_picture_is_continued_as_it_is(folders, name):
+    valid = np.ones(SIZE, np.bool_)
+    valid[8:16, 10:20] = False
+    for color in (0.0, 0.4, 1.0):
+        known = flat(valid, color=color)
+        made = complete(folders, name, [], known)
+        np.testing.assert_allclose(made.rgb, color, atol=1e-6)
+        np.testing.assert_allclose(made.depth, 3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("color", [0.0, 1.0])
+def test_constant_photographs_and_projections_do_no_harm(folders, name, color):
+    valid = np.zeros(SIZE, np.bool_)
+    valid[:, :16] = True
+    context = [
+        replace(view, rgb=np.full_like(view.rgb, color), depth=np.full(view.rgb.shape[:2], 3.0))
+        for view in micro.context_views(2)
+    ]
+    known = flat(valid, color=color)
+    check(complete(folders, name, context, known), known)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_photograph_is_enough_or_said_and_one_is_enough(folders, name):
+    known = micro.guidance(1, size=SIZE)
+    for context in ([], micro.context_views(1), micro.context_views(1, depth=False)):
+        if not context and name in GENERATIVE:
+            with pytest.raises(OptionError, match="at least one context view"):
+                complete(folders, name, context, known)
+            continue
+        made = complete(folders, name, context, known)
+        check(made, known)
+        assert name == "none" or (made.depth > 0).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("size", [(1, 1), (1, 50)])
+def test_photographs_of_any_size_are_looked_at(folders, name, size):
+    known = micro.guidance(1, size=SIZE)
+    check(complete(folders, name, micro.context_views(2, size=size), known), known)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_target_is_an_empty_completion(folders, name):
+    plain = micro.guidance(1, size=SIZE)
+    none = {f: getattr(plain, f)[:0] for f in ("rgb", "depth", "valid", "confidence", "generated")}
+    nothing = Guidance(plain.cameras[:0], **none)
+    made = complete(folders, name, micro.context_views(1), nothing)
+    assert made.rgb.shape == (0, *SIZE, 3)
+    assert made.spent["holes"] == 0
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("power", [-30, 30])
+def test_the_unit_of_the_scene_does_not_matter(folders, name, power):
+    context, known = micro.context_views(2), micro.guidance(1, size=SIZE)
+    far = micro.moved(context, known, scale=10.0**power)
+    made, plain = complete(folders, name, *far), complete(folders, name, context, known)
+    check(made, far[1])
+    np.testing.assert_allclose(made.depth / np.float32(10.0**power), plain.depth, rtol=1e-3)
+    # PatchMatch decides between nearly equal patches.
+    share = np.mean(np.abs(made.rgb - plain.rgb).max(-1) > 1e-3)
+    assert share < (0.1 if name == "exemplar" else 0.005)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("what", "bad"), [("rgb", np.nan), ("depth", np.inf), ("confidence", np.nan)]
+)
+def test_memory_that_is_not_finite_is_refused_and_named_and_holes_may_hold_it(
+    folders, name, what, bad
+):
+    known = micro.guidance(1, size=SIZE)
+    context = micro.context_views(2)
+    row, column = np.argwhere(known.valid[0])[5]
+    spoilt = {what: getattr(known, what).copy()}
+    spoilt[what][0, row, column] = bad
+    with pytest.raises(ShapeError, match=r"view target_1_0: 1 pixel\(s\) hold NaN"):
+        complete(folders, name, context, replace(known, **spoilt))
+    holes = {what: getattr(known, what).copy()}
+    holes[what][~known.valid] = bad
+    made = complete(folders, name, context, replace(known, **holes))
+    plain = complete(folders, name, context, known)
+    np.testing.assert_array_equal(made.rgb, plain.rgb)
+    np.testing.assert_array_equal(made.depth, plain.depth)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("name", NAMES)
+def test_photographs_that_are_not_finite_are_refused_and_named(folders, name, bad):
+    context = micro.context_views(2)
+    context[1].rgb[3, 4, 0] = bad
+    with pytest.raises(ShapeError, match=r"view photo_0_1: 1 pixel\(s\) hold NaN"):
+        complete(folders, name, context, micro.guidance(1, size=SIZE))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_depth_of_a_photograph_that_is_none_counts_as_none(folders, name, bad):
+    known = micro.guidance(1, size=SIZE)
+    views = micro.context_views(2)
+    spoilt = [replace(v, depth=np.full(v.rgb.shape[:2], bad, np.float32)) for v in views]
+    without = [replace(v, depth=None) for v in views]
+    made, plain = (complete(folders, name, context, known) for context in (spoilt, without))
+    np.testing.assert_array_equal(made.rgb, plain.rgb)
+    np.testing.assert_array_equal(made.depth, plain.depth)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_arrays_that_do_not_fit_each_other_are_refused(folders, name):
+    known = micro.guidance(1, size=SIZE)
+    for changes in (
+        {"rgb": known.rgb[..., :1]},
+        {"depth": known.depth[:, :-1]},
+        {"valid": known.valid[0]},
+    ):
+        with pytest.raises(ShapeError, match="guidance"):
+            complete(folders, name, micro.context_views(1), replace(known, **changes))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (65, 47), (128, 128)])
+def test_one_known_pixel_fills_everything_and_none_fills_nothing(dtype, size):
+    values = torch.full((1, 2, *size), float("nan"), dtype=dtype)
+    valid = torch.zeros(1, 1, *size, dtype=torch.bool)
+    assert not push_pull(values, valid).any()
+    assert not push_pull_depth(values[:, :1], valid).any()
+    valid[..., -1, -1], values[..., -1, -1] = True, 2.5
+    rounding = 4 * torch.finfo(dtype).eps
+    for filled in (push_pull(values, valid), push_pull_depth(values[:, :1], valid)):
+        torch.testing.assert_close(filled, torch.full_like(filled, 2.5), rtol=rounding, atol=0)
+
+
+@pytest.mark.parametrize("depth", [1e-37, 1e-20, 1e20, 3e38])
+def test_depth_of_any_size_is_filled(depth):
+    values = torch.full((1, 1, 9, 9), depth)
+    valid = torch.zeros(1, 1, 9, 9, dtype=torch.bool)
+    valid[..., :3] = True
+    filled = push_pull_depth(values, valid)
+    # A rounding of the logarithm, 88 at most, is so much of the depth.
+    torch.testing.assert_close(filled / depth, torch.ones_like(filled), rtol=3e-5, atol=0)
+
+
+def halves() -> tuple[torch.Tensor, torch.Tensor]:
+    """Pictures (1, 3, 16, 16) and the validity of their left half."""
+    generator = torch.Generator().manual_seed(0)
+    valid = torch.zeros(1, 1, 16, 16, dtype=torch.bool)
+    valid[..., :8] = True
+    return torch.rand(1, 3, 16, 16, generator=generator) + 0.5, valid
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("side", ["made", "hint"])
+@pytest.mark.parametrize("column", [2, 12])
+def test_a_pixel_that_went_wrong_spoils_no_other_of_a_correction(bad, side, column):
+    filled, valid = halves()
+    decoded = {"made": filled * 1.1, "hint": filled.flip(-1)}
+    plain = corrected_color(filled, **decoded, valid=valid)
+    plain_depth = corrected_depth(filled[:, :1], **first(decoded), valid=valid)
+    decoded[side] = decoded[side].clone()
+    decoded[side][..., 3, column] = bad
+    color = corrected_color(filled, **decoded, valid=valid)
+    assert (~color.isfinite()).any(1).sum() == 1
+    depth = corrected_depth(filled[:, :1], **first(decoded), valid=valid)
+    assert (~depth.isfinite()).sum() <= 1
+    others = torch.ones(16, 16, dtype=torch.bool)
+    others[3, column] = False
+    # A pixel less to continue from moves the holes a little, and memory's own pixels not at all.
+    for found, wanted in ((color, plain), (depth, plain_depth)):
+        gap = (found - wanted).abs()[..., others]
+        assert gap.max() < (0.2 if column == 2 else 1e-6)
+
+
+def first(decoded: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name: value[:, :1] for name, value in decoded.items()}
+
+
+def test_a_correction_of_depth_saturates():
+    filled, valid = halves()
+    wild = torch.where(valid, filled[:, :1], filled[:, :1] * 1e30)
+    for made, hint, factor in ((wild, filled[:, :1], MOST), (filled[:, :1], wild, 1 / MOST)):
+        found = corrected_depth(filled[:, :1], made, hint, valid)
+        hole = ~valid
+        torch.testing.assert_close(found[hole], factor * filled[:, :1][hole])
+
+
+@pytest.mark.parametrize("share", [0, 1])
+def test_corrections_without_memory_and_without_holes(share):
+    filled, _ = halves()
+    valid = torch.full((1, 1, 16, 16), bool(share))
+    made, hint = filled * 1.2, filled
+    color = corrected_color(filled, made, hint, valid)
+    torch.testing.assert_close(color, filled if share else made)

@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvtools.cameras import Cameras
+from gvtools.errors import ShapeError
+from gvtools.evaluation.consistency.depth_reprojection import (
+    depth_reprojection,
+    depth_reprojection_of_views,
+)
+from gvtools.evaluation.consistency.feature_consistency import feature_consistency
+from gvtools.evaluation.posed_picture import PosedPicture
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+SIZE = (24, 32)
+NOISE = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
+EVERYWHERE = np.ones(SIZE, np.bool_)
+
+
+def wall(
+    *,
+    depth: float | None = 2.0,
+    shift: float = 0.0,
+    rgb: np.ndarray = NOISE,
+    mask: np.ndarray | None = None,
+) -> PosedPicture:
+    """A wall at ``depth``, seen from ``shift`` along x."""
+    size = rgb.shape[:2]
+    pose = np.eye(4)
+    pose[0, 3] = -shift
+    K = np.array([[[30.0, 0, size[1] / 2], [0, 30, size[0] / 2], [0, 0, 1]]])
+    camera = Cameras(K, pose[None], np.array([size[1]]), np.array([size[0]]), ("c",))
+    lengths = None if depth is None else np.full(size, depth, np.float32)
+    return PosedPicture(f"at {shift:g}", camera, rgb, lengths, mask)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(-36, 36), st.sampled_from([0.0, 0.1, 0.5]))
+def test_exact_depth_agrees_in_any_unit(power, step):
+    unit = 10.0**power
+    first, second = wall(depth=2 * unit), wall(depth=2 * unit, shift=step * unit)
+    found = depth_reprojection(first, second)
+    assert found.ok
+    assert found.mean_pixels == pytest.approx(0, abs=1e-10)
+    assert found.mean_relative_depth == pytest.approx(0, abs=1e-12)
+    # The wall moves by 30 step / 2 pixels.
+    assert found.covisible == pytest.approx(24 * (32 - 15 * step), abs=24)
+
+
+@pytest.mark.parametrize("depth", [np.nan, np.inf, -np.inf, 0.0, -1.0, None])
+def test_depth_that_is_none_gives_a_status_and_no_figure(depth):
+    for first, second in ((wall(depth=depth), wall()), (wall(), wall(depth=depth))):
+        found = depth_reprojection(first, second)
+        assert found.status.startswith("empty: ")
+        assert found.mean_pixels is found.mean_relative_depth is None
+        features = feature_consistency(first, second)
+        assert features.status.startswith("empty: ")
+        assert features.score is None and features.places == 0
+
+
+def test_masks_of_nothing_and_of_everything():
+    assert depth_reprojection(wall(mask=~EVERYWHERE), wall()).known == 0
+    unseen = depth_reprojection(wall(), wall(mask=~EVERYWHERE))
+    assert unseen.unknown_share == 1 and not unseen.ok
+    assert depth_reprojection(wall(mask=EVERYWHERE), wall()) == depth_reprojection(wall(), wall())
+    for kind in (np.uint8, np.float32):
+        with pytest.raises(ShapeError, match="expected bool"):
+            wall(mask=EVERYWHERE.astype(kind))
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_constant_pictures_agree_in_depth_and_tell_nothing_by_features(value):
+    flat = np.full_like(NOISE, value)
+    assert depth_reprojection(wall(rgb=flat), wall(rgb=flat, shift=0.1)).ok
+    found = feature_consistency(wall(rgb=flat), wall(rgb=flat, shift=0.1))
+    assert found.status.startswith("degenerate: ")
+    assert found.score is None
+    assert found.overlap > 0.9
+
+
+def test_black_against_white_is_as_far_as_colours_go():
+    found = feature_consistency(wall(rgb=NOISE * 0), wall(rgb=NOISE * 0 + 255))
+    assert found.score is not None and 1 < found.score <= 2
+
+
+def test_a_picture_agrees_with_itself():
+    found = feature_consistency(wall(), wall())
+    assert found.ok and found.score == pytest.approx(0, abs=1e-12)
+    assert found.overlap == 1
+
+
+def test_one_pixel_is_compared():
+    dot = NOISE[:1, :1]
+    found = depth_reprojection(wall(rgb=dot), wall(rgb=dot))
+    assert found.ok and found.covisible == 1 and found.mean_pixels == 0
+    assert feature_consistency(wall(rgb=dot), wall(rgb=dot)).status.startswith("degenerate: ")
+
+
+@pytest.mark.parametrize("pictures", [[], [wall()]])
+@pytest.mark.parametrize("pairs", ["all", "consecutive"])
+def test_no_view_and_one_view_have_a_status(pictures, pairs):
+    found = depth_reprojection_of_views(pictures, pairs=pairs)
+    assert found.status == f"empty: {len(pictures)} view(s); at least 2 are needed"
+    assert found.mean_pixels is found.covisible_share is None

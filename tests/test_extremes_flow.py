@@ -1,0 +1,295 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from gvtools.completers.geoverse.flow import (
+    MOST_SHIFT,
+    check_bounds,
+    clean_from_velocity,
+    integrate,
+    interpolate,
+    interval_bounds,
+    sample,
+    shift_time,
+    time_grid,
+    training_times,
+    unshift_time,
+    velocity_from_clean,
+    velocity_target,
+)
+from gvtools.completers.geoverse.noise import seeded_noise
+from gvtools.completers.geoverse.reflow import (
+    interval_times,
+    reflow_pair,
+    straight_velocity,
+    teacher_times,
+)
+from gvtools.errors import OptionError, ShapeError
+
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.filterwarnings("error")]
+
+DTYPES = (torch.float32, torch.bfloat16, torch.float16)
+# float32 carries the state: a thousand roundings of it, and one to the dtype.
+EXACT = {torch.float32: 1e-4, torch.bfloat16: 2e-2, torch.float16: 2e-3}
+SHAPE = (2, 3, 4, 5, 5)
+
+
+def states(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Clean latents and noise."""
+    first, second = (
+        seeded_noise(SHAPE, [[k, k + 1, k + 2], [k + 3, k + 4, k + 5]], dtype=dtype)
+        for k in (0, 10)
+    )
+    return first, second
+
+
+def toward(clean: Tensor) -> float:
+    """Largest size of a latent, the unit of its rounding."""
+    return float(clean.float().abs().max())
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("steps", [1, 2, 1000])
+def test_any_number_of_steps_reaches_the_clean_state_in_every_precision(dtype, steps):
+    clean, noise = states(dtype)
+    constant = velocity_target(clean, noise)
+
+    def shrinking(state: Tensor, t: Tensor) -> Tensor:
+        return velocity_from_clean(clean, state, t, least=1e-6)
+
+    for velocity in (lambda state, t: constant, shrinking):
+        for shift in (1.0, 1 / MOST_SHIFT, 6.0, MOST_SHIFT):
+            seen: list[Tensor] = []
+            made = sample(
+                velocity,
+                noise,
+                interval_bounds(steps, shift=shift),
+                callback=lambda step, t, state, seen=seen: seen.append(t),  # type: ignore[misc]
+            )
+            assert made.dtype == dtype
+            assert len(seen) == steps
+            assert not seen[-1].any()
+            gap = float((made.float() - clean.float()).abs().max())
+            assert gap <= EXACT[dtype] * toward(noise)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("batched", [False, True])
+def test_the_ends_of_the_path_are_its_ends_bit_for_bit(dtype, batched):
+    clean, noise = states(dtype)
+    for t, end in ((0.0, clean), (1.0, noise)):
+        time = torch.full((2,), t) if batched else t
+        assert torch.equal(interpolate(clean, noise, time), end)
+    velocity = velocity_target(clean, noise)
+    time = torch.ones(2) if batched else 1.0
+    gap = (clean_from_velocity(velocity, noise, time) - clean).float().abs().max()
+    assert float(gap) <= 2 * torch.finfo(dtype).eps * toward(velocity)
+    still = torch.zeros(2) if batched else 0.0
+    assert torch.equal(clean_from_velocity(velocity, clean, still), clean)
+    assert velocity_from_clean(clean, noise, still).isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_states_up_to_half_the_largest_number_are_sampled_and_beyond_it_saturate(dtype):
+    """u = noise - clean has to be a number of the dtype; the state itself may fill it."""
+    large = 0.49 * torch.finfo(dtype).max
+    clean, noise = torch.full((1, 1), -large, dtype=dtype), torch.full((1, 1), large, dtype=dtype)
+    velocity = velocity_target(clean, noise)
+    assert velocity.isfinite().all()
+    made = sample(lambda state, t: velocity, noise, (1, 0.5, 0))
+    torch.testing.assert_close(made, clean)
+    assert velocity_target(2.02 * clean, 2.02 * noise).isinf().all()
+
+
+def test_a_result_beyond_float16_is_infinite_and_not_another_number():
+    state = torch.full((1, 1), 6e4, dtype=torch.float16)
+    made = integrate(lambda x, t: -x, state, (1.0, 0.0))
+    assert made.isposinf().all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.one_of(st.sampled_from([0.0, 1e-300, 1e-9, 1 - 1e-9, 1.0]), st.floats(0, 1)),
+    st.floats(-6, 6).map(lambda power: min(max(10.0**power, 1 / MOST_SHIFT), MOST_SHIFT)),
+)
+def test_shifted_times_stay_in_order_and_come_back(t, shift):
+    moved = shift_time(t, shift)
+    assert 0 <= moved <= 1
+    assert (moved == 0) == (t == 0) or t < 1e-290
+    assert shift_time(0.0, shift) == 0 and shift_time(1.0, shift) == 1
+    assert shift_time(torch.ones(1), shift).item() == 1
+    # One rounding of the shifted time is so much of the unshifted one.
+    assert unshift_time(moved, shift) == pytest.approx(t, abs=4e-16 * max(shift, 1 / shift))
+    # 1 - t' is the shift by 1 / s of 1 - t.
+    other = shift_time(1 - t, 1 / shift)
+    assert 1 - moved == pytest.approx(other, abs=4e-16 * max(shift, 1 / shift))
+    wide = shift_time(torch.tensor([t], dtype=torch.float64), shift)
+    assert wide.item() == pytest.approx(moved, rel=1e-15)
+
+
+@pytest.mark.parametrize("shift", [0.99 / MOST_SHIFT, 1.01 * MOST_SHIFT, 1e-300, 1e17, 1e300])
+def test_a_shift_that_rounds_times_away_is_refused(shift):
+    with pytest.raises(OptionError, match="time shift"):
+        shift_time(1.0, shift)
+    with pytest.raises(OptionError, match="time shift"):
+        interval_bounds(4, shift=shift)
+    ends = (torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+    with pytest.raises(OptionError, match="time shift"):
+        teacher_times(*ends, steps=4, shift=shift)
+
+
+@pytest.mark.parametrize("shift", [1 / MOST_SHIFT, 1.0, MOST_SHIFT])
+@pytest.mark.parametrize("steps", [1, 2, 1000, 100_000])
+def test_grids_of_any_length_fall_strictly(steps, shift):
+    assert len(check_bounds(interval_bounds(steps, shift=shift))) == steps + 1
+
+
+def test_more_steps_than_float64_tells_apart_are_refused():
+    for options in ({"start": 1.0, "end": 1 - 1e-16}, {"start": 5e-324}):
+        with pytest.raises(OptionError, match="than rounding"):
+            time_grid(5, **options)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=5))
+def test_bounds_are_falling_from_one_or_refused_in_one_line(values):
+    try:
+        bounds = check_bounds(values)
+    except OptionError as error:
+        assert "expected 1 = tau_0 > tau_1" in str(error) and "\n" not in str(error)
+        return
+    assert bounds[0] == 1 and bounds[-1] >= 0 and (np.diff(bounds) < 0).all()
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        [],
+        [1],
+        [math.nan, 0],
+        [1, math.nan],
+        [1, math.inf],
+        [1, -math.inf],
+        [1, 1],
+        [1, 0.5, 0.5],
+        [1, 0.2, 0.6],
+        [0, 1],
+        [1, 0, -1e-300],
+    ],
+)
+def test_bounds_that_are_none_reach_no_network(bounds):
+    def never(state: Tensor, t: Tensor) -> Tensor:
+        raise AssertionError("called")
+
+    with pytest.raises(OptionError, match="interval bounds"):
+        sample(never, torch.zeros(1, 2), bounds)
+    with pytest.raises(OptionError, match="interval bounds"):
+        interval_times(torch.zeros(1), torch.zeros(1), bounds)
+
+
+@pytest.mark.parametrize("times", [(), (1.0, math.nan, 0.0), (math.inf, 0.0)])
+def test_times_that_are_not_finite_are_refused(times):
+    with pytest.raises(ShapeError, match="times"):
+        integrate(lambda x, t: x, torch.ones(1, 2), times)
+
+
+def test_one_time_and_no_sample_change_nothing():
+    state = torch.ones(1, 2)
+    assert torch.equal(integrate(lambda x, t: x, state, (1.0,)), state)
+    assert sample(lambda x, t: x, state[:0], (1, 0)).shape == (0, 2)
+
+
+@pytest.mark.parametrize("count", [0, 1, 1000])
+def test_guidance_by_a_network_that_is_not_finite_shows(count):
+    state = torch.ones(1, 2)
+    times = tuple(np.linspace(1, 0, count + 1))
+    made = integrate(lambda x, t: x * math.nan, state, times)
+    assert bool(made.isnan().all()) is (count > 0)
+
+
+def test_training_times_keep_their_ends_at_every_shift():
+    uniform = torch.tensor([0.0, 1 - 2**-24])
+    for shift in (1 / MOST_SHIFT, 1.0, MOST_SHIFT):
+        for most in (0.999, 1.0):
+            times = training_times(uniform, shift=shift, most=most)
+            assert times[0] == 0 and 0 < times[1] <= 1
+    for most in (0.0, 1.1, math.nan):
+        with pytest.raises(OptionError, match="training time"):
+            training_times(uniform, most=most)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.floats(0.001, 0.95),
+    st.floats(-3.99, -0.5).map(lambda power: 10.0**power),
+    st.one_of(st.sampled_from([0.0, 1 - 2**-24]), st.floats(0, 1 - 2**-24, width=32)),
+)
+def test_times_drawn_from_the_shortest_intervals_are_learnt_from(lower, width, share):
+    upper = min(lower + width, 0.999)
+    bounds = (1.0, upper, lower, 0.0)
+    which = torch.tensor([0.5])
+    intervals, t = interval_times(which, torch.tensor([share]), bounds)
+    clean, noise = torch.zeros(1, 2), torch.ones(1, 2)
+    pair = reflow_pair(
+        lambda state, t: torch.ones_like(state), clean, noise,
+        intervals=intervals, t=t, bounds=bounds, steps=1,
+    )  # fmt: skip
+    # The straight path's state is its time, to the rounding of the time.
+    assert pair.state.isfinite().all() and pair.velocity.isfinite().all()
+    torch.testing.assert_close(pair.state, t[:, None].expand(1, 2), atol=2e-7, rtol=0)
+    # A difference of states, rounded, over the interval.
+    torch.testing.assert_close(pair.velocity, torch.ones(1, 2), atol=4e-7 / (upper - lower), rtol=0)
+
+
+@pytest.mark.parametrize("width", [9e-5, 1e-8, 1e-15])
+def test_intervals_within_the_rounding_of_states_are_not_learnt_from(width):
+    with pytest.raises(OptionError, match="expected at least"):
+        reflow_pair(
+            lambda state, t: state, torch.zeros(1, 2), torch.ones(1, 2),
+            intervals=torch.tensor([1]), t=torch.tensor([0.5]),
+            bounds=(1, 0.5, 0.5 - width, 0), steps=1,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("t", [math.nan, math.inf, 0.49, 1.01])
+def test_a_time_that_is_none_of_its_interval_is_refused(t):
+    with pytest.raises(OptionError, match="outside"):
+        reflow_pair(
+            lambda state, t: state, torch.zeros(1, 2), torch.ones(1, 2),
+            intervals=torch.tensor([0]), t=torch.tensor([t]), bounds=(1, 0.5, 0), steps=1,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("which", [math.nan, -1.0])
+def test_a_draw_that_is_none_gives_no_interval(which):
+    with pytest.raises(OptionError, match="intervals"):
+        interval_times(torch.tensor([which]), torch.zeros(1), (1, 0.5, 0))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_one_and_a_thousand_teacher_steps_agree_on_a_straight_path(dtype):
+    clean, noise = states(dtype)
+    intervals, t = torch.tensor([0, 2]), torch.tensor([1.0, 0.0])
+    velocity = velocity_target(clean, noise)
+    for steps in (1, 1000):
+        pair = reflow_pair(
+            lambda state, t: velocity, clean, noise,
+            intervals=intervals, t=t, bounds=(1, 2 / 3, 1 / 3, 0), steps=steps,
+        )  # fmt: skip
+        assert torch.equal(pair.state[0], noise[0])
+        unit = EXACT[dtype] * toward(velocity)
+        torch.testing.assert_close(pair.state[1], clean[1], atol=unit, rtol=0)
+        torch.testing.assert_close(pair.velocity, velocity, atol=6 * unit, rtol=0)
+
+
+def test_the_velocity_of_a_short_interval_is_that_of_float32_states():
+    start, end = torch.tensor([[1.0]]), torch.tensor([[1.0 - 2**-20]])
+    found = straight_velocity(start, end, upper=0.5, lower=0.5 - 2**-20)
+    assert found.item() == 1

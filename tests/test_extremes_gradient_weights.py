@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvtools.completers.geoverse.objective.gradient_weights import (
+    DELTA,
+    gradient_weights,
+    linear_quantiles,
+)
+from gvtools.completers.geoverse.objective.losses import high_gradient_loss, rgb_loss
+
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.filterwarnings("error")]
+
+SIZE = (9, 11)
+
+
+def pictures(*, size: tuple[int, int] = SIZE, views: int = 2) -> torch.Tensor:
+    return torch.rand(1, views, 3, *size, generator=torch.Generator().manual_seed(0))
+
+
+def everywhere(images: torch.Tensor) -> torch.Tensor:
+    return torch.ones(*images.shape[:2], *images.shape[-2:], dtype=torch.bool)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.floats(-1e4, 1e4),
+    st.sampled_from([torch.float16, torch.bfloat16, torch.float32, torch.float64]),
+    st.tuples(st.integers(1, 9), st.integers(1, 9)),
+)
+def test_constant_pictures_of_any_brightness_size_and_precision_have_no_weight(value, dtype, size):
+    images = torch.full((1, 2, 3, *size), value, dtype=dtype)
+    assert not gradient_weights(images, everywhere(images)).any()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0, 1), st.floats(-3, 6))
+def test_equal_quantiles_weigh_by_the_gradient_over_delta(share, power):
+    """With q_low = q_high the denominator is DELTA alone: gradients above it have weight 1."""
+    images = pictures() * 10.0**power
+    weights = gradient_weights(images, everywhere(images), low=share, high=share)
+    assert weights.isfinite().all() and weights.min() >= 0 and weights.max() <= 1
+    if share < 0.9 and power > 0:
+        assert ((weights == 0) | (weights == 1)).float().mean() > 0.99
+        assert weights.mean().item() == pytest.approx(1 - share, abs=0.02)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(-3, 37))
+def test_weights_do_not_depend_on_contrast_until_float32_ends(power):
+    images = pictures()
+    plain = gradient_weights(images, everywhere(images))
+    scaled = gradient_weights(images * 10.0**power, everywhere(images))
+    # Contrasts near DELTA are damped by it.
+    torch.testing.assert_close(scaled, plain, atol=1e-5 + 3 * DELTA / 10.0**power, rtol=0)
+
+
+def test_contrasts_far_below_delta_fade():
+    images = pictures() * 1e-12
+    assert gradient_weights(images, everywhere(images)).max() < 1e-5
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 2)])
+def test_the_smallest_pictures_have_weights(size):
+    images = pictures(size=size)
+    weights = gradient_weights(images, everywhere(images))
+    assert weights.shape == (1, 2, *size)
+    assert weights.isfinite().all()
+    assert bool(weights.any()) is (size != (1, 1))
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf, 3e38])
+def test_masks_of_nothing_and_of_one_pixel_leave_no_trace_of_the_rest(poison):
+    images = torch.full((1, 2, 3, *SIZE), poison)
+    valid = torch.zeros(1, 2, *SIZE, dtype=torch.bool)
+    assert not gradient_weights(images, valid).any()
+    valid[0, 1, 4, 4] = True
+    images[0, 1, :, 4, 4] = 0.5
+    assert not gradient_weights(images, valid).any()
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("loss", [rgb_loss, high_gradient_loss])
+def test_reference_pixels_that_are_not_finite_count_as_absent_in_the_losses(loss, poison):
+    reference = pictures()
+    predicted = (reference + 0.1).requires_grad_()
+    spoilt = reference.clone()
+    spoilt[0, 0, 1, 2:5, 3:6] = poison
+    masked = everywhere(reference)
+    masked[0, 0, 2:5, 3:6] = False
+    found = loss(predicted, spoilt)
+    assert found.item() == pytest.approx(loss(predicted, reference, valid=masked).item())
+    (gradient,) = torch.autograd.grad(found.sum(), predicted)
+    assert gradient.isfinite().all() and not gradient[0, 0, :, 2:5, 3:6].any()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-(2.0**100), 2.0**100, width=32), st.integers(1, 50), st.floats(0, 1))
+def test_quantiles_of_equal_values_are_that_value(value, count, share):
+    found = linear_quantiles(torch.full((count,), value), (0.0, share, 1.0))
+    assert [each.item() for each in found] == [value] * 3

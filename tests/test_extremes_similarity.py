@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
+from gvtools.similarity import COLLINEAR, SimilarityFit, align_depth_scale, fit_similarity
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+SPACE = (1.0, 0.7, 0.4)
+PLANE = (1.0, 0.7, 0.0)
+LINE = (1.0, 0.0, 0.0)
+CUBE = np.array(list(product((-1, 1), repeat=3)), np.float64)
+# Every coordinate is a product of two of the cube's: as far apart, and uncorrelated with it.
+UNRELATED = CUBE * np.roll(CUBE, 1, axis=1)
+
+
+def spread(count: int, axes: tuple[float, float, float], *, seed: int = 0) -> np.ndarray:
+    """Points about the origin, in an arbitrary orientation, with the spread along three axes."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (count, 3)) * axes
+    return (points - points.mean(0)) @ Rotation.random(rng=rng).as_matrix().T
+
+
+def turn(seed: int = 1) -> np.ndarray:
+    return Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+
+
+def is_degenerate(fit: SimilarityFit, reason: str) -> bool:
+    numbers = [fit.scale, fit.rmse, *fit.rotation.ravel(), *fit.translation, *fit.residuals]
+    return not fit.ok and reason in fit.status and bool(np.isnan(numbers).all())
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(-300, 300),
+    st.integers(-300, 300),
+    st.integers(3, 8),
+    st.sampled_from([SPACE, PLANE]),
+    st.booleans(),
+)
+def test_any_units_give_the_similarity_between_them(first, second, count, axes, weighted):
+    assume(abs(second - first) < 300)
+    points, rotation = spread(count, axes, seed=count), turn()
+    thickness = np.linalg.svd(points, compute_uv=False)
+    assume(thickness[1] > 0.01 * thickness[0])
+    fit = fit_similarity(
+        points * 10.0**first,
+        points @ rotation.T * 10.0**second,
+        weights=np.ones(count) if weighted else None,
+    )
+    assert fit.ok
+    assert fit.scale * 10.0 ** (first - second) == pytest.approx(1, rel=1e-12)
+    np.testing.assert_allclose(fit.rotation, rotation, atol=1e-11)
+    assert fit.rmse <= 1e-13 * 10.0**second
+
+
+@pytest.mark.parametrize("unit", [1e-300, 1e-160, 1e-9, 1e9, 1e160, 1e300])
+def test_a_rigid_motion_is_found_in_any_unit(unit):
+    points, rotation = spread(6, SPACE) * unit, turn()
+    fit = fit_similarity(points, points @ rotation.T, with_scale=False)
+    assert fit.scale == 1
+    np.testing.assert_allclose(fit.rotation, rotation, atol=1e-12)
+    assert fit.rmse < 1e-13 * unit
+
+
+def test_a_ratio_of_units_beyond_float64_is_degenerate():
+    points = spread(6, SPACE)
+    for first, second in ((1e-200, 1e200), (1e200, 1e-200), (1e-300, 1e300)):
+        fit = fit_similarity(points * first, points * second)
+        assert is_degenerate(fit, "float64 does not hold")
+    # A rigid motion leaves what the units differ by as its residual, squares included.
+    apart = fit_similarity(points * 1e140, points, with_scale=False)
+    assert apart.ok and apart.rmse == pytest.approx(1e140 * np.sqrt((points**2).sum(1).mean()))
+    too_far = fit_similarity(points * 1e200, points, with_scale=False)
+    assert is_degenerate(too_far, "float64 does not hold")
+
+
+@pytest.mark.parametrize("unit", [1e-300, 1e-9, 1.0, 1e9, 1e300])
+@pytest.mark.parametrize(
+    ("points", "reason"),
+    [
+        (spread(2, SPACE), "2 point pair(s)"),
+        (spread(3, LINE), "collinear"),
+        (spread(9, LINE), "collinear"),
+        (np.repeat(spread(1, SPACE) + 0.3, 5, axis=0), "coincident"),
+        (np.repeat(spread(2, SPACE), 4, axis=0), "collinear"),
+        (np.zeros((4, 3)), "coincident"),
+    ],
+)
+def test_what_leaves_the_rotation_open_is_degenerate_in_any_unit(points, reason, unit):
+    other = spread(len(points), SPACE, seed=5)
+    assert is_degenerate(fit_similarity(points * unit, other), reason)
+    assert is_degenerate(fit_similarity(other, points * unit), reason)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_the_limit_of_a_line_is_a_share_of_its_length(unit):
+    along = np.linspace(-1, 1, 41)
+    across = np.where(np.arange(41) % 2, 1.0, -1.0) * np.sqrt(np.mean(along**2))
+    for share, ok in ((1.1 * COLLINEAR, True), (0.9 * COLLINEAR, False)):
+        points = np.stack([along, share * across, 0 * along], 1)
+        points -= points.mean(0)
+        rotation = turn()
+        fit = fit_similarity(points * unit, points @ rotation.T)
+        assert fit.ok is ok
+        if ok:
+            np.testing.assert_allclose(fit.rotation, rotation, atol=1e-11)
+
+
+@pytest.mark.parametrize("weights", [None, np.ones(6)])
+def test_points_whose_differences_leave_float64_are_degenerate(weights):
+    points = 1.79e308 * np.sign(spread(6, SPACE))
+    for pair in ((points, spread(6, SPACE)), (spread(6, SPACE), points)):
+        assert is_degenerate(fit_similarity(*pair, weights=weights), "overflowing")
+    centres = torch.from_numpy(points)[None]
+    assert center_similarity(centres, centres).status == ("fewer than 2 valid centres",)
+
+
+def test_points_without_correlation_have_no_fit():
+    assert is_degenerate(fit_similarity(CUBE, UNRELATED), "correspond")
+    weighted = fit_similarity(CUBE, UNRELATED, weights=np.ones(8))
+    assert is_degenerate(weighted, "correspond")
+
+
+@pytest.mark.parametrize("with_scale", [True, False])
+def test_a_mirror_image_is_flagged_or_degenerate_where_no_rotation_is_best(with_scale):
+    assert is_degenerate(fit_similarity(CUBE, -CUBE, with_scale=with_scale), "mirror image")
+    points = spread(8, SPACE)
+    fit = fit_similarity(points, points * (1, 1, -1), with_scale=with_scale)
+    assert fit.ok and fit.mirrored
+    assert np.linalg.det(fit.rotation) == pytest.approx(1)
+    flat = spread(8, SPACE) * (1, 1, 0)
+    assert not fit_similarity(flat, flat * (-1, 1, 1), with_scale=with_scale).mirrored
+
+
+def test_rows_of_weight_zero_may_hold_anything_finite():
+    points, rotation = spread(6, SPACE), turn()
+    clean = fit_similarity(points, points @ rotation.T, weights=np.ones(6))
+    for far in (1e20, 1e200, 1e308):
+        source = np.concatenate([[[far, 0, -far]], points])
+        target = np.concatenate([[[0, far, far]], points @ rotation.T])
+        fit = fit_similarity(source, target, weights=[0, 1, 1, 1, 1, 1, 1])
+        assert (fit.scale, fit.rmse) == (clean.scale, clean.rmse)
+        np.testing.assert_array_equal(fit.rotation, clean.rotation)
+
+
+@pytest.mark.parametrize("weight", [1e-310, 1e-300, 1e300, 1.7e308])
+def test_weights_count_by_their_ratios_alone(weight):
+    rng = np.random.default_rng(0)
+    points = spread(6, SPACE)
+    target = points @ turn().T + 0.01 * rng.standard_normal((6, 3))
+    share = np.array([1, 1, 0.5, 0.25, 1, 1])
+    fit, plain = (fit_similarity(points, target, weights=w) for w in (share * weight, share))
+    assert fit.scale == pytest.approx(plain.scale, rel=1e-12)
+    assert fit.rmse == pytest.approx(plain.rmse, rel=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.one_of(
+        st.sampled_from([0.0, 1e-300, 1e-16, 1e-8, np.pi - 1e-8, np.pi - 1e-15, np.pi]),
+        st.floats(0, np.pi),
+    ),
+    st.integers(0, 100),
+    st.sampled_from([SPACE, PLANE]),
+)
+def test_rotations_near_none_and_near_a_half_turn_are_found(angle, seed, axes):
+    axis = np.random.default_rng(seed).standard_normal(3)
+    rotation = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+    points = spread(10, axes, seed=seed)
+    fit = fit_similarity(points, points @ rotation.T)
+    np.testing.assert_allclose(fit.rotation, rotation, atol=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(-38, 37), st.integers(-38, 37), st.integers(2, 6))
+def test_the_scale_of_float32_centres_is_found_or_said_not_to_fit(first, second, count):
+    points = spread(count, SPACE, seed=count)
+    predicted = torch.from_numpy(points * 10.0**first)[None].float()
+    reference = torch.from_numpy(points @ turn().T * 10.0**second)[None].float()
+    fit = center_similarity(predicted, reference)
+    if abs(second - first) < 37:
+        assert fit.status == ("aligned",)
+        wanted = (reference.double().norm() / predicted.double().norm()).item()
+        # Below 1e-38 float32 loses digits of the centres, and of the scale.
+        assert fit.scale.item() == pytest.approx(wanted, rel=1e-3)
+    elif not fit.ok.item():
+        assert fit.status == ("a scale that the type does not hold",)
+        assert fit.scale.isnan().all() and fit.translation.isnan().all()
+    else:
+        assert fit.scale.isfinite().all() and (fit.scale > 0).all()
+
+
+@pytest.mark.parametrize("unit", [1e-300, 1e-200, 1e-9, 1e9, 1e200, 1e299])
+def test_float64_centres_have_their_scale_and_its_gradient_in_any_unit(unit):
+    predicted = torch.from_numpy(spread(5, SPACE) * unit)[None].requires_grad_()
+    reference = torch.from_numpy(spread(5, SPACE) @ turn().T * 3)[None]
+    fit = center_similarity(predicted, reference)
+    assert fit.scale.item() * unit == pytest.approx(3, rel=1e-12)
+    if 1e-100 < unit < 1e100:
+        # s(c x) = s(x) / c: along the points themselves, the scale falls as fast as it is large.
+        (fit.scale * unit).sum().backward()
+        assert predicted.grad is not None
+        along = float((predicted.grad * predicted.detach()).sum())
+        assert along == pytest.approx(-3, rel=1e-10)
+
+
+def test_a_translation_beyond_the_type_is_said():
+    points = torch.from_numpy(spread(4, SPACE))[None].float()
+    fit = center_similarity(points * 1e-5 + 10, points * 1e30)
+    assert fit.ok.item() is bool(fit.translation.isfinite().all())
+    assert not center_similarity(points * 1e-4 + 10, points * 3e37).ok.item()
+
+
+DEPTH = np.random.default_rng(0).uniform(1, 5, (20, 30))
+ALL = np.ones(DEPTH.shape, bool)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(-300, 300))
+def test_depth_scales_of_any_size_are_found(power):
+    fit = align_depth_scale(DEPTH, DEPTH * 10.0**power, valid=ALL)
+    assert fit.ok
+    assert fit.scale == pytest.approx(10.0**power, rel=1e-11)
+    assert fit.inliers == DEPTH.size
+
+
+@pytest.mark.parametrize("power", [160, -160])
+def test_a_depth_scale_beyond_float64_is_unsupported(power):
+    fit = align_depth_scale(DEPTH * 10.0**power, DEPTH * 10.0**-power, valid=ALL)
+    assert "float64" in fit.status and np.isnan(fit.scale)
+
+
+def test_wild_depths_do_not_pull_the_scale():
+    depth = np.where(np.arange(30) % 3 == 0, DEPTH * 1e-300, DEPTH)
+    fit = align_depth_scale(depth, DEPTH * 2, valid=ALL)
+    assert fit.scale == pytest.approx(2, rel=1e-9)
+
+
+@pytest.mark.parametrize("weight", [1e-310, 1e308])
+def test_confidences_count_by_their_ratios_alone(weight):
+    fit = align_depth_scale(DEPTH, DEPTH * 2, valid=ALL, confidence=np.full(DEPTH.shape, weight))
+    assert fit.scale == pytest.approx(2, rel=1e-9)
+
+
+@pytest.mark.parametrize("least", [0, 1, 200])
+@pytest.mark.parametrize(
+    ("depth", "valid"),
+    [(DEPTH, ~ALL), (DEPTH * np.nan, ALL), (-DEPTH, ALL), (DEPTH[:0], ALL[:0])],
+)
+def test_no_common_pixel_has_no_scale(depth, valid, least):
+    reference = np.abs(np.nan_to_num(depth)) + 1
+    fit = align_depth_scale(depth, reference, valid=valid, min_support=least)
+    assert fit.status.startswith("unsupported: 0 common pixels")
+    assert np.isnan(fit.scale) and fit.support == 0
+
+
+def test_constant_depth_and_one_pixel_have_a_scale_where_that_is_enough():
+    assert align_depth_scale(ALL * 2.0, ALL * 6.0, valid=ALL).scale == pytest.approx(3, rel=1e-12)
+    one = align_depth_scale([[2.0]], [[6.0]], valid=[[True]], min_support=1)
+    assert one.scale == pytest.approx(3, rel=1e-12)
