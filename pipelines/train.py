@@ -36,7 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=(*STAGES, "all"),
         default="all",
         help="encoder: pretraining of a small encoder with its heads; denoiser: both denoisers; "
-        "reflow: distillation to few steps; all: one after the other (%(default)s)",
+        "reflow: distillation to few steps; rays: a small encoder's ray head alone; all: those "
+        "that the training has, one after the other (%(default)s)",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the training")
     parser.add_argument(
@@ -81,10 +82,12 @@ def run(args: argparse.Namespace, console: Console) -> None:
     if args.until is not None and args.until < 1:
         raise OptionError(f"--until {args.until}; expected at least step 1")
     init = _init_folder(args.init)
-    stages: tuple[str, ...] = STAGES if args.stage == "all" else (args.stage,)
-    if args.stage == "all" and init is not None and not _is_own(init):
-        # A published encoder has its training behind it.
-        stages = tuple(stage for stage in STAGES if stage != "encoder")
+    stages: tuple[str, ...] = (args.stage,)
+    if args.stage == "all":
+        stages = tuple(stage for stage in STAGES if getattr(config, stage) is not None)
+        if init is not None and not _is_own(init):
+            # A published encoder has its training behind it.
+            stages = tuple(stage for stage in stages if stage != "encoder")
     figures: dict[str, dict[str, float]] = {}
     with started(args.device) as processes:
         for stage in stages:

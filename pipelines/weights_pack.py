@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 
 from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pretrained
+from gvtools.completers.geoverse.weights.folder_parts import config_of
 from gvtools.completers.geoverse.weights.published import CONFIG_FILE, WHOLE_FILE
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
@@ -35,7 +36,8 @@ def pack(training: Path, out: Path) -> Path:
     Raises:
         ProjectError: no stage has finished, or ``out`` is within the training.
     """
-    finished = [name for name in STAGES[1:] if (training / name / WEIGHTS).is_dir()]
+    folders = [training / name / WEIGHTS for name in STAGES]
+    finished = [folder for folder in folders if folder.is_dir() and config_of(folder).trained]
     if not finished:
         raise ProjectError(
             f"{training}: no finished denoiser; expected {training / 'denoiser' / WEIGHTS}; run "
@@ -43,7 +45,7 @@ def pack(training: Path, out: Path) -> Path:
         )
     if out.resolve().is_relative_to(training.resolve()):
         raise ProjectError(f"{out} lies within the training {training}; choose another folder")
-    source = training / finished[-1] / WEIGHTS
+    source = finished[-1]
     model = from_pretrained(source)
     out.mkdir(parents=True, exist_ok=True)
     save_pretrained(model, out, dtype=DTYPE)

@@ -35,12 +35,13 @@ def weights_of(folder: Path) -> dict[str, torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
-    """All three stages, a few steps each."""
+    """All four stages, a few steps each."""
     out = tmp_path_factory.mktemp("training")
     torch.set_num_threads(1)
     assert train(out, "encoder", *steps("encoder", 24)) == 0
     assert train(out, "denoiser", *steps("denoiser", 6)) == 0
     assert train(out, "reflow", *steps("reflow", 3)) == 0
+    assert train(out, "rays", *steps("rays", 4)) == 0
     return out
 
 
@@ -64,6 +65,20 @@ def test_the_loss_falls_and_every_stage_leaves_weights_that_load(trained):
         for name, tensor in student.state_dict().items()
         if name.startswith("level1.")
     )
+
+
+def test_the_last_stage_moves_the_ray_head_alone(trained):
+    student, last = weights_of(trained / "reflow"), weights_of(trained / "rays")
+    moved = {name for name, tensor in last.items() if not torch.equal(tensor, student[name])}
+    assert moved and all(name.startswith("geometry.head.") and "_aux" in name for name in moved)
+    assert from_pretrained(trained / "rays" / "weights").config.trained
+    record = read_log(trained / "rays")[-1]
+    assert record["origin"] > 0 and record["direction"] > 0
+
+
+def test_a_training_without_ray_stage_says_so(tmp_path, capsys):
+    assert main(["train", "base", "--stage", "rays", "--out", str(tmp_path / "base")]) == 2
+    assert "this training has no stage rays" in capsys.readouterr().err
 
 
 def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
@@ -128,11 +143,11 @@ def test_two_processes_see_what_one_would(tmp_path):
 def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
     out = tmp_path / "packed"
     assert main(["weights", "pack", str(trained), str(out)]) == 0
-    assert str(trained / "reflow" / "weights") in capsys.readouterr().out
-    student, packed = weights_of(trained / "reflow"), from_pretrained(out).state_dict()
+    assert str(trained / "rays" / "weights") in capsys.readouterr().out
+    student, packed = weights_of(trained / "rays"), from_pretrained(out).state_dict()
     for name, tensor in student.items():
         assert torch.allclose(packed[name], tensor, rtol=2e-3, atol=1e-5), name
-    whole = (trained / "reflow" / "weights" / "geoverse.safetensors").stat().st_size
+    whole = (trained / "rays" / "weights" / "geoverse.safetensors").stat().st_size
     assert (out / "geoverse.safetensors").stat().st_size < 0.6 * whole
     settings = json.loads((out / "training_encoder.json").read_text())
     assert settings["encoder"]["optimizer"]["steps"] == 24 and settings["data"]["cache"] is None

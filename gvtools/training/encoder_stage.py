@@ -7,6 +7,8 @@ camera centres are in units of the mean context depth, in the frame of the first
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
@@ -18,7 +20,7 @@ from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective.losses import high_gradient_loss
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
-from gvtools.training.options import EncoderStageOptions
+from gvtools.training.options import EncoderStageOptions, RayStageOptions
 
 # Pull of the confidence towards certainty against the error (DA3, VGGT).
 CONFIDENCE_REWARD = 0.2
@@ -40,19 +42,20 @@ class EncoderStage(nn.Module):
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
         model, options = self.model, self.options
-        geometry, noised = self._heads(batch, draws)
-        rgb = model.rgb_head(torch.cat(noised, dim=-1).flatten(0, 1), self._grid(batch)).unflatten(
-            0, batch.images.shape[:2]
-        )
+        features = noised_features(model, batch, draws, options)
+        grid = model.geometry.encoder.grid(*batch.views.size)
+        geometry = model.geometry.head(features.levels, grid)
+        rgb = model.rgb_head(torch.cat(features.levels, dim=-1).flatten(0, 1), grid)
+        rgb = rgb.unflatten(0, batch.images.shape[:2])
         unit = scene_unit(batch)
         depth = batch.depth[:, :, 0] / unit[:, None, None, None]
         terms = {
             "depth": _depth_error(geometry, depth),
             "gradient": _gradient_error(geometry.depth, depth),
-            "ray": ray_error(geometry, batch, unit),
+            "ray": ray_error(geometry.ray, geometry.ray_confidence, batch),
             "rgb": (rgb - batch.images).abs().mean(),
             "hf": high_gradient_loss(rgb, batch.images).mean(),
-            "pose": self._pose_error(batch, unit),
+            "pose": self._pose_error(features.token, batch, unit),
         }
         total = sum(getattr(options, name) * value for name, value in terms.items())
         with torch.no_grad():
@@ -61,49 +64,60 @@ class EncoderStage(nn.Module):
             terms["depth_rel"] = (geometry.depth[known] / depth[known] - 1).abs().median()
         return torch.as_tensor(total), terms
 
-    def _heads(self, batch: TrainingBatch, draws: Draws) -> tuple[Geometry, list[Tensor]]:
-        """Geometry and normed features of all views, from noised levels 0 and 1."""
-        model, options = self.model, self.options
-        views = self._shown(batch, draws)
-        levels = encode_views(model.geometry, views, slice(None), model.config.hints)
-        amount = options.noise * draws.uniform("noise", 1, 1, 1).to(views.images.device)
-        noisy = []
-        for index, level in enumerate(levels):
-            spread = level.detach().float().std(dim=(1, 2), keepdim=True)
-            noise = draws.normal(f"noise{index}", level.shape, level.device)
-            noisy.append(level + amount * spread * noise)
-        drop = draws.uniform("level0", 1, 1, 1).to(level.device) < options.drop_level0
-        mean = noisy[0].detach().mean(dim=(1, 2), keepdim=True)
-        noisy[0] = torch.where(drop, mean, noisy[0])
-        encoder = model.geometry.encoder
-        grid = self._grid(batch)
-        pyramid = [*noisy, *encoder.propagate(noisy[1], grid)]
-        normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
-        self._last_token = pyramid[-1][:, :, 0]
-        return model.geometry.head(normed, grid), normed
-
-    def _shown(self, batch: TrainingBatch, draws: Draws) -> ViewBatch:
-        """True pictures; some targets show their projection, filled as inference fills it."""
-        views = batch.true_views
-        hints = filled(batch.views, self.model.config.hints).images
-        count = views.images.shape[1]
-        swap = draws.uniform("hints", count).to(hints.device) < self.options.hints
-        swap[:, : views.context] = False
-        images = torch.where(swap[:, :, None, None, None], hints, views.images)
-        return ViewBatch(
-            images, views.depth, views.valid, views.cam_from_world, views.K, views.context
-        )
-
-    def _pose_error(self, batch: TrainingBatch, unit: Tensor) -> Tensor:
+    def _pose_error(self, token: Tensor, batch: TrainingBatch, unit: Tensor) -> Tensor:
         """The camera decoder's L1 error, centres in units of the mean context depth."""
         pose = batch.views.cam_from_world
         relative = (pose.double() @ torch.linalg.inv(pose[:, :1].double())).float()
         relative = torch.cat((relative[..., :3], relative[..., 3:] / _homogeneous(unit)), dim=-1)
         truth = encode_cameras(relative, batch.views.K, batch.views.size)
-        return (self.model.geometry.cam_dec(self._last_token.float()) - truth).abs().mean()
+        return (self.model.geometry.cam_dec(token.float()) - truth).abs().mean()
 
-    def _grid(self, batch: TrainingBatch) -> tuple[int, int]:
-        return self.model.geometry.encoder.grid(*batch.views.size)
+
+@dataclass(frozen=True)
+class Features:
+    """What the heads get.
+
+    Attributes:
+        levels: four (B, V, N, C), normed, without token 0.
+        token: (B, V, C) token 0 of the last one.
+    """
+
+    levels: list[Tensor]
+    token: Tensor
+
+
+def noised_features(
+    model: GeoVerse,
+    batch: TrainingBatch,
+    draws: Draws,
+    options: EncoderStageOptions | RayStageOptions,
+) -> Features:
+    """Features of all views; noise on levels 0 and 1, level 0 of some samples at its mean."""
+    views = _shown(model, batch, draws, options.hints)
+    levels = encode_views(model.geometry, views, slice(None), model.config.hints)
+    amount = options.noise * draws.uniform("noise", 1, 1, 1).to(views.images.device)
+    noisy = []
+    for index, level in enumerate(levels):
+        spread = level.detach().float().std(dim=(1, 2), keepdim=True)
+        noise = draws.normal(f"noise{index}", level.shape, level.device)
+        noisy.append(level + amount * spread * noise)
+    drop = draws.uniform("level0", 1, 1, 1).to(level.device) < options.drop_level0
+    mean = noisy[0].detach().mean(dim=(1, 2), keepdim=True)
+    noisy[0] = torch.where(drop, mean, noisy[0])
+    encoder = model.geometry.encoder
+    pyramid = [*noisy, *encoder.propagate(noisy[1], encoder.grid(*batch.views.size))]
+    normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
+    return Features(normed, pyramid[-1][:, :, 0])
+
+
+def _shown(model: GeoVerse, batch: TrainingBatch, draws: Draws, share: float) -> ViewBatch:
+    """True pictures; a share of the targets shows its projection, filled as inference fills it."""
+    views = batch.true_views
+    hints = filled(batch.views, model.config.hints).images
+    swap = draws.uniform("hints", views.images.shape[1]).to(hints.device) < share
+    swap[:, : views.context] = False
+    images = torch.where(swap[:, :, None, None, None], hints, views.images)
+    return ViewBatch(images, views.depth, views.valid, views.cam_from_world, views.K, views.context)
 
 
 def scene_unit(batch: TrainingBatch) -> Tensor:
@@ -125,11 +139,20 @@ def true_rays(batch: TrainingBatch, unit: Tensor, grid: tuple[int, int]) -> Tens
     return torch.cat((direction, origin / unit[:, None, None, None, None]), dim=-1)
 
 
-def ray_error(geometry: Geometry, batch: TrainingBatch, unit: Tensor) -> Tensor:
-    """L1 of directions and origins, and the confidence's loss."""
-    grid = (geometry.ray.shape[-3], geometry.ray.shape[-2])
-    error = (geometry.ray - true_rays(batch, unit, grid)).abs()
-    return _weighted(error.mean(-1), geometry.ray_confidence)
+def ray_error(
+    ray: Tensor, confidence: Tensor, batch: TrainingBatch, *, origin: float = 1.0
+) -> Tensor:
+    """L1 of directions and origins, and the confidence's loss.
+
+    Args:
+        ray: (B, V, h, w, 6).
+        confidence: (B, V, h, w).
+        batch: of the views.
+        origin: weight of the origins' error.
+    """
+    error = (ray - true_rays(batch, scene_unit(batch), (ray.shape[-3], ray.shape[-2]))).abs()
+    direction, place = error.split(3, dim=-1)
+    return _weighted((direction.mean(-1) + origin * place.mean(-1)) / 2, confidence)
 
 
 def _depth_error(geometry: Geometry, depth: Tensor) -> Tensor:

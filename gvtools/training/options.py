@@ -170,6 +170,27 @@ class ReflowStageOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RayStageOptions:
+    """The last stage, for small encoders: the ray head alone, all else frozen.
+
+    What the denoisers work in stays as it is, so that it can follow them.
+
+    Attributes:
+        optimizer: see there.
+        hints: as of the encoder's stage.
+        noise: as of the encoder's stage.
+        drop_level0: as of the encoder's stage.
+        origin: weight of the origins' error against that of the directions.
+    """
+
+    optimizer: OptimizerOptions = field(default_factory=OptimizerOptions)
+    hints: float = 0.3
+    noise: float = 0.4
+    drop_level0: float = 0.3
+    origin: float = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class DataOptions:
     """Where samples come from.
 
@@ -221,6 +242,7 @@ class TrainingConfig:
         encoder: stage 0.
         denoiser: stage 1.
         reflow: stage 2.
+        rays: the last stage; None leaves it out.
     """
 
     model: str = "tiny"
@@ -230,6 +252,7 @@ class TrainingConfig:
     encoder: EncoderStageOptions = field(default_factory=EncoderStageOptions)
     denoiser: DenoiserStageOptions = field(default_factory=DenoiserStageOptions)
     reflow: ReflowStageOptions = field(default_factory=ReflowStageOptions)
+    rays: RayStageOptions | None = None
 
     def __post_init__(self) -> None:
         if self.parallel not in ("data", "sharded"):

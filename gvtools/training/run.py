@@ -15,8 +15,9 @@ from torch import nn
 from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior
+from gvtools.completers.geoverse.weights.folder_parts import config_of
 from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
-from gvtools.errors import CheckpointError
+from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.copies import Copies, models_of
@@ -26,6 +27,7 @@ from gvtools.training.loop import Reporting, Trainer
 from gvtools.training.names import STAGES
 from gvtools.training.options import TrainingConfig
 from gvtools.training.processes import Processes
+from gvtools.training.ray_stage import RayStage
 from gvtools.training.records import TrainingLog, read_log
 from gvtools.training.reflow_stage import ReflowStage
 from gvtools.training.samples import TrainingSamples
@@ -36,6 +38,8 @@ WEIGHTS = "weights"
 # The whole training's settings, as the stage was last run with them.
 SETTINGS = "training.json"
 SHEET_SAMPLES = 3
+# Stages whose weights complete views.
+GENERATIVE = ("denoiser", "reflow")
 # Bytes at each end of a weights file that tell it from another.
 READ = 2**22
 
@@ -68,6 +72,8 @@ class StageRun:
         self.model_config = config.model_config(model_folder)
         self.init = init
         self.options = getattr(config, stage)
+        if self.options is None:
+            raise OptionError(f"this training has no stage {stage}; set {stage}.optimizer.steps=N")
         self._source: Path | None = None
 
     def train(
@@ -120,7 +126,7 @@ class StageRun:
             shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if "count" not in k)
             say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
 
-        drawing = sheet_every and self.stage != "encoder" and (held.together or log is not None)
+        drawing = sheet_every and self.stage in GENERATIVE and (held.together or log is not None)
         held_out = samples.held_out(SHEET_SAMPLES) if drawing else None
 
         def sheet(step: int) -> None:
@@ -169,6 +175,8 @@ class StageRun:
             return EncoderStage(model, self.options)
         if self.stage == "denoiser":
             return DenoiserStage(model, self.options)
+        if self.stage == "rays":
+            return RayStage(model, self.options)
         return ReflowStage(model, self.options)
 
     def _distributed(self, module: nn.Module, video: VideoPrior | None) -> Copies:
@@ -210,7 +218,10 @@ class StageRun:
                     ]
                     measure_statistics(whole.to(device), batches)
                 # An encoder alone completes nothing.
-                whole.config = replace(self.model_config, trained=self.stage != "encoder")
+                trained = self.stage in GENERATIVE
+                if self.stage == "rays" and self._source is not None:
+                    trained = config_of(self._source).trained
+                whole.config = replace(self.model_config, trained=trained)
                 whole.save_pretrained(self.folder / WEIGHTS)
                 self._link_video()
         # The next stage starts from them, in every process.

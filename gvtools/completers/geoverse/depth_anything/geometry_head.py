@@ -6,7 +6,7 @@ coarse to fine, one for depth, one for rays. Rays come at 8/patch of the image's
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -178,6 +178,12 @@ class GeometryHead(nn.Module):
         """Depth and its confidence alone, as ``forward`` gives them, in half the time."""
         (depth,) = self._outputs(levels, grid, (self._depth,), views_at_once)
         return depth[:, :, 0].exp(), depth[:, :, 1].exp() + 1
+
+    def ray_chain(self) -> Iterator[nn.Module]:
+        """The modules that rays alone come from."""
+        for name, module in self.scratch.named_children():
+            if name.endswith("_aux"):
+                yield module
 
     def _outputs(
         self,
