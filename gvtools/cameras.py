@@ -117,7 +117,7 @@ class Cameras:
         local = np.einsum("vij,nj->vni", self.cam_from_world[:, :3, :3], points)
         local += self.cam_from_world[:, None, :3, 3]
         z = local[..., 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             homogeneous = np.einsum("vij,vnj->vni", self.K, local)
             xy = np.where(z[..., None] > 0, homogeneous[..., :2] / z[..., None], np.nan)
         return xy, z
@@ -126,6 +126,7 @@ class Cameras:
         """(H, W, 3) float64: for each pixel centre, the camera-frame point at depth z = 1."""
         x = np.arange(self.width[index]) + 0.5
         y = np.arange(self.height[index]) + 0.5
+        check_usable(self[index])
         grid = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1)
         return grid @ np.linalg.inv(self.K[index]).T
 
@@ -135,6 +136,26 @@ class Cameras:
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
         moment = np.cross(self.centers[index], direction)
         return np.concatenate([direction, moment], axis=-1)
+
+
+def check_usable(cameras: Cameras) -> None:
+    """Refuse cameras that no picture can be taken with.
+
+    Raises:
+        ShapeError: NaN or infinity in K or the pose, a focal length or an image side that is not
+            positive.
+    """
+    for camera in cameras:
+        K, name = camera.K[0], camera.names[0]
+        if not (np.isfinite(K).all() and np.isfinite(camera.cam_from_world).all()):
+            raise ShapeError(f"{name}: its camera holds NaN or infinity; mend it or drop the view")
+        if not (K[0, 0] > 0 and K[1, 1] > 0):
+            raise ShapeError(
+                f"{name}: focal lengths {K[0, 0]:g} and {K[1, 1]:g} px; expected positive ones"
+            )
+        width, height = int(camera.width[0]), int(camera.height[0])
+        if width < 1 or height < 1:
+            raise ShapeError(f"{name}: an image of {width} x {height} pixels; expected at least 1")
 
 
 def concatenate(parts: Sequence[Cameras]) -> Cameras:

@@ -194,14 +194,12 @@ def _run_rounds(plan: Plan, directory: RunDirectory, done: int, console: Console
 
 
 def _start_memory(plan: Plan) -> SpatialMemory:
-    import numpy as np
-
     from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.memory.voxel_index import rounded_origin
 
     centers = plan.scene.subset(plan.context).cameras.centers
-    # A whole number keeps the world frame's decimals as they are.
-    origin = np.rint(centers.mean(axis=0))
     assert plan.config.voxel is not None
+    origin = rounded_origin(centers.mean(axis=0), plan.config.voxel)
     return SpatialMemory(plan.config.voxel, origin=origin, options=plan.config.memory)
 
 

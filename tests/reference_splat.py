@@ -11,7 +11,7 @@ import numpy as np
 
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
-from gvtools.memory.culling import NEAR, SAMPLE
+from gvtools.memory.culling import SAMPLE
 from gvtools.memory.occlusion import in_free_space
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat import NEAREST, OCCLUDER_SIDE, SplatOptions
@@ -78,9 +78,9 @@ class Reference:
             low, high, spacing = runs.box[r, :3], runs.box[r, 3:6], float(runs.box[r, 6])
             corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, 8).T
             local = self._local(corners)
-            if local[:, 2].max() <= NEAR:
+            if local[:, 2].max() <= 0:
                 continue
-            if local[:, 2].min() > NEAR:
+            if local[:, 2].min() > 0:
                 xy = local @ K.T
                 xy = xy[:, :2] / xy[:, 2:]
                 reach = self.options.blend_reach * spacing * max(K[0, 0], K[1, 1])
@@ -94,7 +94,7 @@ class Reference:
             return False
         self.seen = np.array(seen)
         scale = float(np.median(farthest))
-        self.near = NEAREST * scale
+        self.near = min(NEAREST * scale, memory.voxel)
         views = memory.views
         axes = np.array([views[i].camera.cam_from_world[0, 2, :3] for i in range(len(views))])
         centers = np.array([views[i].camera.centers[0] for i in range(len(views))])
@@ -194,7 +194,7 @@ class Reference:
             start = memory.runs.start[r]
             sampled[start : start + memory.runs.length[r] : SAMPLE] = True
         col, row = np.floor(p.u + 0.5), np.floor(p.v + 0.5)
-        sampled &= (col >= 0) & (col < self.width) & (row >= 0) & (row < self.height) & (p.z > NEAR)
+        sampled &= (col >= 0) & (col < self.width) & (row >= 0) & (row < self.height) & (p.z > 0)
         sampled &= ~np.isin(p.view, self.first) & ~memory.views.generated[p.view]
         at = np.flatnonzero(sampled)
         front = p.z[at] < margin * self.depth[row[at].astype(int), col[at].astype(int)]

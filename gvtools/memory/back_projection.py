@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
 from gvtools.memory.compiled import compiled
 from gvtools.memory.points import PointSet
@@ -65,8 +65,9 @@ def back_project(
         options: see BackProjectionOptions.
 
     Raises:
-        ShapeError: the images and the camera disagree in size.
+        ShapeError: the images and the camera disagree in size, or the camera is unusable.
     """
+    check_usable(camera)
     options = options or BackProjectionOptions()
     height, width = int(camera.height[0]), int(camera.width[0])
     for name, array, shape in (

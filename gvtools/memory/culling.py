@@ -14,7 +14,6 @@ from numba import prange
 from gvtools.memory.compiled import FAST, compiled
 from gvtools.memory.occlusion import seen_through
 
-NEAR = 1e-6
 TILE = 16
 SAMPLE = 6
 REACHABLE = 3
@@ -57,7 +56,7 @@ def cull_runs(boxes, rows, cam_from_local, K, width, height, reach, rect, z_rang
             cz += cam_from_local[2, 3]
             low_z = min(low_z, cz)
             high_z = max(high_z, cz)
-            if cz > NEAR:
+            if cz > 0:
                 u = (K[0, 0] * cx + K[0, 1] * cy) / cz + K[0, 2]
                 v = K[1, 1] * cy / cz + K[1, 2]
                 low_u = min(low_u, u)
@@ -70,9 +69,9 @@ def cull_runs(boxes, rows, cam_from_local, K, width, height, reach, rect, z_rang
         rect[i, 3] = -1
         z_range[i, 0] = low_z
         z_range[i, 1] = high_z
-        if high_z <= NEAR:
+        if high_z <= 0:
             continue
-        if low_z <= NEAR:
+        if low_z <= 0:
             # The box crosses the camera plane: its outline is not the corners' outline.
             rect[i, 1] = width - 1
             rect[i, 3] = height - 1
@@ -80,10 +79,11 @@ def cull_runs(boxes, rows, cam_from_local, K, width, height, reach, rect, z_rang
         pad = max(1.0, reach * boxes[i, 6] * focal / low_z) + 1.0
         if high_u + pad < 0 or low_u - pad >= width or high_v + pad < 0 or low_v - pad >= height:
             continue
-        rect[i, 0] = max(0, np.int64(np.floor(low_u - pad)))
-        rect[i, 1] = min(width - 1, np.int64(np.floor(high_u + pad)))
-        rect[i, 2] = max(0, np.int64(np.floor(low_v - pad)))
-        rect[i, 3] = min(height - 1, np.int64(np.floor(high_v + pad)))
+        # Clamped before the conversion: beside the camera a column exceeds every integer.
+        rect[i, 0] = np.int64(max(0.0, np.floor(low_u - pad)))
+        rect[i, 1] = np.int64(min(width - 1.0, np.floor(high_u + pad)))
+        rect[i, 2] = np.int64(max(0.0, np.floor(low_v - pad)))
+        rect[i, 3] = np.int64(min(height - 1.0, np.floor(high_v + pad)))
 
 
 @compiled()
@@ -127,7 +127,7 @@ def in_front(
         first = run_start[r]
         for p in range(first, first + run_length[r], SAMPLE):
             pz = M[2, 0] * x[p] + M[2, 1] * y[p] + M[2, 2] * z[p] + M[2, 3]
-            if pz <= NEAR:
+            if pz <= 0:
                 continue
             px = M[0, 0] * x[p] + M[0, 1] * y[p] + M[0, 2] * z[p] + M[0, 3]
             py = M[1, 0] * x[p] + M[1, 1] * y[p] + M[1, 2] * z[p] + M[1, 3]

@@ -19,6 +19,8 @@ from gvtools.errors import OptionError
 from gvtools.memory.compiled import FAST, compiled
 
 CHUNK = 512
+# Beyond every depth, for a library that takes no infinity.
+FARTHEST = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +156,7 @@ def project_open3d(
     camera: Cameras,
     *,
     origin: ArrayLike = (0.0, 0.0, 0.0),
-    depth_max: float = 1e9,
+    depth_max: float = FARTHEST,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The same through Open3D's ``project_to_rgbd_image``.
 

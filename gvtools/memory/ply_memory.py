@@ -12,6 +12,7 @@ from gvtools.errors import MemoryFileError
 from gvtools.memory.ply import read_ply
 from gvtools.memory.points import PointSet
 from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.voxel_index import rounded_origin
 
 # Nearest neighbours are looked up for this many points when the file gives no spacing.
 SAMPLED = 20_000
@@ -26,7 +27,8 @@ def memory_from_ply(path: Path) -> SpatialMemory:
     which is also the voxel edge.
 
     Raises:
-        MemoryFileError: truncated, damaged, without colours, or without two distinct points.
+        MemoryFileError: truncated, damaged, without colours, without two distinct points, or
+            without a point whose confidence and spacing are positive.
     """
     vertices = read_ply(path)
     names = vertices.dtype.names or ()
@@ -50,7 +52,7 @@ def memory_from_ply(path: Path) -> SpatialMemory:
         else np.ones(count, np.float32)
     )
     generated = vertices["generated"] != 0 if "generated" in names else np.zeros(count, np.bool_)
-    origin = np.rint(positions.mean(axis=0))
+    origin = rounded_origin(positions.mean(axis=0), distance)
     memory = SpatialMemory(distance, origin=origin)
     # Where the points were seen from is unknown; a camera in their midst stands for it.
     pose = np.eye(4)
@@ -71,6 +73,10 @@ def memory_from_ply(path: Path) -> SpatialMemory:
                 {},
             )
             memory.fuse(points, round=int(made), generated=made)
+    if not len(memory):
+        raise MemoryFileError(
+            f"{path}: none of its {count} points has a positive, finite confidence and spacing"
+        )
     return memory
 
 

@@ -47,6 +47,11 @@ class Records:
             for name in self.ARRAYS:
                 setattr(self, name, extended(getattr(self, name), size, self.count))
 
+    def agree(self, rows: NDArray[np.int32], weights: NDArray[np.float32]) -> None:
+        """Add to the agreement of ``rows``; a sum past float32 is infinite until it is capped."""
+        with np.errstate(over="ignore"):
+            np.add.at(self.agreement, rows, weights)
+
     @property
     def position(self) -> NDArray[np.float32]:
         """(N, 3) float32, a copy of x, y, z."""

@@ -17,7 +17,7 @@ from gvtools.memory.occlusion import in_free_space
 from gvtools.memory.points import PointSet
 from gvtools.memory.records import Records, Runs
 from gvtools.memory.views import SourceView, ViewTable
-from gvtools.memory.voxel_index import EMPTY_KEY, MAX_VOXEL, VoxelIndex
+from gvtools.memory.voxel_index import EMPTY_KEY, MAX_VOXEL, VoxelIndex, check_grid
 from gvtools.options import check_range
 
 if TYPE_CHECKING:
@@ -38,7 +38,8 @@ class MemoryOptions:
             own, so that a close-up is not averaged into a distant view.
         observations_per_voxel: longest chain; beyond it the most similar observation takes the
             new one in.
-        weight_cap: confidence saturates here.
+        weight_cap: confidence saturates here, 1e-20 to 1e20; so it does where what a view adds is
+            below 2⁻²⁴ of what is there.
         free_space_tolerance: share of depth that a generated point may stand in front of an
             observed surface.
     """
@@ -53,7 +54,7 @@ class MemoryOptions:
         check_range("memory.same_direction", self.same_direction, least=0, most=180)
         check_range("memory.finer", self.finer, least=0, most=1)
         check_range("memory.observations_per_voxel", self.observations_per_voxel, least=1)
-        check_range("memory.weight_cap", self.weight_cap, above=0)
+        check_range("memory.weight_cap", self.weight_cap, least=1e-20, most=1e20)
         check_range("memory.free_space_tolerance", self.free_space_tolerance, least=0, below=1)
 
 
@@ -69,7 +70,8 @@ class FuseReport:
         merged: points averaged into an observation (of this or an earlier view).
         rejected_observed: generated points in voxels that hold observed content.
         rejected_free: generated points in space that an observed ray saw to be free.
-        out_of_reach: points farther from the origin than voxel keys go.
+        out_of_reach: points farther from the origin than voxel keys go, and points without a finite
+            position or a positive, finite confidence and spacing.
         voxels: voxels that were empty before.
         agreed: observations of earlier rounds whose confidence rose.
     """
@@ -113,12 +115,11 @@ class SpatialMemory:
         origin: ArrayLike = (0.0, 0.0, 0.0),
         options: MemoryOptions | None = None,
     ) -> None:
-        if not (np.isfinite(voxel) and voxel > 0):
-            raise OptionError(f"voxel edge {voxel}; expected a positive length in scene units")
         self.voxel = float(voxel)
         self.origin: NDArray[np.float64] = np.array(origin, np.float64)
         if self.origin.shape != (3,) or not np.isfinite(self.origin).all():
             raise ShapeError(f"memory origin {self.origin.tolist()}; expected three finite numbers")
+        check_grid(self.voxel, self.origin)
         self.options = options or MemoryOptions()
         self.records = Records()
         self.runs = Runs()
@@ -287,7 +288,7 @@ class SpatialMemory:
         if agreed:
             entry = (agreed_record[:agreed].copy(), agreed_weight[:agreed].copy())
             self.agreements.setdefault(int(views.round[view]), []).append(entry)
-            np.add.at(records.agreement, entry[0], entry[1])
+            records.agree(*entry)
         return FuseReport(
             added=int(tally[fusion.ADDED]),
             merged=int(tally[fusion.MERGED_POINTS]),
@@ -328,7 +329,7 @@ class SpatialMemory:
             for i, (row, weight) in enumerate(log):
                 stays = keep[row]
                 log[i] = (new_record[row[stays]].astype(np.int32), weight[stays])
-                np.add.at(records.agreement, log[i][0], log[i][1])
+                records.agree(*log[i])
         # A run holds one view's observations, so it stays or goes as a whole.
         runs, n = self.runs, self.runs.count
         stays = keep_view[runs.view[:n]]

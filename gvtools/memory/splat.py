@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 from gvtools.memory import culling
@@ -26,7 +26,8 @@ from gvtools.options import check_range
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
 
-# Points nearer than this share of the typical depth are behind or inside the camera.
+# Points nearer than this share of the typical depth, and than a voxel, are behind or inside the
+# camera.
 NEAREST = 1e-4
 # An occluder must hold a square of this many pixels.
 OCCLUDER_SIDE = 5
@@ -40,7 +41,8 @@ class SplatOptions:
 
     Attributes:
         nearest_views: views in the first tier; each later tier takes twice as many.
-        proximity: weight of a view is exp(-proximity x (d - d_nearest)), see view_distance.
+        proximity: weight of a view is exp(-proximity x (d - d_nearest)), see view_distance;
+            confidence x weight counts, and is reported, as no less than 1e-36.
         band: relative depth band inside which observations blend.
         depth_reach: half width of the depth pass's footprint, in spacings.
         blend_reach: radius of the blending kernel, in spacings.
@@ -85,6 +87,7 @@ class Target:
         cam_from_local: (4, 4) float64, from the memory's frame.
         rect: (R, 4) int32, image rectangle of each run, see culling.cull_runs.
         near: what is nearer is behind or inside the camera, scene units.
+        unit: a power of two near the typical depth, scene units, that depths are summed in.
         rgb: (H, W, 3) float32 in [0, 1].
         depth: (H, W) float32, scene units.
         valid: (H, W) bool.
@@ -96,6 +99,7 @@ class Target:
     cam_from_local: NDArray[np.float64]
     rect: NDArray[np.int32]
     near: np.float32
+    unit: np.float32
     rgb: NDArray[np.float32]
     depth: NDArray[np.float32]
     valid: NDArray[np.bool_]
@@ -160,8 +164,11 @@ def project(
 ) -> Guidance:
     """Project the memory into cameras of one image size.
 
+    What is nearer to the camera's plane than a voxel and than 1e-4 of the typical depth is not
+    drawn.
+
     Raises:
-        ShapeError: the cameras have images of several sizes, or there is none.
+        ShapeError: the cameras have images of several sizes, or there is none, or one is unusable.
     """
     sizes = set(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
     if len(sizes) != 1:
@@ -169,6 +176,7 @@ def project(
             f"projection into cameras of {len(sizes)} image sizes; expected one; "
             "project each size by itself"
         )
+    check_usable(cameras)
     options = options or SplatOptions()
     if options.backend in ("nearest", "open3d"):
         from gvtools.memory.one_pixel import project_one_pixel
@@ -212,6 +220,7 @@ class _Projection:
             cam_from_local,
             np.empty((memory.runs.count, 4), np.int32),
             np.float32(0),
+            np.float32(1),
             np.zeros((*shape, 3), np.float32),
             np.zeros(shape, np.float32),
             np.zeros(shape, np.bool_),
@@ -249,7 +258,8 @@ class _Projection:
         if not len(self.seen):
             return False
         scale = float(np.median(self.z_range[self.seen, 1]))
-        target.near = np.float32(NEAREST * scale)
+        target.near = np.float32(min(NEAREST * scale, memory.voxel))
+        target.unit = np.float32(np.ldexp(1.0, int(np.frexp(scale)[1])))
         self.distance = view_distance(memory, self.camera, scale)
         present = np.bincount(
             runs.view[self.seen], runs.length[self.seen], minlength=len(memory.views)

@@ -45,7 +45,7 @@ class CpuSplatter:
             chosen, runs.start, runs.length, runs.view, target.rect,
             records.x, records.y, records.z, records.color, records.confidence,
             records.agreement, records.spacing, weight,
-            target.cam_from_local.astype(np.float32), target.camera.K[0], target.near,
+            target.cam_from_local.astype(np.float32), target.camera.K[0], target.near, target.unit,
             limit.reshape(-1), reachable,
             np.float32(options.band), np.float32(options.depth_reach),
             np.float32(options.blend_reach), np.float32(options.size_cap),
@@ -58,6 +58,6 @@ class CpuSplatter:
     def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
         """See gvtools.memory.splat.Splatter."""
         splat_kernels.resolve(
-            self.total, open_, np.float32(self.options.support), generated,
+            self.total, open_, np.float32(self.options.support), target.unit, generated,
             target.rgb, target.depth, target.valid, target.confidence, target.generated,
         )  # fmt: skip

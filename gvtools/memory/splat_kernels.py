@@ -12,8 +12,12 @@ from numba import prange
 from gvtools.memory.compiled import FAST, compiled
 from gvtools.memory.culling import REACHABLE
 
-# Channels of the accumulator: weighted rgb, weight, weighted z, kernel.
+# Channels of the accumulator: weighted rgb, weight, weighted z in Target.unit, kernel.
 CHANNELS = 6
+# Confidence x proximity counts as no less: below, sums of float32 would vanish.
+FAINTEST = np.float32(1e-36)
+# The smallest float32 of full precision, and the least weight that a pixel is divided by.
+SMALLEST = np.finfo(np.float32).tiny
 
 
 @compiled(inline="always")
@@ -70,8 +74,8 @@ def _project_run(
 @compiled(parallel=True, fastmath=FAST)
 def splat_runs(
     runs, run_start, run_length, run_view, rect, x, y, z, color, confidence, agreement, spacing,
-    view_weight, M, K, near, limit, reachable, band, depth_reach, blend_reach, size_cap, weight_cap,
-    threads, blend, width, height, depth, total,
+    view_weight, M, K, near, unit, limit, reachable, band, depth_reach, blend_reach, size_cap,
+    weight_cap, threads, blend, width, height, depth, total,
 ):  # fmt: skip
     """Depth pass, then blending inside the depth band.
 
@@ -80,7 +84,7 @@ def splat_runs(
     one to be written; it is empty when most of the image is open. ``band`` is the relative depth
     band that blends; ``depth_reach`` and ``blend_reach`` are the footprints' half width and the
     kernel's radius in spacings; footprints wider than ``size_cap`` pixels are cut to it. Without
-    ``blend`` it stops after the depth pass.
+    ``blend`` it stops after the depth pass. Depths are summed in the power of two ``unit``.
 
     Writes ``depth`` (H x W,) float32, the nearest depth, or ``limit`` where nothing is nearer, and
     ``total`` (H x W, CHANNELS) float32.
@@ -96,6 +100,7 @@ def splat_runs(
         longest = max(longest, run_length[r])
     one = np.float32(1)
     zero = np.float32(0)
+    per_unit = one / unit
     bands = max(1, min(4, height // (16 * threads)))
     for task in prange(bands * threads):
         # Neighbouring bands go to different threads: what is open tends to lie together.
@@ -154,10 +159,11 @@ def splat_runs(
                 q = one / (reach[k] * reach[k])
                 near_side = zk / (one + band)
                 scale = min(confidence[first + k] + agreement[first + k], weight_cap) * proximity
+                scale = max(scale, FAINTEST)
                 red = scale * np.float32(color[first + k, 0])
                 green = scale * np.float32(color[first + k, 1])
                 blue = scale * np.float32(color[first + k, 2])
-                far = scale * zk
+                far = scale * (zk * per_unit)
                 for row in range(r0[k], r1[k] + 1):
                     dy = np.float32(row) - v[k]
                     for col in range(c0[k], c1[k] + 1):
@@ -176,7 +182,7 @@ def splat_runs(
 
 
 @compiled(parallel=True, fastmath=FAST)
-def resolve(total, open_, support, made, rgb, depth, valid, confidence, generated):
+def resolve(total, open_, support, unit, made, rgb, depth, valid, confidence, generated):
     """Turn accumulators into pixels where ``open_`` and the support suffices."""
     for row in prange(total.shape[0]):
         for col in range(total.shape[1]):
@@ -184,12 +190,12 @@ def resolve(total, open_, support, made, rgb, depth, valid, confidence, generate
                 continue
             kernel = total[row, col, 5]
             weight = total[row, col, 3]
-            if kernel < support or not weight > 0:
+            if kernel < support or not weight >= SMALLEST:
                 continue
             scale = np.float32(1) / weight
             for c in range(3):
                 rgb[row, col, c] = total[row, col, c] * scale * np.float32(1 / 255)
-            depth[row, col] = total[row, col, 4] * scale
+            depth[row, col] = total[row, col, 4] * scale * unit
             confidence[row, col] = weight / kernel
             generated[row, col] = made
             valid[row, col] = True

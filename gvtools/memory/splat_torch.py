@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
-from gvtools.memory.splat_kernels import CHANNELS
+from gvtools.memory.splat_kernels import CHANNELS, FAINTEST, SMALLEST
 
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras
@@ -110,6 +110,7 @@ class TorchSplatter:
         if blend:
             farthest = zbuffer * (1 + self.options.band)
             scale = self.trust[rows] * self._tensor(weight)[view]
+            scale = scale.clamp(min=float(FAINTEST))
             self.total = torch.zeros((height * width, CHANNELS), device=self.device)
             reach = self.options.blend_reach * size
             for i, row, col in self._pairs(u, v, reach, target.shape, sums):
@@ -118,19 +119,20 @@ class TorchSplatter:
                 i, row, col, cell = i[use], row[use], col[use], cell[use]
                 squared = (col - u[i]) ** 2 + (row - v[i]) ** 2
                 kernel = (1 - squared / reach[i] ** 2).clamp(min=0) ** 2
-                self._add(cell, kernel, scale[i], rows[i], z=z[i])
+                self._add(cell, kernel, scale[i], rows[i], z=z[i] / float(target.unit))
         return zbuffer.reshape(height, width).cpu().numpy()
 
     def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
         """See gvtools.memory.splat.Splatter."""
         kernel, weight = self.total[:, 5], self.total[:, 3]
-        done = self._tensor(open_.reshape(-1)) & (kernel >= self.options.support) & (weight > 0)
+        done = self._tensor(open_.reshape(-1)) & (kernel >= self.options.support)
+        done &= weight >= float(SMALLEST)
         cells = torch.nonzero(done)[:, 0]
         total = self.total[cells]
         kernel, weight = total[:, 5], total[:, 3]
         at = cells.cpu().numpy()
         target.rgb.reshape(-1, 3)[at] = (total[:, :3] / weight[:, None] / 255).cpu().numpy()
-        target.depth.reshape(-1)[at] = (total[:, 4] / weight).cpu().numpy()
+        target.depth.reshape(-1)[at] = (total[:, 4] / weight * float(target.unit)).cpu().numpy()
         target.confidence.reshape(-1)[at] = (weight / kernel).cpu().numpy()
         target.generated.reshape(-1)[at] = generated
         target.valid.reshape(-1)[at] = True

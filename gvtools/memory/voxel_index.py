@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.errors import OptionError
 from gvtools.memory.compiled import compiled
 
 BLOCK_BITS = 4
@@ -24,6 +25,10 @@ COORDINATE_BITS = 21
 COORDINATE_OFFSET = 1 << (COORDINATE_BITS - 1)
 # A point farther than this many voxels from the origin has no key.
 MAX_VOXEL = (COORDINATE_OFFSET - 1) << BLOCK_BITS
+# Edges within which float32 holds every product of a projection, whatever the points' distance.
+VOXEL_RANGE = (1e-25, 1e25)
+# The share of a voxel's edge that float64 has to resolve at the origin.
+ORIGIN_STEP = 1 / 16
 SIZE_CLASSES = 16
 SMALLEST_CLASS = 2
 
@@ -247,6 +252,36 @@ class VoxelIndex:
             self.block_count = extended(self.block_count, size, old)
             for array in (self.block_offset, self.block_log2, self.block_count):
                 array[old:] = 0
+
+
+def check_grid(voxel: float, origin: NDArray[np.float64]) -> None:
+    """Refuse voxels that the numbers cannot hold.
+
+    Raises:
+        OptionError: an edge outside VOXEL_RANGE, or an origin so far away that float64 positions
+            there are coarser than ORIGIN_STEP of an edge.
+    """
+    least, most = VOXEL_RANGE
+    if not least <= voxel <= most:
+        raise OptionError(
+            f"voxel edge {voxel}; expected a positive length in scene units, {least:g} to {most:g}"
+        )
+    step = float(np.spacing(np.abs(origin).max()))
+    if step > ORIGIN_STEP * voxel:
+        raise OptionError(
+            f"voxel edge {voxel:g} at the origin {origin.tolist()}, where positions are multiples "
+            f"of {step:g}; move the scene nearer to 0 or take an edge of {step / ORIGIN_STEP:g}"
+        )
+
+
+def rounded_origin(middle: NDArray[np.float64], voxel: float) -> NDArray[np.float64]:
+    """``middle`` (3,) in whole scene units, or in the power of two that fine voxels need.
+
+    Whole numbers keep the decimals of the world frame as they are; the step is smaller where
+    float32 would lose a 64th of a voxel half a step away.
+    """
+    step = min(1.0, 2.0 ** np.floor(np.log2(voxel) + 18))
+    return np.rint(middle / step) * step
 
 
 def extended(array: NDArray, size: int, used: int) -> NDArray:
