@@ -196,7 +196,7 @@ def test_the_encoders_stage_is_shared_out_as_well(tmp_path):
 
 
 def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
-    """Both stages of a model with the video prior, in one call."""
+    """All stages of a model with the video prior, in one call."""
     pytest.importorskip("diffusers", reason="the extra wan is not installed")
     import published_folder
     import tiny_wan
@@ -217,17 +217,18 @@ def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
     data = json.loads((SHIPPED / "micro.json").read_text())
     data["model"] = "model.json"
     data["reflow"]["guidance"] = 1.5
-    for stage in ("denoiser", "reflow"):
+    stages = ("denoiser", "reflow", "rays")
+    for stage in stages:
         data[stage]["optimizer"]["steps"] = 1
     training = tmp_path / "training.json"
     training.write_text(json.dumps(data))
     more = ["--init", "gld", str(folder), "--sheets", "1"]
     # The same samples together: the video prior's noise goes by a sample's place among them.
-    both = [f"{stage}.optimizer.accumulate=2" for stage in ("denoiser", "reflow")]
-    parts = ["--set", both[0], "--set", both[1], "--quiet"]
+    both = [f"{stage}.optimizer.accumulate=2" for stage in stages]
+    parts = [*(word for text in both for word in ("--set", text)), "--quiet"]
     assert main(arguments(str(training), "all", tmp_path / "one", *more, *parts)) == 0
     on_two(str(training), "all", tmp_path / "two", *more, *SHARDED)
-    for stage in ("denoiser", "reflow"):
+    for stage in stages:
         same_record(tmp_path / "two" / stage, tmp_path / "one" / stage)
         same_gradients(tmp_path / "two" / stage, tmp_path / "one" / stage)
         assert (tmp_path / "two" / stage / "weights" / "video" / "vae").is_dir()

@@ -161,7 +161,9 @@ class StageRun:
             if source is not None and (self.init or source.exists()):
                 say(f"{self.stage}: starts from {source}")
                 self._source = source
-                return from_pretrained(source, config=self.model_config)
+                # Rays are of the geometric encoder alone.
+                video = self.stage != "rays"
+                return from_pretrained(source, config=self.model_config, video=video)
         if before:
             raise CheckpointError(
                 f"stage {self.stage} needs weights to start from; run --stage {before[-1]} first, "
