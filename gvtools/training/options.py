@@ -301,7 +301,11 @@ def with_settings(config: TrainingConfig, texts: Sequence[str]) -> TrainingConfi
         *path, last = key.strip().split(".")
         section = data
         for name in path:
-            section = section.setdefault(name, {}) if isinstance(section, dict) else {}
+            # A stage that the training does not have begins with its defaults.
+            section[name] = {} if section.get(name) is None else section[name]
+            section = section[name]
+            if not isinstance(section, dict):
+                raise OptionError(f"--set {text!r}: {name} has a value, no settings of its own")
         try:
             section[last] = json.loads(value)
         except ValueError:

@@ -175,7 +175,7 @@ class GeometryHead(nn.Module):
     def depth(
         self, levels: Sequence[Tensor], grid: tuple[int, int], *, views_at_once: int = 8
     ) -> tuple[Tensor, Tensor]:
-        """Depth and its confidence alone, as ``forward`` gives them, in half the time."""
+        """Depth and its confidence, both (B, V, H, W), as ``forward`` gives them; no rays."""
         (depth,) = self._outputs(levels, grid, (self._depth,), views_at_once)
         return depth[:, :, 0].exp(), depth[:, :, 1].exp() + 1
 
