@@ -76,8 +76,12 @@ def same_weights(found: Path, wanted: Path) -> None:
     assert apart <= 1e-3 * sum(tensor.numel() for tensor in one.values())
 
 
-def same_gradients(found: Path, wanted: Path) -> None:
-    """Of the one step that was made, as Adam's averages have them; of every parameter."""
+def same_gradients(found: Path, wanted: Path, most: float) -> None:
+    """Of the one step that was made, as Adam's averages have them; of every parameter.
+
+    Args:
+        most: by which a parameter's gradients may differ, of its gradient's norm.
+    """
     one, two = (
         torch.load(stage / "state.pt", weights_only=True)["optimizer"]["state"]
         for stage in (wanted, found)
@@ -85,7 +89,7 @@ def same_gradients(found: Path, wanted: Path) -> None:
     assert one.keys() == two.keys()
     for index, entry in one.items():
         gradient, other = entry["exp_avg"], two[index]["exp_avg"]
-        assert float((gradient - other).norm()) <= 1e-4 * float(gradient.norm())
+        assert float((gradient - other).norm()) <= most * float(gradient.norm())
 
 
 def model_of(config: GeoVerseConfig) -> GeoVerse:
@@ -230,6 +234,8 @@ def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
     on_two(str(training), "all", tmp_path / "two", *more, *SHARDED)
     for stage in stages:
         same_record(tmp_path / "two" / stage, tmp_path / "one" / stage)
-        same_gradients(tmp_path / "two" / stage, tmp_path / "one" / stage)
+        # A later stage starts from weights that are the same but for rounding (``same_weights``).
+        most = 1e-4 if stage == stages[0] else 1e-2
+        same_gradients(tmp_path / "two" / stage, tmp_path / "one" / stage, most)
         assert (tmp_path / "two" / stage / "weights" / "video" / "vae").is_dir()
         assert from_pretrained(tmp_path / "two" / stage / "weights").video is not None
