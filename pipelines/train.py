@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=(*STAGES, "all"),
         default="all",
         help="encoder: pretraining of a small encoder with its heads; denoiser: both denoisers; "
-        "reflow: distillation to few steps; rays: a small encoder's ray head alone; all: those "
-        "that the training has, one after the other (%(default)s)",
+        "reflow: distillation to few steps; heads: a small model's heads on what it completes; "
+        "all: those that the training has, one after the other (%(default)s)",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the training")
     parser.add_argument(

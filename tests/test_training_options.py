@@ -7,7 +7,12 @@ from itertools import pairwise
 import pytest
 
 from gvtools.errors import OptionError
-from gvtools.training.options import OptimizerOptions, shipped_or_read, with_settings
+from gvtools.training.options import (
+    HeadsStageOptions,
+    OptimizerOptions,
+    shipped_or_read,
+    with_settings,
+)
 
 
 def test_the_rate_rises_and_falls_once_a_cycle():
@@ -27,15 +32,22 @@ def test_more_cycles_than_steps_are_refused():
         OptimizerOptions(steps=3, cycles=4)
 
 
+def test_heads_of_which_none_learns_are_refused():
+    with pytest.raises(OptionError, match="ray, rgb and depth are all 0"):
+        HeadsStageOptions(ray=0, rgb=0, depth=0)
+    with pytest.raises(OptionError, match=r"heads\.hf"):
+        HeadsStageOptions(hf=-1)
+
+
 def test_a_setting_reaches_a_stage_that_the_training_does_not_have():
     base, _ = shipped_or_read("base")
-    assert base.rays is None
-    changed = with_settings(base, ["rays.optimizer.steps=3", "rays.origin=1.5"])
-    assert changed.rays is not None
-    assert changed.rays.optimizer.steps == 3 and changed.rays.origin == 1.5
+    assert base.heads is None
+    changed = with_settings(base, ["heads.optimizer.steps=3", "heads.origin=1.5"])
+    assert changed.heads is not None
+    assert changed.heads.optimizer.steps == 3 and changed.heads.origin == 1.5
 
 
-@pytest.mark.parametrize("text", ["seed.deep=3", "rays.origin.deep=3", "model.name=tiny"])
+@pytest.mark.parametrize("text", ["seed.deep=3", "heads.origin.deep=3", "model.name=tiny"])
 def test_a_setting_of_what_has_none_is_refused(text):
     with pytest.raises(OptionError, match="settings of its own"):
         with_settings(shipped_or_read("tiny")[0], [text])

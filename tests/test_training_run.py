@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -41,7 +42,7 @@ def trained(tmp_path_factory) -> Path:
     assert train(out, "encoder", *steps("encoder", 24)) == 0
     assert train(out, "denoiser", *steps("denoiser", 6)) == 0
     assert train(out, "reflow", *steps("reflow", 3)) == 0
-    assert train(out, "rays", *steps("rays", 4)) == 0
+    assert train(out, "heads", *steps("heads", 4)) == 0
     return out
 
 
@@ -67,18 +68,61 @@ def test_the_loss_falls_and_every_stage_leaves_weights_that_load(trained):
     )
 
 
-def test_the_last_stage_moves_the_ray_head_alone(trained):
-    student, last = weights_of(trained / "reflow"), weights_of(trained / "rays")
-    moved = {name for name, tensor in last.items() if not torch.equal(tensor, student[name])}
-    assert moved and all(name.startswith("geometry.head.") and "_aux" in name for name in moved)
-    assert from_pretrained(trained / "rays" / "weights").config.trained
-    record = read_log(trained / "rays")[-1]
-    assert record["origin"] > 0 and record["direction"] > 0
+def moved(before: Path, after: Path) -> set[str]:
+    one, two = weights_of(before), weights_of(after)
+    return {name for name, tensor in two.items() if not torch.equal(tensor, one[name])}
 
 
-def test_a_training_without_ray_stage_says_so(tmp_path, capsys):
-    assert main(["train", "base", "--stage", "rays", "--out", str(tmp_path / "base")]) == 2
-    assert "this training has no stage rays" in capsys.readouterr().err
+def of_rays(name: str) -> bool:
+    return name.startswith("geometry.head.") and "_aux" in name
+
+
+def test_the_last_stage_moves_the_heads_alone(trained):
+    names = moved(trained / "reflow", trained / "heads")
+    colors = {name for name in names if name.startswith("rgb_head.")}
+    rays = {name for name in names if of_rays(name)}
+    assert colors and rays
+    # Layers that depth and rays share stay, since both are told from other features.
+    depth = names - colors - rays
+    assert depth and all(
+        name.startswith(("geometry.head.scratch.refinenet", "geometry.head.scratch.output_conv"))
+        for name in depth
+    )
+    assert from_pretrained(trained / "heads" / "weights").config.trained
+    record = read_log(trained / "heads")[-1]
+    for name in ("origin", "direction", "rgb", "hf", "rgb_decoded", "depth", "depth_decoded"):
+        assert 0 < record[name] < 10, name
+
+
+def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
+    shutil.copytree(trained / "reflow", tmp_path / "reflow")
+    rays = ["--set", "heads.rgb=0", "--set", "heads.depth=0", *steps("heads", 2)]
+    assert train(tmp_path, "heads", *rays) == 0
+    names = moved(trained / "reflow", tmp_path / "heads")
+    assert names and all(of_rays(name) for name in names)
+    assert set(read_log(tmp_path / "heads")[-1]).isdisjoint({"rgb", "depth"})
+
+
+def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
+    """Over many steps on the same few samples."""
+    shutil.copytree(trained / "reflow", tmp_path / "reflow")
+    more = ["--set", "heads.ray=0", "--set", "data.pool=8", *steps("heads", 30)]
+    more += ["--set", "heads.optimizer.batch=8"]
+    assert train(tmp_path, "heads", *more) == 0
+    records = read_log(tmp_path / "heads")
+    first, last = records[0], records[-1]
+    assert last["rgb"] < first["rgb"] and last["depth"] < first["depth"]
+
+
+def test_heads_of_an_untrained_denoiser_are_refused(trained, tmp_path, capsys):
+    shutil.copytree(trained / "encoder", tmp_path / "encoder")
+    assert train(tmp_path, "heads") == 2
+    assert "its denoisers are untrained" in capsys.readouterr().err
+
+
+def test_a_training_without_that_stage_says_so(tmp_path, capsys):
+    assert main(["train", "base", "--stage", "heads", "--out", str(tmp_path / "base")]) == 2
+    assert "this training has no stage heads" in capsys.readouterr().err
 
 
 def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
@@ -143,11 +187,11 @@ def test_two_processes_see_what_one_would(tmp_path):
 def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
     out = tmp_path / "packed"
     assert main(["weights", "pack", str(trained), str(out)]) == 0
-    assert str(trained / "rays" / "weights") in capsys.readouterr().out
-    student, packed = weights_of(trained / "rays"), from_pretrained(out).state_dict()
+    assert str(trained / "heads" / "weights") in capsys.readouterr().out
+    student, packed = weights_of(trained / "heads"), from_pretrained(out).state_dict()
     for name, tensor in student.items():
         assert torch.allclose(packed[name], tensor, rtol=2e-3, atol=1e-5), name
-    whole = (trained / "rays" / "weights" / "geoverse.safetensors").stat().st_size
+    whole = (trained / "heads" / "weights" / "geoverse.safetensors").stat().st_size
     assert (out / "geoverse.safetensors").stat().st_size < 0.6 * whole
     settings = json.loads((out / "training_encoder.json").read_text())
     assert settings["encoder"]["optimizer"]["steps"] == 24 and settings["data"]["cache"] is None

@@ -221,7 +221,7 @@ def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
     data = json.loads((SHIPPED / "micro.json").read_text())
     data["model"] = "model.json"
     data["reflow"]["guidance"] = 1.5
-    stages = ("denoiser", "reflow", "rays")
+    stages = ("denoiser", "reflow", "heads")
     for stage in stages:
         data[stage]["optimizer"]["steps"] = 1
     training = tmp_path / "training.json"

@@ -20,7 +20,7 @@ from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective.losses import high_gradient_loss
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
-from gvtools.training.options import EncoderStageOptions, RayStageOptions
+from gvtools.training.options import EncoderStageOptions, HeadsStageOptions
 
 # Pull of the confidence towards certainty against the error (DA3, VGGT).
 CONFIDENCE_REWARD = 0.2
@@ -90,7 +90,7 @@ def noised_features(
     model: GeoVerse,
     batch: TrainingBatch,
     draws: Draws,
-    options: EncoderStageOptions | RayStageOptions,
+    options: EncoderStageOptions | HeadsStageOptions,
 ) -> Features:
     """Features of all views; noise on levels 0 and 1, level 0 of some samples at its mean."""
     views = _shown(model, batch, draws, options.hints)
@@ -170,10 +170,11 @@ def _weighted(error: Tensor, confidence: Tensor, known: Tensor | None = None) ->
     value = error + learned
     if known is None:
         return value.mean()
-    return _masked_mean(value, known)
+    return masked_mean(value, known)
 
 
-def _masked_mean(value: Tensor, known: Tensor) -> Tensor:
+def masked_mean(value: Tensor, known: Tensor) -> Tensor:
+    """Mean over samples of each one's mean over known values; a sample without any counts as 0."""
     total = torch.where(known, value, 0.0).flatten(1).sum(1)
     return (total / known.flatten(1).sum(1).clamp_min(1)).mean()
 
@@ -187,7 +188,7 @@ def _gradient_error(predicted: Tensor, depth: Tensor) -> Tensor:
         size = depth.shape[dim] - 1
         both = known.narrow(dim, 0, size) & known.narrow(dim, 1, size)
         gap = predicted.log().diff(dim=dim) - log.diff(dim=dim)
-        total = total + _masked_mean(gap.abs(), both)
+        total = total + masked_mean(gap.abs(), both)
     return total
 
 

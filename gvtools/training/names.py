@@ -2,4 +2,4 @@
 
 from __future__ import annotations
 
-STAGES = ("encoder", "denoiser", "reflow", "rays")
+STAGES = ("encoder", "denoiser", "reflow", "heads")

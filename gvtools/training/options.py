@@ -170,24 +170,38 @@ class ReflowStageOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RayStageOptions:
-    """The last stage, for small encoders: the ray head alone, all else frozen.
-
-    What the denoisers work in stays as it is, so that it can follow them.
+class HeadsStageOptions:
+    """The last stage, for small models: the heads, on what the frozen denoisers make.
 
     Attributes:
         optimizer: see there.
-        hints: as of the encoder's stage.
-        noise: as of the encoder's stage.
-        drop_level0: as of the encoder's stage.
+        hints: as of the encoder's stage; of the rays' features.
+        noise: likewise.
+        drop_level0: likewise.
+        ray: weight of the rays; 0 leaves their head as it is.
         origin: weight of the origins' error against that of the directions.
+        rgb: weight of the completions' colour; 0 leaves the colour head as it is.
+        hf: of the colour error in high-gradient regions, as a share of it.
+        depth: weight of the completions' log-depth error; 0 leaves the depth head as it is.
+        decoded: of the decodings' own errors, as a share of those of what is composed of them.
     """
 
     optimizer: OptimizerOptions = field(default_factory=OptimizerOptions)
     hints: float = 0.3
     noise: float = 0.4
     drop_level0: float = 0.3
+    ray: float = 1.0
     origin: float = 2.0
+    rgb: float = 2.0
+    hf: float = 0.25
+    depth: float = 1.0
+    decoded: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("ray", "origin", "rgb", "hf", "depth", "decoded"):
+            check_range(f"heads.{name}", getattr(self, name), least=0)
+        if not (self.ray or self.rgb or self.depth):
+            raise OptionError("heads: ray, rgb and depth are all 0; give one of them a weight")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,7 +256,7 @@ class TrainingConfig:
         encoder: stage 0.
         denoiser: stage 1.
         reflow: stage 2.
-        rays: the last stage; None leaves it out.
+        heads: the last stage; None leaves it out.
     """
 
     model: str = "tiny"
@@ -252,7 +266,7 @@ class TrainingConfig:
     encoder: EncoderStageOptions = field(default_factory=EncoderStageOptions)
     denoiser: DenoiserStageOptions = field(default_factory=DenoiserStageOptions)
     reflow: ReflowStageOptions = field(default_factory=ReflowStageOptions)
-    rays: RayStageOptions | None = None
+    heads: HeadsStageOptions | None = None
 
     def __post_init__(self) -> None:
         if self.parallel not in ("data", "sharded"):

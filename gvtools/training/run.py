@@ -23,11 +23,11 @@ from gvtools.training.batch import TrainingBatch
 from gvtools.training.copies import Copies, models_of
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.encoder_stage import EncoderStage, measure_statistics
+from gvtools.training.heads_stage import HeadsStage
 from gvtools.training.loop import Reporting, Trainer
 from gvtools.training.names import STAGES
 from gvtools.training.options import TrainingConfig
 from gvtools.training.processes import Processes
-from gvtools.training.ray_stage import RayStage
 from gvtools.training.records import TrainingLog, read_log
 from gvtools.training.reflow_stage import ReflowStage
 from gvtools.training.samples import TrainingSamples
@@ -39,7 +39,7 @@ WEIGHTS = "weights"
 SETTINGS = "training.json"
 SHEET_SAMPLES = 3
 # Stages whose weights complete views.
-GENERATIVE = ("denoiser", "reflow")
+GENERATIVE = ("denoiser", "reflow", "heads")
 # Bytes at each end of a weights file that tell it from another.
 READ = 2**22
 
@@ -161,9 +161,12 @@ class StageRun:
             if source is not None and (self.init or source.exists()):
                 say(f"{self.stage}: starts from {source}")
                 self._source = source
-                # Rays are of the geometric encoder alone.
-                video = self.stage != "rays"
-                return from_pretrained(source, config=self.model_config, video=video)
+                if self.stage == "heads" and not config_of(source).trained:
+                    raise CheckpointError(
+                        f"{source}: its denoisers are untrained, and heads learn from what they "
+                        "make; run --stage denoiser first"
+                    )
+                return from_pretrained(source, config=self.model_config)
         if before:
             raise CheckpointError(
                 f"stage {self.stage} needs weights to start from; run --stage {before[-1]} first, "
@@ -177,8 +180,8 @@ class StageRun:
             return EncoderStage(model, self.options)
         if self.stage == "denoiser":
             return DenoiserStage(model, self.options)
-        if self.stage == "rays":
-            return RayStage(model, self.options)
+        if self.stage == "heads":
+            return HeadsStage(model, self.options)
         return ReflowStage(model, self.options)
 
     def _distributed(self, module: nn.Module, video: VideoPrior | None) -> Copies:
@@ -220,10 +223,7 @@ class StageRun:
                     ]
                     measure_statistics(whole.to(device), batches)
                 # An encoder alone completes nothing.
-                trained = self.stage in GENERATIVE
-                if self.stage == "rays" and self._source is not None:
-                    trained = config_of(self._source).trained
-                whole.config = replace(self.model_config, trained=trained)
+                whole.config = replace(self.model_config, trained=self.stage in GENERATIVE)
                 whole.save_pretrained(self.folder / WEIGHTS)
                 self._link_video()
         # The next stage starts from them, in every process.

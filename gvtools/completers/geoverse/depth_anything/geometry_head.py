@@ -185,6 +185,12 @@ class GeometryHead(nn.Module):
             if name.endswith("_aux"):
                 yield module
 
+    def depth_chain(self) -> Iterator[nn.Module]:
+        """The modules that depth alone comes from."""
+        for name, module in self.scratch.named_children():
+            if name.startswith(("refinenet", "output")) and not name.endswith("_aux"):
+                yield module
+
     def _outputs(
         self,
         levels: Sequence[Tensor],
