@@ -13,6 +13,8 @@ from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.pictures import write_pictures
 from pipelines.experiments.rows import FILLERS, HINTS, classical_rows, geoverse, undenoised_rows
 
+TEACHERS_HINTS = f"{HINTS}, teacher's heads"
+
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     """Figures and tables; reads weights, teacher, scenes, size, seed, pictures."""
@@ -22,6 +24,8 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     methods["student 3+1"] = geoverse(options.weights)
     methods["student 3+1, decoded"] = geoverse(options.weights, composition="decoded")
     if options.teacher is not None:
+        # Heads that learned from what a denoiser makes may be worse at what none has made.
+        methods[TEACHERS_HINTS] = undenoised_rows(options.teacher)[HINTS]
         methods["teacher 3+1, undistilled"] = geoverse(options.teacher)
         methods["teacher 24+1"] = geoverse(options.teacher, steps=24)
     distance, said = perceptual()
@@ -39,6 +43,9 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         "against_hint_features": records(judged, against=dict.fromkeys(COLUMNS, HINTS)),
     }
     if options.teacher is not None:
+        found["against_teachers_hint_features"] = records(
+            judged, against=dict.fromkeys(COLUMNS, TEACHERS_HINTS)
+        )
         found["against_teacher"] = records(judged, against=dict.fromkeys(COLUMNS, "teacher 24+1"))
     caption = f"Generated pixels of {options.scenes} held-out scenes, {side}x{side}"
     against = peers(judged, FILLERS)
