@@ -329,6 +329,29 @@ def test_steps_and_guidance_are_the_options(weights, monkeypatch):
         assert result.spent["steps"] == len(set(times))
 
 
+def test_temperature_scales_the_noise_that_level_1_starts_from(weights, monkeypatch):
+    states: list[Any] = []
+    velocity = GeoVerse.velocity1
+
+    def kept(self: GeoVerse, prepared: Any, state: Any, t: Any, **options: Any) -> Any:
+        states.append(state.clone())
+        return velocity(self, prepared, state, t, **options)
+
+    monkeypatch.setattr(GeoVerse, "velocity1", kept)
+    context, known = micro.context_views(1), micro.guidance(1)
+    pictures = {}
+    for temperature in (None, 1.0, 0.25, 0.0):
+        options = {} if temperature is None else {"temperature": temperature}
+        pictures[temperature] = complete(weights, context, known, steps=1, **options).rgb
+    own, whole, quarter, none = states
+    assert torch.equal(own, whole) and whole.std() > 0.9
+    assert torch.equal(quarter, 0.25 * whole) and not none.any()
+    assert np.array_equal(pictures[None], pictures[1.0])
+    assert not np.array_equal(pictures[None], pictures[0.25])
+    with pytest.raises(OptionError, match=r"completer\.temperature"):
+        create("geoverse", weights=str(weights), temperature=-1)
+
+
 def test_half_precision_gives_nearly_the_same(weights):
     context, known = micro.context_views(2), micro.guidance(2)
     full = complete(weights, context, known, precision="float32")

@@ -33,6 +33,12 @@ def test_negative_guidance_is_refused():
     assert FlowConfig(guidance=0.0).guidance == 0
 
 
+def test_a_negative_temperature_is_refused():
+    with pytest.raises(OptionError, match=r"flow\.temperature .*at least 0"):
+        FlowConfig(temperature=-0.1)
+    assert FlowConfig().temperature == 1 and named("base").flow.temperature == 1
+
+
 @pytest.mark.parametrize("index", [-6, 5])
 def test_a_reference_that_is_no_view_is_refused(index):
     with pytest.raises(OptionError, match=r"camera\.reference .*at least -5 and at most 4"):

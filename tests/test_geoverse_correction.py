@@ -10,7 +10,7 @@ import torch
 
 from gvtools.completers import Completion, create
 from gvtools.completers.geoverse.color_field import aligned_color
-from gvtools.completers.geoverse.correction import MOST, corrected_color, corrected_depth
+from gvtools.completers.geoverse.correction import CERTAIN, MOST, corrected_color, corrected_depth
 from gvtools.completers.geoverse.full_size import depth_ratios
 from gvtools.completers.geoverse.surface_fill import surface_fill
 from gvtools.errors import OptionError
@@ -59,6 +59,29 @@ def test_a_change_of_everything_is_none_and_one_of_the_hole_is_whole():
     grown = corrected_depth(depth, torch.where(valid, 1.0, 9.0), torch.ones_like(depth), valid)
     assert torch.allclose(grown, torch.where(valid, depth, MOST * depth), rtol=1e-4)
     assert (corrected_depth(torch.zeros_like(depth), depth, depth + 1, valid) == 0).all()
+
+
+def test_a_depth_correction_counts_by_what_exceeds_the_least():
+    """Below it the surface stays as it is; above it, without a step."""
+    depth = torch.full((1, 1, 4, 8), 2.0)
+    valid = torch.zeros(depth.shape, dtype=torch.bool)
+    valid[..., :1] = True
+    hint = torch.ones_like(depth)
+    for change, wanted in (
+        (CERTAIN / 2, 0.0),
+        (-CERTAIN / 2, 0.0),
+        (3 * CERTAIN, 2 * CERTAIN),
+        (-3 * CERTAIN, -2 * CERTAIN),
+    ):
+        made = torch.where(valid, hint, hint * torch.tensor(change).exp())
+        found = corrected_depth(depth, made, hint, valid)
+        expected = torch.where(valid, depth, depth * torch.tensor(wanted).exp())
+        assert torch.allclose(found, expected, rtol=1e-5)
+        whole = corrected_depth(depth, made, hint, valid, certain=0)
+        assert torch.allclose(whole, torch.where(valid, depth, depth * made), rtol=1e-5)
+    broken = hint.clone()
+    broken[..., 3, 3] = torch.nan
+    assert int(corrected_depth(depth, broken, hint, valid).isnan().sum()) == 1
 
 
 def test_colours_follow_the_memory():

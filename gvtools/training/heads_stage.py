@@ -79,7 +79,11 @@ class HeadsStage(nn.Module):
         with torch.no_grad():
             prepared = model.prepare(batch.views, seed=draws.seeds("video", batch.images.shape[1]))
             like = prepared.hints.level1
-            level1 = model.sample1(prepared, draws.normal("eps1", like.shape, like.device))
+            level1 = model.sample1(
+                prepared,
+                draws.normal("eps1", like.shape, like.device),
+                temperature=self.options.temperature,
+            )
             level0 = model.sample0(prepared, level1, draws.normal("eps0", like.shape, like.device))
         made = model.decode(prepared, level0, level1, targets_alone=True)
         rgb, depth = batch.images[:, context:], batch.depth[:, context:, 0]

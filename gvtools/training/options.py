@@ -178,6 +178,8 @@ class HeadsStageOptions:
         hints: as of the encoder's stage; of the rays' features.
         noise: likewise.
         drop_level0: likewise.
+        temperature: of the completions, see ``FlowConfig``; at 1 the heads see more of what the
+            denoisers are unsure of than a model of lower temperature shows them in use.
         ray: weight of the rays; 0 leaves their head as it is.
         origin: weight of the origins' error against that of the directions.
         rgb: weight of the completions' colour; 0 leaves the colour head as it is.
@@ -190,6 +192,7 @@ class HeadsStageOptions:
     hints: float = 0.3
     noise: float = 0.4
     drop_level0: float = 0.3
+    temperature: float = 1.0
     ray: float = 1.0
     origin: float = 2.0
     rgb: float = 2.0
@@ -198,7 +201,7 @@ class HeadsStageOptions:
     decoded: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("ray", "origin", "rgb", "hf", "depth", "decoded"):
+        for name in ("temperature", "ray", "origin", "rgb", "hf", "depth", "decoded"):
             check_range(f"heads.{name}", getattr(self, name), least=0)
         if not (self.ray or self.rgb or self.depth):
             raise OptionError("heads: ray, rgb and depth are all 0; give one of them a weight")

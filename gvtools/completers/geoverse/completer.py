@@ -46,6 +46,8 @@ class GeoVerseCompleter:
             decodes the features of the filled projections as they are.
         cascade_steps: level-0 steps, likewise.
         guidance: classifier-free guidance scale; None for the model's own.
+        temperature: of the noise that level 1 starts from, see ``FlowConfig``; None for the
+            model's own.
         context_views: most photographs in a pass; None for the model's own.
         views: most views in a pass, photographs and targets; None for the model's own.
         alignment: how decoded depth gets the memory's scale, see ``depth_scale``; None for the
@@ -65,6 +67,7 @@ class GeoVerseCompleter:
     steps: int | None = None
     cascade_steps: int | None = None
     guidance: float | None = None
+    temperature: float | None = None
     context_views: int | None = None
     views: int | None = None
     alignment: str | None = None
@@ -77,6 +80,7 @@ class GeoVerseCompleter:
         check_range("completer.steps", self.steps, least=0)
         check_range("completer.cascade_steps", self.cascade_steps, least=1)
         check_range("completer.guidance", self.guidance, least=0)
+        check_range("completer.temperature", self.temperature, least=0)
         check_range("completer.context_views", self.context_views, least=1)
         check_range("completer.views", self.views, least=2)
         for name, value, known in (
@@ -197,6 +201,7 @@ class GeoVerseCompleter:
                 bounds=self._bounds(model),
                 cascade_bounds=self._cascade_bounds(model),
                 guidance=self.guidance,
+                temperature=self.temperature,
                 targets_alone=told,
             )
 

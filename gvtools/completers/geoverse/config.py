@@ -35,6 +35,8 @@ class FlowConfig:
         cascade: interval bounds of level 0.
         shift: of the training times, t' = s t / (1 + (s - 1) t); 1 for none (the paper).
         guidance: classifier-free guidance scale over the cameras; 1 for none (the paper).
+        temperature: of the noise that level 1 starts from, its standard deviation; 1 draws from
+            what the model has learned (the paper), less stays nearer to its mean.
     """
 
     prediction: str = "velocity"
@@ -44,6 +46,7 @@ class FlowConfig:
     cascade: tuple[float, ...] = (1.0, 0.0)
     shift: float = 1.0
     guidance: float = 1.0
+    temperature: float = 1.0
 
     def __post_init__(self) -> None:
         if self.prediction not in ("velocity", "clean"):
@@ -55,6 +58,7 @@ class FlowConfig:
         check_range("flow.least_time", self.least_time, above=0, most=1)
         check_range("flow.shift", self.shift, above=0)
         check_range("flow.guidance", self.guidance, least=0)
+        check_range("flow.temperature", self.temperature, least=0)
         check_bounds(self.level1)
         check_bounds(self.cascade)
 

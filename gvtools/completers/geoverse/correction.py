@@ -21,6 +21,9 @@ from gvtools.completers.geoverse.passes import Decoded
 
 # Depth is corrected by at most this factor.
 MOST = 1.5
+# A correction of depth counts by what it exceeds this log-ratio: the surfaces that memory's are
+# continued along are mostly right, to less than a small network can tell.
+CERTAIN = 0.03
 
 
 def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
@@ -39,7 +42,9 @@ def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -
     return filled + change - push_pull(change, known)
 
 
-def corrected_depth(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
+def corrected_depth(
+    filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor, *, certain: float = CERTAIN
+) -> Tensor:
     """The filled projection's depth by the ratio of two decodings, within ``MOST``.
 
     A pixel without a ratio (NaN, or 0 in both) is NaN, alone.
@@ -49,15 +54,19 @@ def corrected_depth(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -
         made: likewise, model units, above 0.
         hint: likewise.
         valid: (N, 1, H, W) bool, where the memory knows.
+        certain: log-ratio that a correction counts from.
     """
     change = made.log() - hint.log()
     change = change - push_pull(change, valid & change.isfinite())
+    change = torch.where(change.abs() > certain, change - certain * change.sign(), 0 * change)
     limit = math.log(MOST)
     return filled * change.clamp(-limit, limit).exp()
 
 
 def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Tensor, Tensor]:
-    """Pictures (B, T, 3, H, W) and depth (B, T, H, W) of the targets, at the model's size.
+    """Pictures (B, T, 3, H, W) and depth (B, T, H, W) of the targets, as training judges them.
+
+    At the model's size, every correction of depth counting in full.
 
     Args:
         batch: filled as the model saw it (``conditioning.filled``).
@@ -74,7 +83,8 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
     )
     color = corrected_color(filled, rgb.flatten(0, 1), hint.rgb.float().flatten(0, 1), valid)
     first, second = (found.depth.flatten(0, 1)[:, None] for found in (made, hint))
-    length = corrected_depth(known, first, second, valid)
+    # Small errors would have no gradient.
+    length = corrected_depth(known, first, second, valid, certain=0.0)
     told = (known > 0).unflatten(0, shape)
     color, length = color.unflatten(0, shape), length.unflatten(0, shape)
     return torch.where(told, color, rgb), torch.where(told[:, :, 0], length[:, :, 0], depth)

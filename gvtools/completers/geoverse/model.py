@@ -236,10 +236,12 @@ class GeoVerse(nn.Module):
         *,
         bounds: Sequence[float] | None = None,
         guidance: float | None = None,
+        temperature: float | None = None,
         clock: Clock = no_clock,
     ) -> Tensor:
         """Level-1 latents from (B, V, C, h, w) noise, one Euler step an interval."""
         flow = self.config.flow
+        noise = noise * (flow.temperature if temperature is None else temperature)
         scale = flow.guidance if guidance is None else guidance
         without = self.without_cameras(prepared) if scale != 1 else prepared
         tau = check_bounds(bounds or flow.level1)
@@ -340,6 +342,7 @@ class GeoVerse(nn.Module):
         bounds: Sequence[float] | None = None,
         cascade_bounds: Sequence[float] | None = None,
         guidance: float | None = None,
+        temperature: float | None = None,
         video: VideoFeatures | None = None,
         targets_alone: bool = False,
         clock: Clock = no_clock,
@@ -355,6 +358,7 @@ class GeoVerse(nn.Module):
                 denoised, and the hints' own features stand for level 1.
             cascade_bounds: level-0 interval bounds; the configuration's by default.
             guidance: scale; the configuration's by default.
+            temperature: of level 1; the configuration's by default.
             video: features computed before, for the same views.
             targets_alone: without all views' geometry; the same pictures and depth, sooner.
             clock: receives the stages' names.
@@ -373,7 +377,12 @@ class GeoVerse(nn.Module):
         level1 = prepared.hints.unmasked
         if bounds is None or len(bounds):
             level1 = self.sample1(
-                prepared, noise("level1"), bounds=bounds, guidance=guidance, clock=clock
+                prepared,
+                noise("level1"),
+                bounds=bounds,
+                guidance=guidance,
+                temperature=temperature,
+                clock=clock,
             )
         level0 = self.sample0(prepared, level1, noise("level0"), bounds=cascade_bounds, clock=clock)
         with clock(stages.DECODE):
