@@ -17,7 +17,7 @@ EXAMPLES = (
     "gvtools experiment completion --scenes 64 --markdown completion.md",
     "gvtools experiment few-steps --teacher training/tiny/denoiser/weights --json steps.json",
 )
-# Each module has run(options) -> (figures, tables).
+# Each module has run(options) -> (figures, tables), and in READS the options that it looks at.
 EXPERIMENTS = {
     "completion": "fillers, hint features, student and teacher, on generated pixels",
     "few-steps": "quality against level-1 and cascade steps",
@@ -39,19 +39,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--teacher", type=Path, metavar="DIR", help="the undistilled model, for its rows"
     )
-    parser.add_argument("--scenes", type=int, default=64, metavar="N", help="(%(default)s)")
+    parser.add_argument("--scenes", type=int, metavar="N", help="(64)")
     parser.add_argument(
         "--size", type=int, metavar="PIXELS", help="of the pictures (96; long-sequences: 256)"
     )
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="(%(default)s)")
-    parser.add_argument(
-        "--steps", type=int, default=600, metavar="N", help="of its trainings (%(default)s)"
-    )
+    parser.add_argument("--seed", type=int, metavar="N", help="of scenes and completers (0)")
+    parser.add_argument("--steps", type=int, metavar="N", help="of its trainings (600)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where its trainings go")
     parser.add_argument(
         "--pictures", type=Path, metavar="DIR", help="write context, hint, completion, truth there"
     )
-    parser.add_argument("--training", default="tiny", metavar="CONFIG", help="(%(default)s)")
+    parser.add_argument(
+        "--training", metavar="CONFIG", help="settings of its trainings, by name or file (tiny)"
+    )
     parser.add_argument("--project", type=Path, metavar="DIR", help="of real-frames: a scan")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there")
@@ -80,11 +80,19 @@ def run(args: argparse.Namespace, console: Console) -> None:
         "pictures",
         "training",
     )
-    options = ExperimentOptions(**{name: getattr(args, name) for name in names})
+    module = import_module(f"pipelines.experiments.{args.what.replace('-', '_')}")
+    named = {name: getattr(args, name) for name in names}
+    given = {name: value for name, value in named.items() if value is not None}
+    unread = [name for name in given if name not in module.READS]
+    if unread:
+        raise OptionError(
+            f"experiment {args.what} does not look at --{', --'.join(unread)}; leave "
+            f"{'it' if len(unread) == 1 else 'them'} out"
+        )
+    options = ExperimentOptions(**given)
     for path in (args.json, args.markdown):
         if path is not None and not path.parent.is_dir():
             raise OptionError(f"{path}: no folder {path.parent}; make it first")
-    module = import_module(f"pipelines.experiments.{args.what.replace('-', '_')}")
     figures, tables = module.run(options)
     text = "\n\n".join(markdown(table).strip() for table in tables) + "\n"
     console.line(text)

@@ -105,6 +105,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
                 sheet_every=args.sheets,
                 say=console.line if processes.first else lambda text: None,
             )
+            if figures[stage].get("step", 0) < stage_run.options.optimizer.steps:
+                # --until: the next stage has nothing to start from yet.
+                break
         if args.json is not None and processes.first:
             args.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
 

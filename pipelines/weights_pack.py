@@ -34,7 +34,8 @@ def pack(training: Path, out: Path) -> Path:
         The stage's folder that the weights came from.
 
     Raises:
-        ProjectError: no stage has finished, or ``out`` is within the training.
+        ProjectError: no stage has finished, an earlier one was trained again after the last, or
+            ``out`` is within the training.
     """
     folders = [training / name / WEIGHTS for name in STAGES]
     finished = [folder for folder in folders if folder.is_dir() and config_of(folder).trained]
@@ -46,10 +47,19 @@ def pack(training: Path, out: Path) -> Path:
     if out.resolve().is_relative_to(training.resolve()):
         raise ProjectError(f"{out} lies within the training {training}; choose another folder")
     source = finished[-1]
+    weights = [folder / WHOLE_FILE for folder in finished]
+    newest = max(weights, key=lambda path: path.stat().st_mtime)
+    if newest != weights[-1]:
+        raise ProjectError(
+            f"{source}: older than {newest.parent}, which an earlier stage made; run the later "
+            "stage again, with its folder removed"
+        )
     model = from_pretrained(source)
     out.mkdir(parents=True, exist_ok=True)
     save_pretrained(model, out, dtype=DTYPE)
     for stage in STAGES:
+        for name in (f"log_{stage}.jsonl", f"training_{stage}.json"):
+            (out / name).unlink(missing_ok=True)
         records = read_log(training / stage)
         if not records:
             continue

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from gvtools.completers.geoverse import from_pretrained
 from gvtools.guidance import Guidance
 from pipelines.cli import main
 from pipelines.experiments.cases import held_out_cases
 from pipelines.experiments.classical import CLASSICAL, classical
 from pipelines.experiments.judging import COLUMNS, best, judge, records, table
-from pipelines.experiments.rows import FILL, HINTS, INPAINT
+from pipelines.experiments.rows import FILL, HINTS, INPAINT, with_heads_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -102,7 +103,9 @@ def weights(tmp_path_factory) -> Path:
 def experiment(name: str, weights: Path, tmp_path: Path, *more: str) -> dict:
     out = tmp_path / "figures.json"
     student = str(weights / "reflow" / "weights")
-    arguments = ["experiment", name, "--weights", student, "--scenes", "2", "--size", "48"]
+    arguments = ["experiment", name, "--weights", student]
+    if name != "real-frames":
+        arguments += ["--scenes", "2", "--size", "48"]
     assert main([*arguments, "--json", str(out), "--quiet", *more]) == 0
     return json.loads(out.read_text())
 
@@ -121,6 +124,9 @@ def test_completion_compares_fillers_student_and_teacher(weights, tmp_path):
     assert others["student 3+1"]["difference"]["depth"]["to"] in CLASSICAL
     # Undenoised features are decoded, which the fill alone is not.
     assert rows[HINTS]["psnr"] != rows[FILL]["psnr"]
+    others = {row["method"]: row for row in found["against_teacher"]}
+    assert set(others["student 3+1"]["difference"]["psnr"]) == {"to", "by"}
+    assert others["student 3+1"]["difference"]["psnr"]["to"] == "teacher 24+1"
     assert "| student 3+1 |" in tables.read_text()
 
 
@@ -147,9 +153,30 @@ def test_an_experiment_without_what_it_needs_is_one_line(tmp_path, capsys):
     assert "needs --out" in capsys.readouterr().err
     assert main(["experiment", "completion", "--scenes", "0"]) == 2
     assert "expected at least 1" in capsys.readouterr().err
+    assert main(["experiment", "poses", "--teacher", "x", "--pictures", "y"]) == 2
+    assert "poses does not look at --teacher, --pictures" in capsys.readouterr().err
     absent = str(tmp_path / "absent")
     assert main(["experiment", "poses", "--weights", absent]) == 2
     assert absent in capsys.readouterr().err
+
+
+def test_a_teacher_is_judged_with_the_students_heads(weights):
+    """Its own denoisers, so that heads that were trained later are not taken for distillation."""
+    last, before = weights / "reflow" / "weights", weights / "encoder" / "weights"
+    student, teacher = from_pretrained(last), from_pretrained(before)
+    with torch.no_grad():
+        for model in (student, teacher):
+            model.rgb_head.decoder_pred.bias += 1 if model is student else 0
+    folder = last.parent / "changed"
+    student.save_pretrained(folder)
+    with with_heads_of(before, folder) as merged:
+        found = from_pretrained(merged)
+        assert found.config.trained
+        for name, tensor in found.state_dict().items():
+            heads = name.startswith(("rgb_head.", "geometry.head."))
+            other = student if heads else teacher
+            assert torch.equal(tensor, other.state_dict()[name]), name
+    assert not merged.exists()
 
 
 @pytest.mark.slow

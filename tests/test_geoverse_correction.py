@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,15 @@ import torch
 
 from gvtools.completers import Completion, create
 from gvtools.completers.geoverse.color_field import aligned_color
-from gvtools.completers.geoverse.correction import CERTAIN, MOST, corrected_color, corrected_depth
+from gvtools.completers.geoverse.correction import (
+    CERTAIN,
+    MOST,
+    composed,
+    corrected_color,
+    corrected_depth,
+)
 from gvtools.completers.geoverse.full_size import depth_ratios
+from gvtools.completers.geoverse.passes import Decoded
 from gvtools.completers.geoverse.surface_fill import surface_fill
 from gvtools.errors import OptionError
 
@@ -82,6 +90,22 @@ def test_a_depth_correction_counts_by_what_exceeds_the_least():
     broken = hint.clone()
     broken[..., 3, 3] = torch.nan
     assert int(corrected_depth(depth, broken, hint, valid).isnan().sum()) == 1
+
+
+def test_every_depth_correction_has_a_gradient_while_training():
+    """The one that does not exist yet, too, and the one that is far off."""
+    batch = micro.batch(1)
+    batch = replace(batch, depth=torch.full_like(batch.depth, 2.0))
+    shape = (1, batch.images.shape[1] - batch.context, *batch.images.shape[-2:])
+    for factor in (1.0, 1.001, 40.0):
+        depth = torch.full(shape, factor, requires_grad=True)
+        rgb = torch.zeros((*shape[:2], 3, *shape[2:]))
+        one = torch.ones(shape)
+        _, found = composed(batch, Decoded(rgb, depth, one), Decoded(rgb, one, one))
+        holes = ~batch.valid[:, batch.context :, 0]
+        assert holes.any()
+        found.sum().backward()
+        assert (depth.grad[holes].abs() > 0).all(), factor
 
 
 def test_colours_follow_the_memory():

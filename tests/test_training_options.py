@@ -51,3 +51,23 @@ def test_a_setting_reaches_a_stage_that_the_training_does_not_have():
 def test_a_setting_of_what_has_none_is_refused(text):
     with pytest.raises(OptionError, match="settings of its own"):
         with_settings(shipped_or_read("tiny")[0], [text])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "encoder.depth=-5",
+        "encoder.noise=-1",
+        "encoder.hints=1.5",
+        "encoder.statistics=0",
+        "denoiser.decode=-1",
+        "denoiser.cameras=7",
+        "denoiser.source_noise=-3",
+        "reflow.guidance=-1",
+        "heads.drop_level0=2",
+        "heads.temperature=-1",
+    ],
+)
+def test_values_outside_their_range_are_refused_before_anything_is_trained(text):
+    with pytest.raises(OptionError, match=text.partition("=")[0].replace(".", r"\.")):
+        with_settings(shipped_or_read("tiny")[0], [text])

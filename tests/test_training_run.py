@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -114,12 +115,6 @@ def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
     assert last["rgb"] < first["rgb"] and last["depth"] < first["depth"]
 
 
-def test_heads_of_an_untrained_denoiser_are_refused(trained, tmp_path, capsys):
-    shutil.copytree(trained / "encoder", tmp_path / "encoder")
-    assert train(tmp_path, "heads") == 2
-    assert "its denoisers are untrained" in capsys.readouterr().err
-
-
 def test_a_training_without_that_stage_says_so(tmp_path, capsys):
     assert main(["train", "base", "--stage", "heads", "--out", str(tmp_path / "base")]) == 2
     assert "this training has no stage heads" in capsys.readouterr().err
@@ -134,11 +129,90 @@ def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
 
+LATER = {"denoiser": ("encoder", 6), "reflow": ("denoiser", 3), "heads": ("reflow", 4)}
+
+
+@pytest.mark.parametrize("stage", LATER)
+def test_a_later_stage_resumes_exactly_as_well(trained, tmp_path, stage):
+    before, count = LATER[stage]
+    shutil.copytree(trained / before, tmp_path / before)
+    assert train(tmp_path, stage, *steps(stage, count), "--until", "2") == 0
+    assert not (tmp_path / stage / "weights").exists()
+    assert train(tmp_path, stage, *steps(stage, count), "--resume") == 0
+    assert not moved(trained / stage, tmp_path / stage)
+
+
+@pytest.mark.slow
+def test_a_killed_training_goes_on_to_the_uninterrupted_one(trained, tmp_path):
+    """Killed at any moment after its first record, as often as it takes."""
+    out = tmp_path / "killed"
+    command = [sys.executable, "-m", "pipelines.cli", "train", "micro", "--stage", "encoder"]
+    command += ["--out", str(out), *SHORT, *steps("encoder", 24), "--until", "4"]
+    root = Path(__file__).resolve().parent.parent
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    assert subprocess.run(command, cwd=root, env=environment).returncode == 0
+    command[-1] = "24"
+    begun = subprocess.Popen([*command, "--resume"], cwd=root, env=environment)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        begun.wait(timeout=8)
+    begun.kill()
+    begun.wait()
+    assert train(out, "encoder", *steps("encoder", 24), "--resume") == 0
+    assert not moved(trained / "encoder", out / "encoder")
+
+
+def test_finished_stages_are_left_as_they_are(trained, tmp_path, capsys):
+    """Else the next stage, whose state names its start by its bytes, might not go on."""
+    shutil.copytree(trained, tmp_path / "out")
+    out, counts = tmp_path / "out", {"encoder": 24, "denoiser": 6, "reflow": 3, "heads": 4}
+    files = sorted(path for path in out.rglob("*") if path.is_file())
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+    more = [word for stage, count in counts.items() for word in steps(stage, count)]
+    loud = [word for word in SHORT if word != "--quiet"]
+    assert main(["train", "micro", "--out", str(out), *loud, *more, "--resume"]) == 0
+    assert capsys.readouterr().out.count("finished before") == len(counts)
+    assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in files} == before
+
+
+def test_all_stages_until_a_step_end_there(tmp_path):
+    more = [*SHORT, *steps("encoder", 3), "--until", "2"]
+    assert main(["train", "micro", "--out", str(tmp_path), *more]) == 0
+    assert read_log(tmp_path / "encoder")[-1]["step"] == 2
+    assert not (tmp_path / "denoiser").exists()
+
+
+def test_a_student_is_sampled_by_the_bounds_that_it_was_distilled_for(trained, tmp_path):
+    shutil.copytree(trained / "denoiser", tmp_path / "denoiser")
+    bounds = ["--set", "reflow.bounds=[1,0.4,0]", "--set", "reflow.guidance=1.5"]
+    assert train(tmp_path, "reflow", *steps("reflow", 1), *bounds) == 0
+    assert train(tmp_path, "heads", *steps("heads", 1), *bounds) == 0
+    for stage in ("reflow", "heads"):
+        flow = from_pretrained(tmp_path / stage / "weights").config.flow
+        assert flow.level1 == (1, 0.4, 0) and flow.guidance == 1
+    own = from_pretrained(trained / "heads" / "weights").config.flow
+    assert len(own.level1) == 4
+
+
+@pytest.mark.parametrize("stage", ["reflow", "heads"])
+def test_what_learns_from_an_untrained_denoiser_is_refused(trained, tmp_path, capsys, stage):
+    shutil.copytree(trained / "encoder", tmp_path / "encoder")
+    assert train(tmp_path, stage) == 2
+    assert "its denoisers are untrained" in capsys.readouterr().err
+    assert not (tmp_path / stage).exists()
+
+
+def test_batches_across_different_context_counts_are_refused_at_once(tmp_path, capsys):
+    assert train(tmp_path, "encoder", "--set", "encoder.optimizer.batch=12") == 2
+    assert "optimizer.batch = 12" in capsys.readouterr().err
+    more = ["--set", "encoder.optimizer.batch=24", "--set", "encoder.optimizer.accumulate=3"]
+    assert train(tmp_path, "encoder", *more, "--until", "1") == 0
+
+
 def test_a_training_is_not_mixed_with_another(trained, tmp_path, capsys):
     assert train(trained, "encoder", *steps("encoder", 24)) == 2
     assert "--resume" in capsys.readouterr().err
     assert train(trained, "encoder", *steps("encoder", 25), "--resume") == 2
-    assert "options" in capsys.readouterr().err
+    assert "options.optimizer.steps = 24, now 25" in capsys.readouterr().err
     assert train(tmp_path / "new", "denoiser") == 2
     assert "run --stage encoder first" in capsys.readouterr().err
     assert train(tmp_path / "new", "encoder", "--set", "encoder.optimizer.stepz=3") == 2
@@ -197,6 +271,13 @@ def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
     assert settings["encoder"]["optimizer"]["steps"] == 24 and settings["data"]["cache"] is None
     last = json.loads((out / "log_reflow.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 3
+    shutil.copytree(trained, tmp_path / "again")
+    os.utime(tmp_path / "again" / "reflow" / "weights" / "geoverse.safetensors")
+    assert main(["weights", "pack", str(tmp_path / "again"), str(out)]) == 2
+    assert "an earlier stage made" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "again" / "heads")
+    assert main(["weights", "pack", str(tmp_path / "again"), str(out)]) == 0
+    assert (out / "log_reflow.jsonl").exists() and not (out / "log_heads.jsonl").exists()
     assert main(["weights", "pack", str(tmp_path / "nothing"), str(out)]) == 2
     assert "no finished denoiser" in capsys.readouterr().err
     assert main(["weights", "pack", str(trained), str(trained / "inside")]) == 2

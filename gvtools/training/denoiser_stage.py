@@ -52,7 +52,7 @@ class DenoiserStage(nn.Module):
         state1 = interpolate(clean1, noise1, t1)
         velocity1 = model.velocity1(prepared, state1, t1)
         predicted = {"level1": velocity1}
-        wanted = {"level1": velocity_target(clean1, noise1)}
+        wanted = {"level1": model.velocity_wanted(velocity_target(clean1, noise1), t1)}
 
         found0 = torch.zeros_like(clean1)
         if model.cascade is not None:

@@ -19,11 +19,13 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from gvtools.errors import OptionError
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.copies import Copies
 from gvtools.training.draws import Draws
 from gvtools.training.ema import AveragedWeights
 from gvtools.training.options import OptimizerOptions
+from gvtools.training.processes import Processes
 from gvtools.training.state import Progress, StageState, load_state, save_state
 
 
@@ -215,6 +217,32 @@ class Trainer:
         if self.options.precision == "float32":
             return nullcontext()
         return torch.autocast(self.processes.device.type, dtype=torch.bfloat16)
+
+
+def check_parts(options: OptimizerOptions, processes: Processes, group: int) -> None:
+    """Whether the samples of each part of each step have context views of one number.
+
+    Args:
+        options: of the optimiser.
+        processes: this process and the others.
+        group: so many samples in a row, from a multiple of it, have.
+
+    Raises:
+        OptionError: a part would reach over the end of a group.
+    """
+    for step in range(group):
+        start = step * options.batch
+        for part in _parts(
+            processes.share(range(start, start + options.batch)), options.accumulate
+        ):
+            if part[0] // group != part[-1] // group:
+                raise OptionError(
+                    f"optimizer.batch = {options.batch}, optimizer.accumulate = "
+                    f"{options.accumulate}, {processes.count} process(es): one part would hold "
+                    f"samples {part[0]} to {part[-1]}, whose numbers of context views differ; "
+                    f"expected parts within {group} samples, such as a batch of 1, 2, 4 or "
+                    f"{group}, or a multiple of {group} in as many parts"
+                )
 
 
 def _parts(samples: range, count: int) -> list[range]:

@@ -120,6 +120,12 @@ class EncoderStageOptions:
     pose: float = 0.1
     statistics: int = 32
 
+    def __post_init__(self) -> None:
+        for name in ("depth", "gradient", "ray", "rgb", "hf", "pose"):
+            check_range(f"encoder.{name}", getattr(self, name), least=0)
+        _check_features("encoder", self)
+        check_range("encoder.statistics", self.statistics, least=1)
+
 
 @dataclass(frozen=True, kw_only=True)
 class DenoiserStageOptions:
@@ -140,6 +146,12 @@ class DenoiserStageOptions:
     cameras: float = 0.0
     source_noise: float = 0.2
     decode: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_range("denoiser.context_weight", self.context_weight, least=0)
+        check_range("denoiser.cameras", self.cameras, least=0, most=1)
+        check_range("denoiser.source_noise", self.source_noise, least=0)
+        check_range("denoiser.decode", self.decode, least=0, most=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,6 +177,8 @@ class ReflowStageOptions:
     def __post_init__(self) -> None:
         check_range("reflow.rho", self.rho, least=0, most=1)
         check_range("reflow.steps", self.steps, least=1)
+        check_range("reflow.guidance", self.guidance, least=0)
+        check_range("reflow.context_weight", self.context_weight, least=0)
         if self.bounds is not None:
             check_bounds(self.bounds)
 
@@ -203,8 +217,16 @@ class HeadsStageOptions:
     def __post_init__(self) -> None:
         for name in ("temperature", "ray", "origin", "rgb", "hf", "depth", "decoded"):
             check_range(f"heads.{name}", getattr(self, name), least=0)
+        _check_features("heads", self)
         if not (self.ray or self.rgb or self.depth):
             raise OptionError("heads: ray, rgb and depth are all 0; give one of them a weight")
+
+
+def _check_features(stage: str, options: EncoderStageOptions | HeadsStageOptions) -> None:
+    """Of the features that heads are trained on."""
+    check_range(f"{stage}.hints", options.hints, least=0, most=1)
+    check_range(f"{stage}.noise", options.noise, least=0)
+    check_range(f"{stage}.drop_level0", options.drop_level0, least=0, most=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,10 +14,14 @@ from gvtools.completers.geoverse.flow import (
 )
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective.losses import flow_matching_loss
+from gvtools.completers.geoverse.passes import Prepared
 from gvtools.completers.geoverse.reflow import fast_loss, interval_times, reflow_pair
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 from gvtools.training.options import ReflowStageOptions
+
+# The floor of the teacher's times, below any that its steps begin at.
+LEAST = 1e-6
 
 
 class ReflowStage(nn.Module):
@@ -62,11 +66,16 @@ class ReflowStage(nn.Module):
             draws.uniform("interval", 1)[:, 0], draws.uniform("t_inside", 1)[:, 0], self.bounds
         )
         known = teacher.prepare(batch.views, seed=seeds) if options.rho > 0 else prepared
+
+        def taught(conditions: Prepared, state: Tensor, time: Tensor) -> Tensor:
+            # As in sampling: with the floor, short last steps would leave noise behind.
+            return teacher.velocity1(conditions, state, time, least=LEAST)
+
         without = teacher.without_cameras(known) if options.guidance != 1 else known
         pair = reflow_pair(
             guided(
-                lambda state, time: teacher.velocity1(known, state, time),
-                lambda state, time: teacher.velocity1(without, state, time),
+                lambda state, time: taught(known, state, time),
+                lambda state, time: taught(without, state, time),
                 options.guidance,
             ),
             clean,
@@ -83,9 +92,15 @@ class ReflowStage(nn.Module):
         plain = model.velocity1(prepared, state, time)
         weight = options.context_weight
         reflow = flow_matching_loss(
-            student, pair.velocity, context=context, context_weight=weight
+            student,
+            model.velocity_wanted(pair.velocity, pair.t),
+            context=context,
+            context_weight=weight,
         ).mean()
         flow = flow_matching_loss(
-            plain, velocity_target(clean, noise), context=context, context_weight=weight
+            plain,
+            model.velocity_wanted(velocity_target(clean, noise), time),
+            context=context,
+            context_weight=weight,
         ).mean()
         return fast_loss(reflow, flow, rho=options.rho), {"reflow": reflow, "flow": flow}

@@ -12,11 +12,12 @@ from typing import Any
 import torch
 from torch import nn
 
+from gvtools.completers.geoverse.config import FlowConfig, GeoVerseConfig
 from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior
 from gvtools.completers.geoverse.weights.folder_parts import config_of
-from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
+from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER, WHOLE_FILE
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text
 from gvtools.training.batch import TrainingBatch
@@ -24,9 +25,9 @@ from gvtools.training.copies import Copies, models_of
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.encoder_stage import EncoderStage, measure_statistics
 from gvtools.training.heads_stage import HeadsStage
-from gvtools.training.loop import Reporting, Trainer
+from gvtools.training.loop import Reporting, Trainer, check_parts
 from gvtools.training.names import STAGES
-from gvtools.training.options import TrainingConfig
+from gvtools.training.options import ReflowStageOptions, TrainingConfig
 from gvtools.training.processes import Processes
 from gvtools.training.records import TrainingLog, read_log
 from gvtools.training.reflow_stage import ReflowStage
@@ -38,8 +39,11 @@ WEIGHTS = "weights"
 # The whole training's settings, as the stage was last run with them.
 SETTINGS = "training.json"
 SHEET_SAMPLES = 3
-# Stages whose weights complete views.
+# Endings of what terms stood on: in the log, not on the screen.
+COUNTS = ("_pixels", "_empty", "_without_scale")
+# Stages whose weights complete views, and those of them that need others' to learn from.
 GENERATIVE = ("denoiser", "reflow", "heads")
+AFTER_DENOISER = ("reflow", "heads")
 # Bytes at each end of a weights file that tell it from another.
 READ = 2**22
 
@@ -108,9 +112,14 @@ class StageRun:
             samples.batch,
             folder=self.folder,
             seed=self.config.seed,
-            identity=self._identity(),
+            identity=self._identity(samples),
         )
         resumed = trainer.resume() if resume else False
+        finished = trainer.progress.step >= self.options.optimizer.steps
+        if resumed and finished and (self.folder / WEIGHTS / WHOLE_FILE).is_file():
+            # Written again, they might differ in a digit, and the next stage's state would not fit.
+            say(f"{self.stage}: finished before, weights in {self.folder / WEIGHTS}")
+            return _last(self.folder)
         if resumed:
             say(f"{self.stage}: goes on after step {trainer.progress.step}")
         if self.processes.first:
@@ -118,12 +127,13 @@ class StageRun:
             text = json.dumps(to_json(self.config), indent=2) + "\n"
             write_text(self.folder / SETTINGS, text)
         samples.start(trainer, self.processes)
+        check_parts(self.options.optimizer, self.processes, samples.group)
         log = TrainingLog(self.folder, step=trainer.progress.step) if self.processes.first else None
 
         def record(step: int, values: dict[str, float]) -> None:
             if log is not None:
                 log.write(step, values)
-            shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if "count" not in k)
+            shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if not k.endswith(COUNTS))
             say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
 
         drawing = sheet_every and self.stage in GENERATIVE and (held.together or log is not None)
@@ -148,8 +158,7 @@ class StageRun:
         if trainer.progress.step >= self.options.optimizer.steps:
             self._write_weights(model, trainer, samples)
             say(f"{self.stage}: weights in {self.folder / WEIGHTS}")
-        records = read_log(self.folder)
-        return records[-1] if records else {}
+        return _last(self.folder)
 
     def _start(self, say: Callable[[str], None]) -> GeoVerse:
         """The model that the stage begins with; every process makes the same."""
@@ -161,11 +170,15 @@ class StageRun:
             if source is not None and (self.init or source.exists()):
                 say(f"{self.stage}: starts from {source}")
                 self._source = source
-                if self.stage == "heads" and not config_of(source).trained:
-                    raise CheckpointError(
-                        f"{source}: its denoisers are untrained, and heads learn from what they "
-                        "make; run --stage denoiser first"
-                    )
+                if self.stage in AFTER_DENOISER:
+                    found = config_of(source)
+                    if not found.trained:
+                        raise CheckpointError(
+                            f"{source}: its denoisers are untrained, and stage {self.stage} learns "
+                            "from what they make; run --stage denoiser to its end first"
+                        )
+                    if self.stage == "heads":
+                        self.model_config = _sampled_as(self.model_config, found.flow)
                 return from_pretrained(source, config=self.model_config)
         if before:
             raise CheckpointError(
@@ -196,15 +209,21 @@ class StageRun:
             return Shards(module, self.processes)
         return Copies(module, self.processes)
 
-    def _identity(self) -> dict[str, Any]:
+    def _identity(self, samples: TrainingSamples) -> dict[str, Any]:
         """What may not change between the parts of a stage."""
         data = to_json(self.config.data)
         for name in ("workers", "cache"):
             data.pop(name)
+        model = to_json(self.model_config)
+        # Of completions alone.
+        for name in ("alignment", "color_alignment"):
+            model.pop(name)
+        model["flow"].pop("temperature")
         return {
             "stage": self.stage,
             "seed": self.config.seed,
-            "model": to_json(self.model_config),
+            "model": model,
+            "photographs": list(samples.photographs),
             "options": to_json(self.options),
             "start": None if self._source is None else _fingerprint(self._source),
             "data": data,
@@ -223,7 +242,10 @@ class StageRun:
                     ]
                     measure_statistics(whole.to(device), batches)
                 # An encoder alone completes nothing.
-                whole.config = replace(self.model_config, trained=self.stage in GENERATIVE)
+                config = self.model_config
+                if self.stage == "reflow":
+                    config = _distilled(config, self.options)
+                whole.config = replace(config, trained=self.stage in GENERATIVE)
                 whole.save_pretrained(self.folder / WEIGHTS)
                 self._link_video()
         # The next stage starts from them, in every process.
@@ -238,6 +260,26 @@ class StageRun:
             link.unlink()
         if not link.exists():
             link.symlink_to((self._source / VIDEO_FOLDER).resolve(), target_is_directory=True)
+
+
+def _sampled_as(config: GeoVerseConfig, flow: FlowConfig) -> GeoVerseConfig:
+    """The configuration with the bounds and the guidance that its weights were distilled for."""
+    known = replace(config.flow, level1=flow.level1, guidance=flow.guidance)
+    return replace(config, flow=known)
+
+
+def _distilled(config: GeoVerseConfig, options: ReflowStageOptions) -> GeoVerseConfig:
+    """The student's configuration: it takes one step an interval, and its guidance is inside it."""
+    flow = replace(config.flow, level1=options.bounds or config.flow.level1)
+    if options.guidance != 1:
+        flow = replace(flow, guidance=1.0)
+    return replace(config, flow=flow)
+
+
+def _last(folder: Path) -> dict[str, float]:
+    """The stage's last record."""
+    records = read_log(folder)
+    return records[-1] if records else {}
 
 
 def _fingerprint(folder: Path) -> str:

@@ -12,6 +12,7 @@ from gvtools.training.dataset import Samples as DataSet
 from gvtools.training.loader import BatchLoader
 from gvtools.training.loop import Trainer
 from gvtools.training.options import TrainingConfig
+from gvtools.training.photographs import photograph_names
 from gvtools.training.processes import Processes
 from gvtools.training.sample_pool import PooledViews
 from gvtools.training.view_sample import collated
@@ -35,6 +36,16 @@ class TrainingSamples:
         self._fill = model.hints.fill
         self._loader: BatchLoader | None = None
         self._data = self._pooled(self._data_set("train"))
+
+    @property
+    def group(self) -> int:
+        """So many samples in a row, from a multiple of it, have context views of one number."""
+        return self._context.group
+
+    @property
+    def photographs(self) -> tuple[str, ...]:
+        """Those of the textures that are installed: they decide the samples."""
+        return photograph_names("train")
 
     def start(self, trainer: Trainer, processes: Processes) -> None:
         """Make samples ahead, from the trainer's next step on."""

@@ -79,10 +79,23 @@ def load_state(
         raise CheckpointError(
             f"{path}: cannot be read ({error}); start the stage again without --resume"
         ) from None
-    for key, value in identity.items():
-        if state.identity.get(key) != value:
-            raise CheckpointError(
-                f"{path}: was trained with {key} = {state.identity.get(key)!r}, now {value!r}; "
-                "use the same settings, or another --out"
-            )
+    difference = _difference(state.identity, identity)
+    if difference is not None:
+        key, before, now = difference
+        raise CheckpointError(
+            f"{path}: was trained with {key} = {before!r}, now {now!r}; use the same settings, or "
+            "another --out"
+        )
     return state
+
+
+def _difference(before: Any, now: Any, where: str = "") -> tuple[str, Any, Any] | None:
+    """The first entry of ``now`` that ``before`` has otherwise: its dotted name and both values."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for name in now:
+            inside = f"{where}.{name}" if where else str(name)
+            found = _difference(before.get(name), now[name], inside)
+            if found is not None:
+                return found
+        return None
+    return None if before == now else (where, before, now)

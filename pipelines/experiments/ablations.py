@@ -2,7 +2,7 @@
 
 The video prior at this scale is Wan VACE's architecture with random frozen weights: there is no
 small published one. Its rows show what the injection costs and that it works, not what a trained
-prior would give.
+prior would give. Every variant is one training: intervals are over scenes, not over trainings.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ from pipelines.experiments.cases import SIZE, Case, held_out_cases
 from pipelines.experiments.judging import COLUMNS, Judged, judge, perceptual, records, table
 from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.rows import geoverse
+
+READS = ("weights", "scenes", "size", "seed", "steps", "out", "training")
 
 # The video prior has as many taps as layers of level 1 that its features enter.
 TAPS = 4
@@ -71,7 +73,7 @@ VARIANTS = {
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
-    """Train and test every variant; reads weights (the encoder's), scenes, seed, steps and out.
+    """Train and test every variant, from the encoder's weights; see ``READS``.
 
     A variant that is trained already is only tested; one that was interrupted goes on; one that was
     trained with other settings is refused.

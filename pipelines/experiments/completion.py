@@ -2,59 +2,84 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from typing import Any
 
 from gvtools.completers.base import Completer
 from gvtools.evaluation.tables import Table
+from gvtools.training.photographs import photograph_names
 from pipelines.experiments.cases import SIZE, held_out_cases
 from pipelines.experiments.classical import CLASSICAL
 from pipelines.experiments.judging import COLUMNS, judge, peers, perceptual, records, table
 from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.pictures import write_pictures
-from pipelines.experiments.rows import FILLERS, HINTS, classical_rows, geoverse, undenoised_rows
+from pipelines.experiments.rows import (
+    FILLERS,
+    HINTS,
+    classical_rows,
+    geoverse,
+    undenoised_rows,
+    with_heads_of,
+)
 
+READS = ("weights", "teacher", "scenes", "size", "seed", "pictures")
+
+STUDENT, TEACHER = "student 3+1", "teacher 24+1"
 TEACHERS_HINTS = f"{HINTS}, teacher's heads"
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
-    """Figures and tables; reads weights, teacher, scenes, size, seed, pictures."""
+    """Figures and tables; see ``READS``."""
+    with ExitStack() as stack:
+        methods: dict[str, Completer] = classical_rows() | undenoised_rows(options.weights)
+        methods["student 1+1"] = geoverse(options.weights, steps=1)
+        methods[STUDENT] = geoverse(options.weights)
+        methods[f"{STUDENT}, temperature 1"] = geoverse(options.weights, temperature=1.0)
+        methods[f"{STUDENT}, decoded"] = geoverse(options.weights, composition="decoded")
+        if options.teacher is not None:
+            # Heads that learned from what a denoiser makes may be worse at what none has made.
+            methods[TEACHERS_HINTS] = undenoised_rows(options.teacher)[HINTS]
+            teacher = stack.enter_context(with_heads_of(options.teacher, options.weights))
+            methods["teacher 3+1, undistilled"] = geoverse(teacher)
+            methods[TEACHER] = geoverse(teacher, steps=24)
+            methods[f"{TEACHER}, temperature 1"] = geoverse(teacher, steps=24, temperature=1.0)
+        return _judged(options, methods)
+
+
+def _judged(
+    options: ExperimentOptions, methods: dict[str, Completer]
+) -> tuple[dict[str, Any], list[Table]]:
     side = options.size or SIZE
-    methods: dict[str, Completer] = classical_rows() | undenoised_rows(options.weights)
-    methods["student 1+1"] = geoverse(options.weights, steps=1)
-    methods["student 3+1"] = geoverse(options.weights)
-    methods["student 3+1, decoded"] = geoverse(options.weights, composition="decoded")
-    if options.teacher is not None:
-        # Heads that learned from what a denoiser makes may be worse at what none has made.
-        methods[TEACHERS_HINTS] = undenoised_rows(options.teacher)[HINTS]
-        methods["teacher 3+1, undistilled"] = geoverse(options.teacher)
-        methods["teacher 24+1"] = geoverse(options.teacher, steps=24)
     distance, said = perceptual()
     cases = list(held_out_cases(options.scenes, seed=options.seed, size=side))
     judged = judge(methods, cases, distance=distance, seed=options.seed)
     if options.pictures is not None:
         write_pictures(options.pictures, cases, geoverse(options.weights), seed=options.seed)
-    found = {
+    against = {
+        "best_filler": peers(judged, FILLERS),
+        "best_other_filler": peers(judged, CLASSICAL),
+        "hint_features": dict.fromkeys(COLUMNS, HINTS),
+        "teachers_hint_features": dict.fromkeys(COLUMNS, TEACHERS_HINTS),
+        "teacher": dict.fromkeys(COLUMNS, TEACHER),
+    }
+    found: dict[str, Any] = {
         "scenes": options.scenes,
         "size": side,
         "seed": options.seed,
+        "photographs": list(photograph_names("held-out")),
         "perceptual_distance": said,
-        "against_best_filler": records(judged, against=peers(judged, FILLERS)),
-        "against_best_other_filler": records(judged, against=peers(judged, CLASSICAL)),
-        "against_hint_features": records(judged, against=dict.fromkeys(COLUMNS, HINTS)),
     }
-    if options.teacher is not None:
-        found["against_teachers_hint_features"] = records(
-            judged, against=dict.fromkeys(COLUMNS, TEACHERS_HINTS)
-        )
-        found["against_teacher"] = records(judged, against=dict.fromkeys(COLUMNS, "teacher 24+1"))
+    for name, rows in against.items():
+        if set(rows.values()) <= set(judged):
+            found[f"against_{name}"] = records(judged, against=rows)
     caption = f"Generated pixels of {options.scenes} held-out scenes, {side}x{side}"
-    against = peers(judged, FILLERS)
-    return found, [table(judged, caption=caption, against=against, notes=(_note(said),))]
+    shown = table(judged, caption=caption, against=against["best_filler"], notes=(_note(said),))
+    return found, [shown]
 
 
 def _note(distance: str) -> str:
     return (
         f"Perceptual distance: {distance}; mean of its map over generated pixels. Depth: relative "
         "error. Differences: to the best filler of each figure, 95 % of the paired bootstrap over "
-        "scenes."
+        "scenes. Teachers have the student's heads."
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 from gvtools.completers.base import Completer
@@ -9,18 +11,28 @@ from gvtools.evaluation.tables import Table
 from pipelines.experiments.cases import SIZE, held_out_cases
 from pipelines.experiments.judging import judge, perceptual, records, table
 from pipelines.experiments.options import ExperimentOptions
-from pipelines.experiments.rows import geoverse
+from pipelines.experiments.rows import geoverse, with_heads_of
+
+READS = ("weights", "teacher", "scenes", "size", "seed")
 
 LEVEL1 = (49, 24, 12, 6, 3, 2, 1)
 CASCADE = (1, 2, 4, 8, 24)
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
-    """Figures and tables; reads weights, teacher, scenes, size and seed."""
+    """Figures and tables; see ``READS``. The teacher has the student's heads."""
+    with ExitStack() as stack:
+        models = {"student": options.weights}
+        if options.teacher is not None:
+            folder = stack.enter_context(with_heads_of(options.teacher, options.weights))
+            models["teacher"] = folder
+        return _swept(options, models)
+
+
+def _swept(
+    options: ExperimentOptions, models: dict[str, Path | None]
+) -> tuple[dict[str, Any], list[Table]]:
     side = options.size or SIZE
-    models = {"student": options.weights} | (
-        {} if options.teacher is None else {"teacher": options.teacher}
-    )
     found: dict[str, Any] = {"scenes": options.scenes, "size": side, "seed": options.seed}
     tables = []
     distance, found["perceptual_distance"] = perceptual()

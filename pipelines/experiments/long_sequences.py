@@ -2,7 +2,9 @@
 
 With it, each round's targets are completed from the projected memory and fused back, as
 ``gvtools reconstruct`` does. Without it nothing is projected: the completer sees the photographs
-and the pictures that it made in the round before.
+and the pictures that it made in the round before. It is the model that was trained with
+projections, so that part of the gap is that it misses what it is used to; the ablations train one
+without.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.rows import INPAINT, geoverse
 from pipelines.rounds import Clock, complete_targets
 
+READS = ("weights", "scenes", "size", "seed")
+
 ROUNDS, PER_ROUND, CONTEXT = 3, 4, 4
 SIZE = 256
 WITH, WITHOUT = "with memory", "without memory"
@@ -45,7 +49,7 @@ class _Arm:
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
-    """Figures and a table; reads weights, scenes, size and seed."""
+    """Figures and a table; see ``READS``."""
     from gvtools.completers.base import create
     from gvtools.training.dataset import ProceduralViews
 

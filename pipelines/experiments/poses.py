@@ -23,9 +23,11 @@ from pipelines.experiments.cases import SIZE
 from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.rows import geoverse
 
+READS = ("weights", "scenes", "size", "seed")
+
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
-    """Figures and a table; reads weights, scenes, size and seed."""
+    """Figures and a table; see ``READS``."""
     side = options.size or SIZE
     model = geoverse(options.weights).model  # type: ignore[attr-defined]
     data = ProceduralViews(

@@ -31,6 +31,8 @@ from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.pictures import write_pictures
 from pipelines.experiments.rows import FILLERS, classical_rows, geoverse, undenoised_rows
 
+READS = ("weights", "project", "seed", "steps", "out", "training", "pictures")
+
 CONTEXT, TARGETS = "every:20", "every:20+10"
 # Of a fine-tuning: views of a sample, share of the scan, learning rate, least common depth.
 VIEWS, SHARE, RATE, OVERLAP = 2, 0.5, 2e-4, 0.15
@@ -39,7 +41,7 @@ SLOW = "biharmonic"
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
-    """Figures and a table; reads weights, project, seed, steps, and out for the fine-tuning.
+    """Figures and a table; see ``READS``. With ``out`` it fine-tunes.
 
     Raises:
         OptionError: no project.

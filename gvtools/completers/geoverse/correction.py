@@ -24,6 +24,8 @@ MOST = 1.5
 # A correction of depth counts by what it exceeds this log-ratio: the surfaces that memory's are
 # continued along are mostly right, to less than a small network can tell.
 CERTAIN = 0.03
+# The same factor while training: out of the way.
+FAR = 1e3
 
 
 def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
@@ -43,9 +45,15 @@ def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -
 
 
 def corrected_depth(
-    filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor, *, certain: float = CERTAIN
+    filled: Tensor,
+    made: Tensor,
+    hint: Tensor,
+    valid: Tensor,
+    *,
+    certain: float = CERTAIN,
+    most: float = MOST,
 ) -> Tensor:
-    """The filled projection's depth by the ratio of two decodings, within ``MOST``.
+    """The filled projection's depth by the ratio of two decodings.
 
     A pixel without a ratio (NaN, or 0 in both) is NaN, alone.
 
@@ -55,11 +63,13 @@ def corrected_depth(
         hint: likewise.
         valid: (N, 1, H, W) bool, where the memory knows.
         certain: log-ratio that a correction counts from.
+        most: largest factor.
     """
     change = made.log() - hint.log()
     change = change - push_pull(change, valid & change.isfinite())
-    change = torch.where(change.abs() > certain, change - certain * change.sign(), 0 * change)
-    limit = math.log(MOST)
+    if certain > 0:
+        change = torch.where(change.abs() > certain, change - certain * change.sign(), 0 * change)
+    limit = math.log(most)
     return filled * change.clamp(-limit, limit).exp()
 
 
@@ -83,8 +93,8 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
     )
     color = corrected_color(filled, rgb.flatten(0, 1), hint.rgb.float().flatten(0, 1), valid)
     first, second = (found.depth.flatten(0, 1)[:, None] for found in (made, hint))
-    # Small errors would have no gradient.
-    length = corrected_depth(known, first, second, valid, certain=0.0)
+    # The smallest corrections and the worst would have no gradient.
+    length = corrected_depth(known, first, second, valid, certain=0.0, most=FAR)
     told = (known > 0).unflatten(0, shape)
     color, length = color.unflatten(0, shape), length.unflatten(0, shape)
     return torch.where(told, color, rgb), torch.where(told[:, :, 0], length[:, :, 0], depth)

@@ -30,7 +30,12 @@ from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.control import ControlBranch
 from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
 from gvtools.completers.geoverse.depth_anything.network import DepthAnything3
-from gvtools.completers.geoverse.flow import check_bounds, sample, velocity_from_clean
+from gvtools.completers.geoverse.flow import (
+    check_bounds,
+    over_state,
+    sample,
+    velocity_from_clean,
+)
 from gvtools.completers.geoverse.injection import check_features, video_keys
 from gvtools.completers.geoverse.noise import seeded_noise, view_seed
 from gvtools.completers.geoverse.passes import Decoded, Generated, Prepared
@@ -224,6 +229,17 @@ class GeoVerse(nn.Module):
             return out
         clean = out + prepared.hints.unmasked if flow.skip else out
         return velocity_from_clean(clean, state, t, least=least or flow.least_time)
+
+    def velocity_wanted(self, velocity: Tensor, t: Tensor) -> Tensor:
+        """What ``velocity1`` should give at ``t`` where ``velocity`` (B, V, C, h, w) is right.
+
+        A clean prediction's velocity is divided by no less than ``flow.least_time``; a target that
+        is not would have the prediction wrong below it.
+        """
+        flow = self.config.flow
+        if flow.prediction == "velocity":
+            return velocity
+        return velocity * over_state((t / flow.least_time).clamp(max=1), velocity)
 
     def cascade_conditions(self, prepared: Prepared, level1: Tensor) -> Conditions:
         """What the cascade knows: clean context level 0, level 1 of all views, cameras (Eq. 3)."""
