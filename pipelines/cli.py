@@ -19,6 +19,7 @@ COMMANDS = {
     "check": "pipelines.check",
     "reconstruct": "pipelines.reconstruct",
     "render": "pipelines.render",
+    "tradeoff": "pipelines.tradeoff",
     "evaluate": "pipelines.evaluate",
     "trajectory": "pipelines.trajectory",
     "weights": "pipelines.weights",

@@ -200,6 +200,15 @@ def with_setting(config: RunConfig, key: str, value: Any) -> RunConfig:
     return _with(config, head, _converted(key, get_type_hints(RunConfig)[head], value))
 
 
+def changed_settings(config: RunConfig) -> dict[str, Any]:
+    """The dotted settings by which ``config`` differs from the defaults, as a file takes them."""
+    usual = dict(_flat(RunConfig().to_dict()))
+    options = {f"completer.{key}": value for key, value in config.completer_options.items()}
+    plain = _flat({**config.to_dict(), "completer_options": None})
+    changed = {key: value for key, value in plain if key in usual and value != usual[key]}
+    return {key: value for key, value in changed.items() if key != "profile"} | options
+
+
 def _with(config: RunConfig, name: str, value: Any) -> RunConfig:
     changes: dict[str, Any] = {name: value}
     return replace(config, **changes)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -8,6 +9,7 @@ from gvtools.errors import OptionError
 from pipelines.config import (
     PROFILES,
     RunConfig,
+    changed_settings,
     with_file,
     with_profile,
     with_setting,
@@ -94,3 +96,15 @@ def test_settings_that_depend_on_each_other_may_come_in_any_order():
         config = with_settings(RunConfig(), texts)
         assert (config.stereo.sources, config.stereo.best) == (1, 1)
     assert with_settings(RunConfig(), ["stereo.sources=1"]).stereo.sources == 1
+
+
+def test_changed_settings_are_those_that_a_file_needs(tmp_path):
+    texts = ["voxel=0.02", "splat.band=0.03", "completer=geoverse", "completer.steps=2", "seed=0"]
+    config = with_settings(RunConfig(), [*texts, "profile=fast"])
+    changed = changed_settings(config)
+    assert changed["splat.band"] == 0.03 and changed["completer.steps"] == "2"
+    assert "seed" not in changed and "profile" not in changed and "splat.support" not in changed
+    (tmp_path / "profile.json").write_text(json.dumps(changed))
+    again = with_file(RunConfig(), tmp_path / "profile.json")
+    assert replace(again, profile="fast") == config
+    assert changed_settings(RunConfig()) == {}

@@ -1,0 +1,228 @@
+"""``gvtools tradeoff``: how speed trades for accuracy on a user's own scene."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gvtools.errors import OptionError
+
+if TYPE_CHECKING:
+    from pipelines.console import Console
+    from pipelines.tradeoffs.outcome import Outcome
+    from pipelines.tradeoffs.search import Search, Tried
+
+SUMMARY = "try a run's settings on held-out views: what each gives and takes, and what to choose"
+EXAMPLES = (
+    "gvtools tradeoff scan/ --out runs/tradeoff --budget 60",
+    "gvtools reconstruct scan/ --config runs/tradeoff/profile.json --out runs/scan",
+)
+UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+BYTES = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2.0**10, "mib": 2.0**20, "gib": 2.0**30}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    from pipelines.scene_arguments import add_scene_arguments
+
+    parser.add_argument("project", type=Path, help="COLMAP, posed RGB-D or transforms.json")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the results")
+    parser.add_argument(
+        "--budget",
+        metavar="AMOUNT",
+        help="of a run: seconds (60, 5m, 2h) or bytes of memory (200MB, 1GiB); default: none",
+    )
+    parser.add_argument(
+        "--context", default="every:2", metavar="SPEC", help="views that are given (%(default)s)"
+    )
+    parser.add_argument(
+        "--targets",
+        default="every:2+1",
+        metavar="SPEC",
+        help="views that are held out and completed (%(default)s)",
+    )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings to start from")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="one setting; repeatable"
+    )
+    parser.add_argument(
+        "--limit",
+        default="15m",
+        metavar="TIME",
+        help="of the whole sweep: trials that would not fit are left out and named (%(default)s)",
+    )
+    add_scene_arguments(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Sweep, and write table, front, marginal values and the recommended profile.
+
+    Raises:
+        GvError: a project or settings that cannot be run, or a budget that is none.
+    """
+    from dataclasses import replace
+
+    from pipelines import config as settings
+    from pipelines.plan import make_plan
+    from pipelines.scene_arguments import open_scene
+    from pipelines.tradeoffs.knobs import knobs_of
+    from pipelines.tradeoffs.search import Search
+    from pipelines.tradeoffs.trial import Trials
+
+    kind, budget = parse_budget(args.budget)
+    limit_kind, limit = parse_budget(args.limit)
+    if limit_kind != "seconds" or limit is None:
+        raise OptionError(f"--limit {args.limit}; expected a time, such as 900 or 15m")
+    config = settings.RunConfig()
+    if args.config:
+        config = settings.with_file(config, args.config)
+    config = settings.with_settings(config, args.set)
+    config = replace(config, context=args.context, targets=args.targets)
+    scene = open_scene(args.project, args)
+    plan = make_plan(scene, config, say=console.line)
+    if any(view is None for view in plan.targets.truth) or plan.targets.project is not None:
+        raise OptionError(
+            f"--targets {args.targets}: no views of the project; expected a selection of them, "
+            "since a trial is measured against their pictures"
+        )
+    config = replace(config, voxel=plan.config.voxel)
+    args.out.mkdir(parents=True, exist_ok=True)
+    trials = Trials(scene, config, plan.targets.cameras.names, args.out / "trials")
+    trials.folder.mkdir(exist_ok=True)
+
+    def fits(outcome: Outcome) -> bool:
+        if budget is None:
+            return True
+        spent = outcome.bytes if kind == "bytes" else outcome.seconds(len(trials.names))
+        return spent <= budget
+
+    search = Search(
+        knobs_of(plan), trials.outcome, len(trials.names), limit=limit, say=console.line
+    )
+    profiles = [
+        (f"profile {name}", changes) for name, changes in settings.PROFILES.items() if changes
+    ]
+    search.sweep(profiles, fits)
+
+    def profile(outcome: Outcome) -> Mapping[str, Any]:
+        """Everything but which views are given and which are completed."""
+        whole = config
+        for key, value in outcome.settings.items():
+            whole = settings.with_setting(whole, key, value)
+        changed = settings.changed_settings(whole)
+        return {key: changed[key] for key in changed if key not in ("context", "targets")}
+
+    _write(search, args.out, scene.root.name, kind, budget, fits, profile, console)
+
+
+def parse_budget(text: str | None) -> tuple[str, float | None]:
+    """("seconds" or "bytes", amount) of ``60``, ``5m``, ``200MB``; None without a text.
+
+    Raises:
+        OptionError: another unit, or nothing above 0.
+    """
+    if text is None:
+        return "seconds", None
+    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", text)
+    unit = found[2].lower() if found else "?"
+    if not found or (unit not in UNITS and unit not in BYTES) or not float(found[1]) > 0:
+        raise OptionError(f"{text!r}; expected seconds (60, 5m, 2h) or bytes (200MB, 1GiB)")
+    if unit in BYTES:
+        return "bytes", float(found[1]) * BYTES[unit]
+    return "seconds", float(found[1]) * UNITS[unit]
+
+
+def _write(
+    search: Search,
+    out: Path,
+    name: str,
+    kind: str,
+    budget: float | None,
+    fits: Callable[[Outcome], bool],
+    profile: Callable[[Outcome], Mapping[str, Any]],
+    console: Console,
+) -> None:
+    from gvtools.evaluation.tables import csv_text, markdown
+    from gvtools.files import replaced_when_written, write_text
+    from pipelines.console import write_json
+    from pipelines.tradeoffs.outcome import front
+    from pipelines.tradeoffs.search import marginal_values, recommended
+    from pipelines.tradeoffs.tables import front_table, marginal_table, trial_table
+    from viz.pareto import draw_pareto
+
+    whole = search.whole() or search.tried
+    chosen = recommended(whole, fits)
+    best = front([entry.outcome for entry in whole], search.targets)
+    marginal = marginal_values(search)
+    trials, edge, effects = (
+        trial_table(search),
+        front_table(search, best),
+        marginal_table(marginal),
+    )
+    write_text(out / "trials.csv", csv_text(trials))
+    write_text(out / "front.csv", csv_text(edge))
+    points = [_point(entry, search.targets) for entry in whole]
+    drawn = [points[at] for at, entry in enumerate(whole) if entry.outcome in best]
+    with replaced_when_written(out / "front.png") as temporary:
+        draw_pareto(
+            points,
+            front=sorted(drawn, key=lambda point: point["seconds"]),
+            recommended=None if chosen is None else _point(chosen, search.targets),
+            budget=budget if kind == "seconds" else None,
+            title=f"{name}: {search.targets} held-out views",
+        ).savefig(temporary, format="png", dpi=120)
+    write_json(
+        out / "tradeoff.json",
+        {
+            "targets": search.targets,
+            "budget": budget,
+            "budget_of": kind,
+            "trials": [
+                {"label": entry.label, "share": entry.share, **entry.outcome.to_json()}
+                for entry in search.tried
+            ],
+            "front": [outcome.to_json() for outcome in best],
+            "marginal": marginal,
+            "recommended": None if chosen is None else chosen.outcome.to_json(),
+            "refused": search.refused,
+            "left_out": search.left_out,
+        },
+    )
+    console.line(markdown(effects))
+    console.line(markdown(edge))
+    if search.left_out:
+        console.warn(
+            f"{len(search.left_out)} trials were left out for --limit: "
+            f"{', '.join(search.left_out[:4])}; the same command with a longer one goes on"
+        )
+    if chosen is None:
+        (out / "profile.json").unlink(missing_ok=True)
+        fastest = min(whole, key=lambda entry: entry.outcome.seconds(search.targets))
+        console.warn(
+            f"no trial is within the budget; the cheapest takes "
+            f"{fastest.outcome.seconds(search.targets):.1f} s and "
+            f"{fastest.outcome.bytes / 2**20:.0f} MiB; no profile.json is written"
+        )
+        return
+    write_json(out / "profile.json", profile(chosen.outcome))
+    console.line(
+        f"recommended: {chosen.outcome.psnr:.2f} dB in "
+        f"{chosen.outcome.seconds(search.targets):.1f} s, {chosen.outcome.bytes / 2**20:.0f} MiB; "
+        f"gvtools reconstruct ... --config {out / 'profile.json'}"
+    )
+    console.line(f"results in {out}: front.png, front.csv, trials.csv, tradeoff.json, profile.json")
+
+
+def _point(entry: Tried, targets: int) -> dict[str, Any]:
+    label = entry.label
+    kind = label if label in ("start", "combination") else "trial"
+    return {
+        "label": label,
+        "kind": "profile" if label.startswith("profile") else kind,
+        "seconds": entry.outcome.seconds(targets),
+        "bytes": entry.outcome.bytes,
+        "psnr": entry.outcome.psnr,
+    }

@@ -1,0 +1,161 @@
+"""What a trade-off varies: each knob's levels, from cheap to dear, as settings of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from gvtools.completers.base import create
+from gvtools.errors import GvError
+from gvtools.scenes.reduced import SMALLEST
+
+if TYPE_CHECKING:
+    from pipelines.plan import Plan
+
+# Of the voxel edge that the run has.
+EDGES = (4.0, 2.0, 1.0, 0.5)
+# Level-1 steps of the generative core.
+STEPS = (1, 3, 6)
+Settings = Mapping[str, Any]
+Point = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Level:
+    """One position of a knob.
+
+    Attributes:
+        name: as a table shows it.
+        settings: dotted keys of a run's settings, and their values.
+    """
+
+    name: str
+    settings: Settings = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A part of a run that can be cheap or dear.
+
+    Attributes:
+        name: what it is.
+        levels: from cheap to dear.
+        usual: index of the level that the sweep starts from.
+    """
+
+    name: str
+    levels: tuple[Level, ...]
+    usual: int
+
+
+def settings_of(knobs: Sequence[Knob], point: Point) -> dict[str, Any]:
+    """The settings of one level of each knob."""
+    out: dict[str, Any] = {}
+    for knob, level in zip(knobs, point, strict=True):
+        out |= knob.levels[level].settings
+    return out
+
+
+def usual(knobs: Sequence[Knob]) -> Point:
+    """Where a sweep starts."""
+    return tuple(knob.usual for knob in knobs)
+
+
+def neighbours(knobs: Sequence[Knob], point: Point) -> list[Point]:
+    """Every point that differs from ``point`` in one knob."""
+    return [
+        (*point[:at], level, *point[at + 1 :])
+        for at, knob in enumerate(knobs)
+        for level in range(len(knob.levels))
+        if level != point[at]
+    ]
+
+
+def knobs_of(plan: Plan) -> list[Knob]:
+    """The knobs that change something in this run.
+
+    Args:
+        plan: of a run with the settings that the sweep starts from.
+    """
+    config = plan.config
+    assert config.voxel is not None
+    knobs = [
+        Knob("voxel edge", tuple(_edge(config.voxel, share) for share in EDGES), EDGES.index(1.0)),
+        _numbers("observations a voxel", "memory.observations_per_voxel",
+                 (2, 4, 12, 48), config.memory.observations_per_voxel),
+        _numbers("merging angle, degrees", "memory.same_direction",
+                 (15.0, 8.0, 2.0, 0.0), config.memory.same_direction),
+        Knob(
+            "projection",
+            (
+                Level("one pixel a point", {"splat.backend": "nearest"}),
+                Level("blended, first tiers alone", {"splat.occluders": False}),
+                Level("blended", {}),
+                Level("blended, 4 views first", {"splat.nearest_views": 4}),
+            ),
+            2,
+        ),
+        _completers(plan),
+        _numbers("views a round", "views_per_round", (3, 6, 12), config.views_per_round),
+    ]  # fmt: skip
+    side = max(int(plan.targets.cameras.width.max()), int(plan.targets.cameras.height.max()))
+    sides = [size for size in (side // 2, 3 * side // 4) if size >= 2 * SMALLEST]
+    knobs.append(
+        Knob(
+            "picture size",
+            (*(Level(f"{size} px", {"max_side": size}) for size in sides), Level(f"{side} px")),
+            len(sides),
+        )
+    )
+    if plan.source.name == "plane-sweep":
+        knobs += [
+            _numbers("stereo sources", "stereo.sources", (2, 4, 6), config.stereo.sources),
+            _numbers("stereo picture size", "stereo.max_side",
+                     (320, 480, 640, 960), config.stereo.max_side),
+            _numbers("stereo iterations", "stereo.iterations", (0, 1, 2), config.stereo.iterations),
+        ]  # fmt: skip
+    return [knob for knob in knobs if len(knob.levels) > 1]
+
+
+def _numbers(name: str, key: str, values: Sequence[float], start: float) -> Knob:
+    """Levels by number, in the order given; the run's own value is one of them."""
+    if start not in values:
+        rising = values[0] < values[-1]
+        values = sorted({*values, start}, reverse=not rising)
+    levels = tuple(Level(f"{value:g}", {key: value}) for value in values)
+    return Knob(name, levels, list(values).index(start))
+
+
+def _edge(voxel: float, share: float) -> Level:
+    """As an edge, not as a share of the footprints: the sweep's runs need not find it again."""
+    return Level(f"{share:g} x {voxel:.3g}", {"voxel": float(f"{share * voxel:.4g}")})
+
+
+def _completers(plan: Plan) -> Knob:
+    """Completers that this installation has; the run's own with its options."""
+    config = plan.config
+    options = {f"completer.{key}": value for key, value in config.completer_options.items()}
+    own = {"completer": config.completer, **options}
+    weights = {key: value for key, value in options.items() if key == "completer.weights"}
+    known: list[Level] = [Level(name, {"completer": name}) for name in ("none", "inpaint")]
+    for steps in STEPS:
+        settings = {"completer": "geoverse", "completer.steps": steps, **weights}
+        known.append(Level(f"geoverse {steps}+1", settings))
+    levels = [level for level in known if _available(level)]
+    if own not in [level.settings for level in levels]:
+        levels.append(Level(f"{config.completer} as given", own))
+    return Knob("completer", tuple(levels), [level.settings for level in levels].index(own))
+
+
+def _available(level: Level) -> bool:
+    options = {
+        key.partition(".")[2]: value
+        for key, value in level.settings.items()
+        if key.startswith("completer.")
+    }
+    try:
+        create(str(level.settings["completer"]), **options)
+    except GvError:
+        return False
+    return True

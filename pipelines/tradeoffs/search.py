@@ -1,0 +1,247 @@
+"""Successive halving over knobs: many settings on few targets, few settings on all of them.
+
+First every knob by itself, on a small share of the targets. Time, memory and PSNR are then taken
+as sums of the knobs' own effects (of their logarithms; of PSNR itself), which predicts every
+combination; combinations on the predicted front are tried on a larger share, the prediction is
+corrected by what they gave, and the best of what was measured is tried on all targets.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import GvError
+from pipelines.tradeoffs.knobs import Knob, Point, Settings, neighbours, settings_of, usual
+from pipelines.tradeoffs.outcome import Outcome, front
+
+# Shares of the targets, by stage.
+SHARES = (0.25, 0.5, 1.0)
+# Combinations of the predicted front that are tried, and runs on all targets.
+COMBINED, FINAL = 6, 4
+# Combinations that are looked at; more are drawn at random.
+LOOKED_AT = 50_000
+# Pull of the effects towards 0, so that combinations cannot be explained by two knobs at once.
+RIDGE = 1e-3
+Run = Callable[[Settings, float], Outcome]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A trial.
+
+    Attributes:
+        label: what it was tried for.
+        point: its knobs' levels; None for settings of their own, such as a profile.
+        share: of the targets.
+        outcome: what it gave.
+    """
+
+    label: str
+    point: Point | None
+    share: float
+    outcome: Outcome
+
+
+@dataclass
+class Search:
+    """A sweep in progress.
+
+    Attributes:
+        knobs: what is varied.
+        run: makes a trial of settings on a share of the targets.
+        targets: of a whole run.
+        limit: seconds that the sweep may take; trials that would not fit are left out.
+        say: is told of each trial.
+        clock: seconds, for tests.
+    """
+
+    knobs: Sequence[Knob]
+    run: Run
+    targets: int
+    limit: float
+    say: Callable[[str], None] = print
+    clock: Callable[[], float] = time.perf_counter
+    tried: list[Tried] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+
+    def sweep(self, named: Sequence[tuple[str, Settings]], fits: Callable[[Outcome], bool]) -> None:
+        """All stages.
+
+        Args:
+            named: settings of their own to try beside the knobs, such as profiles.
+            fits: whether a whole run of an outcome is within the user's budget.
+        """
+        self._end = self.clock() + self.limit
+        base = usual(self.knobs)
+        self._try("start", base, SHARES[0])
+        if not self.tried:
+            raise GvError(f"the run that was asked for is refused: {self.refused['start']}")
+        for name, settings in named:
+            self._try_settings(name, settings, None, SHARES[0])
+        for point in neighbours(self.knobs, base):
+            self._try(self._change(point), point, SHARES[0])
+        for point in self._promising():
+            self._try("combination", point, SHARES[1])
+        for entry in self._finalists(fits):
+            self._try_settings(entry.label, entry.outcome.settings, entry.point, SHARES[-1])
+
+    def whole(self) -> list[Tried]:
+        """Trials on all targets."""
+        return [entry for entry in self.tried if entry.share == SHARES[-1]]
+
+    def predicted(self, points: Sequence[Point]) -> NDArray[np.float64]:
+        """(N, 3) seconds of a whole run, bytes, PSNR of points, by the sum of the knobs' effects.
+
+        What is known of a share's targets is told from what is known of the knobs by a term of
+        the share's own; predictions are for the smallest share's targets.
+        """
+        known = [entry for entry in self.tried if entry.point is not None]
+        rows = np.stack([self._row(entry.point, entry.share) for entry in known])  # type: ignore[arg-type]
+        values = np.array([self._values(entry.outcome) for entry in known])
+        mean = values.mean(0)
+        gram = rows.T @ rows + RIDGE * np.eye(rows.shape[1])
+        effects = np.linalg.solve(gram, rows.T @ (values - mean))
+        found = np.stack([self._row(point, SHARES[0]) for point in points]) @ effects + mean
+        found[:, :2] = np.exp(found[:, :2])
+        return found
+
+    def _values(self, outcome: Outcome) -> tuple[float, float, float]:
+        return (
+            float(np.log(outcome.seconds(self.targets))),
+            float(np.log(max(outcome.bytes, 1.0))),
+            outcome.psnr,
+        )
+
+    def _row(self, point: Point, share: float) -> NDArray[np.float64]:
+        """Indicators of levels that are not the usual ones, and of the share."""
+        row = []
+        for knob, level in zip(self.knobs, point, strict=True):
+            row += [float(level == i) for i in range(len(knob.levels)) if i != knob.usual]
+        row += [float(share == other) for other in SHARES[1:]]
+        return np.array(row)
+
+    def _promising(self) -> list[Point]:
+        """Points on the predicted front, spread over its times."""
+        points = list(self._combinations())
+        values = self.predicted(points)
+        order = np.lexsort((-values[:, 2], values[:, 0]))
+        best = -np.inf
+        found: list[int] = []
+        for index in order:
+            if values[index, 2] > best + 1e-3:
+                best = values[index, 2]
+                found.append(int(index))
+        # Evenly over the front's log-time, its ends included.
+        times = np.log(values[found, 0])
+        wanted = np.linspace(times[0], times[-1], COMBINED)
+        chosen = sorted({int(np.abs(times - time).argmin()) for time in wanted})
+        return [points[found[i]] for i in chosen]
+
+    def _combinations(self) -> Iterable[Point]:
+        """All points whose levels have each been tried, or a random draw of them."""
+        levels = []
+        for at, knob in enumerate(self.knobs):
+            seen = {entry.point[at] for entry in self.tried if entry.point is not None}
+            levels.append([i for i in range(len(knob.levels)) if i in seen])
+        total = int(np.prod([len(choice) for choice in levels]))
+        if total <= LOOKED_AT:
+            yield from itertools.product(*levels)
+            return
+        rng = np.random.default_rng(0)
+        for _ in range(LOOKED_AT):
+            yield tuple(int(rng.choice(choice)) for choice in levels)
+
+    def _finalists(self, fits: Callable[[Outcome], bool]) -> list[Tried]:
+        """What is tried on all targets: the start, profiles, and the best of the larger share."""
+        larger = [entry for entry in self.tried if entry.share == SHARES[1]]
+        best = front([entry.outcome for entry in larger], self.targets)
+        within = [outcome for outcome in best if fits(outcome)] or best[:1]
+        # The most accurate within the budget first, then the others of the front.
+        ranked = list(reversed(within)) + [o for o in reversed(best) if o not in within]
+        chosen = [entry for o in ranked[: FINAL - 1] for entry in larger if entry.outcome is o]
+        start = [entry for entry in self.tried if entry.label == "start"]
+        return start + chosen
+
+    def _change(self, point: Point) -> str:
+        for knob, level in zip(self.knobs, point, strict=True):
+            if level != knob.usual:
+                return f"{knob.name}: {knob.levels[level].name}"
+        return "start"
+
+    def _try(self, label: str, point: Point, share: float) -> None:
+        self._try_settings(label, settings_of(self.knobs, point), point, share)
+
+    def _try_settings(
+        self, label: str, settings: Settings, point: Point | None, share: float
+    ) -> None:
+        if any(e.share == share and e.outcome.settings == settings for e in self.tried):
+            return
+        left = self._end - self.clock()
+        if self._expected(settings, share) > left:
+            self.left_out.append(label)
+            return
+        try:
+            outcome = self.run(settings, share)
+        except GvError as error:
+            self.refused[label] = str(error)
+            self.say(f"{label}: refused, {error}")
+            return
+        self.tried.append(Tried(label, point, share, outcome))
+        self.say(
+            f"{label} ({share:.0%} of the targets): {outcome.psnr:.2f} dB, "
+            f"{outcome.seconds(self.targets):.1f} s a run, {outcome.bytes / 2**20:.0f} MiB"
+        )
+
+    def _expected(self, settings: Settings, share: float) -> float:
+        """Seconds of a trial: of the same settings on fewer targets, or else of the start."""
+        same = [e for e in self.tried if e.outcome.settings == settings]
+        known = same or self.tried[:1]
+        return known[-1].outcome.seconds(round(share * self.targets)) if known else 0.0
+
+
+def recommended(tried: Sequence[Tried], fits: Callable[[Outcome], bool]) -> Tried | None:
+    """The most accurate trial within the budget; None when none is."""
+    within = [entry for entry in tried if fits(entry.outcome)]
+    return max(within, key=lambda entry: entry.outcome.psnr, default=None)
+
+
+def marginal_values(search: Search) -> list[dict[str, Any]]:
+    """What each knob alone gives and takes, from one level to the next dearer one.
+
+    All on the smallest share's targets: PSNR as a difference, time, memory and observations as
+    factors.
+    """
+    start = usual(search.knobs)
+    smallest = {
+        entry.point: entry.outcome
+        for entry in search.tried
+        if entry.point is not None and entry.share == SHARES[0]
+    }
+    rows = []
+    for at, knob in enumerate(search.knobs):
+        for level in range(len(knob.levels) - 1):
+            one, two = (
+                smallest.get((*start[:at], index, *start[at + 1 :])) for index in (level, level + 1)
+            )
+            if one is None or two is None:
+                continue
+            rows.append(
+                {
+                    "knob": knob.name,
+                    "from": knob.levels[level].name,
+                    "to": knob.levels[level + 1].name,
+                    "psnr": two.psnr - one.psnr,
+                    "time": two.seconds(search.targets) / one.seconds(search.targets),
+                    "bytes": two.bytes / max(one.bytes, 1.0),
+                    "observations": two.observations / max(one.observations, 1),
+                }
+            )
+    return rows

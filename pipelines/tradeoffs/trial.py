@@ -1,0 +1,134 @@
+"""One trial: a reconstruction with other settings, measured at the truth's full size."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from gvtools.errors import GvError
+from gvtools.evaluation.view_figures import view_figures
+from gvtools.scenes.scene import Scene, View
+from pipelines.config import RunConfig, with_setting
+from pipelines.console import Console, write_json
+from pipelines.measure import mean_of
+from pipelines.reconstruct import reconstruct
+from pipelines.round_files import TargetFiles, read_target
+from pipelines.run_directory import RunDirectory
+from pipelines.tradeoffs.outcome import Outcome
+
+
+class _Silent(Console):
+    """Says nothing, warnings included: a sweep's runs are not the user's."""
+
+    def __init__(self) -> None:
+        super().__init__(quiet=True)
+
+    def warn(self, text: str) -> None:
+        """Nothing."""
+
+
+class Trials:
+    """Runs with changed settings, each made once and kept by what decides it.
+
+    Args:
+        scene: the project.
+        config: the run that was asked for; its voxel edge is set.
+        names: of the target views, held out.
+        folder: where outcomes are kept, one JSON file each.
+    """
+
+    def __init__(self, scene: Scene, config: RunConfig, names: Sequence[str], folder: Path) -> None:
+        self.scene, self.config, self.names, self.folder = scene, config, tuple(names), folder
+        self._warm = False
+
+    def outcome(self, settings: Mapping[str, Any], share: float) -> Outcome:
+        """The run with these settings on an even share of the targets.
+
+        Raises:
+            GvError: the run is refused.
+        """
+        count = max(1, round(share * len(self.names)))
+        rows = sorted({round((i + 0.5) * len(self.names) / count - 0.5) for i in range(count)})
+        names = [self.names[row] for row in rows]
+        kept = self.folder / f"{self._key(settings, names)}.json"
+        if kept.exists():
+            return Outcome(**json.loads(kept.read_text(encoding="utf-8"))["outcome"])
+        if not self._warm:
+            # Compiled kernels load, and files come into the cache, once.
+            self._warm = True
+            self._run({}, names[:1])
+        found = self._run(settings, names)
+        write_json(kept, {"outcome": found.to_json(), "names": names})
+        return found
+
+    def _key(self, settings: Mapping[str, Any], names: Sequence[str]) -> str:
+        import gvtools
+
+        said = [self.config.to_dict(), dict(settings), list(names), gvtools.__version__]
+        text = json.dumps([*said, str(self.scene.root.resolve())], sort_keys=True, default=str)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    def _run(self, settings: Mapping[str, Any], names: Sequence[str]) -> Outcome:
+        config = with_setting(self.config, "targets", ",".join(names))
+        for key, value in settings.items():
+            config = with_setting(config, key, value)
+        out = self.folder / "running"
+        shutil.rmtree(out, ignore_errors=True)
+        start = time.perf_counter()
+        try:
+            reconstruct(self.scene, config, out, console=_Silent())
+            whole = time.perf_counter() - start
+            directory = RunDirectory(out)
+            reports = directory.reports()
+            figures = [
+                _figures(read_target(directory.round_path(number), entry), self.scene)
+                for number, report in enumerate(reports)
+                for entry in report["views"]
+            ]
+        finally:
+            shutil.rmtree(out, ignore_errors=True)
+        targets = len(figures)
+        rounds = sum(report["seconds"]["total"] for report in reports[1:])
+        psnr = mean_of(figures, "psnr")
+        if psnr is None:
+            raise GvError("no target has a true picture to compare with; hold views out")
+        return Outcome(
+            settings=dict(settings),
+            targets=targets,
+            fixed=whole - rounds,
+            per_target=rounds / targets,
+            bytes=float(reports[-1]["bytes"]),
+            observations=int(reports[-1]["points"]),
+            psnr=psnr,
+            psnr_valid=mean_of(figures, "psnr_valid"),
+            psnr_generated=mean_of(figures, "psnr_generated"),
+            depth_rel=mean_of(figures, "depth_rel_valid"),
+            coverage=mean_of(figures, "coverage"),
+        )
+
+
+def _figures(target: TargetFiles, scene: Scene) -> dict[str, Any]:
+    """Figures of one target, its picture enlarged to the truth's size where the run reduced it."""
+    view: View = scene[target.name]
+    truth = view.load()
+    size = (truth.rgb.shape[1], truth.rgb.shape[0])
+    picture, depth = target.picture, target.depth
+    observed, generated = target.observed, target.generated
+    if picture.shape != truth.rgb.shape:
+        picture = np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BILINEAR))
+        depth, observed, generated = (
+            np.asarray(Image.fromarray(values).resize(size, Image.Resampling.NEAREST))
+            for values in (depth, observed, generated)
+        )
+    figures: dict[str, Any] = view_figures(
+        picture, truth, observed=observed, generated=generated, depth=depth
+    )
+    return {**figures, "coverage": float(observed.mean())}

@@ -1,0 +1,87 @@
+"""``gvtools tradeoff`` on a small scan, from the command line."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from tiny_scan import write_scan
+
+from gvtools.errors import OptionError
+from pipelines.cli import main
+from viz.pareto import draw_pareto
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory) -> Path:
+    return write_scan(tmp_path_factory.mktemp("scan"))
+
+
+@pytest.fixture(scope="module")
+def swept(scan, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("sweep") / "out"
+    assert main(["tradeoff", str(scan), "--out", str(out), "--budget", "1h", "--quiet"]) == 0
+    return out
+
+
+def test_a_sweep_leaves_table_front_plot_and_profile(swept):
+    found = json.loads((swept / "tradeoff.json").read_text())
+    trials = list(csv.DictReader((swept / "trials.csv").read_text().splitlines()))
+    assert len(trials) == len(found["trials"]) > 12
+    assert (swept / "front.png").read_bytes()[:4] == b"\x89PNG"
+    front = found["front"]
+    assert front and [row["psnr"] for row in front] == sorted(row["psnr"] for row in front)
+    best = found["recommended"]
+    whole = [trial for trial in found["trials"] if trial["share"] == 1]
+    assert whole and best["psnr"] == max(trial["psnr"] for trial in whole)
+    names = {row["knob"] for row in found["marginal"]}
+    assert {"voxel edge", "completer", "projection"} <= names
+    for row in found["marginal"]:
+        assert row["time"] > 0 and row["bytes"] > 0
+    coarse = next(row for row in found["marginal"] if row["knob"] == "voxel edge")
+    assert coarse["observations"] > 1.2 and coarse["bytes"] > 1
+    # Runs leave nothing behind but their outcomes.
+    assert all(path.suffix == ".json" for path in (swept / "trials").iterdir())
+
+
+def test_the_profile_is_what_reconstruct_takes_and_gives_its_figures(scan, swept, tmp_path):
+    best = json.loads((swept / "tradeoff.json").read_text())["recommended"]
+    arguments = ["reconstruct", str(scan), "--context", "every:2", "--targets", "every:2+1"]
+    arguments += ["--config", str(swept / "profile.json"), "--out", str(tmp_path / "run")]
+    assert main([*arguments, "--quiet"]) == 0
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["observations"] == best["observations"]
+    assert found["psnr"] == pytest.approx(best["psnr"], abs=1e-6)
+
+
+def test_a_second_sweep_takes_over_what_is_there(scan, swept, capsys):
+    before = {path: path.stat().st_mtime_ns for path in (swept / "trials").iterdir()}
+    assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "1B"]) == 2
+    assert "expected seconds" in capsys.readouterr().err
+    assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "1kB"]) == 0
+    captured = capsys.readouterr()
+    assert "no trial is within the budget" in captured.err
+    after = {path: path.stat().st_mtime_ns for path in (swept / "trials").iterdir()}
+    assert all(after[path] == stamp for path, stamp in before.items())
+    assert not (swept / "profile.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--targets", "orbit:3"], "no views of the project"),
+        (["--limit", "100MB"], "expected a time"),
+        (["--set", "splat.bandd=1"], "did you mean"),
+    ],
+)
+def test_what_cannot_be_swept_is_one_line(scan, tmp_path, capsys, more, said):
+    assert main(["tradeoff", str(scan), "--out", str(tmp_path / "x"), *more]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_plot_without_trials_is_refused():
+    with pytest.raises(OptionError, match="without trials"):
+        draw_pareto([], front=[], title="nothing")

@@ -1,0 +1,169 @@
+"""The sweep of a trade-off, on made-up runs whose time and accuracy are known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from gvtools.errors import GvError, OptionError
+from pipelines.tradeoff import parse_budget
+from pipelines.tradeoffs.knobs import Knob, Level, neighbours, settings_of, usual
+from pipelines.tradeoffs.outcome import Outcome, front
+from pipelines.tradeoffs.search import SHARES, Search, marginal_values, recommended
+
+TARGETS = 40
+KNOBS = [
+    Knob("edge", tuple(Level(str(v), {"edge": v}) for v in (4, 2, 1)), 1),
+    Knob("steps", tuple(Level(str(v), {"steps": v}) for v in (1, 3)), 0),
+    Knob("waste", tuple(Level(str(v), {"waste": v}) for v in (0, 5)), 1),
+]
+
+
+class Runs:
+    """Seconds multiply, decibels add; waste takes time and gives nothing."""
+
+    def __init__(self, refuse: object = None) -> None:
+        self.now = 0.0
+        self.refuse = refuse
+        self.made: list[tuple[dict, float]] = []
+
+    def __call__(self, settings, share):
+        self.made.append((dict(settings), share))
+        edge, steps = settings.get("edge", 2), settings.get("steps", 1)
+        if edge == self.refuse:
+            raise OptionError("edge is refused")
+        seconds = 8.0 / edge * (1 + 0.5 * (steps == 3)) * (1 + settings.get("waste", 5) / 5)
+        count = round(share * TARGETS)
+        self.now += seconds * share
+        return Outcome(
+            settings=dict(settings),
+            targets=count,
+            fixed=0.2 * seconds,
+            per_target=0.8 * seconds / TARGETS,
+            bytes=1e6 / edge,
+            observations=1000 // edge,
+            psnr=20 - math.log2(edge) + 0.7 * (steps == 3) + 0.01 * share,
+            psnr_valid=None,
+            psnr_generated=None,
+            depth_rel=None,
+            coverage=None,
+        )
+
+
+def swept(budget: float, *, limit: float = 1e6, refuse: object = None) -> tuple[Search, Runs]:
+    runs = Runs(refuse)
+    search = Search(KNOBS, runs, TARGETS, limit=limit, say=lambda _: None, clock=lambda: runs.now)
+    search.sweep([("profile odd", {"edge": 3})], lambda outcome: fits(outcome, budget))
+    return search, runs
+
+
+def fits(outcome: Outcome, budget: float) -> bool:
+    return outcome.seconds(TARGETS) <= budget
+
+
+@pytest.mark.parametrize(
+    ("budget", "best"),
+    [
+        (100, {"edge": 1, "steps": 3, "waste": 0}),
+        (9, {"edge": 1, "steps": 1, "waste": 0}),
+        (3.5, {"edge": 4, "steps": 3, "waste": 0}),
+    ],
+)
+def test_the_recommendation_is_the_best_combination_within_the_budget(budget, best):
+    """None of them was tried before its knobs were known one by one."""
+    search, runs = swept(budget)
+    chosen = recommended(search.whole(), lambda outcome: fits(outcome, budget))
+    assert chosen is not None and chosen.outcome.settings == best
+    assert chosen.share == 1.0
+    assert len([1 for _, share in runs.made if share == 1.0]) <= 5
+
+
+def test_early_trials_are_small_and_each_knob_is_tried_alone():
+    _, runs = swept(100)
+    first = [settings for settings, share in runs.made if share == SHARES[0]]
+    start = settings_of(KNOBS, usual(KNOBS))
+    assert first[0] == start and {"edge": 3} in first
+    for settings in first[2:]:
+        assert sum(settings[key] != start[key] for key in start) == 1
+    assert len(first) == 2 + len(neighbours(KNOBS, usual(KNOBS)))
+
+
+def test_marginal_values_are_those_of_one_step_of_one_knob():
+    search, _ = swept(100)
+    rows = {(row["knob"], row["from"]): row for row in marginal_values(search)}
+    halved = rows["edge", "2"]
+    assert halved["psnr"] == pytest.approx(1.0) and halved["time"] == pytest.approx(2.0)
+    assert halved["bytes"] == pytest.approx(2.0)
+    steps = rows["steps", "1"]
+    assert steps["psnr"] == pytest.approx(0.7) and steps["time"] == pytest.approx(1.5)
+    wasted = rows["waste", "0"]
+    assert wasted["psnr"] == pytest.approx(0.0) and wasted["time"] == pytest.approx(2.0)
+
+
+def test_a_prediction_is_near_what_a_combination_gives():
+    search, runs = swept(100)
+    point = (2, 1, 0)
+    seconds, size, psnr = search.predicted([point])[0]
+    true = runs(settings_of(KNOBS, point), SHARES[0])
+    assert seconds == pytest.approx(true.seconds(TARGETS), rel=0.05)
+    assert size == pytest.approx(true.bytes, rel=0.05) and psnr == pytest.approx(true.psnr, abs=0.1)
+
+
+def test_the_limit_holds_and_what_was_left_out_is_named():
+    search, runs = swept(100, limit=20)
+    assert runs.now <= 20
+    assert search.left_out and search.tried
+    whole, _ = swept(100)
+    assert not whole.left_out and len(whole.tried) > len(search.tried)
+
+
+def test_a_refused_setting_is_named_and_the_sweep_goes_on():
+    search, _ = swept(100, refuse=4)
+    assert search.refused == {"edge: 4": "edge is refused"}
+    assert all(entry.outcome.settings.get("edge") != 4 for entry in search.tried)
+    with pytest.raises(GvError, match="the run that was asked for is refused: edge is refused"):
+        swept(100, refuse=2)
+
+
+def test_no_trial_within_the_budget_gives_no_recommendation():
+    search, _ = swept(0.1)
+    assert recommended(search.whole(), lambda outcome: fits(outcome, 0.1)) is None
+
+
+def test_the_front_holds_what_no_other_beats():
+    search, _ = swept(100)
+    outcomes = [entry.outcome for entry in search.tried]
+    best = front(outcomes, TARGETS)
+    for outcome in outcomes:
+        beaten = any(
+            other.seconds(TARGETS) <= outcome.seconds(TARGETS) and other.psnr > outcome.psnr
+            for other in outcomes
+        )
+        assert (outcome in best) != beaten or any(
+            other.psnr == outcome.psnr and other.seconds(TARGETS) <= outcome.seconds(TARGETS)
+            for other in best
+        )
+    times = [outcome.seconds(TARGETS) for outcome in best]
+    assert times == sorted(times)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "amount"),
+    [
+        ("60", "seconds", 60),
+        ("1.5m", "seconds", 90),
+        ("2h", "seconds", 7200),
+        ("200MB", "bytes", 2e8),
+        ("1 GiB", "bytes", 2**30),
+        (None, "seconds", None),
+    ],
+)
+def test_budgets_are_seconds_or_bytes(text, kind, amount):
+    assert parse_budget(text) == (kind, amount)
+
+
+@pytest.mark.parametrize("text", ["", "0", "-3", "5 apples", "fast", "1e3x"])
+def test_a_budget_that_is_none_is_refused(text):
+    with pytest.raises(OptionError, match="expected seconds"):
+        parse_budget(text)
