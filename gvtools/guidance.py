@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, concatenate
+from gvtools.errors import ShapeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,3 +59,21 @@ class Guidance:
     def coverage(self) -> float:
         """The share of pixels that memory supports."""
         return float(self.valid.mean()) if self.valid.size else 0.0
+
+
+def together(views: Sequence[Guidance]) -> Guidance:
+    """Several guidances of one picture size as one batch, in their order.
+
+    Raises:
+        ShapeError: none, or pictures of different sizes.
+    """
+    sizes = sorted({guidance.valid.shape[1:] for guidance in views})
+    if len(sizes) != 1:
+        raise ShapeError(f"guidance of {len(sizes)} picture sizes {sizes}; expected one")
+    return Guidance(
+        concatenate([guidance.cameras for guidance in views]),
+        *(
+            np.concatenate([getattr(guidance, name) for guidance in views])
+            for name in ("rgb", "depth", "valid", "confidence", "generated")
+        ),
+    )

@@ -241,12 +241,17 @@ def _round(
             known = [memory.project(camera, options=plan.config.splat) for camera in cameras]
         before = _mean([guidance.coverage for guidance in known])
         results, total = rounds.complete_targets(
-            cameras, number, memory=memory,
+            known, number, memory=memory,
             completer=create(plan.config.completer, **plan.config.completer_options),
             context=context, config=plan.config, clock=clock, progress=console.track,
         )  # fmt: skip
         with clock.stage("project"):
-            grown = [memory.project(camera, options=plan.config.splat) for camera in cameras]
+            # Where nothing was fused, memory is what it was.
+            grown = (
+                [memory.project(camera, options=plan.config.splat) for camera in cameras]
+                if total.points
+                else known
+            )
         after = _mean([guidance.coverage for guidance in grown])
         stems = target_stems(plan.targets.cameras.names)
         rows = plan.schedule[number - 1]

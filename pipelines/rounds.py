@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
 from gvtools.completers.base import Completer, Completion, ContextView
 from gvtools.errors import ProjectError
-from gvtools.guidance import Guidance
+from gvtools.guidance import Guidance, together
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.scenes.scene import Scene
@@ -137,7 +136,7 @@ def load_context(scene: Scene, names: Sequence[str], source: KeptDepth) -> list[
 
 
 def complete_targets(
-    cameras: Cameras,
+    known: Sequence[Guidance],
     number: int,
     *,
     memory: SpatialMemory,
@@ -147,36 +146,62 @@ def complete_targets(
     clock: Clock,
     progress: Any,
 ) -> tuple[list[TargetResult], FuseReport]:
-    """Rounds 1, 2, ...: project, complete, align and fuse the round's targets.
+    """Rounds 1, 2, ...: complete, align and fuse the round's targets.
 
-    A completer that looks at several targets at once (``joint``) gets them all; for any other, each
-    view is completed on what the views before it added, so that they agree with each other.
+    A completer that looks at several targets at once (``joint``) gets all of one size together; for
+    any other, each view is completed on what the views before it added, so that they agree with
+    each other.
+
+    Args:
+        known: the memory as it is projected into each target, a batch of one each.
+        number: of the round.
+        memory: is added to.
+        completer: see ``Completer``.
+        context: the given views.
+        config: of the run.
+        clock: receives the stages' times.
+        progress: (items, label) to the items.
+
+    Returns:
+        What became of each target, in the order given, and the sum of what was fused.
     """
     seed = config.seed + number
+    results = []
+    total = FuseReport()
     if getattr(completer, "joint", False):
-        with clock.stage("project"):
-            guidance = memory.project(cameras, options=config.splat)
         with clock.stage("complete"):
-            completion = completer.complete(context, guidance, seed=seed)
-        pairs = [(guidance[i], _row(completion, i)) for i in range(len(cameras))]
-        results = []
-        total = FuseReport()
-        for known, made in progress(pairs, f"round {number}"):
-            result, report = _align_and_fuse(known, made, number, memory, config, clock)
+            made = _completed_together(completer, context, known, seed)
+        pairs = list(zip(known, made, strict=True))
+        for guidance, completion in progress(pairs, f"round {number}"):
+            result, report = _align_and_fuse(guidance, completion, number, memory, config, clock)
             results.append(result)
             total += report
         return results, total
-    results = []
-    total = FuseReport()
-    for camera in progress(list(cameras), f"round {number}"):
-        with clock.stage("project"):
-            guidance = memory.project(camera, options=config.splat)
+    for guidance in progress(list(known), f"round {number}"):
+        if total.points:
+            with clock.stage("project"):
+                guidance = memory.project(guidance.cameras, options=config.splat)
         with clock.stage("complete"):
             completion = completer.complete(context, guidance, seed=seed)
         result, report = _align_and_fuse(guidance, completion, number, memory, config, clock)
         results.append(result)
         total += report
     return results, total
+
+
+def _completed_together(
+    completer: Completer, context: Sequence[ContextView], known: Sequence[Guidance], seed: int
+) -> list[Completion]:
+    """A batch of one for each target, of batches of all targets of one size."""
+    made: list[Completion | None] = [None] * len(known)
+    sizes: dict[tuple[int, ...], list[int]] = {}
+    for index, guidance in enumerate(known):
+        sizes.setdefault(guidance.valid.shape[1:], []).append(index)
+    for rows in sizes.values():
+        completion = completer.complete(context, together([known[i] for i in rows]), seed=seed)
+        for place, index in enumerate(rows):
+            made[index] = _row(completion, place)
+    return [completion for completion in made if completion is not None]
 
 
 def _row(completion: Completion, index: int) -> Completion:

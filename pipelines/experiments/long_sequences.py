@@ -125,7 +125,7 @@ def _follow(
         cameras = truth.cameras[rows]
         if arm.memory:
             results, _ = complete_targets(
-                cameras,
+                [memory.project(camera, options=config.splat) for camera in cameras],
                 number + 1,
                 memory=memory,
                 completer=arm.completer,
