@@ -31,18 +31,23 @@ class FusionOptions:
         voxel_percentile: the automatic voxel edge follows this percentile of the context's pixel
             footprints; near surfaces are what a coarse voxel blurs.
         voxel_scale: how many such footprints the edge is.
+        voxel_loss: dB by which context views, predicted from their neighbours, may be worse than
+            with the best edge for a coarser one to be taken; None keeps the footprints'. Only views
+            with recorded depth are asked.
     """
 
     min_confidence: float = 0.08
     max_scale_residual: float = 0.1
     voxel_percentile: float = 50.0
     voxel_scale: float = 1.0
+    voxel_loss: float | None = 0.05
 
     def __post_init__(self) -> None:
         check_range("fusion.min_confidence", self.min_confidence, least=0, most=1)
         check_range("fusion.max_scale_residual", self.max_scale_residual, above=0)
         check_range("fusion.voxel_percentile", self.voxel_percentile, least=0, most=100)
         check_range("fusion.voxel_scale", self.voxel_scale, above=0)
+        check_range("fusion.voxel_loss", self.voxel_loss, least=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +122,7 @@ PROFILES: dict[str, dict[str, Any]] = {
     "balanced": {},
     "accurate": {
         "fusion.voxel_percentile": 25.0,
+        "fusion.voxel_loss": None,
         "memory.same_direction": 0.0,
         "memory.observations_per_voxel": 64,
     },

@@ -60,10 +60,12 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
     """
     from gvtools.completers.base import create
     from gvtools.depth.choice import choose_source
+    from gvtools.depth.source import is_recorded
     from gvtools.errors import ProjectError
     from gvtools.scenes.reduced import reduced
     from gvtools.scenes.selection import select
     from pipelines.targets import resolve_targets
+    from pipelines.voxel_probe import sufficient_scale
 
     errors = [finding.message for finding in scene.findings if finding.level == "error"]
     if errors:
@@ -90,6 +92,11 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
             scene, context, chosen.source, percentile=config.fusion.voxel_percentile, say=say
         )
         edge *= config.fusion.voxel_scale
+        if config.fusion.voxel_loss is not None:
+            recorded = [name for name in context if is_recorded(chosen.source, scene[name])]
+            edge *= sufficient_scale(
+                scene, recorded, edge, config=config, loss=config.fusion.voxel_loss, say=say
+            )
         config = replace(config, voxel=float(f"{edge:.3g}"))
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = replace(config, rounds=len(schedule))

@@ -1,0 +1,130 @@
+"""How coarse a memory may be: context views, predicted from their neighbours at several edges.
+
+A footprint says what a pixel could show, not what the pictures do: blur, noise and the mixing of
+views often leave less, and coarser voxels then store a fraction of it and look the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.memory.back_projection import back_project
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.voxel_index import rounded_origin
+from pipelines.sampling import sampled
+
+if TYPE_CHECKING:
+    from gvtools.scenes.scene import Frame, Scene
+    from pipelines.config import RunConfig
+
+# Edges that are tried, in shares of the one given.
+SCALES = (1.0, 1.5, 2.0, 3.0, 4.0)
+# Views that are predicted, and neighbours that each is predicted from.
+PROBES, NEIGHBOURS = 3, 4
+# Fewer valid pixels of a view tell nothing.
+LEAST = 1000
+# Mean squared errors below it, of one part in a hundred, are one: nobody sees them.
+UNSEEN = 1e-4
+
+
+def sufficient_scale(
+    scene: Scene,
+    names: Sequence[str],
+    voxel: float,
+    *,
+    config: RunConfig,
+    loss: float,
+    say: Callable[[str], None] | None = None,
+) -> float:
+    """The coarsest of ``SCALES`` that predicts views within ``loss`` of the best one.
+
+    Args:
+        scene: the project.
+        names: context views with recorded depth.
+        voxel: edge, scene units.
+        config: of the run: how points are lifted, kept and projected.
+        loss: dB that the mean PSNR of the predicted views may fall behind.
+        say: is told what was found.
+
+    Returns:
+        A share of ``voxel``; 1 where there are too few views to tell.
+    """
+    if len(names) <= NEIGHBOURS:
+        return 1.0
+    frames: dict[str, Frame] = {}
+    probes = [(name, _nearest(scene, names, name)) for name in sampled(names, PROBES)]
+    found: dict[float, float] = {}
+    valid: list[NDArray[np.bool_]] = []
+    for scale in SCALES:
+        errors, masks = [], []
+        for name, others in probes:
+            error, mask = _predicted(scene, name, others, scale * voxel, config, frames)
+            errors.append(error)
+            masks.append(mask)
+        # On what the finest memory knows: coarser ones know more.
+        valid = valid or masks
+        figures = [
+            -10 * np.log10(max(float(error[mask].mean()), UNSEEN))
+            for error, mask in zip(errors, valid, strict=True)
+            if mask.sum() >= LEAST
+        ]
+        if not figures:
+            return 1.0
+        found[scale] = float(np.mean(figures))
+        if found[scale] < max(found.values()) - loss:
+            break
+    best = max(found.values())
+    chosen = max(scale for scale, psnr in found.items() if psnr >= best - loss)
+    if say is not None:
+        said = ", ".join(f"{scale * voxel:.3g}: {psnr:.2f} dB" for scale, psnr in found.items())
+        say(f"voxel edge by {len(probes)} context views predicted from their neighbours ({said})")
+    return chosen
+
+
+def _nearest(scene: Scene, names: Sequence[str], name: str) -> list[str]:
+    """The views that stand and look most like one."""
+    camera = scene[name].camera
+    others = [other for other in names if other != name]
+    cameras = scene.subset(others).cameras
+    apart = np.linalg.norm(cameras.centers - camera.centers, axis=1)
+    forward = cameras.world_from_cam[:, :3, 2] @ camera.world_from_cam[0, :3, 2]
+    spread = max(float(np.median(apart)), 1e-12)
+    order = np.argsort(apart / spread + (1 - forward), kind="stable")
+    return [others[i] for i in order[:NEIGHBOURS]]
+
+
+def _predicted(
+    scene: Scene,
+    name: str,
+    others: Sequence[str],
+    voxel: float,
+    config: RunConfig,
+    frames: dict[str, Frame],
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """(H, W) squared colour error of a view, and where its neighbours' memory knows it."""
+    for other in (name, *others):
+        if other not in frames:
+            frames[other] = scene[other].load()
+    view, truth = scene[name], frames[name]
+    origin = rounded_origin(scene.subset(others).cameras.centers.mean(axis=0), voxel)
+    memory = SpatialMemory(voxel, origin=origin, options=config.memory)
+    for other in others:
+        frame = frames[other]
+        assert frame.depth is not None
+        points = back_project(
+            frame.rgb,
+            frame.depth,
+            scene[other].camera,
+            origin=origin,
+            mask=frame.mask,
+            options=config.back_projection,
+        )
+        memory.fuse(points, round=0)
+    guidance = memory.project(view.camera, options=config.splat)
+    known = guidance.valid[0] if truth.mask is None else guidance.valid[0] & truth.mask
+    error = guidance.rgb[0] - truth.rgb.astype(np.float32) / np.float32(255)
+    return np.square(error).mean(-1), known
