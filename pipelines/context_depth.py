@@ -22,6 +22,7 @@ from gvtools.depth.source import DepthMap, DepthSource, RecordedDepth
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.files import replaced_when_written
 from gvtools.scenes.scene import Frame, Scene, View
+from pipelines.array_files import save_arrays
 from pipelines.console import Console
 from pipelines.round_files import target_stems, write_png
 
@@ -114,7 +115,7 @@ def _write(path: Path, found: DepthMap, failed: str) -> None:
     with replaced_when_written(path.with_suffix(".png")) as temporary:
         write_png(temporary, colored(found.depth))
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(
+        save_arrays(
             file,
             depth=found.depth,
             confidence=found.confidence,

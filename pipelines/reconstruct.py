@@ -6,7 +6,9 @@ import argparse
 import shutil
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +27,9 @@ EXAMPLES = (
     "gvtools reconstruct scan/ --context every:2 --targets every:2+1 --out runs/scan",
     "gvtools reconstruct colmap/ --targets orbit:24 --completer inpaint --out runs/orbit",
 )
+
+# Targets whose files are written at once.
+WRITERS = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -255,10 +260,13 @@ def _round(
         after = _mean([guidance.coverage for guidance in grown])
         stems = target_stems(plan.targets.cameras.names)
         rows = plan.schedule[number - 1]
+        # Compression leaves the interpreter alone.
+        with ThreadPoolExecutor(WRITERS) as pool:
+            names = [stems[row] for row in rows]
+            list(pool.map(partial(write_target, folder), names, results, grown))
         for at, (row, result, start_of_round, end_of_round) in enumerate(
             zip(rows, results, known, grown, strict=True)
         ):
-            write_target(folder, stems[row], result, end_of_round)
             views.append(
                 {
                     **result.report,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written
 from gvtools.guidance import Guidance
+from pipelines.array_files import save_arrays
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 
@@ -79,7 +80,7 @@ def write_view(folder: Path, stem: PurePosixPath, guidance: Guidance) -> None:
     _write_png(base.with_name(f"{base.name}.confidence.png"), grey)
     path = base.with_name(f"{base.name}.depth.npz")
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, depth=guidance.depth[0].astype(np.float32))
+        save_arrays(file, depth=guidance.depth[0].astype(np.float32))
 
 
 def _write_png(path: Path, pixels: NDArray[np.uint8]) -> None:

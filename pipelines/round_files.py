@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance
+from pipelines.array_files import save_arrays
 from pipelines.render_files import file_stems
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def write_target(folder: Path, stem: str, result: TargetResult, after: Guidance)
     write_png(folder / f"valid_{stem}.png", support)
     write_png(folder / f"generated_{stem}.png", to_bytes(result.completion.rgb[0]))
     write_png(folder / f"after_{stem}.png", to_bytes(after.rgb[0]))
-    np.savez_compressed(
+    save_arrays(
         folder / f"depth_{stem}.npz",
         guidance=result.guidance.depth[0],
         completion=result.completion.depth[0],
@@ -140,7 +141,7 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     """One PNG."""
     from PIL import Image
 
-    Image.fromarray(image).save(path, format="PNG", compress_level=4)
+    Image.fromarray(image).save(path, format="PNG", compress_level=1)
 
 
 def read_png(path: Path) -> NDArray[np.uint8]:
