@@ -254,12 +254,14 @@ def test_a_pixel_that_went_wrong_spoils_no_other_of_a_correction(bad, side, colu
     filled, valid = halves()
     decoded = {"made": filled * 1.1, "hint": filled.flip(-1)}
     plain = corrected_color(filled, **decoded, valid=valid)
-    plain_depth = corrected_depth(filled[:, :1], **first(decoded), valid=valid)
+    one = first(decoded)
+    plain_depth = corrected_depth(filled[:, :1], one["made"], one["hint"], valid)
     decoded[side] = decoded[side].clone()
     decoded[side][..., 3, column] = bad
     color = corrected_color(filled, **decoded, valid=valid)
     assert (~color.isfinite()).any(1).sum() == 1
-    depth = corrected_depth(filled[:, :1], **first(decoded), valid=valid)
+    one = first(decoded)
+    depth = corrected_depth(filled[:, :1], one["made"], one["hint"], valid)
     assert (~depth.isfinite()).sum() <= 1
     others = torch.ones(16, 16, dtype=torch.bool)
     others[3, column] = False

@@ -341,7 +341,7 @@ def test_temperature_scales_the_noise_that_level_1_starts_from(weights, monkeypa
     context, known = micro.context_views(1), micro.guidance(1)
     pictures = {}
     for temperature in (None, 1.0, 0.25, 0.0):
-        options = {} if temperature is None else {"temperature": temperature}
+        options: dict[str, Any] = {} if temperature is None else {"temperature": temperature}
         pictures[temperature] = complete(weights, context, known, steps=1, **options).rgb
     own, whole, quarter, none = states
     assert torch.equal(own, whole) and whole.std() > 0.9

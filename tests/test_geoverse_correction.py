@@ -105,6 +105,7 @@ def test_every_depth_correction_has_a_gradient_while_training():
         holes = ~batch.valid[:, batch.context :, 0]
         assert holes.any()
         found.sum().backward()
+        assert depth.grad is not None
         assert (depth.grad[holes].abs() > 0).all(), factor
 
 

@@ -83,7 +83,7 @@ def test_a_run_takes_the_measured_edge_unless_told_otherwise(scan):
     scene = open_project(scan)
     texts = ["context=not:first:1", "targets=first:1"]
     edges = {
-        name: make_plan(scene, with_settings(RunConfig(), [*texts, *more])).config.voxel
+        name: make_plan(scene, with_settings(RunConfig(), [*texts, *more])).config.voxel or 0
         for name, more in {
             "footprint": ["fusion.voxel_loss=none"],
             "accurate": ["profile=accurate"],
