@@ -84,7 +84,7 @@ def from_depth(
             frame.rgb if exposures is None else exposures.common(frame.rgb, name),
             found.depth,
             scene[name].camera,
-            origin=memory.origin,
+            frame=memory.frame,
             confidence=found.confidence,
             mask=frame.mask,
         )
@@ -111,7 +111,7 @@ def from_sparse(scene: Scene, context: tuple[str, ...], footprint: float) -> Spa
             colors=points.colors[kept],
             confidence=np.ones(count, np.float32),
             spacing=spacing.astype(np.float32),
-            origin=origin,
+            frame=memory.frame,
             camera=camera,
             free_depth=None,
             dropped={},

@@ -60,7 +60,7 @@ def compare_fusing(memory: SpatialMemory, frames: list[Frame], *, repeat: int) -
 
     def ours(turn: int) -> None:
         rgb, depth, camera = frames[turn]
-        memory.fuse(back_project(rgb, depth, camera, origin=memory.origin), round=number)
+        memory.fuse(back_project(rgb, depth, camera, frame=memory.frame), round=number)
 
     def concatenate(turn: int) -> None:
         open3d_peers.concatenated(old, clouds[turn], voxel)

@@ -76,7 +76,8 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
     config = _on_device(config)
     scene = reduced(scene, config.max_side)
     completer = create(config.completer, **config.completer_options)
-    context = select(scene.names, config.context)
+    # By name: a project may list its views in any order, and merging depends on theirs.
+    context = tuple(sorted(select(scene.names, config.context)))
     targets = resolve_targets(
         scene,
         context,

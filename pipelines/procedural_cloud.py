@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
+from gvtools.memory.local_frame import LocalFrame
 from gvtools.memory.points import PointSet
 
 Float64 = NDArray[np.float64]
@@ -54,7 +55,7 @@ def walls(size: Float64, voxel: float) -> list[PointSet]:
                     np.ones(count, np.float32),
                     np.full(count, voxel, np.float32),
                     inside_camera(size, turn=0.0, width=640, height=480),
-                    np.zeros(3),
+                    LocalFrame.at(),
                     None,
                     {},
                 )

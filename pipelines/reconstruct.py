@@ -200,12 +200,13 @@ def _run_rounds(plan: Plan, directory: RunDirectory, done: int, console: Console
 
 def _start_memory(plan: Plan) -> SpatialMemory:
     from gvtools.memory.spatial_memory import SpatialMemory
-    from gvtools.memory.voxel_index import rounded_origin
+    from pipelines.grid_frame import grid_frame
 
-    centers = plan.scene.subset(plan.context).cameras.centers
     assert plan.config.voxel is not None
-    origin = rounded_origin(centers.mean(axis=0), plan.config.voxel)
-    return SpatialMemory(plan.config.voxel, origin=origin, options=plan.config.memory)
+    frame = grid_frame(plan.scene, plan.context)
+    return SpatialMemory(
+        plan.config.voxel, origin=frame.origin, axes=frame.axes, options=plan.config.memory
+    )
 
 
 def _round(

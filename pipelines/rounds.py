@@ -90,7 +90,7 @@ def observe_context(
                 frame.rgb,
                 depth_map.depth,
                 view.camera,
-                origin=memory.origin,
+                frame=memory.frame,
                 confidence=depth_map.confidence,
                 mask=frame.mask,
                 options=config.back_projection,
@@ -249,7 +249,7 @@ def _align_and_fuse(
                 np.rint(np.clip(completion.rgb[0], 0, 1) * 255).astype(np.uint8),
                 (depth * np.float32(fit.scale)).astype(np.float32),
                 guidance.cameras,
-                origin=memory.origin,
+                frame=memory.frame,
                 # Unused outside the mask, where it must still be positive.
                 confidence=np.where(fused, confidence, np.float32(1)),
                 mask=fused,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 SUMMARY = "try a run's settings on held-out views: what each gives and takes, and what to choose"
 EXAMPLES = (
     "gvtools tradeoff scan/ --out runs/tradeoff --budget 60",
-    "gvtools tradeoff colmap/ --out runs/small --budget 200MB --context every:4 --targets every:4+2",
+    "gvtools tradeoff colmap/ --out runs/small --budget 200MB --targets every:8+4",
 )
 UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 BYTES = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2.0**10, "mib": 2.0**20, "gib": 2.0**30}

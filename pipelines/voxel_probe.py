@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.voxel_index import rounded_origin
+from pipelines.grid_frame import grid_frame
 from pipelines.sampling import sampled
 
 if TYPE_CHECKING:
@@ -110,17 +110,17 @@ def _predicted(
         if other not in frames:
             frames[other] = scene[other].load()
     view, truth = scene[name], frames[name]
-    origin = rounded_origin(scene.subset(others).cameras.centers.mean(axis=0), voxel)
-    memory = SpatialMemory(voxel, origin=origin, options=config.memory)
+    frame = grid_frame(scene, others)
+    memory = SpatialMemory(voxel, origin=frame.origin, axes=frame.axes, options=config.memory)
     for other in others:
-        frame = frames[other]
-        assert frame.depth is not None
+        seen = frames[other]
+        assert seen.depth is not None
         points = back_project(
-            frame.rgb,
-            frame.depth,
+            seen.rgb,
+            seen.depth,
             scene[other].camera,
-            origin=origin,
-            mask=frame.mask,
+            frame=frame,
+            mask=seen.mask,
             options=config.back_projection,
         )
         memory.fuse(points, round=0)

@@ -56,6 +56,6 @@ def fused(
         view = scene.views[row]
         frame = view.load()
         assert frame.depth is not None
-        points = back_project(frame.rgb, frame.depth, view.camera, origin=origin)
+        points = back_project(frame.rgb, frame.depth, view.camera, frame=memory.frame)
         memory.fuse(points, round=number, generated=row in generated)
     return memory

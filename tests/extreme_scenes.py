@@ -37,7 +37,7 @@ def square_before_wall(
         square = (abs(at_square) <= 0.41).all(-1)
         depth = (np.where(square, SQUARE, WALL) - center[2]) * scale
         rgb = np.where(square[..., None], (255, 40 * i, 0), (0, 40 * i, 255)).astype(np.uint8)
-        points = back_project(rgb, depth.astype(np.float32), source, origin=memory.origin)
+        points = back_project(rgb, depth.astype(np.float32), source, frame=memory.frame)
         reports.append(memory.fuse(points, round=i // 2, generated=i == len(CENTERS) - 1))
     return memory, reports
 

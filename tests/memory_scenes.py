@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras
 from gvtools.memory.back_projection import back_project
+from gvtools.memory.local_frame import LocalFrame
 from gvtools.memory.points import PointSet
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 
@@ -45,7 +46,7 @@ def points(
         np.array(np.broadcast_to(confidence, count), np.float32),
         np.array(np.broadcast_to(spacing, count), np.float32),
         camera() if source is None else source,
-        np.asarray(origin, float),
+        LocalFrame.at(origin),
         free_depth,
         {},
     )
@@ -89,7 +90,7 @@ def plane_view(
     shape = (int(source.height[0]), int(source.width[0]))
     rgb = np.array(np.broadcast_to(np.asarray(color, np.uint8), (*shape, 3)))
     image = np.array(np.broadcast_to(np.asarray(depth, np.float32), shape))
-    return back_project(rgb, image, source, origin=origin)
+    return back_project(rgb, image, source, frame=LocalFrame.at(origin))
 
 
 def saved_bytes(memory: SpatialMemory, folder: Path) -> bytes:

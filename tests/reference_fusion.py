@@ -34,7 +34,7 @@ class ReferenceMemory:
 
     def fuse(self, points: PointSet, *, round: int, generated: bool = False) -> dict[str, int]:
         """Free space is not looked at."""
-        self.centers.append(points.camera.centers[0] - points.origin)
+        self.centers.append(points.frame.from_world(points.camera.centers)[0])
         self.rounds.append(round)
         self.made.append(generated)
         cells: dict[tuple[int, int, int], list[int]] = {}

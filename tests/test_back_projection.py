@@ -8,6 +8,7 @@ from memory_scenes import camera
 
 from gvtools.errors import ShapeError
 from gvtools.memory.back_projection import FREE_CELL, BackProjectionOptions, back_project
+from gvtools.memory.local_frame import LocalFrame
 
 KEEP_ALL = BackProjectionOptions(edge=1e9, grazing=0)
 
@@ -35,7 +36,9 @@ def test_projection_undoes_back_projection(seed, far):
     )  # fmt: skip
     depth = rng.uniform(1, 9, (30, 40)).astype(np.float32)
     depth[rng.random((30, 40)) < 0.2] = 0
-    lifted = back_project(_numbered((30, 40)), depth, source, origin=origin, options=KEEP_ALL)
+    lifted = back_project(
+        _numbered((30, 40)), depth, source, frame=LocalFrame.at(origin), options=KEEP_ALL
+    )
     # The oracle's own rounding is that of coordinates of millions: look from near the origin.
     xy, z = source.project(lifted.positions.astype(float) + origin)
     rows, cols = lifted.colors[:, 0].astype(int), lifted.colors[:, 1].astype(int)

@@ -12,6 +12,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.memory.local_frame import LocalFrame
 from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.thinning import thinned
 from gvtools.scenes.project import open_project
@@ -168,8 +169,8 @@ def test_glb_keeps_millimetres_far_from_the_origin(scene, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     near = fused(scene, [0])
     far = fused(scene, [0])
-    far.origin = np.array(ORIGIN)
-    far.views.origin = far.origin
+    far.frame = LocalFrame.at(ORIGIN)
+    far.views.frame = far.frame
     far.save(tmp_path / "memory.npz")
     run(tmp_path / "memory.npz", "--format", "glb", "--out", tmp_path / "cloud.glb")
     loaded = trimesh.load_scene(tmp_path / "cloud.glb")

@@ -176,7 +176,7 @@ def test_cameras_far_from_the_origin_are_told_apart(scene, tmp_path):
     beside[0, 0, 3] += 0.5
     near = Cameras(far[0].K, beside, far[0].width, far[0].height, ("a.png",))
     frame = scene.views[0].load()
-    memory.fuse(back_project(frame.rgb, frame.depth, far[0], origin=ORIGIN), round=0)
+    memory.fuse(back_project(frame.rgb, frame.depth, far[0], frame=memory.frame), round=0)
     add_view(memory, near, "a.png", number=1, generated=True)
     memory.save(tmp_path / "memory.npz")
     run(tmp_path / "memory.npz", "--format", "colmap", "--out", tmp_path / "out")

@@ -85,13 +85,15 @@ def test_points_of_one_voxel_are_averaged_by_confidence():
 
 def test_views_of_one_direction_merge_and_the_weight_is_capped():
     memory = SpatialMemory(1.0, options=MemoryOptions(weight_cap=2.5))
-    for x, weight in ((0.2, 1.0), (0.4, 1.0), (0.8, 2.0)):
-        memory.fuse(points([(x, 0.5, 5.5)], confidence=weight), round=0)
+    for number, (x, weight) in enumerate(((0.2, 1.0), (0.4, 1.0), (0.8, 2.0))):
+        source = camera(name=f"v{number}")
+        memory.fuse(points([(x, 0.5, 5.5)], source=source, confidence=weight), round=0)
     assert len(memory) == 1
     assert memory.records.view[0] == 0  # ties and capped weights stay with the earlier view
     np.testing.assert_allclose(memory.positions[0, 0], 0.3 + 0.5 * (0.8 - 0.3), rtol=1e-6)
     assert memory.confidence[0] == 2.5
-    memory.fuse(points([(0.5, 0.5, 5.5)], confidence=2.6), round=0)
+    last = camera(name="last")
+    memory.fuse(points([(0.5, 0.5, 5.5)], source=last, confidence=2.6), round=0)
     assert memory.records.view[0] == 3  # the more confident view wins, numbers are not averaged
 
 

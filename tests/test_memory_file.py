@@ -154,7 +154,7 @@ def _rewritten(path: Path, change) -> None:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (lambda h: h.update(version=2), "version 2; this gvtools reads version 1"),
+        (lambda h: h.update(version=3), "version 3; this gvtools reads version 2"),
         (lambda h: h.update(format="other"), "not a gvtools memory"),
         (lambda h: h["names"].append("x"), "do not fit together"),
         (lambda h: h.pop("voxel"), "do not fit together"),

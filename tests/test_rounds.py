@@ -48,7 +48,7 @@ def memory() -> SpatialMemory:
     out = SpatialMemory(0.02)
     seen = camera("seen", (24, 32))
     rgb = np.full((24, 32, 3), 200, np.uint8)
-    out.fuse(back_project(rgb, np.full((24, 32), 2, np.float32), seen, origin=out.origin), round=0)
+    out.fuse(back_project(rgb, np.full((24, 32), 2, np.float32), seen, frame=out.frame), round=0)
     return out
 
 

@@ -169,7 +169,7 @@ def test_a_far_origin_keeps_a_millimetre():
 
 def test_points_of_another_origin_and_earlier_rounds_are_refused():
     memory = SpatialMemory(0.1, origin=(1, 2, 3))
-    with pytest.raises(ShapeError, match="back-project with the memory's origin"):
+    with pytest.raises(ShapeError, match="back-project with the memory's frame"):
         memory.fuse(points([(0, 0, 1)]), round=0)
     memory.fuse(points([(0, 0, 1)], origin=(1, 2, 3)), round=2)
     with pytest.raises(OptionError, match="rounds only go forward"):

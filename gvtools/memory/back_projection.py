@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
 from gvtools.memory.compiled import compiled
+from gvtools.memory.local_frame import LocalFrame
 from gvtools.memory.points import PointSet
 from gvtools.options import check_range
 
@@ -44,7 +45,7 @@ def back_project(
     depth: NDArray[np.float32],
     camera: Cameras,
     *,
-    origin: ArrayLike = (0.0, 0.0, 0.0),
+    frame: LocalFrame | None = None,
     confidence: NDArray[np.float32] | None = None,
     mask: NDArray[np.bool_] | None = None,
     options: BackProjectionOptions | None = None,
@@ -59,7 +60,7 @@ def back_project(
         rgb: (H, W, 3) uint8.
         depth: (H, W) float32 z-depth, scene units; 0, NaN and inf mean none.
         camera: a batch of one, of the same image size.
-        origin: (3,) world point the positions are taken relative to.
+        frame: of the memory that the points are for (``memory.frame``); None for the world's.
         confidence: (H, W) float32 of the source, > 0; None means 1.
         mask: (H, W) bool, True = use.
         options: see BackProjectionOptions.
@@ -80,9 +81,8 @@ def back_project(
             raise ShapeError(
                 f"{camera.names[0]}: {name} has shape {array.shape}; its camera needs {shape}"
             )
-    origin = np.asarray(origin, np.float64)
-    world_from_cam = camera.world_from_cam[0].copy()
-    world_from_cam[:3, 3] -= origin
+    frame = frame or LocalFrame.at()
+    local_from_cam = frame.local_from_cam(camera.world_from_cam[0])
     z = np.ascontiguousarray(depth, np.float32)
     use = np.ones((0, 0), np.bool_) if mask is None else np.ascontiguousarray(mask, np.bool_)
     trust = (
@@ -95,7 +95,7 @@ def back_project(
     weight = np.empty(height * width, np.float32)
     spacing = np.empty(height * width, np.float32)
     count, invalid, edges, masked = _lift(
-        np.ascontiguousarray(rgb, np.uint8), z, trust, use, camera.K[0], world_from_cam,
+        np.ascontiguousarray(rgb, np.uint8), z, trust, use, camera.K[0], local_from_cam,
         options.edge, np.inf if options.depth_max is None else options.depth_max, options.grazing,
         positions, colors, weight, spacing,
     )  # fmt: skip
@@ -108,7 +108,7 @@ def back_project(
         weight[:count].copy(),
         spacing[:count].copy(),
         camera,
-        origin,
+        frame,
         _free_depth(sure, use, np.float32(far)),
         {"no depth": invalid, "depth edge": edges, "masked": masked},
     )
@@ -120,7 +120,7 @@ def _usable(z):
 
 
 @compiled()
-def _lift(rgb, depth, trust, mask, K, world_from_cam, edge, depth_max, grazing,
+def _lift(rgb, depth, trust, mask, K, local_from_cam, edge, depth_max, grazing,
           positions, colors, weight, spacing):  # fmt: skip
     height, width = depth.shape
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -154,8 +154,8 @@ def _lift(rgb, depth, trust, mask, K, world_from_cam, edge, depth_max, grazing,
             for k in range(3):
                 positions[n, k] = (
                     z
-                    * (world_from_cam[k, 0] * rx + world_from_cam[k, 1] * ry + world_from_cam[k, 2])
-                    + world_from_cam[k, 3]
+                    * (local_from_cam[k, 0] * rx + local_from_cam[k, 1] * ry + local_from_cam[k, 2])
+                    + local_from_cam[k, 3]
                 )
                 colors[n, k] = rgb[row, col, k]
             weight[n] = w

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
 
 FORMAT = "gvtools memory"
-VERSION = 1
+VERSION = 2
 CONVENTION = "OpenCV axes (x right, y down, z forward); first pixel's centre at (0.5, 0.5)"
 # Zip members carry a time stamp; a fixed one keeps equal memories equal files.
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -47,6 +47,7 @@ def save_memory(memory: SpatialMemory, path: Path) -> None:
         "convention": CONVENTION,
         "voxel": memory.voxel.hex(),
         "origin": [float(x).hex() for x in memory.origin],
+        "axes": [float(x).hex() for x in memory.frame.axes.ravel()],
         "options": asdict(memory.options),
         "names": [memory.views[i].camera.names[0] for i in range(len(memory.views))],
         "arrays": {name: [array.dtype.str, list(array.shape)] for name, array in arrays.items()},
@@ -81,6 +82,7 @@ def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Spati
     memory = SpatialMemory(
         float.fromhex(header["voxel"]),
         origin=[float.fromhex(x) for x in header["origin"]],
+        axes=np.reshape([float.fromhex(x) for x in header["axes"]], (3, 3)),
         options=MemoryOptions(**header["options"]),
     )
     _check_consistency(arrays, len(header["names"]))
@@ -91,7 +93,7 @@ def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Spati
         setattr(records, name, arrays[f"record_{name}"])
     records.next = np.empty(count, np.int32)
     runs.append(*(arrays[f"run_{name}"] for name in _RUN_ARRAYS))
-    memory.views = ViewTable(memory.origin, _views(header["names"], arrays))
+    memory.views = ViewTable(memory.frame, _views(header["names"], arrays))
     start = arrays["agreement_start"]
     for i, round_ in enumerate(arrays["agreement_round"].tolist()):
         rows = slice(int(start[i]), int(start[i + 1]))

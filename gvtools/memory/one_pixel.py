@@ -55,7 +55,7 @@ def _nearest(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     records, n = memory.records, len(memory)
     xyz = (records.x[:n], records.y[:n], records.z[:n])
-    image = project_nearest(xyz, camera, origin=memory.origin)
+    image = project_nearest(xyz, memory.frame.seen_from(camera))
     return image.depth, image.index
 
 
@@ -66,7 +66,7 @@ def _open3d(
     number = np.arange(len(memory))
     tag = np.stack([number // _SPLIT, number % _SPLIT, np.zeros_like(number)], axis=1)
     depth, tags = project_open3d(
-        memory.records.position, tag.astype(np.float32), camera, origin=memory.origin
+        memory.records.position, tag.astype(np.float32), memory.frame.seen_from(camera)
     )
     index = tags[..., 0].astype(np.int32) * _SPLIT + tags[..., 1].astype(np.int32)
     return depth, np.where(depth > 0, index, -1).astype(np.int32)

@@ -68,7 +68,7 @@ def memory_from_ply(path: Path) -> SpatialMemory:
                 confidence[rows],
                 spacing[rows],
                 camera,
-                origin,
+                memory.frame,
                 None,
                 {},
             )

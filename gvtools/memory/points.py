@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ShapeError
+from gvtools.memory.local_frame import LocalFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,12 +17,12 @@ class PointSet:
     """N points seen by one camera.
 
     Attributes:
-        positions: (N, 3) float32, scene units, world frame, relative to ``origin``.
+        positions: (N, 3) float32, scene units, in ``frame``.
         colors: (N, 3) uint8.
         confidence: (N,) float32 > 0.
         spacing: (N,) float32, scene units: the width of the surface patch a point stands for.
         camera: the camera that saw them (a batch of one).
-        origin: (3,) float64, world frame.
+        frame: of the memory that they are for.
         free_depth: (h, w) float32, scene units: a coarse grid over the camera's image; space
             nearer than this along a cell's rays was seen to be empty, 0 where nothing is known.
         dropped: how many pixels gave no point, by reason.
@@ -32,7 +33,7 @@ class PointSet:
     confidence: NDArray[np.float32]
     spacing: NDArray[np.float32]
     camera: Cameras
-    origin: NDArray[np.float64]
+    frame: LocalFrame
     free_depth: NDArray[np.float32] | None
     dropped: dict[str, int]
 

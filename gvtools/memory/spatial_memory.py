@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ShapeError
 from gvtools.memory import fusion
+from gvtools.memory.local_frame import LocalFrame
 from gvtools.memory.occlusion import in_free_space
 from gvtools.memory.points import PointSet
 from gvtools.memory.records import Records, Runs
@@ -105,6 +106,8 @@ class SpatialMemory:
         voxel: voxel edge, scene units.
         origin: (3,) float64 world point that positions are held relative to, so that float32
             keeps millimetres in a georeferenced scene.
+        axes: (3, 3) rotation whose columns are the voxel grid's axes in the world frame; None for
+            the world's own. See LocalFrame.
         options: see MemoryOptions.
     """
 
@@ -113,20 +116,24 @@ class SpatialMemory:
         voxel: float,
         *,
         origin: ArrayLike = (0.0, 0.0, 0.0),
+        axes: ArrayLike | None = None,
         options: MemoryOptions | None = None,
     ) -> None:
         self.voxel = float(voxel)
-        self.origin: NDArray[np.float64] = np.array(origin, np.float64)
-        if self.origin.shape != (3,) or not np.isfinite(self.origin).all():
-            raise ShapeError(f"memory origin {self.origin.tolist()}; expected three finite numbers")
+        self.frame = LocalFrame.at(origin, axes)
         check_grid(self.voxel, self.origin)
         self.options = options or MemoryOptions()
         self.records = Records()
         self.runs = Runs()
-        self.views = ViewTable(self.origin)
+        self.views = ViewTable(self.frame)
         # Per round: (records, confidences) by which it agreed with observations of other rounds.
         self.agreements: dict[int, list[tuple[NDArray[np.int32], NDArray[np.float32]]]] = {}
         self._index = VoxelIndex()
+
+    @property
+    def origin(self) -> NDArray[np.float64]:
+        """(3,) world point that positions are held relative to."""
+        return self.frame.origin
 
     def __len__(self) -> int:
         """Number of stored observations."""
@@ -165,7 +172,7 @@ class SpatialMemory:
     @property
     def positions(self) -> NDArray[np.float64]:
         """(N, 3) float64, world frame, scene units."""
-        return self.records.position.astype(np.float64) + self.origin
+        return self.frame.to_world(self.records.position)
 
     @property
     def confidence(self) -> NDArray[np.float32]:
@@ -183,19 +190,19 @@ class SpatialMemory:
         """Take one view's points in.
 
         Args:
-            points: relative to this memory's origin.
+            points: in this memory's frame.
             round: the round they belong to; not smaller than any round already there.
             generated: True for a completer's points: they enter neither voxels that hold observed
                 content nor space that an observed ray saw to be free.
 
         Raises:
             OptionError: ``round`` lies before the last one.
-            ShapeError: the points are relative to another origin.
+            ShapeError: the points are in another frame.
         """
-        if not np.array_equal(points.origin, self.origin):
+        if not points.frame.same_as(self.frame):
             raise ShapeError(
-                f"points are relative to {points.origin}, the memory to {self.origin}; "
-                "back-project with the memory's origin"
+                f"points are relative to {points.frame.origin}, the memory to {self.origin}, or "
+                "their axes differ; back-project with the memory's frame"
             )
         if self.rounds and round < self.rounds[-1]:
             raise OptionError(
@@ -224,7 +231,7 @@ class SpatialMemory:
         if not keep.all():
             columns = [column[keep] for column in columns]
         grid = points.free_depth if points.free_depth is not None else np.zeros((0, 0), np.float32)
-        view = self.views.append(SourceView(points.camera, int(round), bool(generated), grid))
+        view = self.views.take(SourceView(points.camera, int(round), bool(generated), grid))
         report = self._fuse_columns(columns, view)
         return replace(
             report,
@@ -322,7 +329,7 @@ class SpatialMemory:
             setattr(records, name, array[:count][keep])
         records.count = int(keep.sum())
         records.view[:] = new_view[records.view]
-        self.views = ViewTable(self.origin, [views[int(i)] for i in np.flatnonzero(keep_view)])
+        self.views = ViewTable(self.frame, [views[int(i)] for i in np.flatnonzero(keep_view)])
         self.agreements.pop(round, None)
         records.agreement[:] = 0
         for log in self.agreements.values():
@@ -377,7 +384,10 @@ class SpatialMemory:
         cloud = o3d.t.geometry.PointCloud()
         tensor = o3d.core.Tensor.from_numpy
         view = records.view[:n]
-        cloud.point.positions = tensor(records.position)
+        positions = records.position
+        if not np.array_equal(self.frame.axes, np.eye(3)):
+            positions = (positions.astype(np.float64) @ self.frame.axes.T).astype(np.float32)
+        cloud.point.positions = tensor(positions)
         cloud.point.colors = tensor(records.color[:n].copy())
         cloud.point.confidence = tensor(self.confidence[:, None])
         cloud.point.spacing = tensor(records.spacing[:n, None].copy())

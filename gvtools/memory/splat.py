@@ -153,9 +153,12 @@ def view_distance(memory: SpatialMemory, camera: Cameras, scale: float) -> NDArr
     The angle between the optical axes over 15 degrees, plus the distance of the centres over
     0.15 x ``scale`` (a typical depth, scene units): about 8 degrees of parallax.
     """
-    cosine = memory.views.cam_from_local[:, 2, :3] @ camera.cam_from_world[0, 2, :3]
+    local = memory.frame.seen_from(camera)
+    cosine = memory.views.cam_from_local[:, 2, :3] @ local.cam_from_world[0, 2, :3]
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    distance = np.linalg.norm(memory.views.centers + memory.origin - camera.centers[0], axis=1)
+    distance = np.linalg.norm(
+        memory.views.centers - memory.frame.from_world(camera.centers), axis=1
+    )
     return angle / 15 + distance / (0.15 * scale)
 
 
@@ -213,8 +216,7 @@ class _Projection:
         self.memory, self.camera, self.options = memory, camera, options
         self.splatter = splatter
         shape = (int(camera.height[0]), int(camera.width[0]))
-        cam_from_local = camera.cam_from_world[0].copy()
-        cam_from_local[:3, 3] += cam_from_local[:3, :3] @ memory.origin
+        cam_from_local = memory.frame.cam_from_local(camera.cam_from_world)[0]
         self.target = Target(
             camera,
             cam_from_local,

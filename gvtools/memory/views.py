@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
+from gvtools.memory.local_frame import LocalFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +32,8 @@ class SourceView:
 class ViewTable:
     """The fused views in order, and their columns as arrays for the kernels."""
 
-    def __init__(self, origin: NDArray[np.float64], views: Iterable[SourceView] = ()) -> None:
-        self.origin = origin
+    def __init__(self, frame: LocalFrame, views: Iterable[SourceView] = ()) -> None:
+        self.frame = frame
         self._views: list[SourceView] = []
         self.round: NDArray[np.int32] = np.zeros(0, np.int32)
         self.generated: NDArray[np.bool_] = np.zeros(0, np.bool_)
@@ -52,14 +53,34 @@ class ViewTable:
         """All cameras, in the world frame; None when there are no views."""
         return concatenate([view.camera for view in self._views]) if self._views else None
 
+    def take(self, view: SourceView) -> int:
+        """The row of a view: the last one's where it goes on with it, else a new one."""
+        if not self._views or not _goes_on(self._views[-1], view):
+            return self.append(view)
+        last = self._views[-1]
+        # Each knows a part; a cell is free as far as either saw.
+        if last.free_depth.shape == view.free_depth.shape:
+            free = np.maximum(last.free_depth, view.free_depth)
+            self._views[-1] = replace(last, free_depth=free)
+        return len(self._views) - 1
+
     def append(self, view: SourceView) -> int:
         """Add a view; returns its row."""
         self._views.append(view)
         self.round = np.append(self.round, np.int32(view.round))
         self.generated = np.append(self.generated, view.generated)
-        self.centers = np.concatenate([self.centers, view.camera.centers - self.origin])
-        local = view.camera.cam_from_world.copy()
-        # x_cam = R x_world + t = R (x_local + origin) + t
-        local[:, :3, 3] += local[0, :3, :3] @ self.origin
+        self.centers = np.concatenate([self.centers, self.frame.from_world(view.camera.centers)])
+        local = self.frame.cam_from_local(view.camera.cam_from_world)
         self.cam_from_local = np.concatenate([self.cam_from_local, local])
         return len(self._views) - 1
+
+
+def _goes_on(last: SourceView, view: SourceView) -> bool:
+    """Whether both are one camera's, of one round and one kind: a fusion in parts."""
+    one, two = last.camera, view.camera
+    return (
+        (last.round, last.generated, one.names) == (view.round, view.generated, two.names)
+        and np.array_equal(one.cam_from_world, two.cam_from_world)
+        and np.array_equal(one.K, two.K)
+        and (int(one.width[0]), int(one.height[0])) == (int(two.width[0]), int(two.height[0]))
+    )

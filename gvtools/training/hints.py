@@ -135,7 +135,7 @@ def projected(
     memory = SpatialMemory(voxel, origin=targets.centers[0], options=options.memory)
     for rgb, depth, camera in lifted:
         points = back_project(
-            rgb, depth, camera, origin=memory.origin, options=options.back_projection
+            rgb, depth, camera, frame=memory.frame, options=options.back_projection
         )
         memory.fuse(points, round=0)
     return memory.project(targets, options=options.splat)

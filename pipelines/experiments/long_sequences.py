@@ -117,7 +117,7 @@ def _follow(
     footprint = float(np.median(truth.depth[:CONTEXT])) / float(truth.cameras.K[0, 0, 0])
     memory = SpatialMemory(footprint, origin=truth.cameras.centers[0], options=config.memory)
     for i in range(CONTEXT):
-        points = back_project(truth.rgb[i], truth.depth[i], truth.cameras[i], origin=memory.origin)
+        points = back_project(truth.rgb[i], truth.depth[i], truth.cameras[i], frame=memory.frame)
         memory.fuse(points, round=0)
     known = list(context)
     for number in range(ROUNDS):
