@@ -9,6 +9,9 @@ from pathlib import Path
 
 from gvtools.errors import ProjectError
 
+# Members of a zip carry a time stamp; this one keeps equal content equal files.
+ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+
 
 @contextmanager
 def replaced_when_written(path: Path) -> Iterator[Path]:

@@ -12,9 +12,9 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.files import ZIP_EPOCH
+
 LEVEL = 1
-# Zip members carry a time stamp; a fixed one keeps equal arrays equal files.
-EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 def save_arrays(target: Path | IO[bytes], **arrays: NDArray[Any]) -> None:
@@ -26,7 +26,7 @@ def save_arrays(target: Path | IO[bytes], **arrays: NDArray[Any]) -> None:
     """
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
         for name, array in arrays.items():
-            info = zipfile.ZipInfo(f"{name}.npy", EPOCH)
+            info = zipfile.ZipInfo(f"{name}.npy", ZIP_EPOCH)
             info.compress_type = zipfile.ZIP_DEFLATED
             info._compresslevel = LEVEL  # type: ignore[attr-defined]
             with archive.open(info, "w", force_zip64=True) as file:

@@ -67,7 +67,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
     from pipelines import config as settings
     from pipelines.plan import make_plan
-    from pipelines.scene_arguments import open_scene
+    from pipelines.run_identity import run_identity
+    from pipelines.scene_arguments import open_scene, reading_of
     from pipelines.tradeoffs.knobs import knobs_of
     from pipelines.tradeoffs.search import Search
     from pipelines.tradeoffs.trial import Trials
@@ -90,7 +91,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
         )
     config = replace(config, voxel=plan.config.voxel)
     args.out.mkdir(parents=True, exist_ok=True)
-    trials = Trials(scene, config, plan.targets.cameras.names, args.out / "trials")
+    identity = run_identity(plan, reading_of(args))
+    trials = Trials(scene, config, plan.targets.cameras.names, args.out / "trials", identity)
     trials.folder.mkdir(exist_ok=True)
 
     def fits(outcome: Outcome) -> bool:

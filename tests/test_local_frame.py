@@ -117,3 +117,17 @@ def test_a_cameras_frame_is_the_cameras_with_an_exact_rotation():
     np.testing.assert_allclose(found.axes, seen.world_from_cam[0, :3, :3], atol=1e-6)
     there = found.from_world(found.to_world([[1.0, 2.0, 3.0]]))
     np.testing.assert_allclose(there, [[1, 2, 3]], atol=1e-12)
+
+
+def test_what_two_parts_of_a_view_know_is_free_as_far_as_both_saw():
+    """The nearer surface ends it; a cell that one part does not know is the other's."""
+    memory = SpatialMemory(0.1)
+    source = camera()
+    rgb = np.zeros((24, 32, 3), np.uint8)
+    for value, columns in ((3.0, np.s_[:24]), (2.0, np.s_[8:])):
+        mask = np.zeros((24, 32), np.bool_)
+        mask[:, columns] = True
+        depth = np.full((24, 32), value, np.float32)
+        memory.fuse(back_project(rgb, depth, source, mask=mask), round=0)
+    assert len(memory.views) == 1
+    assert memory.views[0].free_depth[0].tolist() == [3, 3, 2, 2, 2, 2, 2, 2]

@@ -68,6 +68,14 @@ def test_a_second_sweep_takes_over_what_is_there(scan, swept, capsys):
     assert not (swept / "profile.json").exists()
 
 
+def test_a_project_that_is_read_otherwise_is_tried_anew(scan, swept, capsys):
+    before = set((swept / "trials").iterdir())
+    arguments = ["tradeoff", str(scan), "--out", str(swept), "--limit", "1"]
+    assert main([*arguments, "--depth-unit", "0.002", "--quiet"]) == 0
+    assert set((swept / "trials").iterdir()) - before
+    assert "trials were left out for --limit" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [

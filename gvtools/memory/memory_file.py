@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError, MemoryFileError
-from gvtools.files import replaced_when_written
+from gvtools.files import ZIP_EPOCH, replaced_when_written
 from gvtools.memory.views import SourceView, ViewTable
 
 if TYPE_CHECKING:
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 FORMAT = "gvtools memory"
 VERSION = 2
 CONVENTION = "OpenCV axes (x right, y down, z forward); first pixel's centre at (0.5, 0.5)"
-# Zip members carry a time stamp; a fixed one keeps equal memories equal files.
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 _RECORD_ARRAYS = ("x", "y", "z", "color", "confidence", "spacing", "view", "agreement")
 _RUN_ARRAYS = ("start", "length", "view", "box")
 
@@ -156,7 +154,7 @@ def _views(names: list[str], arrays: dict[str, NDArray[Any]]) -> list[SourceView
 
 
 def _write(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
-    archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+    archive.writestr(zipfile.ZipInfo(name, ZIP_EPOCH), data)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:

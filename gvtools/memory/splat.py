@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import OptionError, ShapeError
-from gvtools.guidance import Guidance
+from gvtools.guidance import Guidance, together
 from gvtools.memory import culling
 from gvtools.options import check_range
 
@@ -153,8 +153,8 @@ def view_distance(memory: SpatialMemory, camera: Cameras, scale: float) -> NDArr
     The angle between the optical axes over 15 degrees, plus the distance of the centres over
     0.15 x ``scale`` (a typical depth, scene units): about 8 degrees of parallax.
     """
-    local = memory.frame.seen_from(camera)
-    cosine = memory.views.cam_from_local[:, 2, :3] @ local.cam_from_world[0, 2, :3]
+    forward = memory.frame.cam_from_local(camera.cam_from_world)[0, 2, :3]
+    cosine = memory.views.cam_from_local[:, 2, :3] @ forward
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     distance = np.linalg.norm(
         memory.views.centers - memory.frame.from_world(camera.centers), axis=1
@@ -186,15 +186,7 @@ def project(
 
         return project_one_pixel(memory, cameras, open3d=options.backend == "open3d")
     splatter = _splatter(memory, options)
-    return joined(cameras, [_Projection(memory, c, options, splatter).run() for c in cameras])
-
-
-def joined(cameras: Cameras, parts: list[Guidance]) -> Guidance:
-    """The views of ``parts`` as one batch."""
-    names = ("rgb", "depth", "valid", "confidence", "generated")
-    return Guidance(
-        cameras, *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
-    )
+    return together([_Projection(memory, c, options, splatter).run() for c in cameras])
 
 
 def _splatter(memory: SpatialMemory, options: SplatOptions) -> Splatter:

@@ -58,9 +58,10 @@ class ViewTable:
         if not self._views or not _goes_on(self._views[-1], view):
             return self.append(view)
         last = self._views[-1]
-        # Each knows a part; a cell is free as far as either saw.
         if last.free_depth.shape == view.free_depth.shape:
-            free = np.maximum(last.free_depth, view.free_depth)
+            # Each knows a part; what both know is free as far as both saw.
+            one, two = last.free_depth, view.free_depth
+            free = np.where((one > 0) & (two > 0), np.minimum(one, two), np.maximum(one, two))
             self._views[-1] = replace(last, free_depth=free)
         return len(self._views) - 1
 

@@ -23,8 +23,8 @@ from pipelines.tradeoffs.outcome import Outcome, front
 
 # Shares of the targets, by stage.
 SHARES = (0.25, 0.5, 1.0)
-# Combinations of the predicted front that are tried, and runs on all targets.
-COMBINED, FINAL = 6, 4
+# Combinations of the predicted front that are tried, and those of them that are on all targets.
+COMBINED, FINAL = 6, 3
 # Combinations that are looked at; more are drawn at random.
 LOOKED_AT = 50_000
 # Pull of the effects towards 0, so that combinations cannot be explained by two knobs at once.
@@ -71,6 +71,8 @@ class Search:
     tried: list[Tried] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
+    _end: float = field(init=False, default=0.0)
+    _given: set[str] = field(init=False, default_factory=set)
 
     def sweep(self, named: Sequence[tuple[str, Settings]], fits: Callable[[Outcome], bool]) -> None:
         """All stages.
@@ -80,6 +82,7 @@ class Search:
             fits: whether a whole run of an outcome is within the user's budget.
         """
         self._end = self.clock() + self.limit
+        self._given = {"start", *(name for name, _ in named)}
         base = usual(self.knobs)
         self._try("start", base, SHARES[0])
         if not self.tried:
@@ -166,9 +169,9 @@ class Search:
         within = [outcome for outcome in best if fits(outcome)] or best[:1]
         # The most accurate within the budget first, then the others of the front.
         ranked = list(reversed(within)) + [o for o in reversed(best) if o not in within]
-        chosen = [entry for o in ranked[: FINAL - 1] for entry in larger if entry.outcome is o]
-        start = [entry for entry in self.tried if entry.label == "start"]
-        return start + chosen
+        chosen = [entry for o in ranked[:FINAL] for entry in larger if entry.outcome is o]
+        given = [e for e in self.tried if e.share == SHARES[0] and e.label in self._given]
+        return given + chosen
 
     def _change(self, point: Point) -> str:
         for knob, level in zip(self.knobs, point, strict=True):

@@ -43,10 +43,20 @@ class Trials:
         config: the run that was asked for; its voxel edge is set.
         names: of the target views, held out.
         folder: where outcomes are kept, one JSON file each.
+        identity: of that run, see ``run_identity``: other pictures, masks, weights or units are
+            other trials.
     """
 
-    def __init__(self, scene: Scene, config: RunConfig, names: Sequence[str], folder: Path) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        config: RunConfig,
+        names: Sequence[str],
+        folder: Path,
+        identity: Mapping[str, Any],
+    ) -> None:
         self.scene, self.config, self.names, self.folder = scene, config, tuple(names), folder
+        self.identity = identity
         self._warm = False
 
     def outcome(self, settings: Mapping[str, Any], share: float) -> Outcome:
@@ -72,8 +82,8 @@ class Trials:
     def _key(self, settings: Mapping[str, Any], names: Sequence[str]) -> str:
         import gvtools
 
-        said = [self.config.to_dict(), dict(settings), list(names), gvtools.__version__]
-        text = json.dumps([*said, str(self.scene.root.resolve())], sort_keys=True, default=str)
+        said = [self.identity, dict(settings), list(names), gvtools.__version__]
+        text = json.dumps(said, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def _run(self, settings: Mapping[str, Any], names: Sequence[str]) -> Outcome:
