@@ -51,6 +51,21 @@ class FusionOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SavingsOptions:
+    """What a run does not compute because the scene does not require it.
+
+    The voxel edge (``fusion.voxel_loss``) and what a voxel keeps (``memory.same_direction``,
+    ``memory.observations_per_voxel``) are savings, too.
+
+    Attributes:
+        reuse: what observed views show of a target is not projected again after completions were
+            fused; the pictures are the same.
+    """
+
+    reuse: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunConfig:
     """Everything that decides what a run computes.
 
@@ -74,6 +89,7 @@ class RunConfig:
         da3: see FoundationOptions; of depth by Depth Anything 3.
         splat: see SplatOptions.
         fusion: see FusionOptions.
+        savings: see SavingsOptions.
         completer_options: options of the completer by name.
     """
 
@@ -95,6 +111,7 @@ class RunConfig:
     da3: FoundationOptions = field(default_factory=FoundationOptions)
     splat: SplatOptions = field(default_factory=SplatOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
+    savings: SavingsOptions = field(default_factory=SavingsOptions)
     completer_options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

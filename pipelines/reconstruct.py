@@ -218,6 +218,7 @@ def _round(
     console: Console,
 ) -> dict[str, Any]:
     from gvtools.completers.base import create
+    from gvtools.memory.followed import FollowedCamera
     from pipelines import rounds
     from pipelines.context_depth import KeptDepth, warn_of_depth
     from pipelines.round_files import camera_entry, target_stems, write_target
@@ -244,20 +245,21 @@ def _round(
     else:
         cameras = plan.targets.cameras[list(plan.schedule[number - 1])]
         with clock.stage("project"):
-            known = [memory.project(camera, options=plan.config.splat) for camera in cameras]
+            followed = [
+                FollowedCamera(
+                    memory, camera, options=plan.config.splat, reuse=plan.config.savings.reuse
+                )
+                for camera in cameras
+            ]
+            known = [target.guidance() for target in followed]
         before = _mean([guidance.coverage for guidance in known])
         results, total = rounds.complete_targets(
-            known, number, memory=memory,
+            followed, number, memory=memory,
             completer=create(plan.config.completer, **plan.config.completer_options),
             context=context, config=plan.config, clock=clock, progress=console.track,
         )  # fmt: skip
         with clock.stage("project"):
-            # Where nothing was fused, memory is what it was.
-            grown = (
-                [memory.project(camera, options=plan.config.splat) for camera in cameras]
-                if total.points
-                else known
-            )
+            grown = [target.guidance() for target in followed]
         after = _mean([guidance.coverage for guidance in grown])
         stems = target_stems(plan.targets.cameras.names)
         rows = plan.schedule[number - 1]

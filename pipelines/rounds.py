@@ -15,6 +15,7 @@ from gvtools.completers.base import Completer, Completion, ContextView
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, together
 from gvtools.memory.back_projection import back_project
+from gvtools.memory.followed import FollowedCamera
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.scenes.scene import Scene
 from gvtools.similarity import ScaleFit, align_depth_scale
@@ -136,7 +137,7 @@ def load_context(scene: Scene, names: Sequence[str], source: KeptDepth) -> list[
 
 
 def complete_targets(
-    known: Sequence[Guidance],
+    targets: Sequence[FollowedCamera],
     number: int,
     *,
     memory: SpatialMemory,
@@ -153,7 +154,7 @@ def complete_targets(
     each other.
 
     Args:
-        known: the memory as it is projected into each target, a batch of one each.
+        targets: the round's cameras, following ``memory``.
         number: of the round.
         memory: is added to.
         completer: see ``Completer``.
@@ -169,6 +170,8 @@ def complete_targets(
     results = []
     total = FuseReport()
     if getattr(completer, "joint", False):
+        with clock.stage("project"):
+            known = [target.guidance() for target in targets]
         with clock.stage("complete"):
             made = _completed_together(completer, context, known, seed)
         pairs = list(zip(known, made, strict=True))
@@ -177,10 +180,9 @@ def complete_targets(
             results.append(result)
             total += report
         return results, total
-    for guidance in progress(list(known), f"round {number}"):
-        if total.points:
-            with clock.stage("project"):
-                guidance = memory.project(guidance.cameras, options=config.splat)
+    for target in progress(list(targets), f"round {number}"):
+        with clock.stage("project"):
+            guidance = target.guidance()
         with clock.stage("complete"):
             completion = completer.complete(context, guidance, seed=seed)
         result, report = _align_and_fuse(guidance, completion, number, memory, config, clock)

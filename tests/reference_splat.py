@@ -93,7 +93,9 @@ class Reference:
         if not seen:
             return False
         self.seen = np.array(seen)
-        scale = float(np.median(farthest))
+        made = [bool(memory.views.generated[runs.view[r]]) for r in seen]
+        observed = [z for z, generated in zip(farthest, made, strict=True) if not generated]
+        scale = float(np.median(observed or farthest))
         self.near = min(NEAREST * scale, memory.voxel)
         views = memory.views
         axes = np.array([views[i].camera.cam_from_world[0, 2, :3] for i in range(len(views))])

@@ -12,6 +12,7 @@ from gvtools.completers.base import Completion
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, together
 from gvtools.memory.back_projection import back_project
+from gvtools.memory.followed import FollowedCamera
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.config import RunConfig
 from pipelines.rounds import Clock, complete_targets
@@ -60,10 +61,12 @@ def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras])
         calls.append(cameras.names[0])
         return project(cameras, **options)
 
-    known = [project(target) for target in targets]
+    followed = [FollowedCamera(memory, target, reuse=False) for target in targets]
+    for target in followed:
+        target.guidance()
     memory.project = counted  # type: ignore[method-assign]
     results, total = complete_targets(
-        known,
+        followed,
         1,
         memory=memory,
         completer=completer,

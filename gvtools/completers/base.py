@@ -10,6 +10,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import cached_property
 from importlib import import_module
 from typing import Any, Protocol, get_type_hints, runtime_checkable
 
@@ -53,6 +54,14 @@ class ContextView:
                 raise ShapeError(
                     f"context view {self.name}: {what} {value.shape}; expected {size} like rgb"
                 )
+
+    @cached_property
+    def spoilt(self) -> int:
+        """How many pixels have colours that are not finite; counted once."""
+        # A sum is finite only where everything is, and takes a third of the time.
+        with np.errstate(invalid="ignore"):
+            total = self.rgb.sum(dtype=np.float64)
+        return 0 if np.isfinite(total) else int((~np.isfinite(self.rgb)).any(-1).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,13 +141,7 @@ def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
             f"guidance: rgb {guidance.rgb.shape}, depth {guidance.depth.shape}, valid {shape}; "
             "expected (V, H, W, 3), (V, H, W) and (V, H, W)"
         )
-    wrong = {}
-    for view in context:
-        # A sum is finite only where everything is, and takes a third of the time.
-        with np.errstate(invalid="ignore"):
-            total = view.rgb.sum(dtype=np.float64)
-        if not np.isfinite(total):
-            wrong[view.name] = int((~np.isfinite(view.rgb)).any(-1).sum())
+    wrong = {view.name: view.spoilt for view in context}
     finite = np.isfinite(guidance.rgb).all(-1)
     finite &= np.isfinite(guidance.depth) & np.isfinite(guidance.confidence)
     spoilt = (guidance.valid & ~finite).sum(axis=(1, 2)).tolist()

@@ -128,6 +128,8 @@ class SpatialMemory:
         self.views = ViewTable(self.frame)
         # Per round: (records, confidences) by which it agreed with observations of other rounds.
         self.agreements: dict[int, list[tuple[NDArray[np.int32], NDArray[np.float32]]]] = {}
+        # How often something was fused or forgotten, and how often that touched observations.
+        self.changes = self.observed_changes = 0
         self._index = VoxelIndex()
 
     @property
@@ -231,6 +233,8 @@ class SpatialMemory:
         if not keep.all():
             columns = [column[keep] for column in columns]
         grid = points.free_depth if points.free_depth is not None else np.zeros((0, 0), np.float32)
+        self.changes += 1
+        self.observed_changes += not generated
         view = self.views.take(SourceView(points.camera, int(round), bool(generated), grid))
         report = self._fuse_columns(columns, view)
         return replace(
@@ -318,6 +322,8 @@ class SpatialMemory:
         """
         if round not in self.rounds:
             raise OptionError(f"round {round} is not in the memory; it has rounds {self.rounds}")
+        self.changes += 1
+        self.observed_changes += 1
         records, views = self.records, self.views
         count = records.count
         keep_view = views.round != round

@@ -32,6 +32,8 @@ NEAREST = 1e-4
 # An occluder must hold a square of this many pixels.
 OCCLUDER_SIDE = 5
 BACKENDS = ("cpu", "torch", "nearest", "open3d")
+# Back ends without blending.
+ONE_PIXEL = ("nearest", "open3d")
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -181,12 +183,43 @@ def project(
         )
     check_usable(cameras)
     options = options or SplatOptions()
-    if options.backend in ("nearest", "open3d"):
+    if options.backend in ONE_PIXEL:
         from gvtools.memory.one_pixel import project_one_pixel
 
         return project_one_pixel(memory, cameras, open3d=options.backend == "open3d")
     splatter = _splatter(memory, options)
     return together([_Projection(memory, c, options, splatter).run() for c in cameras])
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """What the observed tiers alone wrote of a camera's images; see Target."""
+
+    rgb: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    confidence: NDArray[np.float32]
+
+
+def project_again(
+    memory: SpatialMemory, camera: Cameras, observed: Observed | None, *, options: SplatOptions
+) -> tuple[Guidance, Observed | None]:
+    """``project`` into one camera, and what the observed views show there.
+
+    Args:
+        memory: is projected.
+        camera: a batch of one.
+        observed: from an earlier call; it is taken over. The caller knows that nothing observed
+            was fused or forgotten since. None: all is splatted.
+        options: of a back end that blends.
+
+    Returns:
+        The same guidance, to the bit, as ``project`` gives, and what the observed views show;
+        None where they show nothing.
+    """
+    check_usable(camera)
+    projection = _Projection(memory, camera, options, _splatter(memory, options))
+    return projection.run(observed, keep=True), projection.observed
 
 
 def _splatter(memory: SpatialMemory, options: SplatOptions) -> Splatter:
@@ -221,13 +254,30 @@ class _Projection:
             np.zeros(shape, np.float32),
             np.zeros(shape, np.bool_),
         )
+        self.observed: Observed | None = None
 
-    def run(self) -> Guidance:
+    def run(self, observed: Observed | None = None, *, keep: bool = False) -> Guidance:
+        """The images.
+
+        Args:
+            observed: what the observed tiers write, where that is known.
+            keep: leave a copy of that in ``observed``.
+        """
+        t = self.target
         if self._cull():
-            self._splat_tiers()
+            tiers, split = self._tiers()
+            if observed is None:
+                self._splat_tiers(tiers[:split], 0)
+            else:
+                t.rgb[:], t.depth[:] = observed.rgb, observed.depth
+                t.valid[:], t.confidence[:] = observed.valid, observed.confidence
+            if keep:
+                self.observed = observed or Observed(
+                    t.rgb.copy(), t.depth.copy(), t.valid.copy(), t.confidence.copy()
+                )
+            self._splat_tiers(tiers[split:], split)
             if self.options.occluders:
                 self._splat_occluders()
-        t = self.target
         return Guidance(
             self.camera,
             t.rgb[None],
@@ -251,7 +301,10 @@ class _Projection:
         self.seen = rows[target.rect[rows, 1] >= 0]
         if not len(self.seen):
             return False
-        scale = float(np.median(self.z_range[self.seen, 1]))
+        # Of what was observed where there is any: it must not hang on what was added to it.
+        far = self.z_range[self.seen, 1]
+        made = memory.views.generated[runs.view[self.seen]]
+        scale = float(np.median(far if made.all() else far[~made]))
         target.near = np.float32(min(NEAREST * scale, memory.voxel))
         target.unit = np.float32(np.ldexp(1.0, int(np.frexp(scale)[1])))
         self.distance = view_distance(memory, self.camera, scale)
@@ -277,27 +330,34 @@ class _Projection:
             self.options.blend_reach, rect, z_range,
         )  # fmt: skip
 
-    def _tiers(self) -> list[NDArray[np.int64]]:
-        """The ranked views cut into tiers that double in size; observed and generated apart."""
+    def _tiers(self) -> tuple[list[NDArray[np.int64]], int]:
+        """The ranked views cut into tiers that double in size, and how many are of observed views.
+
+        Generated views come in tiers of their own.
+        """
         made = self.memory.views.generated[self.ranked]
-        tiers = []
-        size = self.options.nearest_views
+        tiers: list[NDArray[np.int64]] = []
+        size, split = self.options.nearest_views, 0
         for part in (self.ranked[~made], self.ranked[made]):
+            split = len(tiers)
             at = 0
             while at < len(part):
+                self.tier[part[at : at + size]] = len(tiers)
                 tiers.append(part[at : at + size])
                 at += size
                 size *= 2
-        return tiers
+        return tiers, split
 
-    def _splat_tiers(self) -> None:
-        """Nearest views first; each later tier writes what is still open."""
+    def _splat_tiers(self, tiers: list[NDArray[np.int64]], first: int) -> None:
+        """Nearest views first; each later tier writes what is still open.
+
+        ``first`` is the number of the first of these tiers.
+        """
         target = self.target
         view = self.memory.runs.view[self.seen]
         open_ = np.empty(target.shape, np.bool_)
         limit = np.empty(target.shape, np.float32)
-        for number, members in enumerate(self._tiers()):
-            self.tier[members] = number
+        for number, members in enumerate(tiers, first):
             culling.still_open(target.valid, open_, limit)
             chosen = self.seen[self.tier[view] == number]
             table = None
@@ -363,7 +423,7 @@ def _stacked(
     grids: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
     """K (T, 3, 3), cam_from_local (T, 4, 4) and the grids (T, h, w), padded with 0 = unknown."""
-    shape = np.max([grid.shape for _, _, grid in grids], axis=0, initial=1)
+    shape = np.max([(1, 1), *(grid.shape for _, _, grid in grids)], axis=0)
     stack = np.zeros((len(grids), *shape), np.float32)
     for row, (_, _, grid) in zip(stack, grids, strict=True):
         row[: grid.shape[0], : grid.shape[1]] = grid

@@ -23,6 +23,7 @@ from gvtools.evaluation.pose_probe.probe import PoseProbe
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.tables import Column, Table
 from gvtools.memory.back_projection import back_project
+from gvtools.memory.followed import FollowedCamera
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.training.hints import Clip
 from pipelines.config import RunConfig
@@ -125,7 +126,7 @@ def _follow(
         cameras = truth.cameras[rows]
         if arm.memory:
             results, _ = complete_targets(
-                [memory.project(camera, options=config.splat) for camera in cameras],
+                [FollowedCamera(memory, camera, options=config.splat) for camera in cameras],
                 number + 1,
                 memory=memory,
                 completer=arm.completer,
