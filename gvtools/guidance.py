@@ -37,9 +37,13 @@ class Guidance:
 
     def __getitem__(self, index: int) -> Guidance:
         """One view, as a batch of one."""
-        rows = slice(index, index + 1)
+        return self.rows([index])
+
+    def rows(self, index: Sequence[int]) -> Guidance:
+        """Some views, in that order."""
+        rows = list(index)
         return Guidance(
-            self.cameras[index],
+            self.cameras[rows],
             self.rgb[rows],
             self.depth[rows],
             self.valid[rows],

@@ -60,9 +60,16 @@ class SavingsOptions:
     Attributes:
         reuse: what observed views show of a target is not projected again after completions were
             fused; the pictures are the same.
+        minor_holes: a view with no unknown pixel farther than this share of the image diagonal from
+            a known one is left to ``inpaint`` where the completer is a costly one (geoverse,
+            exemplar); 0 leaves it none.
     """
 
     reuse: bool = True
+    minor_holes: float = 0.02
+
+    def __post_init__(self) -> None:
+        check_range("savings.minor_holes", self.minor_holes, least=0)
 
 
 @dataclass(frozen=True, kw_only=True)

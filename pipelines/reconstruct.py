@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import time
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,9 +24,6 @@ EXAMPLES = (
     "gvtools reconstruct scan/ --context every:2 --targets every:2+1 --out runs/scan",
     "gvtools reconstruct colmap/ --targets orbit:24 --completer inpaint --out runs/orbit",
 )
-
-# Targets whose files are written at once.
-WRITERS = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -165,6 +159,8 @@ def reconstruct(
 
 def _run_rounds(plan: Plan, directory: RunDirectory, done: int, console: Console) -> None:
     """The rounds from number ``done`` on, then the end products."""
+    from pipelines.run_round import run_round
+
     memory = _start_memory(plan)
     if done:
         from gvtools.errors import ProjectError
@@ -191,7 +187,7 @@ def _run_rounds(plan: Plan, directory: RunDirectory, done: int, console: Console
             kept_depth = KeptDepth(plan.scene, plan.context, plan.source, directory.round_path(0))
             context = load_context(plan.scene, plan.context, kept_depth)
         with directory.writing_round(number) as folder:
-            report = _round(plan, memory, number, context or [], folder, console)
+            report = run_round(plan, memory, number, context or [], folder, console)
             memory.save(folder / "memory.npz")
             write_json(folder / "report.json", report)
         console.line(_round_line(report))
@@ -207,108 +203,6 @@ def _start_memory(plan: Plan) -> SpatialMemory:
     return SpatialMemory(
         plan.config.voxel, origin=frame.origin, axes=frame.axes, options=plan.config.memory
     )
-
-
-def _round(
-    plan: Plan,
-    memory: SpatialMemory,
-    number: int,
-    context: list[ContextView],
-    folder: Path,
-    console: Console,
-) -> dict[str, Any]:
-    from gvtools.completers.base import create
-    from gvtools.memory.followed import FollowedCamera
-    from pipelines import rounds
-    from pipelines.context_depth import KeptDepth, warn_of_depth
-    from pipelines.round_files import camera_entry, target_stems, write_target
-
-    clock = rounds.Clock()
-    start = time.perf_counter()
-    voxels = memory.voxels
-    views: list[dict[str, Any]] = []
-    before = after = None
-    dropped: dict[str, int] = {}
-    depth: list[dict[str, Any]] = []
-    if number == 0:
-        source = KeptDepth(plan.scene, plan.context, plan.source, folder, unfinished=True)
-        if source.kept:
-            console.line(
-                f"taking over the depth of {source.kept} of {len(plan.context)} context views, "
-                "which an interrupted attempt at this run had computed"
-            )
-        total, dropped, depth = rounds.observe_context(
-            plan.scene, plan.context, source=source,
-            memory=memory, config=plan.config, clock=clock, progress=console.track,
-        )  # fmt: skip
-        warn_of_depth(depth, console)
-    else:
-        cameras = plan.targets.cameras[list(plan.schedule[number - 1])]
-        with clock.stage("project"):
-            followed = [
-                FollowedCamera(
-                    memory, camera, options=plan.config.splat, reuse=plan.config.savings.reuse
-                )
-                for camera in cameras
-            ]
-            known = [target.guidance() for target in followed]
-        before = _mean([guidance.coverage for guidance in known])
-        results, total = rounds.complete_targets(
-            followed, number, memory=memory,
-            completer=create(plan.config.completer, **plan.config.completer_options),
-            context=context, config=plan.config, clock=clock, progress=console.track,
-        )  # fmt: skip
-        with clock.stage("project"):
-            grown = [target.guidance() for target in followed]
-        after = _mean([guidance.coverage for guidance in grown])
-        stems = target_stems(plan.targets.cameras.names)
-        rows = plan.schedule[number - 1]
-        # Compression leaves the interpreter alone.
-        with ThreadPoolExecutor(WRITERS) as pool:
-            names = [stems[row] for row in rows]
-            list(pool.map(partial(write_target, folder), names, results, grown))
-        for at, (row, result, start_of_round, end_of_round) in enumerate(
-            zip(rows, results, known, grown, strict=True)
-        ):
-            views.append(
-                {
-                    **result.report,
-                    "stem": stems[row],
-                    "camera": camera_entry(cameras[at]),
-                    "coverage": start_of_round.coverage,
-                    "coverage_after": end_of_round.coverage,
-                }
-            )
-        refused = [view for view in views if view["scale"]["status"] != "aligned"]
-        if refused:
-            console.warn(
-                f"round {number}: {len(refused)} of {len(views)} completions give no points, first "
-                f"{refused[0]['name']}: {refused[0]['scale']['status']}"
-            )
-    generated = int(memory.generated.sum())
-    return {
-        "round": number,
-        "points": len(memory),
-        "voxels": memory.voxels,
-        "voxels_added": memory.voxels - voxels,
-        "observed": len(memory) - generated,
-        "generated": generated,
-        "added": total.added,
-        "merged": total.merged,
-        "rejected": total.rejected,
-        "fuse": asdict(total),
-        "dropped": dropped,
-        "depth": depth,
-        "coverage_before": before,
-        "coverage_after": after,
-        "seconds": {**clock.seconds, "total": time.perf_counter() - start},
-        "bytes": memory.nbytes,
-        "views": views,
-    }
-
-
-def _mean(values: list[float]) -> float | None:
-    return sum(values) / len(values) if values else None
 
 
 def _round_line(report: dict[str, Any]) -> str:

@@ -40,14 +40,13 @@ def target_stems(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def write_target(folder: Path, stem: str, result: TargetResult, after: Guidance) -> None:
-    """Write what the completer of a target was given, what it made, and what memory knows now.
+def write_target(folder: Path, stem: str, result: TargetResult) -> None:
+    """Write what the completer of a target was given and what it made.
 
     ``guidance_NAME.png`` (holes black), ``valid_NAME.png`` (where the guidance stands on what was
     observed 255, on what was generated before 128, holes 0), ``generated_NAME.png`` (the completed
-    picture), ``after_NAME.png`` (the memory after the round), and ``depth_NAME.npz`` with the keys
-    guidance and completion (float32 z-depth, scene units, 0 = none) and fused (bool). NAME is the
-    target's stem, see target_stems.
+    picture), and ``depth_NAME.npz`` with the keys guidance and completion (float32 z-depth, scene
+    units, 0 = none) and fused (bool). NAME is the target's stem, see target_stems.
     """
     guidance = result.guidance
     support = np.where(guidance.generated[0], SUPPORT_GENERATED, SUPPORT_OBSERVED)
@@ -55,13 +54,17 @@ def write_target(folder: Path, stem: str, result: TargetResult, after: Guidance)
     write_png(folder / f"guidance_{stem}.png", to_bytes(result.guidance.rgb[0]))
     write_png(folder / f"valid_{stem}.png", support)
     write_png(folder / f"generated_{stem}.png", to_bytes(result.completion.rgb[0]))
-    write_png(folder / f"after_{stem}.png", to_bytes(after.rgb[0]))
     save_arrays(
         folder / f"depth_{stem}.npz",
         guidance=result.guidance.depth[0],
         completion=result.completion.depth[0],
         fused=result.fused,
     )
+
+
+def write_after(folder: Path, stem: str, after: Guidance) -> None:
+    """Write what memory shows of a target after the round, ``after_NAME.png``; holes black."""
+    write_png(folder / f"after_{stem}.png", to_bytes(after.rgb[0]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -146,6 +146,7 @@ def complete_targets(
     config: RunConfig,
     clock: Clock,
     progress: Any,
+    done: Callable[[int, TargetResult], object] = lambda row, result: None,
 ) -> tuple[list[TargetResult], FuseReport]:
     """Rounds 1, 2, ...: complete, align and fuse the round's targets.
 
@@ -162,32 +163,36 @@ def complete_targets(
         config: of the run.
         clock: receives the stages' times.
         progress: (items, label) to the items.
+        done: is told of each target as soon as it is completed: its place and what became of it.
 
     Returns:
         What became of each target, in the order given, and the sum of what was fused.
     """
     seed = config.seed + number
-    results = []
+    results: list[TargetResult] = []
     total = FuseReport()
+
+    def take(guidance: Guidance, completion: Completion) -> None:
+        nonlocal total
+        result, report = _align_and_fuse(guidance, completion, number, memory, config, clock)
+        done(len(results), result)
+        results.append(result)
+        total += report
+
     if getattr(completer, "joint", False):
         with clock.stage("project"):
             known = [target.guidance() for target in targets]
         with clock.stage("complete"):
             made = _completed_together(completer, context, known, seed)
-        pairs = list(zip(known, made, strict=True))
-        for guidance, completion in progress(pairs, f"round {number}"):
-            result, report = _align_and_fuse(guidance, completion, number, memory, config, clock)
-            results.append(result)
-            total += report
+        for pair in progress(list(zip(known, made, strict=True)), f"round {number}"):
+            take(*pair)
         return results, total
     for target in progress(list(targets), f"round {number}"):
         with clock.stage("project"):
             guidance = target.guidance()
         with clock.stage("complete"):
             completion = completer.complete(context, guidance, seed=seed)
-        result, report = _align_and_fuse(guidance, completion, number, memory, config, clock)
-        results.append(result)
-        total += report
+        take(guidance, completion)
     return results, total
 
 

@@ -76,7 +76,8 @@ class Completion:
         spent: what the completion cost and met, such as ``seconds``, ``steps``, ``unfilled``.
         support: for each view, what the scale of its generated depth stands on, by the completer's
             own account: "..." of its evidence, or "refused: ..." with the reason, and then its
-            depth is 0 where it was generated. None where depth has no scale to find.
+            depth is 0 where it was generated. None, of a view or of all, where depth has no scale
+            to find.
     """
 
     rgb: Float32
@@ -84,7 +85,7 @@ class Completion:
     confidence: Float32
     rays: Float32 | None = None
     spent: Mapping[str, float] = field(default_factory=dict)
-    support: tuple[str, ...] | None = None
+    support: tuple[str | None, ...] | None = None
 
     def __post_init__(self) -> None:
         shape = self.depth.shape
@@ -105,7 +106,8 @@ class Completion:
 class Completer(Protocol):
     """Fills what memory does not know of the target views.
 
-    One with ``joint`` = True gets all targets of a round at once. One that reads weights names them
+    One with ``joint`` = True gets all targets of a round at once. One with ``costly`` = True is
+    spared views whose holes are small (see ``sparing``). One that reads weights names them
     in an attribute ``files``: they decide the result. What a user should be told before a run may
     stand in ``notes``.
     """

@@ -42,6 +42,7 @@ class ExemplarCompleter(InpaintCompleter):
     """
 
     name: ClassVar[str] = "exemplar"
+    costly: ClassVar[bool] = True
 
     source_views: int = 1
     levels: int = 4

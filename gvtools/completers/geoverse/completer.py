@@ -62,6 +62,7 @@ class GeoVerseCompleter:
 
     name: ClassVar[str] = "geoverse"
     joint: ClassVar[bool] = True
+    costly: ClassVar[bool] = True
 
     weights: str | None = None
     steps: int | None = None
@@ -154,7 +155,7 @@ class GeoVerseCompleter:
         passes = 0
         for first in range(0, len(holes), room):
             rows = holes[first : first + room]
-            part = _rows(guidance, rows)
+            part = guidance.rows(rows)
             chosen = nearest_views(context, part.cameras, most)
             fill = None
             if model.config.hints.fill == "surfaces":
@@ -318,19 +319,6 @@ def nearest_views(
             best = next(int(index) for index in rest if int(index) not in chosen)
         chosen.append(best)
     return [context[index] for index in chosen]
-
-
-def _rows(guidance: Guidance, rows: Sequence[int]) -> Guidance:
-    """Some views of a guidance."""
-    index = list(rows)
-    return Guidance(
-        guidance.cameras[index],
-        guidance.rgb[index],
-        guidance.depth[index],
-        guidance.valid[index],
-        guidance.confidence[index],
-        guidance.generated[index],
-    )
 
 
 @lru_cache(maxsize=2)

@@ -1,0 +1,107 @@
+"""A costly completer for views with large holes, a cheap one for those whose holes are small."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.completers.base import Completer, Completion, ContextView
+from gvtools.completers.inpaint import InpaintCompleter
+from gvtools.guidance import Guidance
+
+
+def hole_reach(valid: NDArray[np.bool_]) -> float:
+    """How far the pixel farthest from what is known lies from it, as a share of the diagonal.
+
+    Args:
+        valid: (H, W) bool, where something is known.
+
+    Returns:
+        0 without holes, infinity where nothing is known.
+    """
+    if valid.all():
+        return 0.0
+    if not valid.any():
+        return float("inf")
+    distance = cv2.distanceTransform((~valid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return float(distance.max()) / float(np.hypot(*valid.shape))
+
+
+@dataclass
+class SparingCompleter:
+    """Gives views whose holes all reach no farther than ``minor`` to ``cheap``.
+
+    Where a hole is narrow, what stands around it says nearly everything about it, and a generative
+    model adds little but time.
+
+    Attributes:
+        costly: completes the other views.
+        minor: the greatest ``hole_reach`` of a view that is spared.
+        cheap: completes the views that are spared.
+        name: the costly one's.
+        joint: the costly one's.
+    """
+
+    costly: Completer
+    minor: float
+    cheap: Completer = field(default_factory=InpaintCompleter)
+
+    def __post_init__(self) -> None:
+        self.name = self.costly.name
+        self.joint = bool(getattr(self.costly, "joint", False))
+
+    def complete(
+        self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
+    ) -> Completion:
+        """Complete all views, each by one of the two; see ``Completer.complete``.
+
+        ``spent["spared_views"]`` counts the cheap one's.
+        """
+        spared = [
+            row for row in range(len(guidance)) if hole_reach(guidance.valid[row]) <= self.minor
+        ]
+        others = [row for row in range(len(guidance)) if row not in spared]
+        parts = []
+        for completer, rows in ((self.cheap, spared), (self.costly, others)):
+            if rows:
+                made = completer.complete(context, guidance.rows(rows), seed=seed)
+                parts.append((rows, made))
+        return _merged(guidance, parts, len(spared))
+
+
+def sparing(completer: Completer, minor: float) -> Completer:
+    """``completer``, spared the views with small holes where it is costly and ``minor`` > 0."""
+    if minor > 0 and getattr(completer, "costly", False):
+        return SparingCompleter(completer, minor)
+    return completer
+
+
+def _merged(
+    guidance: Guidance, parts: Sequence[tuple[Sequence[int], Completion]], spared: int
+) -> Completion:
+    """The completions of some rows each, as one of all rows."""
+    shape = guidance.valid.shape
+    rgb, depth = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
+    confidence = np.zeros(shape, np.float32)
+    rays: NDArray[np.float32] | None = None
+    if any(made.rays is not None for _, made in parts):
+        every = [guidance.cameras.plucker(row) for row in range(len(guidance))]
+        rays = np.stack(every).astype(np.float32)
+    support: list[str | None] = [None] * len(guidance)
+    spent: dict[str, Any] = {"spared_views": float(spared)}
+    for rows, made in parts:
+        at = list(rows)
+        rgb[at], depth[at], confidence[at] = made.rgb, made.depth, made.confidence
+        if rays is not None and made.rays is not None:
+            rays[at] = made.rays
+        for place, row in enumerate(at):
+            support[row] = None if made.support is None else made.support[place]
+        for key, value in made.spent.items():
+            spent[key] = spent.get(key, 0.0) + value
+    told = None if all(said is None for said in support) else tuple(support)
+    return Completion(rgb, depth, confidence, rays, spent, told)

@@ -1,0 +1,151 @@
+"""One round of a run with its files and its report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from gvtools.completers.base import ContextView, create
+from gvtools.completers.sparing import sparing
+from gvtools.memory.followed import FollowedCamera
+from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
+from pipelines import rounds
+from pipelines.console import Console
+from pipelines.context_depth import KeptDepth, warn_of_depth
+from pipelines.plan import Plan
+from pipelines.round_files import camera_entry, target_stems, write_after, write_target
+
+# Targets whose files are written at once.
+WRITERS = 2
+
+
+def run_round(
+    plan: Plan,
+    memory: SpatialMemory,
+    number: int,
+    context: Sequence[ContextView],
+    folder: Path,
+    console: Console,
+) -> dict[str, Any]:
+    """Run round ``number`` (0 is the context's), write its files, and report it, JSON-ready."""
+    clock = rounds.Clock()
+    start = time.perf_counter()
+    voxels = memory.voxels
+    about: dict[str, Any] = {"dropped": {}, "depth": [], "views": []}
+    about |= {"coverage_before": None, "coverage_after": None}
+    if number == 0:
+        total = _lift_context(plan, memory, folder, clock, console, about)
+    else:
+        total = _complete(plan, memory, number, context, folder, clock, console, about)
+    generated = int(memory.generated.sum())
+    return {
+        "round": number,
+        "points": len(memory),
+        "voxels": memory.voxels,
+        "voxels_added": memory.voxels - voxels,
+        "observed": len(memory) - generated,
+        "generated": generated,
+        "added": total.added,
+        "merged": total.merged,
+        "rejected": total.rejected,
+        "fuse": asdict(total),
+        "dropped": about["dropped"],
+        "depth": about["depth"],
+        "coverage_before": about["coverage_before"],
+        "coverage_after": about["coverage_after"],
+        "seconds": {**clock.seconds, "total": time.perf_counter() - start},
+        "bytes": memory.nbytes,
+        "views": about["views"],
+    }
+
+
+def _lift_context(
+    plan: Plan,
+    memory: SpatialMemory,
+    folder: Path,
+    clock: rounds.Clock,
+    console: Console,
+    about: dict[str, Any],
+) -> FuseReport:
+    source = KeptDepth(plan.scene, plan.context, plan.source, folder, unfinished=True)
+    if source.kept:
+        console.line(
+            f"taking over the depth of {source.kept} of {len(plan.context)} context views, "
+            "which an interrupted attempt at this run had computed"
+        )
+    total, about["dropped"], about["depth"] = rounds.observe_context(
+        plan.scene, plan.context, source=source,
+        memory=memory, config=plan.config, clock=clock, progress=console.track,
+    )  # fmt: skip
+    warn_of_depth(about["depth"], console)
+    return total
+
+
+def _complete(
+    plan: Plan,
+    memory: SpatialMemory,
+    number: int,
+    context: Sequence[ContextView],
+    folder: Path,
+    clock: rounds.Clock,
+    console: Console,
+    about: dict[str, Any],
+) -> FuseReport:
+    config, rows = plan.config, plan.schedule[number - 1]
+    cameras = plan.targets.cameras[list(rows)]
+    all_stems = target_stems(plan.targets.cameras.names)
+    stems = [all_stems[row] for row in rows]
+    targets = [
+        FollowedCamera(memory, camera, options=config.splat, reuse=config.savings.reuse)
+        for camera in cameras
+    ]
+    with clock.stage("project"):
+        known = [target.guidance() for target in targets]
+    # Files are compressed beside the work on the next targets.
+    with ThreadPoolExecutor(WRITERS) as pool:
+        writing: list[Future[None]] = []
+        results, total = rounds.complete_targets(
+            targets, number, memory=memory,
+            completer=sparing(
+                create(config.completer, **config.completer_options), config.savings.minor_holes
+            ),
+            context=context, config=config, clock=clock, progress=console.track,
+            done=lambda at, result: writing.append(
+                pool.submit(write_target, folder, stems[at], result)
+            ),
+        )  # fmt: skip
+        with clock.stage("project"):
+            grown = [target.guidance() for target in targets]
+        for stem, guidance in zip(stems, grown, strict=True):
+            writing.append(pool.submit(write_after, folder, stem, guidance))
+        for written in writing:
+            written.result()
+    about["coverage_before"] = _mean([guidance.coverage for guidance in known])
+    about["coverage_after"] = _mean([guidance.coverage for guidance in grown])
+    about["views"] = [
+        {
+            **result.report,
+            "stem": stem,
+            "camera": camera_entry(camera),
+            "coverage": before.coverage,
+            "coverage_after": after.coverage,
+        }
+        for stem, camera, result, before, after in zip(
+            stems, cameras, results, known, grown, strict=True
+        )
+    ]
+    refused = [view for view in about["views"] if view["scale"]["status"] != "aligned"]
+    if refused:
+        console.warn(
+            f"round {number}: {len(refused)} of {len(results)} completions give no points, first "
+            f"{refused[0]['name']}: {refused[0]['scale']['status']}"
+        )
+    return total
+
+
+def _mean(values: list[float]) -> float | None:
+    return sum(values) / len(values) if values else None

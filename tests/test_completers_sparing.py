@@ -1,0 +1,122 @@
+"""Views with small holes are left to a cheap completer, and the rest get what they got before."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from gvtools.cameras import Cameras
+from gvtools.completers.base import Completion, create
+from gvtools.completers.inpaint import InpaintCompleter
+from gvtools.completers.sparing import SparingCompleter, hole_reach, sparing
+from gvtools.errors import OptionError
+from gvtools.guidance import Guidance
+from pipelines.config import RunConfig, with_setting
+
+HEIGHT, WIDTH = 60, 80
+
+
+@dataclass
+class Recorder:
+    """Paints holes red, and tells whom it was given."""
+
+    name: str = "recorder"
+    joint: bool = True
+    costly: bool = True
+    said: str | None = "own"
+    given: list[tuple[str, ...]] = field(default_factory=list)
+
+    def complete(self, context, guidance: Guidance, *, seed: int = 0) -> Completion:
+        self.given.append(guidance.cameras.names)
+        hole = ~guidance.valid
+        rgb = np.where(hole[..., None], np.array([1, 0, 0], np.float32), guidance.rgb)
+        depth = np.where(hole, np.float32(3), guidance.depth)
+        support = None if self.said is None else (self.said,) * len(guidance)
+        rays = np.full((*hole.shape, 6), 7, np.float32)
+        return Completion(rgb, depth, hole * np.float32(0.5), rays, {"passes": 1.0}, support)
+
+
+def guidance_with(*radii: int) -> Guidance:
+    """A grey wall at depth 2 in each view, with a round hole of the radius in its middle."""
+    count = len(radii)
+    pose = np.tile(np.eye(4), (count, 1, 1))
+    K = np.tile(np.array([[60.0, 0, WIDTH / 2], [0, 60.0, HEIGHT / 2], [0, 0, 1]]), (count, 1, 1))
+    names = tuple(f"r{radius}_{i}" for i, radius in enumerate(radii))
+    cameras = Cameras(K, pose, np.full(count, WIDTH), np.full(count, HEIGHT), names)
+    y, x = np.indices((HEIGHT, WIDTH))
+    away = np.hypot(y - HEIGHT // 2, x - WIDTH // 2)
+    valid = np.stack([away >= radius for radius in radii])
+    return Guidance(
+        cameras,
+        (valid[..., None] * np.full(3, 0.5)).astype(np.float32),
+        np.where(valid, np.float32(2), np.float32(0)),
+        valid,
+        valid.astype(np.float32),
+        np.zeros_like(valid),
+    )
+
+
+@pytest.mark.parametrize("radius", [1, 5, 17])
+def test_the_reach_of_a_hole_is_its_inner_radius(radius):
+    valid = guidance_with(radius).valid[0]
+    # The middle pixel lies that far from the rim.
+    assert hole_reach(valid) == pytest.approx(radius / 100, abs=1e-6)
+
+
+def test_the_reach_at_the_ends():
+    full = np.ones((HEIGHT, WIDTH), bool)
+    assert hole_reach(full) == 0
+    assert hole_reach(~full) == float("inf")
+    strip = full.copy()
+    strip[:, :10] = False
+    assert hole_reach(strip) == pytest.approx(0.1)
+
+
+def test_small_holes_go_to_the_cheap_one_and_the_rest_stay_as_they_were():
+    guidance = guidance_with(2, 15, 0, 20, 4)
+    alone, costly = Recorder(), Recorder()
+    made = SparingCompleter(costly, 0.05).complete((), guidance)
+    assert costly.given == [("r15_1", "r20_3")]
+    assert made.spent["spared_views"] == 3 and made.spent["passes"] == 1
+    whole = alone.complete((), guidance)
+    cheap = InpaintCompleter().complete((), guidance)
+    for row in range(5):
+        expected = whole if row in (1, 3) else cheap
+        for key in ("rgb", "depth", "confidence"):
+            assert np.array_equal(getattr(made, key)[row], getattr(expected, key)[row])
+    assert made.support == (None, "own", None, "own", None)
+    assert made.rays is not None
+    assert (made.rays[[1, 3]] == 7).all()
+    assert np.allclose(made.rays[0], guidance.cameras.plucker(0))
+
+
+def test_nothing_is_asked_of_a_completer_that_has_nothing_to_do():
+    costly, cheap = Recorder(), Recorder("cheap")
+    SparingCompleter(costly, 0.05, cheap).complete((), guidance_with(2, 3))
+    assert not costly.given and len(cheap.given) == 1
+    SparingCompleter(costly, 0.05, cheap).complete((), guidance_with(20))
+    assert len(costly.given) == 1 and len(cheap.given) == 1
+
+
+def test_only_costly_completers_are_spared_and_only_where_that_is_on():
+    costly = Recorder()
+    wrapped = sparing(costly, 0.02)
+    assert isinstance(wrapped, SparingCompleter)
+    assert (wrapped.name, wrapped.joint) == ("recorder", True)
+    assert sparing(costly, 0.0) is costly
+    modest = replace(costly, costly=False)
+    assert sparing(modest, 0.02) is modest
+    for name, spared in (("inpaint", False), ("none", False), ("exemplar", True)):
+        assert isinstance(sparing(create(name), 0.02), SparingCompleter) == spared
+
+
+def test_support_is_absent_where_neither_has_a_scale_to_find():
+    costly = Recorder(said=None)
+    assert SparingCompleter(costly, 0.05).complete((), guidance_with(2, 20)).support is None
+
+
+def test_a_negative_share_is_refused():
+    with pytest.raises(OptionError, match="minor_holes"):
+        with_setting(RunConfig(), "savings.minor_holes", -0.1)
