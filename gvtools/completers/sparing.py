@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.completers.base import Completer, Completion, ContextView
-from gvtools.completers.inpaint import InpaintCompleter
+from gvtools.completers.base import Completer, Completion, ContextView, create
 from gvtools.guidance import Guidance
 
 
@@ -49,7 +48,7 @@ class SparingCompleter:
 
     costly: Completer
     minor: float
-    cheap: Completer = field(default_factory=InpaintCompleter)
+    cheap: Completer = field(default_factory=lambda: create("inpaint"))
 
     def __post_init__(self) -> None:
         self.name = self.costly.name
