@@ -63,12 +63,16 @@ class SavingsOptions:
         minor_holes: a view with no unknown pixel farther than this share of the image diagonal from
             a known one is left to ``inpaint`` where the completer is a costly one (geoverse,
             exemplar); 0 leaves it none.
+        explained: a context view whose depth would have to be computed takes memory's instead where
+            the views before it explain this share of its pixels; None computes all.
     """
 
     reuse: bool = True
     minor_holes: float = 0.02
+    explained: float | None = 0.9
 
     def __post_init__(self) -> None:
+        check_range("savings.explained", self.explained, above=0, most=1)
         check_range("savings.minor_holes", self.minor_holes, least=0)
 
 

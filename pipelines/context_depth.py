@@ -9,7 +9,7 @@ killed in round 0 goes on with the next view.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.depth.scale_check import disagrees, scale_to_points
-from gvtools.depth.source import DepthMap, DepthSource, RecordedDepth
+from gvtools.depth.source import DepthMap, DepthSource, RecordedDepth, is_recorded
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.files import replaced_when_written
 from gvtools.scenes.scene import Frame, Scene, View
@@ -39,6 +39,7 @@ class KeptDepth:
         source: where depth comes from.
         folder: of round 0; what is not recorded is written there, and read again later.
         unfinished: round 0 is being written; a damaged file in its folder is then replaced.
+        known: gives the depth of a view that needs none computed, or None.
 
     Attributes:
         failed: views that no depth was found for, with the reason.
@@ -52,7 +53,9 @@ class KeptDepth:
         folder: Path,
         *,
         unfinished: bool = False,
+        known: Callable[[View, Frame], DepthMap | None] = lambda view, frame: None,
     ) -> None:
+        self._known = known
         self.scene, self.source, self.folder = scene, source, folder
         self.failed: dict[str, str] = {}
         self._unfinished = unfinished
@@ -89,7 +92,8 @@ class KeptDepth:
                     self.failed[view.name] = failed
                 return found
         try:
-            found = self.source.depth(self.scene, view, frame)
+            spared = None if is_recorded(self.source, view) else self._known(view, frame)
+            found = spared or self.source.depth(self.scene, view, frame)
         except DegenerateError as error:
             # The view stays without depth; the others carry the run.
             self.failed[view.name] = str(error)

@@ -11,8 +11,12 @@ from typing import Any
 
 from gvtools.completers.base import ContextView, create
 from gvtools.completers.sparing import sparing
+from gvtools.depth.scale_check import disagrees, scale_to_points
+from gvtools.depth.source import DepthMap
+from gvtools.memory.explained import MEMORY, explained_depth
 from gvtools.memory.followed import FollowedCamera
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
+from gvtools.scenes.scene import Frame, View
 from pipelines import rounds
 from pipelines.console import Console
 from pipelines.context_depth import KeptDepth, warn_of_depth
@@ -71,7 +75,18 @@ def _lift_context(
     console: Console,
     about: dict[str, Any],
 ) -> FuseReport:
-    source = KeptDepth(plan.scene, plan.context, plan.source, folder, unfinished=True)
+    least = plan.config.savings.explained
+
+    def known(view: View, frame: Frame) -> DepthMap | None:
+        if least is None:
+            return None
+        splat = plan.config.splat
+        found = explained_depth(memory, view.camera, frame.rgb, least=least, options=splat)
+        # What a view before it got wrong must not spread.
+        fit = found and scale_to_points(plan.scene, view.name, found.depth)
+        return None if fit and disagrees(fit) else found
+
+    source = KeptDepth(plan.scene, plan.context, plan.source, folder, unfinished=True, known=known)
     if source.kept:
         console.line(
             f"taking over the depth of {source.kept} of {len(plan.context)} context views, "
@@ -82,6 +97,12 @@ def _lift_context(
         memory=memory, config=plan.config, clock=clock, progress=console.track,
     )  # fmt: skip
     warn_of_depth(about["depth"], console)
+    spared = sum(report["source"] == MEMORY for report in about["depth"])
+    if spared:
+        console.line(
+            f"memory explains {spared} of {len(about['depth'])} context views: their depth was "
+            "not computed"
+        )
     return total
 
 

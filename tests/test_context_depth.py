@@ -18,6 +18,7 @@ from pipelines.cli import main
 from pipelines.context_depth import colored, off_scale
 
 RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3", "--quiet")
+ALL = ("--set", "savings.explained=none")
 
 
 class Exact:
@@ -54,7 +55,7 @@ def reconstruct(scan, out, *more: object) -> int:
 
 def test_computed_depth_is_kept_and_asked_for_once(scan, tmp_path):
     out = tmp_path / "run"
-    assert reconstruct(scan, out, "--voxel", "0.03") == 0
+    assert reconstruct(scan, out, "--voxel", "0.03", *ALL) == 0
     # Once a view, although round 0 lifts it and the completer looks at it in every round.
     assert Exact.asked == 3
     kept = sorted((out / "round_000").glob("context_depth_*.npz"))
@@ -69,6 +70,21 @@ def test_computed_depth_is_kept_and_asked_for_once(scan, tmp_path):
     assert [entry["source"] for entry in report["depth"]] == ["exact"] * 3
     assert report["depth"][0]["known"] == 1
     assert report["depth"][0]["scale"] is None
+
+
+def test_a_view_that_memory_explains_needs_none_computed(scan, tmp_path):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out, "--voxel", "0.03", "--set", "savings.explained=0.8") == 0
+    report = json.loads((out / "round_000" / "report.json").read_text())
+    sources = [entry["source"] for entry in report["depth"]]
+    assert sources[0] == "exact" and sources.count("memory") == 3 - Exact.asked > 0
+    row = sources.index("memory")
+    assert report["depth"][row]["known"] >= 0.8
+    kept = sorted((out / "round_000").glob("context_depth_*.npz"))
+    with np.load(kept[row]) as stored:
+        known = stored["depth"] > 0
+        truth = render(world_from_cam(row))[1]
+        assert np.median(np.abs(stored["depth"][known] / truth[known] - 1)) < 0.01
 
 
 def test_a_resumed_run_reads_it_again(scan, tmp_path):
@@ -100,7 +116,7 @@ def test_a_view_without_depth_does_not_stop_the_others(scan, tmp_path, monkeypat
 
     monkeypatch.setattr(choice, "_stereo", lambda *_: Lacking())
     out = tmp_path / "run"
-    assert reconstruct(scan, out) == 0
+    assert reconstruct(scan, out, *ALL) == 0
     assert "1 of 3 views have no depth" in capsys.readouterr().err
     report = json.loads((out / "round_000" / "report.json").read_text())
     assert [entry["known"] for entry in report["depth"]] == [1, 0, 1]
