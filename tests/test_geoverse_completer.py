@@ -13,8 +13,9 @@ import torch
 
 from gvtools.cameras import Cameras
 from gvtools.completers import Completion, ContextView, create
-from gvtools.completers.geoverse.completer import GeoVerseCompleter, nearest_views
+from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.context_views import nearest_views
 from gvtools.completers.geoverse.depth_scale import PassScale
 from gvtools.completers.geoverse.full_size import GENERATED
 from gvtools.completers.geoverse.model import Generated, GeoVerse

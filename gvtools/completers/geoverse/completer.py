@@ -13,9 +13,9 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from gvtools.cameras import Cameras
 from gvtools.completers.base import Completion, ContextView, check_views
 from gvtools.completers.geoverse.color_field import COLOR_ALIGNMENTS
+from gvtools.completers.geoverse.context_views import CHOICES, chosen_views
 from gvtools.completers.geoverse.depth_scale import ALIGNMENTS
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.full_size import Completed, Fill, averaged, brought_back, corrected
@@ -49,6 +49,8 @@ class GeoVerseCompleter:
         temperature: of the noise that level 1 starts from, see ``FlowConfig``; None for the
             model's own.
         context_views: most photographs in a pass; None for the model's own.
+        context_by: "seen" takes the photographs that see most of what the targets show, "near" those
+            that stand and look most like them; see ``context_views``.
         views: most views in a pass, photographs and targets; None for the model's own.
         alignment: how decoded depth gets the memory's scale, see ``depth_scale``; None for the
             model's own. A correction has the memory's scale already.
@@ -70,6 +72,7 @@ class GeoVerseCompleter:
     guidance: float | None = None
     temperature: float | None = None
     context_views: int | None = None
+    context_by: str = "seen"
     views: int | None = None
     alignment: str | None = None
     color_alignment: str | None = None
@@ -87,6 +90,7 @@ class GeoVerseCompleter:
         for name, value, known in (
             ("precision", self.precision, PRECISIONS),
             ("device", self.device, DEVICES),
+            ("context_by", self.context_by, CHOICES),
             ("alignment", self.alignment or ALIGNMENTS[0], ALIGNMENTS),
             ("color_alignment", self.color_alignment or "none", COLOR_ALIGNMENTS),
         ):
@@ -156,13 +160,14 @@ class GeoVerseCompleter:
         for first in range(0, len(holes), room):
             rows = holes[first : first + room]
             part = guidance.rows(rows)
-            chosen = nearest_views(context, part.cameras, most)
             fill = None
             if model.config.hints.fill == "surfaces":
                 # It needs more than torch and numpy.
                 from gvtools.completers.geoverse.surface_fill import surface_fill
 
                 fill = surface_fill(context, part)
+            shown = part.depth if fill is None else fill[1]
+            chosen = chosen_views(context, part.cameras, shown, most, by=self.context_by)
             canvas.put(rows, self._pass(model, device, chosen, part, fill, seed), part)
             passes += 1
         spent = {
@@ -285,40 +290,6 @@ class _Canvas:
             spent={**self.spent, **spent},
             support=tuple(self.support),
         )
-
-
-def nearest_views(
-    context: Sequence[ContextView], targets: Cameras, count: int
-) -> list[ContextView]:
-    """The context views that stand and look most like the targets, the very best first.
-
-    Distances are in units of the scene's extent between cameras; a right angle between viewing
-    directions weighs as much as that extent.
-    """
-    if len(context) <= 1:
-        return list(context)
-    centres = np.concatenate([view.camera.centers for view in context])
-    forward = np.concatenate([view.camera.world_from_cam[:, :3, 2] for view in context])
-    target_centres, target_forward = targets.centers, targets.world_from_cam[:, :3, 2]
-    everything = np.concatenate((centres, target_centres))
-    # Centres that differ by their rounding alone are one place.
-    least = 1e-9 * max(float(np.abs(everything).max()), 1e-12)
-    extent = max(float(np.linalg.norm(np.ptp(everything, axis=0))), least)
-    apart = np.linalg.norm(centres[:, None] - target_centres[None], axis=-1) / extent
-    turned = 1 - np.clip(forward @ target_forward.T, -1, 1)
-    cost = apart + turned
-    # The best for any target first, then those that are best for the targets served worst.
-    chosen: list[int] = [int(cost.mean(1).argmin())]
-    while len(chosen) < min(count, len(context)):
-        served = cost[chosen].min(0)
-        gain = np.maximum(served[None] - cost, 0).sum(1)
-        gain[chosen] = -1
-        best = int(gain.argmax())
-        if gain[best] <= 0:
-            rest = [index for index in np.argsort(cost.min(1), kind="stable")]
-            best = next(int(index) for index in rest if int(index) not in chosen)
-        chosen.append(best)
-    return [context[index] for index in chosen]
 
 
 @lru_cache(maxsize=2)
