@@ -49,8 +49,8 @@ class GeoVerseCompleter:
         temperature: of the noise that level 1 starts from, see ``FlowConfig``; None for the
             model's own.
         context_views: most photographs in a pass; None for the model's own.
-        context_by: "seen" takes the photographs that see most of what the targets show, "near" those
-            that stand and look most like them; see ``context_views``.
+        context_by: "seen" takes the photographs that see most of what the targets show, "near"
+            those that stand and look most like them; see ``context_views``.
         views: most views in a pass, photographs and targets; None for the model's own.
         alignment: how decoded depth gets the memory's scale, see ``depth_scale``; None for the
             model's own. A correction has the memory's scale already.
