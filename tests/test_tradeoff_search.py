@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
+import numpy as np
 import pytest
 
 from gvtools.errors import GvError, OptionError
+from pipelines.config import RunConfig, with_setting
+from pipelines.plan import Plan
 from pipelines.tradeoff import parse_budget
-from pipelines.tradeoffs.knobs import Knob, Level, neighbours, settings_of, usual
+from pipelines.tradeoffs.knobs import Knob, Level, knobs_of, neighbours, settings_of, usual
 from pipelines.tradeoffs.outcome import Outcome, front
 from pipelines.tradeoffs.search import SHARES, Search, marginal_values, recommended
 
@@ -167,3 +173,33 @@ def test_budgets_are_seconds_or_bytes(text, kind, amount):
 def test_a_budget_that_is_none_is_refused(text):
     with pytest.raises(OptionError, match="expected seconds"):
         parse_budget(text)
+
+
+def knobs_in(source: str, config: RunConfig) -> dict[str, Knob]:
+    """The knobs of a run whose depth comes from ``source``, by name."""
+    cameras = SimpleNamespace(width=np.array([640]), height=np.array([480]))
+    plan = SimpleNamespace(
+        config=replace(config, voxel=0.01),
+        targets=SimpleNamespace(cameras=cameras),
+        source=SimpleNamespace(name=source),
+    )
+    return {knob.name: knob for knob in knobs_of(cast(Plan, plan))}
+
+
+def test_what_is_swept_is_what_the_run_has():
+    recorded = knobs_in("recorded", RunConfig(completer="none"))
+    assert "stereo planes" not in recorded and "views explained, share of pixels" not in recorded
+    computed = knobs_in("plane-sweep", RunConfig(completer="none"))
+    planes, explained = computed["stereo planes"], computed["views explained, share of pixels"]
+    assert planes.levels[planes.usual].settings == {"stereo.planes": None}
+    assert explained.levels[explained.usual].settings == {"savings.explained": 0.9}
+    assert explained.levels[-1].settings == {"savings.explained": None}
+    # A value that is not among the usual ones is one of the levels, too.
+    own = with_setting(RunConfig(completer="none"), "savings.explained", 0.95)
+    explained = knobs_in("da3", own)["views explained, share of pixels"]
+    assert explained.levels[explained.usual].settings == {"savings.explained": 0.95}
+    # Every level is a setting that a run takes.
+    for knob in computed.values():
+        for level in knob.levels:
+            for key, value in level.settings.items():
+                with_setting(RunConfig(), key, value)

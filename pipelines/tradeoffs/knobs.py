@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from gvtools.completers.base import create
+from gvtools.depth.source import RecordedDepth
 from gvtools.errors import GvError
 from gvtools.scenes.reduced import SMALLEST
 
@@ -80,6 +81,7 @@ def knobs_of(plan: Plan) -> list[Knob]:
     """
     config = plan.config
     assert config.voxel is not None
+    completers = _completers(plan)
     knobs = [
         Knob("voxel edge", tuple(_edge(config.voxel, share) for share in EDGES), EDGES.index(1.0)),
         _numbers("observations a voxel", "memory.observations_per_voxel",
@@ -96,7 +98,7 @@ def knobs_of(plan: Plan) -> list[Knob]:
             ),
             2,
         ),
-        _completers(plan),
+        completers,
         _numbers("views a round", "views_per_round", (3, 6, 12), config.views_per_round),
     ]  # fmt: skip
     side = max(int(plan.targets.cameras.width.max()), int(plan.targets.cameras.height.max()))
@@ -108,8 +110,27 @@ def knobs_of(plan: Plan) -> list[Knob]:
             len(sides),
         )
     )
+    if "geoverse" in [level.settings["completer"] for level in completers.levels]:
+        knobs.append(
+            _numbers("holes left to inpaint, share of the diagonal", "savings.minor_holes",
+                     (0.1, 0.05, 0.02, 0.0), config.savings.minor_holes)
+        )  # fmt: skip
+    if config.completer == "geoverse":
+        given = config.completer_options
+        knobs += [
+            _values("cascade steps", "completer.cascade_steps", (1, 2, 4, None),
+                    given.get("cascade_steps")),
+            _values("precision", "completer.precision", ("bfloat16", "float32"),
+                    given.get("precision", "auto")),
+        ]  # fmt: skip
+    if plan.source.name != RecordedDepth.name:
+        knobs.append(
+            _values("views explained, share of pixels", "savings.explained",
+                    (0.7, 0.8, 0.9, None), config.savings.explained)
+        )  # fmt: skip
     if plan.source.name == "plane-sweep":
         knobs += [
+            _values("stereo planes", "stereo.planes", (16, 32, 64, None), config.stereo.planes),
             _numbers("stereo sources", "stereo.sources", (2, 4, 6), config.stereo.sources),
             _numbers("stereo picture size", "stereo.max_side",
                      (320, 480, 640, 960), config.stereo.max_side),
@@ -125,6 +146,16 @@ def _numbers(name: str, key: str, values: Sequence[float], start: float) -> Knob
         values = sorted({*values, start}, reverse=not rising)
     levels = tuple(Level(f"{value:g}", {key: value}) for value in values)
     return Knob(name, levels, list(values).index(start))
+
+
+def _values(name: str, key: str, values: Sequence[Any], start: Any) -> Knob:
+    """Levels in the order given, None among them; the run's own value is one, if need be the last.
+
+    None stands for what a run finds by itself, or for a saving that is off.
+    """
+    values = list(values) if start in values else [*values, start]
+    levels = tuple(Level("none" if v is None else str(v), {key: v}) for v in values)
+    return Knob(name, levels, values.index(start))
 
 
 def _edge(voxel: float, share: float) -> Level:
