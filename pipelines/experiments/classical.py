@@ -21,8 +21,6 @@ Float32 = NDArray[np.float32]
 Filler = Callable[[Float32, NDArray[np.bool_]], Float32]
 # Radius of OpenCV's fillers, px, as its tutorial has it.
 RADIUS = 3
-# Range of the log depth in OpenCV's 8 bit pictures.
-LEVELS = 255
 
 
 @dataclass
@@ -99,14 +97,20 @@ def navier_stokes(values: Float32, valid: NDArray[np.bool_]) -> Float32:
 
 
 def _opencv(values: Float32, valid: NDArray[np.bool_], method: int) -> Float32:
-    """In 8 bits over the known range: OpenCV's result for floating-point pictures is wrong."""
+    """In integers over the known range: OpenCV's result for floating-point pictures is wrong.
+
+    One channel in 16 bits, three in 8: it takes no others.
+    """
     import cv2
+
+    kind = np.uint16 if values.shape[-1] == 1 else np.uint8
+    most = np.iinfo(kind).max
 
     low, high = float(values[valid].min()), float(values[valid].max())
     span = max(high - low, 1e-6)
-    levels = np.rint((values - low) / span * LEVELS).clip(0, LEVELS).astype(np.uint8)
+    levels = np.rint((values - low) / span * most).clip(0, most).astype(kind)
     filled = cv2.inpaint(levels.squeeze(), (~valid).astype(np.uint8), RADIUS, method)
-    return (filled.reshape(values.shape) / np.float32(LEVELS) * span + low).astype(np.float32)
+    return (filled.reshape(values.shape) / np.float32(most) * span + low).astype(np.float32)
 
 
 CLASSICAL = {
