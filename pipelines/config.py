@@ -151,6 +151,8 @@ PROFILES: dict[str, dict[str, Any]] = {
     "accurate": {
         "fusion.voxel_percentile": 25.0,
         "fusion.voxel_loss": None,
+        "savings.minor_holes": 0.0,
+        "savings.explained": None,
         "memory.same_direction": 0.0,
         "memory.observations_per_voxel": 64,
     },
