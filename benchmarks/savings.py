@@ -53,7 +53,7 @@ class Row:
         """Once more."""
         out = folder / "run"
         start = time.perf_counter()
-        reconstruct(scene, self.config, out, console=Console(quiet=True))
+        reconstruct(scene, self.config, out, console=Console(quiet=True), drawn=False)
         self.whole.append(time.perf_counter() - start)
         reports = RunDirectory(out).reports()
         self.rounds.append(sum(report["seconds"]["total"] for report in reports))

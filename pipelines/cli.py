@@ -22,10 +22,13 @@ COMMANDS = {
     "tradeoff": "pipelines.tradeoff",
     "evaluate": "pipelines.evaluate",
     "trajectory": "pipelines.trajectory",
+    "report": "pipelines.report",
+    "plot": "pipelines.plot",
     "weights": "pipelines.weights",
     "train": "pipelines.train",
     "experiment": "pipelines.experiment",
     "export": "pipelines.export",
+    "view": "pipelines.view",
     "bench": "pipelines.bench",
 }
 

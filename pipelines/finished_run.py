@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene, View
 
 
-_RECORDED = ("schedule", "context", "targets", "config", "versions")
+_RECORDED = (
+    "project", "reading", "targets_project", "targets_kind", "schedule", "context", "targets",
+    "config", "versions",
+)  # fmt: skip
 _OF_A_VIEW = ("name", "coverage", "coverage_after", "camera", "stem", "scale")
 
 
@@ -91,35 +94,67 @@ def open_run(path: Path, *, project: Path | None = None) -> FinishedRun:
     Raises:
         ProjectError: no run, one without a round of targets, or one whose project is gone.
     """
+    record = read_record(path)
+    reports = read_reports(path)
+    if len(reports) < 2:
+        raise ProjectError(f"{path}: no round of targets is done; expected one; add --resume to it")
+    scene, truths = open_scenes(record, project=project)
+    return FinishedRun(path, record, scene, truths, reports)
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """What the run.json of a run's folder holds.
+
+    Raises:
+        ProjectError: no run, or a record of another version.
+    """
     file = path / "run.json"
     if not file.is_file():
         raise ProjectError(f"{path}: holds no run.json; expected the folder of a run")
     try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-        root, reading = Path(record["project"]), record["reading"]
-        other, kind = record["targets_project"], record["targets_kind"]
+        record: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
         lacking = [key for key in _RECORDED if key not in record]
         if lacking:
             raise KeyError(", ".join(lacking))
+        if not isinstance(record["project"], str):
+            raise TypeError("project is no path")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ProjectError(
             f"{file}: no record of a run of this version ({error!r}); run reconstruct again"
         ) from None
-    reports = tuple(RunDirectory(path).reports())
-    _check_reports(path, reports)
-    if len(reports) < 2:
-        raise ProjectError(f"{path}: no round of targets is done; expected one; add --resume to it")
+    return record
+
+
+def open_scenes(
+    record: Mapping[str, Any], *, project: Path | None = None
+) -> tuple[Scene, Scene | None]:
+    """The project of a run, and the scene whose views show the truth of its targets, if any does.
+
+    Args:
+        record: of its run.json.
+        project: where the project lies now; None: where it lay.
+
+    Raises:
+        GvError: it cannot be read any more.
+    """
     max_side = record["config"].get("max_side")
-    scene = reduced(reopen_scene(project or root, reading), max_side)
-    truths = {"hold-out": scene}.get(kind)
+    root = project or Path(record["project"])
+    scene = reduced(reopen_scene(root, record["reading"]), max_side)
+    other = record["targets_project"]
     if other is not None:
         from gvtools.scenes.project import open_project
 
-        truths = reduced(open_project(Path(other)), max_side)
-    return FinishedRun(path, record, scene, truths, reports)
+        return scene, reduced(open_project(Path(other)), max_side)
+    return scene, scene if record["targets_kind"] == "hold-out" else None
 
 
-def _check_reports(path: Path, reports: Sequence[Mapping[str, Any]]) -> None:
+def read_reports(path: Path) -> tuple[Mapping[str, Any], ...]:
+    """The reports of a run's whole rounds, the context's (round 0) first; perhaps none.
+
+    Raises:
+        ProjectError: one is damaged, or of another version.
+    """
+    reports = tuple(RunDirectory(path).reports())
     for number, report in enumerate(reports):
         views = report.get("views")
         whole = isinstance(views, list) and "seconds" in report
@@ -128,6 +163,7 @@ def _check_reports(path: Path, reports: Sequence[Mapping[str, Any]]) -> None:
                 f"{RunDirectory(path).round_path(number)}/report.json: no report of this version; "
                 "run reconstruct again"
             )
+    return reports
 
 
 def _same_camera(view: View, target: TargetFiles) -> bool:

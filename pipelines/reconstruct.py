@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``reconstruct``."""
     parser.add_argument("project", type=Path, help="COLMAP, posed RGB-D or transforms.json")
     add_run_arguments(parser, out_required=True)
+    parser.add_argument(
+        "--live", action="store_true", help="open the web viewer and follow the run"
+    )
 
 
 def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) -> None:
@@ -73,18 +77,21 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run ``gvtools reconstruct``."""
     from pipelines.scene_arguments import open_scene, reading_of
+    from pipelines.view import live_viewer
 
     config = config_from(args)
-    reconstruct(
-        open_scene(args.project, args),
-        config,
-        args.out,
-        console=console,
-        resume=args.resume,
-        dry_run=args.dry_run,
-        reading=reading_of(args),
-    )
-    copy_figures(args, args.out)
+    watched = args.live and not args.dry_run
+    with live_viewer(args.out, console) if watched else nullcontext():
+        reconstruct(
+            open_scene(args.project, args),
+            config,
+            args.out,
+            console=console,
+            resume=args.resume,
+            dry_run=args.dry_run,
+            reading=reading_of(args),
+        )
+        copy_figures(args, args.out)
 
 
 def copy_figures(args: argparse.Namespace, out: Path) -> None:
@@ -124,6 +131,7 @@ def reconstruct(
     resume: bool = False,
     dry_run: bool = False,
     reading: Mapping[str, Any] | None = None,
+    drawn: bool = True,
 ) -> Path:
     """The main job; returns the run's folder.
 
@@ -136,6 +144,7 @@ def reconstruct(
         dry_run: say what would be done, and write nothing.
         reading: how the user said the project is to be read, JSON-ready; part of what a resumed
             run must share with its beginning.
+        drawn: False leaves growth.png and report.html out.
 
     Raises:
         GvError: wrong input or options; nothing of an earlier run is lost.
@@ -153,11 +162,13 @@ def reconstruct(
         console.line(f"dry run: {out}: {state}")
         return out
     with directory.taken_up(identity, resume=resume) as done:
-        _run_rounds(plan, directory, done, console)
+        _run_rounds(plan, directory, done, console, drawn=drawn)
     return out
 
 
-def _run_rounds(plan: Plan, directory: RunDirectory, done: int, console: Console) -> None:
+def _run_rounds(
+    plan: Plan, directory: RunDirectory, done: int, console: Console, *, drawn: bool
+) -> None:
     """The rounds from number ``done`` on, then the end products."""
     from pipelines.run_round import run_round
 
@@ -191,7 +202,7 @@ def _run_rounds(plan: Plan, directory: RunDirectory, done: int, console: Console
             memory.save(folder / "memory.npz")
             write_json(folder / "report.json", report)
         console.line(_round_line(report))
-    _finish(plan, memory, directory, console)
+    _finish(plan, memory, directory, console, drawn=drawn)
 
 
 def _start_memory(plan: Plan) -> SpatialMemory:
@@ -216,12 +227,15 @@ def _round_line(report: dict[str, Any]) -> str:
     return f"{text}, {report['seconds']['total']:.1f} s"
 
 
-def _finish(plan: Plan, memory: SpatialMemory, directory: RunDirectory, console: Console) -> None:
+def _finish(
+    plan: Plan, memory: SpatialMemory, directory: RunDirectory, console: Console, *, drawn: bool
+) -> None:
     """The run's end products, all derived from the last round's memory."""
     from gvtools.files import replaced_when_written
     from gvtools.memory.ply import export_memory_ply
     from pipelines.context_depth import off_scale
     from pipelines.measure import measure_run
+    from pipelines.report import write_report
     from viz.growth import draw_growth, growth_text
 
     out = directory.path
@@ -231,13 +245,18 @@ def _finish(plan: Plan, memory: SpatialMemory, directory: RunDirectory, console:
             shutil.copyfile(last, temporary)
     export_memory_ply(memory, out / "memory.ply")
     reports = directory.reports()
-    with replaced_when_written(out / "growth.png") as temporary:
-        draw_growth(reports, title=plan.scene.root.name).savefig(temporary, format="png", dpi=120)
     metrics = measure_run(plan, memory, directory, console)
     write_json(out / "metrics.json", metrics)
+    if drawn:
+        figure = draw_growth(reports, title=plan.scene.root.name)
+        with replaced_when_written(out / "growth.png") as temporary:
+            figure.savefig(temporary, format="png", dpi=120)
+        write_report(plan, out)
     last.unlink(missing_ok=True)
     console.line(growth_text(reports))
     flagged = off_scale(reports[0].get("depth", ()))
     if flagged:
         console.warn(f"{flagged}; figures in {directory.round_path(0) / 'report.json'}")
-    console.line(f"results in {out}: memory.npz, memory.ply, growth.png, metrics.json, round_*/")
+    console.line(
+        f"results in {out}: memory.npz, memory.ply, report.html, growth.png, metrics.json, round_*/"
+    )

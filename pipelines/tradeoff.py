@@ -13,7 +13,7 @@ from gvtools.errors import OptionError
 if TYPE_CHECKING:
     from pipelines.console import Console
     from pipelines.tradeoffs.outcome import Outcome
-    from pipelines.tradeoffs.search import Search, Tried
+    from pipelines.tradeoffs.search import Search
 
 SUMMARY = "try a run's settings on held-out views: what each gives and takes, and what to choose"
 EXAMPLES = (
@@ -151,6 +151,7 @@ def _write(
     from gvtools.files import replaced_when_written, write_text
     from pipelines.console import write_json
     from pipelines.tradeoffs.outcome import front
+    from pipelines.tradeoffs.points import trial_point
     from pipelines.tradeoffs.search import marginal_values, recommended
     from pipelines.tradeoffs.tables import front_table, marginal_table, trial_table
     from viz.pareto import draw_pareto
@@ -166,13 +167,15 @@ def _write(
     )
     write_text(out / "trials.csv", csv_text(trials))
     write_text(out / "front.csv", csv_text(edge))
-    points = [_point(entry, search.targets) for entry in whole]
+    points = [trial_point(entry.label, entry.outcome, search.targets) for entry in whole]
     drawn = [points[at] for at, entry in enumerate(whole) if entry.outcome in best]
     with replaced_when_written(out / "front.png") as temporary:
         draw_pareto(
             points,
             front=sorted(drawn, key=lambda point: point["seconds"]),
-            recommended=None if chosen is None else _point(chosen, search.targets),
+            recommended=None
+            if chosen is None
+            else trial_point(chosen.label, chosen.outcome, search.targets),
             budget=budget if kind == "seconds" else None,
             title=f"{name}: {search.targets} held-out views",
         ).savefig(temporary, format="png", dpi=120)
@@ -216,15 +219,3 @@ def _write(
         f"gvtools reconstruct ... --config {out / 'profile.json'}"
     )
     console.line(f"results in {out}: front.png, front.csv, trials.csv, tradeoff.json, profile.json")
-
-
-def _point(entry: Tried, targets: int) -> dict[str, Any]:
-    label = entry.label
-    kind = label if label in ("start", "combination") else "trial"
-    return {
-        "label": label,
-        "kind": "profile" if label.startswith("profile") else kind,
-        "seconds": entry.outcome.seconds(targets),
-        "bytes": entry.outcome.bytes,
-        "psnr": entry.outcome.psnr,
-    }

@@ -64,7 +64,7 @@ def reconstruct(scan: Path, out: Path, *more: str) -> int:
 
 def results(out: Path) -> dict[str, bytes]:
     """Every file of a run, without times."""
-    timed = ("report.json", "rounds.jsonl", "growth.png")
+    timed = ("report.json", "rounds.jsonl", "growth.png", "report.html")
     return {
         str(path.relative_to(out)): path.read_bytes()
         for path in sorted(out.rglob("*"))

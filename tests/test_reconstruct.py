@@ -44,7 +44,7 @@ def run(scan: Path, out: Path, *settings: str, resume: bool = False, dry_run: bo
 
 def results(out: Path) -> dict[str, bytes]:
     """Every file of a run whose bytes an interruption may not change."""
-    timed = ("report.json", "rounds.jsonl", "growth.png")
+    timed = ("report.json", "rounds.jsonl", "growth.png", "report.html")
     return {
         str(path.relative_to(out)): path.read_bytes()
         for path in sorted(out.rglob("*"))

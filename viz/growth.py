@@ -2,73 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
+from viz.canvas import Rounds, check_rounds, chosen, figure_of, round_axis
+from viz.coverage import coverage_panel
+from viz.palette import COLORS, HATCHES
+from viz.timing import times_panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Rounds = Sequence[Mapping[str, Any]]
-
-# Okabe and Ito's palette, which the common forms of colour blindness tell apart.
-COLORS = {
-    "observed": "#0072B2",
-    "generated": "#E69F00",
-    "voxels": "#000000",
-    "added": "#009E73",
-    "merged": "#56B4E9",
-    "rejected": "#D55E00",
-    "new voxels": "#999999",
-    "depth": "#0072B2",
-    "fuse": "#009E73",
-    "project": "#56B4E9",
-    "complete": "#E69F00",
-    "align": "#CC79A7",
-}
-HATCHES = {"generated": "//", "rejected": "xx", "merged": "..", "complete": "//", "align": "xx"}
-STAGES = ("depth", "fuse", "project", "complete", "align")
 FATES = ("added", "merged", "rejected", "new voxels")
 
 
-def draw_growth(rounds: Rounds, *, title: str) -> Figure:
-    """Four panels: what is stored, what became of the points, coverage, and time.
+def draw_growth(
+    rounds: Rounds, *, title: str | None = None, panels: Sequence[str] | None = None
+) -> Figure:
+    """What is stored, what became of the points, coverage, and time.
 
     Args:
         rounds: the lines of a run's ``rounds.jsonl``, in order.
         title: what was reconstructed.
+        panels: of "stored", "fates", "coverage" and "time"; None is all four.
 
     Returns:
         A figure with its own Agg canvas; no state of pyplot is touched.
 
     Raises:
-        OptionError: no rounds.
+        OptionError: no rounds, or no such panel.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    _check(rounds)
-    figure = Figure(figsize=(11, 7.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    (stored, fates), (coverage, times) = figure.subplots(2, 2)
-    _draw_stored(stored, rounds)
-    _draw_fates(fates, rounds)
-    _draw_coverage(coverage, rounds)
-    _draw_times(times, rounds)
-    for axes in (stored, fates, coverage, times):
-        axes.set_xticks(range(len(rounds)), [str(entry["round"]) for entry in rounds])
-        axes.set_xlim(-0.6, len(rounds) - 0.4)
-        axes.set_xlabel("round")
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", color="#dddddd", linewidth=0.6)
-        axes.set_axisbelow(True)
-        if len(rounds) > 20:
-            axes.set_xticks(range(0, len(rounds), len(rounds) // 10))
-    figure.suptitle(f"{title}: growth of the memory")
-    return figure
+    check_rounds(rounds)
+    known = {
+        "stored": partial(stored_panel, rounds=rounds),
+        "fates": partial(fates_panel, rounds=rounds),
+        "coverage": partial(coverage_panel, rounds=rounds),
+        "time": partial(times_panel, rounds=rounds),
+    }
+    heading = None if title is None else f"{title}: growth of the memory"
+    return figure_of(chosen(known, panels), title=heading)
 
 
 def growth_text(rounds: Rounds, width: int = 72) -> str:
@@ -81,7 +57,7 @@ def growth_text(rounds: Rounds, width: int = 72) -> str:
     Raises:
         OptionError: no rounds, or a width below 60.
     """
-    _check(rounds)
+    check_rounds(rounds)
     if width < 60:
         raise OptionError(f"growth: {width} characters wide; expected 60 or more")
     legend = "round  observations  # observed  + generated"
@@ -112,17 +88,14 @@ def growth_text(rounds: Rounds, width: int = 72) -> str:
     return "\n".join(lines)
 
 
-def _check(rounds: Rounds) -> None:
-    if not rounds:
-        raise OptionError("growth: no rounds; expected the lines of a run's rounds.jsonl")
-
-
 def _new_voxels(rounds: Rounds) -> list[int]:
     totals = [0, *(entry["voxels"] for entry in rounds)]
     return [after - before for before, after in pairwise(totals)]
 
 
-def _draw_stored(axes: Axes, rounds: Rounds) -> None:
+def stored_panel(axes: Axes, *, rounds: Rounds) -> None:
+    """Observations by origin on top of each other, and the voxels that hold them."""
+    round_axis(axes, rounds)
     at = range(len(rounds))
     observed = [entry["observed"] for entry in rounds]
     generated = [entry["generated"] for entry in rounds]
@@ -140,7 +113,9 @@ def _draw_stored(axes: Axes, rounds: Rounds) -> None:
     axes.legend(ncols=3, loc="upper left", frameon=False, fontsize="small")
 
 
-def _draw_fates(axes: Axes, rounds: Rounds) -> None:
+def fates_panel(axes: Axes, *, rounds: Rounds) -> None:
+    """What became of the points that arrived in each round."""
+    round_axis(axes, rounds)
     values = {name: [entry[name] for entry in rounds] for name in FATES[:3]}
     values["new voxels"] = _new_voxels(rounds)
     step = 0.8 / len(FATES)
@@ -156,57 +131,15 @@ def _draw_fates(axes: Axes, rounds: Rounds) -> None:
     positive = [value for row in values.values() for value in row if value > 0]
     if positive:
         axes.set_yscale("log")
-        axes.set_ylim(min(positive) / 3, max(positive) * 8)
+        axes.minorticks_off()
+        low, high = min(positive) / 3, max(positive)
+        # A share of the decades above the bars is the legend's.
+        axes.set_ylim(low, high * (high / low) ** 0.25)
         _engineering(axes)
-    axes.legend(ncols=4, loc="upper right", frameon=False, fontsize="small")
-
-
-def _draw_coverage(axes: Axes, rounds: Rounds) -> None:
-    axes.set_title("target pixels that the memory supports")
-    axes.set_ylabel("coverage, % of pixels")
-    axes.set_ylim(0, 119)
-    axes.set_yticks(range(0, 101, 20))
-    known = [
-        (i, 100 * entry["coverage_before"], 100 * entry["coverage_after"])
-        for i, entry in enumerate(rounds)
-        if entry["coverage_before"] is not None and entry["coverage_after"] is not None
-    ]
-    if not known:
-        axes.text(0.5, 0.5, "no targets", transform=axes.transAxes, ha="center")
-        return
-    at, before, after = zip(*known, strict=True)
-    axes.vlines(at, before, after, color="#999999", linewidth=2, zorder=2)
-    axes.scatter(
-        at, before, s=45, color="white", edgecolor=COLORS["observed"], linewidth=1.8, zorder=3,
-        label="before the round",
+    axes.legend(
+        ncols=4, loc="upper right", frameon=False, fontsize="small", handlelength=1.2,
+        columnspacing=0.9,
     )  # fmt: skip
-    axes.scatter(at, after, s=45, color=COLORS["observed"], zorder=3, label="after the round")
-    if len(known) <= 12:
-        for x, low, high in known:
-            axes.annotate(f"{high:.1f}", (x, high), (0, 6), textcoords="offset points",
-                          ha="center", fontsize="small")  # fmt: skip
-            if high - low > 6:
-                axes.annotate(f"{low:.1f}", (x, low), (0, -13), textcoords="offset points",
-                              ha="center", fontsize="small")  # fmt: skip
-    axes.legend(ncols=2, loc="upper left", frameon=False, fontsize="small")
-
-
-def _draw_times(axes: Axes, rounds: Rounds) -> None:
-    bottom = [0.0] * len(rounds)
-    for stage in STAGES:
-        seconds = [float(entry["seconds"].get(stage) or 0) for entry in rounds]
-        if not any(seconds):
-            continue
-        axes.bar(
-            range(len(rounds)), seconds, bottom=bottom, color=COLORS[stage],
-            hatch=HATCHES.get(stage), edgecolor="white", linewidth=0, label=stage,
-        )  # fmt: skip
-        bottom = [a + b for a, b in zip(bottom, seconds, strict=True)]
-    axes.set_title("time")
-    axes.set_ylabel("seconds")
-    axes.set_ylim(0, 1.22 * max(1e-3, *bottom))
-    if any(bottom):
-        axes.legend(ncols=5, loc="upper left", frameon=False, fontsize="small")
 
 
 def _engineering(axes: Axes) -> None:

@@ -94,7 +94,7 @@ class Trials:
         shutil.rmtree(out, ignore_errors=True)
         start = time.perf_counter()
         try:
-            reconstruct(self.scene, config, out, console=_Silent())
+            reconstruct(self.scene, config, out, console=_Silent(), drawn=False)
             whole = time.perf_counter() - start
             directory = RunDirectory(out)
             reports = directory.reports()

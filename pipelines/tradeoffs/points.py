@@ -1,0 +1,69 @@
+"""A sweep's trials as its plot takes them: from the search, or read back from tradeoff.json."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from gvtools.errors import ProjectError
+from pipelines.tradeoffs.outcome import Outcome, front
+from viz.pareto import TradeOff
+
+FILE = "tradeoff.json"
+
+
+def trial_point(label: str, outcome: Outcome, targets: int) -> dict[str, Any]:
+    """One trial, for viz.pareto.
+
+    Args:
+        label: "start", "combination", "profile NAME", or the setting that it changes.
+        outcome: what it gave.
+        targets: of the run that its seconds are to stand for.
+    """
+    kind = label if label in ("start", "combination") else "trial"
+    return {
+        "label": label,
+        "kind": "profile" if label.startswith("profile") else kind,
+        "seconds": outcome.seconds(targets),
+        "bytes": outcome.bytes,
+        "psnr": outcome.psnr,
+    }
+
+
+def read_trade_off(file: Path) -> TradeOff:
+    """The sweep of a tradeoff.json.
+
+    Raises:
+        ProjectError: it cannot be read, or is of another version.
+    """
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        targets = int(found["targets"])
+        share = max(entry["share"] for entry in found["trials"])
+        entries = [entry for entry in found["trials"] if entry["share"] == share]
+        outcomes = [_outcome(entry) for entry in entries]
+        points = [
+            trial_point(entry["label"], outcome, targets)
+            for entry, outcome in zip(entries, outcomes, strict=True)
+        ]
+        chosen = found["recommended"]
+        of_time = found["budget_of"] == "seconds"
+        best = [points[outcomes.index(outcome)] for outcome in front(outcomes, targets)]
+        return TradeOff(
+            str(file),
+            points,
+            best,
+            None if chosen is None else trial_point("recommended", _outcome(chosen), targets),
+            found["budget"] if of_time else None,
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ProjectError(
+            f"{file}: no trade-off of this version ({error!r}); run gvtools tradeoff again"
+        ) from None
+
+
+def _outcome(entry: Mapping[str, Any]) -> Outcome:
+    return Outcome(**{field.name: entry[field.name] for field in fields(Outcome)})

@@ -1,0 +1,194 @@
+"""``gvtools view``: pictures without a display, Open3D's window, and options that do not fit."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_scan import write_scan
+
+from gvtools.memory.spatial_memory import SpatialMemory
+from pipelines import view
+from pipelines.cli import main
+from viz.point_colors import MODES
+from viz.run_view_render import picture_of
+from viz.web_viewer import BUDGET, LOCAL, PORT
+
+CAMERA = "frame-000004.color.png"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("command")
+    scan = write_scan(root / "scan", views=6)
+    options = ("--context", "first:3", "--targets", "range:4-5", "--views-per-round", "1")
+    run = root / "run"
+    assert main(["reconstruct", str(scan), "--out", str(run), *options, "--quiet"]) == 0
+    return run
+
+
+@contextmanager
+def display(tmp_path):
+    """An X server without a screen; skipped, with the reason, where there is none."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("no Xvfb (Debian: xvfb)")
+    read, write = os.pipe()
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-nolisten", "tcp"]
+    with (tmp_path / "xvfb.log").open("wb") as log:
+        server = subprocess.Popen(command, pass_fds=[write], stderr=log)
+    os.close(write)
+    try:
+        with os.fdopen(read) as told:
+            yield f":{told.readline().strip()}"
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def refused(capsys, *arguments):
+    assert main(["view", *map(str, arguments)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1 and error.startswith("gvtools: ")
+    return error
+
+
+def test_the_parser_knows_what_the_viewers_know():
+    assert (view.LOCAL, view.PORT, view.MAX_POINTS) == (LOCAL, PORT, BUDGET)
+    assert LOCAL == "127.0.0.1"
+    assert tuple(MODES) == view.COLORS
+
+
+def test_a_picture_needs_no_display(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    out = tmp_path / "shot.png"
+    options = ("--screenshot", str(out), "--camera", CAMERA, "--round", "1")
+    assert main(["view", str(folder), *options]) == 0
+    assert "rendered by the project's own splatter" in capsys.readouterr().out
+    memory = SpatialMemory.load(folder / "memory.npz")
+    memory.forget(round=2)
+    row = next(i for i in range(len(memory.views)) if memory.views[i].camera.names[0] == CAMERA)
+    expected = picture_of(memory.project(memory.views[row].camera))
+    np.testing.assert_array_equal(np.array(Image.open(out)), expected)
+
+
+def test_the_splatter_steps_in_for_open3d_and_says_so(folder, tmp_path, monkeypatch, capsys):
+    from viz import screenshot
+
+    # A child that cannot render, as without EGL and X.
+    monkeypatch.setattr(screenshot, "CHILD", ("-c", "raise RuntimeError('no EGL')"))
+    out = tmp_path / "shot.png"
+    assert main(["view", str(folder), "--open3d", "--screenshot", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "rendered by the project's own splatter (Open3D cannot: no EGL)" in said
+    assert np.array(Image.open(out)).std() > 10
+
+
+def test_bad_options_are_refused_in_one_line(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    shot = ("--screenshot", tmp_path / "x.png")
+    assert "no such file or folder" in refused(capsys, tmp_path / "absent", *shot)
+    assert "such as 'frame-000000" in refused(capsys, folder, *shot, "--camera", "nobody")
+    assert "rounds 0 to 2" in refused(capsys, folder, "--round", "3")
+    assert "ends with .png" in refused(capsys, folder, "--screenshot", tmp_path / "x.jpg")
+    assert "no display" in refused(capsys, folder, "--open3d")
+    assert "--live" in refused(capsys, folder, "--live", *shot)
+    assert "expected 1 to 65535" in refused(capsys, folder, "--port", "99999")
+    # 192.0.2.1 is nobody's, by RFC 5737.
+    assert "cannot listen" in refused(capsys, folder, "--host", "192.0.2.1")
+    assert not (tmp_path / "x.png").exists()
+
+
+def test_the_open3d_window_shows_the_run_and_steps_through_it(folder, tmp_path):
+    code = f"""
+from pathlib import Path
+import numpy as np
+from pipelines.view_source import ViewSource
+from viz.open3d_viewer import Open3dViewer
+
+said = []
+viewer = Open3dViewer(ViewSource(Path({str(folder)!r})).read(), say=said.append)
+viewer.look_from(0)
+def look():
+    for _ in range(3):
+        viewer.window.poll_events()
+        viewer.window.update_renderer()
+    return np.rint(255 * np.asarray(viewer.window.capture_screen_float_buffer(True))).astype("u1")
+pictures = [look()]
+viewer.step_round(-2)
+pictures.append(look())
+viewer.step_round(2)
+viewer.next_mode()
+pictures.append(look())
+viewer.toggle_cameras()
+pictures.append(look())
+viewer.look_from(4)
+viewer.window.destroy_window()
+np.save({str(tmp_path / "pictures.npy")!r}, pictures)
+print("\\n".join(said))
+"""
+    with display(tmp_path) as name:
+        environment = {**os.environ, "DISPLAY": name, "LIBGL_ALWAYS_SOFTWARE": "1"}
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True,
+            timeout=120, check=False,
+        )  # fmt: skip
+    if "GLFW" in done.stderr and done.returncode:
+        pytest.skip("the X server has no OpenGL (Debian: libgl1-mesa-dri)")
+    assert done.returncode == 0, done.stderr
+    last, first, colored, bare = np.load(tmp_path / "pictures.npy").astype(int)
+    covered = [(picture < 250).any(axis=2).mean() for picture in (first, last)]
+    assert covered[1] > covered[0] > 0.05
+    assert np.abs(colored - last).mean() > 3 and (bare != colored).any()
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("round 0 of 2") and "0 generated" in lines[0]
+    assert lines[2].startswith("round 2 of 2") and "round: round that" in lines[2]
+
+
+@pytest.mark.slow
+def test_open3d_renders_a_picture_where_there_is_a_display(folder, tmp_path, capsys, monkeypatch):
+    with display(tmp_path) as name:
+        monkeypatch.setenv("DISPLAY", name)
+        pictures = []
+        for extra in ((), ("--open3d",)):
+            out = tmp_path / f"shot{len(extra)}.png"
+            options = ("--screenshot", str(out), "--camera", "frame-000001.color.png", *extra)
+            assert main(["view", str(folder), *options]) == 0
+            pictures.append(np.array(Image.open(out)).astype(int))
+    said = capsys.readouterr().out
+    if "Open3D cannot" in said:
+        pytest.skip(said.splitlines()[-1])
+    assert "rendered by Open3D" in said
+    # Both show the same thing from the same place, each in its own way.
+    assert np.abs(pictures[0] - pictures[1]).mean() < 20
+
+
+def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(folder, monkeypatch, tmp_path):
+    pytest.importorskip("viser", reason="viser is not installed")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    monkeypatch.setattr(view, "LIVE_OPTIONS", ("--port", str(port)))
+    later = tmp_path / "run"
+    threading.Timer(1.0, shutil.copytree, (folder, later)).start()
+    from pipelines.console import Console
+
+    def reached() -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
+    with view.live_viewer(later, Console(quiet=True)):
+        end = time.monotonic() + 60
+        while not reached():
+            assert time.monotonic() < end
+            time.sleep(0.2)
+    assert not reached()

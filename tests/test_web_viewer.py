@@ -1,0 +1,315 @@
+"""The web viewer as a person meets it, in a headless browser, and what it lets nobody reach."""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import io
+import shutil
+import socket
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Browser, open_browser
+from PIL import Image
+from tiny_scan import write_scan
+
+from pipelines.cli import main
+from pipelines.view_source import ViewSource
+from viz.run_view import TARGET
+from viz.run_view_render import RunRenderer, picture_of
+
+pytest.importorskip("viser", reason="viser is not installed (extra web)")
+
+from viz.web_viewer import WebViewer
+from viz.web_viewer_cameras import placement
+from viz.web_viewer_panel import GAP, PICTURES_WIDTH
+from viz.web_viewer_splats import client_camera
+
+# A page in software on a busy machine.
+PATIENCE = 60.0
+# Where the scene shows, free of the controls: the window is 1280 x 800, the controls on the right.
+SCENE = np.s_[60:460, 20:930]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("web")
+    scan = write_scan(root / "scan", views=8)
+    options = ("--context", "first:3", "--targets", "range:4-7", "--views-per-round", "2")
+    run = root / "run"
+    assert main(["reconstruct", str(scan), "--out", str(run), *options, "--quiet"]) == 0
+    return run
+
+
+@pytest.fixture(scope="module")
+def viewer(folder):
+    found = WebViewer(ViewSource(folder).read(), port=free_port())
+    yield found
+    found.stop()
+
+
+@pytest.fixture(scope="module")
+def browser(viewer):
+    with open_browser() as found:
+        found.driver.get(viewer.url)
+        wait(lambda: "observations after round 2" in found.text())
+        close_notes(found)
+        yield found
+        # Whatever the tests did, nothing went wrong on the page and nothing left the machine.
+        assert found.console_errors() == []
+        assert found.foreign_requests() == []
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def wait(condition, patience=PATIENCE):
+    """What ``condition`` gives once it gives something."""
+    end = time.monotonic() + patience
+    while not (found := condition()):
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.1)
+    return found
+
+
+def close_notes(browser: Browser) -> None:
+    """Click away what the page says of a machine without a graphics card."""
+    for button in browser.driver.find_elements("css selector", ".mantine-Notification-closeButton"):
+        button.click()
+
+
+def choose(browser: Browser, shown: str, option: str) -> None:
+    """Open the menu that shows one text and click another."""
+    menus = browser.driver.find_elements("css selector", "input[role=combobox]")
+    next(m for m in menus if m.get_attribute("value") == shown).click()
+
+    def visible():
+        options = browser.driver.find_elements("css selector", "[role=option]")
+        return [o for o in options if o.is_displayed() and o.text == option]
+
+    wait(visible)[0].click()
+
+
+def steady(browser: Browser, differs_from=None):
+    """The scene once two looks at it agree, and it is another one than before."""
+
+    def look():
+        first = browser.picture()[SCENE]
+        time.sleep(0.3)
+        second = browser.picture()[SCENE]
+        if not np.array_equal(first, second):
+            return None
+        if differs_from is not None and np.array_equal(second, differs_from):
+            return None
+        return (second,)
+
+    return wait(look)[0]
+
+
+def painted(picture) -> int:
+    """Pixels that are not background."""
+    return int((picture < 250).any(axis=2).sum())
+
+
+def test_the_slider_shows_the_memory_growing(browser, viewer):
+    counts = [viewer.run.counts(number) for number in range(3)]
+    thumb = browser.driver.find_element("css selector", "[role=slider]")
+    last = steady(browser)
+    assert painted(last) > 0.05 * last[..., 0].size
+    sizes = [painted(last)]
+    for number in (1, 0):
+        thumb.send_keys("\ue012")  # the left arrow
+        wait(lambda number=number: f"observations after round {number}" in browser.text())
+        text = browser.text()
+        assert f"{counts[number].observed + counts[number].generated:,} observations" in text
+        assert f"{counts[number].generated:,} generated" in text
+        last = steady(browser, last)
+        sizes.append(painted(last))
+    assert sizes[0] > sizes[1] > sizes[2] > 0
+    thumb.send_keys("\ue014\ue014")
+    wait(lambda: "observations after round 2" in browser.text())
+    steady(browser, last)
+
+
+def test_colours_tell_generated_from_observed(browser, viewer):
+    plain = steady(browser)
+    choose(browser, "colour", "observed / generated")
+    wait(lambda: "where a point comes from" in browser.text())
+    tinted = steady(browser, plain).astype(int)
+    red, green, blue = np.moveaxis(tinted, -1, 0)
+    assert ((red > blue + 60) & (green > blue + 30)).sum() > 200, "nothing orange"
+    assert ((blue > red + 60) & (blue > green)).sum() > 200, "nothing blue"
+    choose(browser, "observed / generated", "view count")
+    wait(lambda: "views with observations in the point's voxel" in browser.text())
+    assert (steady(browser, tinted) != tinted).any()
+    choose(browser, "view count", "colour")
+    wait(lambda: "as photographed or completed" in browser.text())
+
+
+def test_a_click_on_a_camera_flies_there_and_shows_its_pictures(browser, viewer):
+    client = next(iter(viewer.server.get_clients().values()))
+    # The last one stands in front of no other.
+    target = viewer.run.cameras[-1]
+    x, y = on_screen(client, viewer, target)
+    click(browser, x, y)
+    wait(lambda: f"{target.name}, {TARGET}, round 2" in browser.text())
+    text = browser.text()
+    for title in ("guidance", "completion", "truth", "before the round"):
+        assert title in text
+    _, goal = placement(target.camera, viewer.run)
+    wait(lambda: np.linalg.norm(np.array(client.camera.position) - goal) < 1e-3)
+    (row,) = wait(lambda: shown_picture(browser))
+    pictures = viewer.run.pictures(target)
+    width = pictures["completion"].shape[1]
+    factor = (row.shape[1] - 2 * GAP) // (3 * width)
+    assert row.shape[1] == 3 * factor * width + 2 * GAP >= PICTURES_WIDTH
+    for number, title in enumerate(("guidance", "completion", "truth")):
+        left = number * (factor * width + GAP)
+        part = row[factor // 2 :: factor, left : left + factor * width][:, factor // 2 :: factor]
+        assert np.abs(part.astype(int) - pictures[title]).mean() < 6, title
+
+
+@pytest.mark.slow
+def test_the_splatter_renders_the_viewers_own_view(browser, viewer):
+    before = steady(browser)
+    choose(browser, "points", "splats")
+    steady(browser, before)
+    client = next(iter(viewer.server.get_clients().values()))
+    camera = client_camera(client, viewer.run)
+    expected = picture_of(RunRenderer(viewer.run).render(camera, round=2))
+    canvas = browser.driver.find_element("css selector", "canvas").rect
+    size = (round(canvas["width"]), round(canvas["height"]))
+    whole = np.array(Image.fromarray(expected).resize(size))
+
+    def alike():
+        left, top = round(canvas["x"]), round(canvas["y"])
+        seen = browser.picture()[top : top + size[1], left : left + size[0]]
+        return np.abs(seen[60:400, 20:900].astype(int) - whole[60:400, 20:900]).mean() < 10
+
+    wait(alike)
+    choose(browser, "splats", "points")
+
+
+@pytest.mark.slow
+def test_the_ply_is_downloaded(browser, viewer, folder, tmp_path):
+    browser.driver.execute_cdp_cmd(
+        "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
+    )
+    buttons = browser.driver.find_elements("css selector", "button")
+    next(b for b in buttons if b.text == "Download PLY").click()
+    path = tmp_path / "run.ply"
+    wait(path.is_file)
+    assert path.read_bytes() == (folder / "memory.ply").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_page_follows_a_run_that_grows(folder, tmp_path):
+    growing = tmp_path / "growing"
+    shutil.copytree(folder, growing)
+    later = tmp_path / "later"
+    (growing / "round_002").rename(later)
+    source = ViewSource(growing)
+    run = source.read()
+    # As a run at work has it: the memory after the last whole round.
+    run.memory.forget(round=2)
+    run.memory.save(growing / "memory.npz")
+    viewer = WebViewer(source.read(), port=free_port())
+    try:
+        with open_browser() as browser:
+            browser.driver.get(viewer.url)
+            wait(lambda: "observations after round 1" in browser.text())
+            assert "round 2 of 2 is at work" in browser.text()
+            shutil.copy(folder / "memory.npz", growing / "memory.npz")
+            later.rename(growing / "round_002")
+            viewer.update(source.read())
+            wait(lambda: "observations after round 2" in browser.text())
+            assert "at work" not in browser.text()
+    finally:
+        viewer.stop()
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/run.json", "/../../../../../../../etc/hostname", "/%2e%2e/%2e%2e/%2e%2e/etc/hostname",
+     "/..%2f..%2f..%2f..%2fetc%2fhostname", "//etc/hostname", "/etc/hostname",
+     "/..\\..\\..\\etc\\hostname"],
+)  # fmt: skip
+def test_no_file_is_served_but_the_page(viewer, folder, path):
+    def get(address):
+        connection = http.client.HTTPConnection("127.0.0.1", viewer.server.get_port(), timeout=20)
+        connection.request("GET", address)
+        return connection.getresponse()
+
+    assert get("/").status == 200
+    assert get(path).status == 404
+
+
+def test_nobody_else_is_served_and_nothing_is_shared(viewer):
+    assert viewer.url.startswith("http://127.0.0.1:")
+    # A page may ask for an address in the open; it gets none.
+    assert viewer.server.request_share_url() is None
+    if sys.platform != "linux":
+        pytest.skip("listening addresses are read from /proc")
+    listening = {
+        line.split()[1]
+        for table in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
+        if line.split()[1].endswith(f":{viewer.server.get_port():04X}") and line.split()[3] == "0A"
+    }
+    assert {address.split(":")[0] for address in listening} == {"0100007F"}
+
+
+def test_points_cost_fifteen_bytes_and_stay_within_the_budget(folder):
+    run = ViewSource(folder).read()
+    viewer = WebViewer(run, port=free_port(), budget=900)
+    try:
+        nodes = viewer._points._nodes.values()
+        drawn = sum(len(node.points) for node in nodes)
+        assert 300 < drawn <= 900
+        assert sum(n.points.nbytes + n.colors.nbytes for n in nodes) == 15 * drawn
+        assert viewer._points.drawn(0) < viewer._points.drawn(2) == drawn
+    finally:
+        viewer.stop()
+
+
+def on_screen(client, viewer, shown) -> tuple[float, float]:
+    """Where the middle of a camera's frustum is in the canvas, CSS pixels."""
+    seen = client_camera(client, viewer.run)
+    pose = shown.camera.world_from_cam[0]
+    inside = pose[:3, 3] + 0.9 * viewer._cameras._depth * pose[:3, 2]
+    xy, z = seen.project(inside[None])
+    assert z[0, 0] > 0
+    scale = client.camera.image_width / seen.width[0]
+    return tuple(xy[0, 0] * scale)
+
+
+def click(browser: Browser, x: float, y: float) -> None:
+    """Press and let go of the mouse at a place of the canvas."""
+    box = browser.driver.find_element("css selector", "canvas").rect
+    place = {"x": box["x"] + x, "y": box["y"] + y, "button": "left", "clickCount": 1}
+    for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+        browser.driver.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": kind, **place})
+        time.sleep(0.4)
+
+
+def shown_picture(browser: Browser):
+    """The picture in the panel as the page decoded it, (H, W, 3) uint8 in a tuple; or None."""
+    script = """
+        const image = [...document.images].find(i => i.naturalWidth > 700 && i.complete);
+        if (!image) return null;
+        const canvas = document.createElement("canvas");
+        canvas.width = image.naturalWidth; canvas.height = image.naturalHeight;
+        canvas.getContext("2d").drawImage(image, 0, 0);
+        return canvas.toDataURL("image/png").split(",")[1];
+    """
+    data = browser.driver.execute_script(script)
+    if data is None:
+        return None
+    return (np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")),)

@@ -1,0 +1,119 @@
+"""What the viewer's own camera sees, rendered by the project's splatter behind the scene."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gvtools.cameras import Cameras
+from gvtools.errors import GvError
+from viz.run_view import RunView
+from viz.run_view_render import RunRenderer, picture_of
+
+if TYPE_CHECKING:
+    import viser
+
+# Longer side of a rendered picture, pixels.
+LONGEST = 960
+# The client's depth maps end there; what lies behind is drawn there.
+FARTHEST = 167.0
+
+
+class SplatLook:
+    """Renders for each client whenever its camera, the round or the colour mode has changed.
+
+    Args:
+        server: whose clients look.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._renderer: RunRenderer | None = None
+        self._round, self._mode, self._on = 0, "color", False
+        self._asked = threading.Event()
+        self._stopped = False
+        self._cleared = True
+        self._seen: dict[int, tuple[object, ...]] = {}
+        server.on_client_connect(self._follow)
+        self._worker = threading.Thread(target=self._work, daemon=True)
+        self._worker.start()
+
+    def set_run(self, run: RunView) -> None:
+        """Render another run, or the same one grown."""
+        self._renderer = RunRenderer(run)
+        self._ask()
+
+    def set_state(self, number: int, mode: str) -> None:
+        """Render the memory after a round, in the colours of a mode."""
+        self._round, self._mode = number, mode
+        self._ask()
+
+    def set_on(self, on: bool) -> None:
+        """Begin or end."""
+        self._on = on
+        self._ask()
+
+    def stop(self) -> None:
+        """End for good."""
+        self._stopped = True
+        self._asked.set()
+        self._worker.join()
+
+    def _ask(self) -> None:
+        self._seen = {}
+        self._asked.set()
+
+    def _follow(self, client: viser.ClientHandle) -> None:
+        client.camera.on_update(lambda _: self._asked.set())
+
+    def _work(self) -> None:
+        while not self._stopped:
+            self._asked.wait()
+            # Whatever changes from here on is for the next turn.
+            self._asked.clear()
+            if self._on:
+                self._cleared = False
+                for client in self._server.get_clients().values():
+                    self._render(client)
+            elif not self._cleared:
+                self._cleared = True
+                for client in self._server.get_clients().values():
+                    client.scene.set_background_image(None)
+
+    def _render(self, client: viser.ClientHandle) -> None:
+        renderer, number, mode = self._renderer, self._round, self._mode
+        if renderer is None:
+            return
+        camera = client_camera(client, renderer.run)
+        state = (number, mode, id(renderer), camera.K.tobytes(), camera.cam_from_world.tobytes())
+        if self._seen.get(client.client_id) == state:
+            return
+        self._seen[client.client_id] = state
+        try:
+            guidance = renderer.render(camera, round=number, mode=mode)
+        except GvError as error:
+            client.add_notification("Not rendered", str(error), color="red")
+            return
+        depth = np.where(guidance.valid[0], guidance.depth[0], FARTHEST)
+        client.scene.set_background_image(
+            picture_of(guidance), format="jpeg", jpeg_quality=90, depth=np.minimum(depth, FARTHEST)
+        )
+
+
+def client_camera(client: viser.ClientHandle, run: RunView) -> Cameras:
+    """A client's camera in the run's frame: a batch of one of at most LONGEST pixels a side."""
+    from viser.transforms import SO3
+
+    seen = client.camera
+    factor = min(1.0, LONGEST / max(seen.image_width, seen.image_height, 1))
+    width = max(1, round(seen.image_width * factor))
+    height = max(1, round(seen.image_height * factor))
+    focal = height / (2 * np.tan(seen.fov / 2))
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    rotation = SO3(np.array(seen.wxyz)).as_matrix().T
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ (np.array(seen.position) + run.memory.origin)
+    return Cameras(K[None], pose[None], np.array([width]), np.array([height]), ("viewer",))
