@@ -13,6 +13,7 @@ import torch
 
 from gvtools.cameras import Cameras
 from gvtools.completers import Completion, ContextView, create
+from gvtools.completers.geoverse import completer as completer_module
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.context_views import nearest_views
@@ -387,8 +388,10 @@ def folders(root: Path) -> dict[str, tuple[str | None, str]]:
 
 
 @pytest.mark.parametrize("what", ["none", "absent", "empty", "damaged", "unknown", "patchless"])
-def test_a_folder_that_is_no_model_is_refused_in_one_line_at_creation(what, tmp_path):
+def test_a_folder_that_is_no_model_is_refused_in_one_line_at_creation(what, tmp_path, monkeypatch):
     folder, said = folders(tmp_path)[what]
+    # As in an installation that was stripped of its weights.
+    monkeypatch.setattr(completer_module, "SHIPPED", tmp_path / "nothing")
     with pytest.raises((OptionError, CheckpointError)) as refused:
         create("geoverse", weights=folder)
     assert said in str(refused.value) and "\n" not in str(refused.value)

@@ -17,9 +17,11 @@ from gvtools.completers.geoverse.correction import (
     composed,
     corrected_color,
     corrected_depth,
+    seamless,
+    without_seams,
 )
 from gvtools.completers.geoverse.full_size import depth_ratios
-from gvtools.completers.geoverse.passes import Decoded
+from gvtools.completers.geoverse.passes import Decoded, Generated
 from gvtools.completers.geoverse.surface_fill import surface_fill
 from gvtools.errors import OptionError
 
@@ -188,3 +190,45 @@ def test_what_does_not_fit_is_refused(weights):
         create("geoverse", weights=str(weights), composition="sum")
     with pytest.raises(OptionError, match="needs filled hints"):
         micro.config(composition="correction")
+
+
+def test_steps_between_patches_go_and_what_a_patch_shows_stays():
+    generator = torch.Generator().manual_seed(3)
+    means = torch.rand(2, 3, 4, 5, generator=generator)
+    detail = torch.rand(2, 3, 24, 30, generator=generator)
+    detail = detail - without_means(detail)
+    picture = means.repeat_interleave(6, -1).repeat_interleave(6, -2) + detail
+    smooth = without_seams(picture, 6)
+    # Across a border the means differ by a sixth of their step, a pixel on.
+    across = (smooth - detail).diff(dim=-1).abs().amax()
+    assert across <= means.diff(dim=-1).abs().amax() / 6 + 1e-5
+    assert (picture - detail).diff(dim=-1).abs().amax() > 3 * across
+    # Patches that agree are left alone, and so is a picture of one patch.
+    flat = 0.3 + detail
+    torch.testing.assert_close(without_seams(flat, 6), flat)
+    one = picture[..., :6, :6]
+    torch.testing.assert_close(without_seams(one, 6), one)
+
+
+def without_means(values: torch.Tensor) -> torch.Tensor:
+    means = torch.nn.functional.avg_pool2d(values, 6)
+    return means.repeat_interleave(6, -1).repeat_interleave(6, -2)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_broken_pixel_does_not_spread_when_seams_are_taken_away(bad):
+    picture = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(4))
+    picture[0, 1, 7, 8] = bad
+    smooth = without_seams(picture, 6)
+    assert int((~smooth.isfinite()).sum()) == 1 and not smooth[0, 1, 7, 8].isfinite()
+    picture[0, 0, :6, :6] = bad
+    assert int((~without_seams(picture, 6).isfinite()).sum()) == 37
+
+
+def test_a_pass_without_a_hint_is_made_seamless_too():
+    rgb = torch.rand(1, 2, 3, 12, 12, generator=torch.Generator().manual_seed(5))
+    length = torch.ones(1, 2, 12, 12)
+    made = Generated(torch.zeros(1), torch.zeros(1), Decoded(rgb, length, length))
+    joined = seamless(made, 6)
+    assert joined.hint is None and joined.decoded.depth is length
+    torch.testing.assert_close(joined.decoded.rgb[0], without_seams(rgb[0], 6))

@@ -16,6 +16,7 @@ import torch
 from gvtools.completers.base import Completion, ContextView, check_views
 from gvtools.completers.geoverse.color_field import COLOR_ALIGNMENTS
 from gvtools.completers.geoverse.context_views import CHOICES, chosen_views
+from gvtools.completers.geoverse.correction import seamless
 from gvtools.completers.geoverse.depth_scale import ALIGNMENTS
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.full_size import Completed, Fill, averaged, brought_back, corrected
@@ -220,6 +221,7 @@ class GeoVerseCompleter:
 
         if filled is None:
             return brought(self.color_alignment or model.config.color_alignment)
+        made = seamless(made, model.config.patch)
         return corrected(made, part, filled, back=None if told else brought("none"))
 
     def _bounds(self, model: GeoVerse) -> tuple[float, ...]:

@@ -11,21 +11,54 @@ the paper, whose result is the decoding itself (``composition``).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.fill import push_pull
-from gvtools.completers.geoverse.passes import Decoded
+from gvtools.completers.geoverse.passes import Decoded, Generated
 
 # Depth is corrected by at most this factor.
 MOST = 1.5
 # A correction of depth counts by what it exceeds this log-ratio: the surfaces that memory's are
-# continued along are mostly right, to less than a small network can tell.
-CERTAIN = 0.03
+# continued along are mostly right, to less than a small network can tell; where they are wrong, it
+# is by much.
+CERTAIN = 0.08
 # The same factor while training: out of the way.
 FAR = 1e3
+
+
+def without_seams(values: Tensor, patch: int) -> Tensor:
+    """Decoded pictures (N, C, H, W) without the steps from patch to patch.
+
+    A small decoder makes each patch by itself. Here the means of the patches are joined linearly,
+    and what a patch shows around its mean stays. A pixel that is not finite stays so, alone.
+
+    Args:
+        values: H and W are multiples of ``patch``.
+        patch: side of a patch, pixels.
+    """
+    finite = values.isfinite()
+    share = F.avg_pool2d(finite.to(values.dtype), patch)
+    mean = F.avg_pool2d(torch.where(finite, values, 0), patch) / share.clamp_min(1 / patch**2)
+    size = (values.shape[-2], values.shape[-1])
+    steps = F.interpolate(mean, size=size, mode="nearest")
+    return values - steps + F.interpolate(mean, size=size, mode="bilinear", align_corners=False)
+
+
+def seamless(made: Generated, patch: int) -> Generated:
+    """A pass whose pictures are ``without_seams``."""
+
+    def joined(found: Decoded) -> Decoded:
+        shape = found.rgb.shape[:2]
+        rgb = without_seams(found.rgb.float().flatten(0, 1), patch).unflatten(0, shape)
+        return replace(found, rgb=rgb)
+
+    hint = None if made.hint is None else joined(made.hint)
+    return replace(made, decoded=joined(made.decoded), hint=hint)
 
 
 def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
