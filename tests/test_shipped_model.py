@@ -7,7 +7,7 @@ import json
 import pytest
 
 from gvtools.completers.base import create
-from gvtools.completers.geoverse.completer import SHIPPED
+from gvtools.completers.geoverse.completer import SHIPPED, GeoVerseCompleter
 from gvtools.completers.geoverse.weights.folder_parts import config_of
 from gvtools.training.names import STAGES
 from pipelines.experiments import completion, poses
@@ -32,6 +32,7 @@ def test_it_is_small_and_brings_its_record():
 
 def test_a_completer_without_weights_uses_it():
     completer = create("geoverse")
+    assert isinstance(completer, GeoVerseCompleter)
     assert completer.folder == SHIPPED
     assert config_of(SHIPPED).trained and not completer.notes
 
