@@ -120,4 +120,6 @@ def test_the_choice_hangs_on_no_unit(scale):
 def test_without_depth_the_nearest_stand_in():
     target = looking((0, 0, 0), 0.0, "target")
     context = photographs(looking((3, 0, 0), 0.0, "far"), looking((0.1, 0, 0), 0.0, "near"))
-    assert names(seeing_views(context, target, 0 * wall(1.0)[None], 1)) == ["near"]
+    for nothing in (0.0, np.nan, np.inf):
+        depth = np.full((1, 30, 40), nothing, np.float32)
+        assert names(seeing_views(context, target, depth, 1)) == ["near"]

@@ -45,7 +45,8 @@ def seeing_views(
     Args:
         context: to choose from.
         targets: V cameras of one picture size.
-        depth: (V, H, W) z-depth, scene units, filled where that is possible; 0 counts not.
+        depth: (V, H, W) z-depth, scene units, filled where that is possible; 0 and what is not finite
+            count not.
         count: how many to choose.
     """
     if len(context) <= 1:
@@ -71,7 +72,7 @@ def _samples(targets: Cameras, depth: NDArray[np.float32]) -> tuple[Float64, Flo
     """World points (N, 3) on the targets' surfaces, and unit rays (N, 3) that they are seen by."""
     points, directions = [], []
     for row in range(len(targets)):
-        rows, columns = np.nonzero(depth[row] > 0)
+        rows, columns = np.nonzero((depth[row] > 0) & np.isfinite(depth[row]))
         some = slice(None, None, max(1, len(rows) // SAMPLES))
         rows, columns = rows[some], columns[some]
         ray = targets.rays(row)[rows, columns] @ targets.world_from_cam[row, :3, :3].T
