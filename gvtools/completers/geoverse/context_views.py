@@ -45,8 +45,8 @@ def seeing_views(
     Args:
         context: to choose from.
         targets: V cameras of one picture size.
-        depth: (V, H, W) z-depth, scene units, filled where that is possible; 0 and what is not finite
-            count not.
+        depth: (V, H, W) z-depth, scene units, filled where that is possible; 0 and what is not
+            finite count not.
         count: how many to choose.
     """
     if len(context) <= 1:
