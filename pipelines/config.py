@@ -186,7 +186,7 @@ def with_file(config: RunConfig, path: Path) -> RunConfig:
         raise OptionError(f"{path}: holds a {type(data).__name__}; expected an object of settings")
     if "profile" in data:
         config = with_profile(config, str(data["profile"]))
-    for key, value in _flat(data):
+    for key, value in flat_settings(data):
         if key != "profile":
             config = with_setting(config, key, value)
     return config
@@ -238,9 +238,9 @@ def with_setting(config: RunConfig, key: str, value: Any) -> RunConfig:
 
 def changed_settings(config: RunConfig) -> dict[str, Any]:
     """The dotted settings by which ``config`` differs from the defaults, as a file takes them."""
-    usual = dict(_flat(RunConfig().to_dict()))
+    usual = dict(flat_settings(RunConfig().to_dict()))
     options = {f"completer.{key}": value for key, value in config.completer_options.items()}
-    plain = _flat({**config.to_dict(), "completer_options": None})
+    plain = flat_settings({**config.to_dict(), "completer_options": None})
     changed = {key: value for key, value in plain if key in usual and value != usual[key]}
     return {key: value for key, value in changed.items() if key != "profile"} | options
 
@@ -250,16 +250,17 @@ def _with(config: RunConfig, name: str, value: Any) -> RunConfig:
     return replace(config, **changes)
 
 
-def _flat(data: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+def flat_settings(data: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    """Nested settings as dotted keys with their values."""
     for key, value in data.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
+        if isinstance(value, Mapping):
+            yield from flat_settings(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
 
 
 def _unknown(key: str, config: RunConfig) -> OptionError:
-    known = [name for name, _ in _flat(config.to_dict())] + ["completer.OPTION"]
+    known = [name for name, _ in flat_settings(config.to_dict())] + ["completer.OPTION"]
     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
     return OptionError(f"no setting {key!r}; {hint}")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import GvError, ProjectError
+from pipelines.config import RunConfig, flat_settings
 from pipelines.context_depth import off_scale
 from pipelines.finished_run import open_scenes, read_record, read_reports
 from pipelines.report_measures import read_measures, report_poses
@@ -85,7 +86,7 @@ def collect(
     )
     poses = report_poses(reports, sources.scene, record["context"], measures.poses)
     trade_off, unread = _trade_off(path)
-    settings = dict(_flat(record["config"]))
+    settings = dict(flat_settings(record["config"]))
     return RunReport(
         title=f"{path.resolve().name}: a run of gvtools",
         facts=_facts(record, reports),
@@ -186,9 +187,7 @@ def _few(names: Sequence[str], most: int = 4) -> str:
 
 def _changed(settings: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Settings that differ from the defaults, with both."""
-    from pipelines.config import RunConfig
-
-    usual = dict(_flat(RunConfig().to_dict()))
+    usual = dict(flat_settings(RunConfig().to_dict()))
     return [
         (key, _said(value), _said(usual[key]) if key in usual else "none")
         for key, value in settings.items()
@@ -196,13 +195,5 @@ def _changed(settings: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _flat(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
 def _said(value: object) -> str:
-    return "auto" if value is None else str(value)
+    return "not set" if value is None else str(value)

@@ -42,9 +42,10 @@ def run_round(
     about: dict[str, Any] = {"dropped": {}, "depth": [], "views": []}
     about |= {"coverage_before": None, "coverage_after": None}
     if number == 0:
-        total = _lift_context(plan, memory, folder, clock, console, about)
+        total, said = _lift_context(plan, memory, folder, clock, console)
     else:
-        total = _complete(plan, memory, number, context, folder, clock, console, about)
+        total, said = _complete(plan, memory, number, context, folder, clock, console)
+    about |= said
     generated = int(memory.generated.sum())
     return {
         "round": number,
@@ -73,8 +74,7 @@ def _lift_context(
     folder: Path,
     clock: rounds.Clock,
     console: Console,
-    about: dict[str, Any],
-) -> FuseReport:
+) -> tuple[FuseReport, dict[str, Any]]:
     least = plan.config.savings.explained
 
     def known(view: View, frame: Frame) -> DepthMap | None:
@@ -92,18 +92,17 @@ def _lift_context(
             f"taking over the depth of {source.kept} of {len(plan.context)} context views, "
             "which an interrupted attempt at this run had computed"
         )
-    total, about["dropped"], about["depth"] = rounds.observe_context(
+    total, dropped, depth = rounds.observe_context(
         plan.scene, plan.context, source=source,
         memory=memory, config=plan.config, clock=clock, progress=console.track,
     )  # fmt: skip
-    warn_of_depth(about["depth"], console)
-    spared = sum(report["source"] == MEMORY for report in about["depth"])
+    warn_of_depth(depth, console)
+    spared = sum(report["source"] == MEMORY for report in depth)
     if spared:
         console.line(
-            f"memory explains {spared} of {len(about['depth'])} context views: their depth was "
-            "not computed"
+            f"memory explains {spared} of {len(depth)} context views: their depth was not computed"
         )
-    return total
+    return total, {"dropped": dropped, "depth": depth}
 
 
 def _complete(
@@ -114,8 +113,7 @@ def _complete(
     folder: Path,
     clock: rounds.Clock,
     console: Console,
-    about: dict[str, Any],
-) -> FuseReport:
+) -> tuple[FuseReport, dict[str, Any]]:
     config, rows = plan.config, plan.schedule[number - 1]
     cameras = plan.targets.cameras[list(rows)]
     all_stems = target_stems(plan.targets.cameras.names)
@@ -145,9 +143,7 @@ def _complete(
             writing.append(pool.submit(write_after, folder, stem, guidance))
         for written in writing:
             written.result()
-    about["coverage_before"] = _mean([guidance.coverage for guidance in known])
-    about["coverage_after"] = _mean([guidance.coverage for guidance in grown])
-    about["views"] = [
+    views = [
         {
             **result.report,
             "stem": stem,
@@ -159,13 +155,17 @@ def _complete(
             stems, cameras, results, known, grown, strict=True
         )
     ]
-    refused = [view for view in about["views"] if view["scale"]["status"] != "aligned"]
+    refused = [view for view in views if view["scale"]["status"] != "aligned"]
     if refused:
         console.warn(
             f"round {number}: {len(refused)} of {len(results)} completions give no points, first "
             f"{refused[0]['name']}: {refused[0]['scale']['status']}"
         )
-    return total
+    return total, {
+        "coverage_before": _mean([guidance.coverage for guidance in known]),
+        "coverage_after": _mean([guidance.coverage for guidance in grown]),
+        "views": views,
+    }
 
 
 def _mean(values: list[float]) -> float | None:

@@ -30,8 +30,6 @@ LOCAL, PORT, MAX_POINTS = "127.0.0.1", 8080, 1_000_000
 COLORS = ("color", "round", "source", "confidence", "views", "depth-error")
 POLL_SECONDS = 1.0
 ENDING_SECONDS = 10.0
-# More options of the viewer that reconstruct opens.
-LIVE_OPTIONS: tuple[str, ...] = ()
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -171,12 +169,13 @@ def _wait_for_round(source: ViewSource, console: Console) -> bool:
 
 
 @contextmanager
-def live_viewer(out: Path, console: Console) -> Iterator[None]:
+def live_viewer(out: Path, console: Console, *options: str) -> Iterator[None]:
     """A web viewer of the run in ``out``, in a process of its own, as long as the block lasts.
 
     It only reads the folder. On a terminal it stays when the block has ended well, until Ctrl-C.
+    ``options`` are more words of ``gvtools view``.
     """
-    command = [sys.executable, "-m", "pipelines.cli", "view", str(out), "--live", *LIVE_OPTIONS]
+    command = [sys.executable, "-m", "pipelines.cli", "view", str(out), "--live", *options]
     process = subprocess.Popen([*command, *(["--quiet"] if console.quiet else [])])
     try:
         yield

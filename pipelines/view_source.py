@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import GvError, MemoryFileError, ProjectError
+from pipelines.finished_run import open_scenes, read_record
 from pipelines.memory_source import open_memory
 from pipelines.run_directory import RunDirectory
 from viz.run_view import RunView, cameras_of
@@ -47,7 +47,7 @@ class ViewSource:
         if not self.path.is_dir():
             memory = open_memory(self.path)
             return RunView(self.path, memory, (), cameras_of(memory, ()), self._frames)
-        record = self._record()
+        record = read_record(self.path) if (self.path / "run.json").is_file() else {}
         for attempt in range(ATTEMPTS):
             reports = RunDirectory(self.path).reports()
             try:
@@ -70,16 +70,6 @@ class ViewSource:
                 "reconstruct again"
             ) from None
         return RunView(self.path, memory, tuple(reports), cameras, self._frames, planned)
-
-    def _record(self) -> dict[str, Any]:
-        path = self.path / "run.json"
-        if not path.is_file():
-            return {}
-        try:
-            record = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise ProjectError(f"{path}: unreadable ({error}); run reconstruct again") from None
-        return record if isinstance(record, dict) else {}
 
     def lacking(self) -> str | None:
         """Why the project's own pictures cannot be shown; None when they can."""
@@ -124,7 +114,7 @@ class ProjectFrames:
                 self._lacking = "a memory without a run: no pictures of its cameras"
                 return
             try:
-                self._scene, self._truths = _scenes(self.record, self._project)
+                self._scene, self._truths = open_scenes(self.record, project=self._project)
             except (GvError, KeyError, TypeError) as error:
                 self._lacking = f"no pictures of the project: {error}"
 
@@ -136,16 +126,3 @@ class ProjectFrames:
             return scene[name].load()
         except GvError:
             return None
-
-
-def _scenes(record: dict[str, Any], project: Path | None) -> tuple[Scene, Scene | None]:
-    """The project, and the scene that has the truth of the targets, if any."""
-    from gvtools.scenes.project import open_project
-    from gvtools.scenes.reduced import reduced
-    from pipelines.scene_arguments import reopen_scene
-
-    max_side = record["config"].get("max_side")
-    scene = reduced(reopen_scene(project or Path(record["project"]), record["reading"]), max_side)
-    if record["targets_project"] is not None:
-        return scene, reduced(open_project(Path(record["targets_project"])), max_side)
-    return scene, scene if record["targets_kind"] == "hold-out" else None

@@ -172,12 +172,11 @@ def test_open3d_renders_a_picture_where_there_is_a_display(folder, tmp_path, cap
     assert np.abs(pictures[0] - pictures[1]).mean() < 20
 
 
-def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(folder, monkeypatch, tmp_path):
+def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(folder, tmp_path):
     pytest.importorskip("viser", reason="viser is not installed")
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    monkeypatch.setattr(view, "LIVE_OPTIONS", ("--port", str(port)))
     later = tmp_path / "run"
     threading.Timer(1.0, shutil.copytree, (folder, later)).start()
     from pipelines.console import Console
@@ -186,7 +185,7 @@ def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(folder, monkeypa
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", port)) == 0
 
-    with view.live_viewer(later, Console(quiet=True)):
+    with view.live_viewer(later, Console(quiet=True), "--port", str(port)):
         end = time.monotonic() + 60
         while not reached():
             assert time.monotonic() < end
