@@ -20,7 +20,7 @@ from gvtools.completers.geoverse.correction import (
     seamless,
     without_seams,
 )
-from gvtools.completers.geoverse.full_size import depth_ratios
+from gvtools.completers.geoverse.full_size import DOUBTED, depth_ratios
 from gvtools.completers.geoverse.passes import Decoded, Generated
 from gvtools.completers.geoverse.surface_fill import surface_fill
 from gvtools.errors import OptionError
@@ -128,7 +128,8 @@ def test_the_fill_keeps_memory_and_leaves_no_hole_where_memory_tells_anything():
     known.valid[1, 5, 7], known.depth[1, 5, 7] = True, 3.0
     for values in (known.rgb, known.depth):
         values[~known.valid] = 0
-    rgb, depth = surface_fill(micro.context_views(2), known)
+    fill = surface_fill(micro.context_views(2), known)
+    rgb, depth = fill.rgb, fill.depth
     assert (rgb[known.valid] == known.rgb[known.valid]).all()
     assert (depth[known.valid] == known.depth[known.valid]).all()
     assert (depth[:2] > 0).all() and not depth[2].any() and not rgb[2].any()
@@ -139,9 +140,14 @@ def test_the_fill_keeps_memory_and_leaves_no_hole_where_memory_tells_anything():
 def test_without_denoising_the_completion_is_the_fill(weights, size):
     known = micro.guidance(2, size=size)
     made = complete(weights, size, steps=0)
-    rgb, depth = surface_fill(micro.context_views(2), known)
-    np.testing.assert_allclose(made.rgb, rgb, atol=1e-5)
-    np.testing.assert_allclose(made.depth, depth, rtol=1e-5)
+    fill = surface_fill(micro.context_views(2), known, shared=True)
+    np.testing.assert_allclose(made.rgb, fill.rgb, atol=1e-5)
+    np.testing.assert_allclose(made.depth, fill.depth, rtol=1e-5)
+    assert fill.confidence is not None
+    # As sure as the fill; half as sure in a view whose decoded depth is not the memory's.
+    holes = ~known.valid
+    share = made.confidence[holes] / fill.confidence[holes]
+    assert np.isin(share, (DOUBTED, 1)).all()
     assert made.spent["steps"] == 0
     assert set(made.support or ()) == {"the memory's surfaces"}
 
@@ -161,7 +167,9 @@ def test_denoising_changes_holes_alone(weights):
 def test_a_view_that_memory_tells_nothing_of_leaves_the_others_as_they_are(weights):
     size = (30, 40)
     known = micro.guidance(2, size=size)
-    completer = create("geoverse", weights=str(weights), device="cpu", context_views=2)
+    completer = create(
+        "geoverse", weights=str(weights), device="cpu", context_views=2, shared_fill=False
+    )
     both = completer.complete(micro.context_views(2), known, seed=1)
     for values in (known.valid, known.rgb, known.depth):
         values[1] = 0

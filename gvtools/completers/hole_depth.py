@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Float64
+from gvtools.completers.hole_median import median_of_fill
 
 # Eight directions (dy, dx); direction k + 8 is the opposite of k.
 _HALF = ((0, 1), (1, 2), (1, 1), (2, 1), (1, 0), (2, -1), (1, -1), (1, -2))
@@ -105,7 +106,7 @@ def fill_depth(
     clipped = _combine(inverse, known, hits, planes, plane_of, slope, limits, spread)
     if smoothing:
         for step in (8, 4, 2, 1, 1):
-            inverse = _median(inverse, known, distance, step)
+            inverse = median_of_fill(inverse, known, distance, step)
     return HoleDepth(inverse, hits, planes, plane_of, spread, distance, int(clipped))
 
 
@@ -347,44 +348,3 @@ def _weighted_quantile(values, weights, share):
         if total <= 0:
             return values[i]
     return values[-1]
-
-
-@numba.njit(cache=True)
-def _median(inverse, known, distance, step):
-    """5x5 median with holes of ``step`` pixels between its taps, over the fill alone.
-
-    The taps are point-symmetric sets of hole pixels, so planes stay exact. A wide one acts only
-    deep inside, where directions far apart at the rim meet in shards.
-    """
-    height, width = inverse.shape
-    result = inverse.copy()
-    values = np.zeros(25)
-    for y in range(height):
-        for x in range(width):
-            if inverse[y, x] == 0 or distance[y, x] < (1 if step == 1 else 4 * step):
-                continue
-            values[0] = inverse[y, x]
-            count = 1
-            for dy in range(3):
-                for dx in range(-2, 3):
-                    if dy == 0 and dx <= 0:
-                        continue
-                    ya, xa = y + dy * step, x + dx * step
-                    yb, xb = y - dy * step, x - dx * step
-                    if ya >= height or yb < 0 or min(xa, xb) < 0 or max(xa, xb) >= width:
-                        continue
-                    if known[ya, xa] or known[yb, xb]:
-                        continue
-                    if inverse[ya, xa] == 0 or inverse[yb, xb] == 0:
-                        continue
-                    values[count], values[count + 1] = inverse[ya, xa], inverse[yb, xb]
-                    count += 2
-            # The sets have odd size: the centre and pairs. Only the lower half need be sorted.
-            for i in range(count // 2 + 1):
-                least = i
-                for j in range(i + 1, count):
-                    if values[j] < values[least]:
-                        least = j
-                values[i], values[least] = values[least], values[i]
-            result[y, x] = values[count // 2]
-    return result

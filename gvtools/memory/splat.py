@@ -395,6 +395,8 @@ class _Projection:
         runs, records, K = memory.runs, memory.records, self.camera.K[0]
         view = runs.view[self.seen]
         later = self.seen[(self.tier[view] != 0) & ~memory.views.generated[view]]
+        if not len(later):
+            return
         seen_free = _stacked(memory.observed_grids(np.flatnonzero(self.tier == 0)))
         tolerance = memory.options.free_space_tolerance
         chosen = culling.in_front(

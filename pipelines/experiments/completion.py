@@ -10,10 +10,19 @@ from gvtools.evaluation.tables import Table
 from gvtools.training.photographs import photograph_names
 from pipelines.experiments.cases import SIZE, held_out_cases
 from pipelines.experiments.classical import CLASSICAL
-from pipelines.experiments.judging import COLUMNS, judge, peers, perceptual, records, table
+from pipelines.experiments.judging import (
+    COLUMNS,
+    comparisons,
+    judge,
+    peers,
+    perceptual,
+    records,
+    table,
+)
 from pipelines.experiments.options import ExperimentOptions
 from pipelines.experiments.pictures import write_pictures
 from pipelines.experiments.rows import (
+    FILL,
     FILLERS,
     HINTS,
     classical_rows,
@@ -25,6 +34,8 @@ from pipelines.experiments.rows import (
 READS = ("weights", "teacher", "scenes", "size", "seed", "pictures")
 
 STUDENT, TEACHER = "student 3+1", "teacher 24+1"
+UNDISTILLED = "teacher 3+1, undistilled"
+UNSHARED = f"{STUDENT}, each target's fill by itself"
 TEACHERS_HINTS = f"{HINTS}, teacher's heads"
 
 
@@ -36,11 +47,12 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         methods[STUDENT] = geoverse(options.weights)
         methods[f"{STUDENT}, temperature 1"] = geoverse(options.weights, temperature=1.0)
         methods[f"{STUDENT}, decoded"] = geoverse(options.weights, composition="decoded")
+        methods[UNSHARED] = geoverse(options.weights, shared_fill=False)
         if options.teacher is not None:
             # Heads that learned from what a denoiser makes may be worse at what none has made.
             methods[TEACHERS_HINTS] = undenoised_rows(options.teacher)[HINTS]
             teacher = stack.enter_context(with_heads_of(options.teacher, options.weights))
-            methods["teacher 3+1, undistilled"] = geoverse(teacher)
+            methods[UNDISTILLED] = geoverse(teacher)
             methods[TEACHER] = geoverse(teacher, steps=24)
             methods[f"{TEACHER}, temperature 1"] = geoverse(teacher, steps=24, temperature=1.0)
         return _judged(options, methods)
@@ -74,7 +86,20 @@ def _judged(
             found[f"against_{name}"] = records(judged, against=rows)
     caption = f"Generated pixels of {options.scenes} held-out scenes, {side}x{side}"
     shown = table(judged, caption=caption, against=against["best_filler"], notes=(_note(said),))
-    return found, [shown]
+    pairs = [
+        (row, said, against[key])
+        for row in ("student 1+1", STUDENT)
+        for said, key in (
+            ("best classical filler", "best_filler"),
+            ("best other than this project's", "best_other_filler"),
+            ("hint features decoded", "hint_features"),
+            (TEACHER, "teacher"),
+        )
+    ]
+    pairs += [
+        (STUDENT, other, dict.fromkeys(COLUMNS, other)) for other in (UNDISTILLED, FILL, UNSHARED)
+    ]
+    return found, [shown, comparisons(judged, pairs, caption="Differences, two by two")]
 
 
 def _note(distance: str) -> str:

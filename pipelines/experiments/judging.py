@@ -132,6 +132,31 @@ def table(
     return Table(tuple(columns), tuple(rows), caption, notes)
 
 
+def comparisons(
+    judged: Mapping[str, Judged],
+    pairs: Iterable[tuple[str, str, Mapping[str, str]]],
+    *,
+    caption: str,
+) -> Table:
+    """Paired differences of chosen rows in every figure, pooled and of the view means.
+
+    Args:
+        judged: all rows.
+        pairs: a row, what it is compared with, and that in each figure. Those of absent rows are
+            left out.
+        caption: of the table.
+    """
+    shown = (Column(f"{c.title}, {c.unit.split(', ')[-1]}") for c in COLUMNS.values())
+    columns = (Column("method"), Column("against"), *shown)
+    rows = tuple(
+        (name, said, *(_shown(judged[name], judged[peers[f]], f) for f in COLUMNS))
+        for name, said, peers in pairs
+        if name in judged and set(peers.values()) <= set(judged)
+    )
+    notes = ("Differences with 95 % of the paired bootstrap over scenes.",)
+    return Table(columns, rows, caption, notes)
+
+
 def records(
     judged: Mapping[str, Judged], against: Mapping[str, str] | None = None
 ) -> list[dict[str, Any]]:

@@ -14,6 +14,7 @@ from pipelines.experiments.classical import CLASSICAL, classical
 
 HINTS = "hint features decoded, no denoiser"
 FILL = "filled projection alone"
+UNSHARED_FILL = f"{FILL}, each target's by itself"
 INPAINT = "inpaint (this project's planes)"
 # What the core has to beat.
 FILLERS = (*CLASSICAL, INPAINT)
@@ -30,6 +31,7 @@ def undenoised_rows(weights: Path | None) -> dict[str, Completer]:
     """What the chain gives before any denoising, decoded and as a correction of nothing."""
     return {
         FILL: geoverse(weights, steps=0),
+        UNSHARED_FILL: geoverse(weights, steps=0, shared_fill=False),
         HINTS: geoverse(weights, steps=0, composition="decoded"),
     }
 

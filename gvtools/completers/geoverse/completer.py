@@ -18,8 +18,9 @@ from gvtools.completers.geoverse.color_field import COLOR_ALIGNMENTS
 from gvtools.completers.geoverse.context_views import CHOICES, chosen_views
 from gvtools.completers.geoverse.correction import seamless
 from gvtools.completers.geoverse.depth_scale import ALIGNMENTS
+from gvtools.completers.geoverse.fill import Filled
 from gvtools.completers.geoverse.flow import interval_bounds
-from gvtools.completers.geoverse.full_size import Completed, Fill, averaged, brought_back, corrected
+from gvtools.completers.geoverse.full_size import Completed, averaged, brought_back, corrected
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.model_views import context_depth, view_batch
 from gvtools.completers.geoverse.resampling import model_size
@@ -59,6 +60,7 @@ class GeoVerseCompleter:
             the model's own. A correction follows them already.
         composition: "decoded" shows the decoding itself where a model's form is "correction", see
             ``correction``; None for the model's own.
+        shared_fill: whether targets share what their holes are filled with, see ``surface_fill``.
         precision: "auto" is bfloat16 on a GPU and float32 on a CPU.
         device: "auto" takes a GPU where there is one.
     """
@@ -78,6 +80,7 @@ class GeoVerseCompleter:
     alignment: str | None = None
     color_alignment: str | None = None
     composition: str | None = None
+    shared_fill: bool = True
     precision: str = "auto"
     device: str = "auto"
 
@@ -158,16 +161,12 @@ class GeoVerseCompleter:
         most = min(self.context_views or model.config.context, views - 1)
         room = views - min(most, len(context))
         passes = 0
+        filled = self._filled(model, context, guidance.rows(holes)) if holes else None
         for first in range(0, len(holes), room):
             rows = holes[first : first + room]
             part = guidance.rows(rows)
-            fill = None
-            if model.config.hints.fill == "surfaces":
-                # It needs more than torch and numpy.
-                from gvtools.completers.geoverse.surface_fill import surface_fill
-
-                fill = surface_fill(context, part)
-            shown = part.depth if fill is None else fill[1]
+            fill = None if filled is None else filled.rows(range(first, first + len(rows)))
+            shown = part.depth if fill is None else fill.depth
             chosen = chosen_views(context, part.cameras, shown, most, by=self.context_by)
             canvas.put(rows, self._pass(model, device, chosen, part, fill, seed), part)
             passes += 1
@@ -178,13 +177,24 @@ class GeoVerseCompleter:
         }
         return canvas.completion(spent)
 
+    def _filled(
+        self, model: GeoVerse, context: Sequence[ContextView], guidance: Guidance
+    ) -> Filled | None:
+        """What the model sees in holes; None where it fills them itself."""
+        if model.config.hints.fill != "surfaces":
+            return None
+        # It needs more than torch and numpy.
+        from gvtools.completers.geoverse.surface_fill import surface_fill
+
+        return surface_fill(context, guidance, shared=self.shared_fill)
+
     def _pass(
         self,
         model: GeoVerse,
         device: torch.device,
         context: Sequence[ContextView],
         part: Guidance,
-        fill: Fill | None,
+        fill: Filled | None,
         seed: int,
     ) -> Completed:
         """One pass of the model over context views and a few targets."""
@@ -199,7 +209,7 @@ class GeoVerseCompleter:
         if model.config.composition == "correction" and self.composition != "decoded":
             filled = averaged(part) if fill is None else fill
         # Where memory tells of every pixel, the model's own scale is of no use.
-        told = filled is not None and bool((filled[1] > 0).all())
+        told = filled is not None and bool((filled.depth > 0).all())
         with self._precision(device):
             made = model.generate(
                 batch,

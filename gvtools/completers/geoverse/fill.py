@@ -6,9 +6,35 @@ The Lumigraph.)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Filled:
+    """Projections with their holes filled, however that was done.
+
+    Attributes:
+        rgb: (T, H, W, 3) in [0, 1].
+        depth: (T, H, W) z-depth, scene units; 0 = none.
+        confidence: (T, H, W) of the depth, in [0, 1]; None where the fill has no notion of it.
+    """
+
+    rgb: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32] | None = None
+
+    def rows(self, index: Sequence[int]) -> Filled:
+        """Some views, in that order."""
+        rows = list(index)
+        confidence = None if self.confidence is None else self.confidence[rows]
+        return Filled(self.rgb[rows], self.depth[rows], confidence)
 
 
 def push_pull(values: Tensor, valid: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from gvtools.cameras import Cameras
 from gvtools.completers.geoverse.color_field import aligned_color
 from gvtools.completers.geoverse.correction import corrected_color, corrected_depth
 from gvtools.completers.geoverse.depth_scale import MAX_FACTOR, pass_scale, scaled_depth
-from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
+from gvtools.completers.geoverse.fill import Filled, push_pull, push_pull_depth
 from gvtools.completers.geoverse.passes import Generated
 from gvtools.completers.geoverse.resampling import resampled, resampled_depth
 from gvtools.guidance import Guidance
@@ -26,9 +26,10 @@ from gvtools.guidance import Guidance
 GENERATED = 0.9
 # Confidence of a corrected view whose decoded depth is far from the memory's.
 UNSCALED = 0.1
+# What remains of a fill's confidence where the model moves its depth, and in such a view.
+DOUBTED = 0.5
 # A view's scale is taken from at least so many pixels, and from about so many at most.
 LEAST, LOOKED_AT = 50, 5_000
-Fill = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -102,19 +103,19 @@ def brought_back(
 
 
 def corrected(
-    made: Generated, part: Guidance, fill: Fill, *, back: Completed | None = None
+    made: Generated, part: Guidance, fill: Filled, *, back: Completed | None = None
 ) -> Completed:
     """The filled projection with what the model changed, in views that memory tells of.
 
     Args:
         made: with the hints' decoding.
         part: the targets' projections.
-        fill: colour (T, H, W, 3) and depth (T, H, W) of the filled projections.
+        fill: the filled projections.
         back: what stands where the fill has no depth; None where it has depth everywhere.
     """
     assert made.hint is not None
     full = (part.depth.shape[1], part.depth.shape[2])
-    filled = torch.from_numpy(fill[0]).permute(0, 3, 1, 2), torch.from_numpy(fill[1])
+    filled = torch.from_numpy(fill.rgb).permute(0, 3, 1, 2), torch.from_numpy(fill.depth)
     both = [
         (
             resampled(found.rgb[0].float().cpu(), full),
@@ -139,9 +140,13 @@ def corrected(
             scales,
             ("none",) * len(part),
         )
-    certain = _certainty(made.decoded.depth_confidence[0], full)
-    certain[~np.isfinite(scales)] = UNSCALED
-    certain[~np.isfinite(certain)] = 0
+    if fill.confidence is None:
+        certain = _certainty(made.decoded.depth_confidence[0], full)
+        certain[~np.isfinite(scales)] = UNSCALED
+        certain[~np.isfinite(certain)] = 0
+    else:
+        doubted = (depth.numpy() != fill.depth) | ~np.isfinite(scales)[:, None, None]
+        certain = np.where(doubted, DOUBTED * fill.confidence, fill.confidence)
     return replace(
         back,
         rgb=np.where(known[..., None], rgb.numpy(), back.rgb),
@@ -179,12 +184,12 @@ def _certainty(confidence: Tensor, full: tuple[int, int]) -> NDArray[np.float32]
     return (GENERATED * (1 - 1 / certain.clamp_min(1))).numpy().astype(np.float32)
 
 
-def averaged(part: Guidance) -> Fill:
+def averaged(part: Guidance) -> Filled:
     """Projections filled as the model fills them, at their own size."""
     valid = torch.from_numpy(part.valid)[:, None]
     color = push_pull(torch.from_numpy(part.rgb).permute(0, 3, 1, 2), valid)
     depth = push_pull_depth(torch.from_numpy(part.depth)[:, None], valid)
-    return color.permute(0, 2, 3, 1).numpy(), depth[:, 0].numpy()
+    return Filled(color.permute(0, 2, 3, 1).numpy(), depth[:, 0].numpy())
 
 
 def _plucker(

@@ -19,6 +19,7 @@ from torch import Tensor
 from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.base import ContextView
 from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.fill import Filled
 from gvtools.completers.geoverse.resampling import resampled
 from gvtools.guidance import Guidance
 
@@ -33,7 +34,7 @@ def view_batch(
     targets: Guidance,
     size: tuple[int, int],
     *,
-    fill: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
+    fill: Filled | None = None,
 ) -> tuple[ViewBatch, Cameras]:
     """One sample of the model.
 
@@ -41,8 +42,7 @@ def view_batch(
         context: at least one view.
         targets: the projections to complete.
         size: (H, W) of the model's pictures.
-        fill: (T, H, W, 3) colour and (T, H, W) depth of the targets with their holes filled; None
-            leaves holes at 0.
+        fill: the targets with their holes filled; None leaves holes at 0.
 
     Returns:
         The batch, in the first context view's frame and a unit in which the farthest view stands
@@ -113,16 +113,11 @@ def _cropped(
     return view.rgb[window], depth[window], camera
 
 
-def _over(
-    rgb: Tensor,
-    depth: Tensor,
-    valid: Tensor,
-    fill: tuple[NDArray[np.float32], NDArray[np.float32]],
-) -> tuple[Tensor, Tensor]:
+def _over(rgb: Tensor, depth: Tensor, valid: Tensor, fill: Filled) -> tuple[Tensor, Tensor]:
     """Projections (T, 3, h, w) and (T, 1, h, w) over a fill of any size, where that has depth."""
     size = (rgb.shape[-2], rgb.shape[-1])
-    color = resampled(torch.from_numpy(fill[0]).permute(0, 3, 1, 2).float(), size).clamp(0, 1)
-    lengths = torch.from_numpy(fill[1]).float()[:, None]
+    color = resampled(torch.from_numpy(fill.rgb).permute(0, 3, 1, 2).float(), size).clamp(0, 1)
+    lengths = torch.from_numpy(fill.depth).float()[:, None]
     lengths = F.interpolate(lengths, size=size, mode="nearest-exact")
     color = torch.where(lengths > 0, color, 0.0)
     return torch.where(valid, rgb, color), torch.where(valid, depth, lengths)

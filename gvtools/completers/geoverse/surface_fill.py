@@ -3,41 +3,133 @@
 The classical completer's planes and photographs where the memory supports them, averages elsewhere:
 what a denoiser then has to add is what these do not know. A departure from the paper, whose holes
 are black (``hints.fill``).
+
+Targets that are completed together may share their fills: what one view is much surer of, because
+it lies at the rim of a hole there, is carried to the views for which it lies deep inside one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gvtools.completers.base import ContextView
-from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
+from gvtools.cameras import Cameras
+from gvtools.completers.base import Completion, ContextView
+from gvtools.completers.geoverse.fill import Filled, push_pull, push_pull_depth
 from gvtools.completers.inpaint import InpaintCompleter
 from gvtools.guidance import Guidance
+from gvtools.memory.back_projection import back_project
+from gvtools.memory.spatial_memory import SpatialMemory
 
-Float32 = NDArray[np.float32]
+# Confidence of what is averaged: below that of any plane worth fusing.
+AVERAGED = 0.005
+# Fills less confident than this are not carried to other views.
+CARRIED = 0.02
+# What is carried replaces a view's own fill where it is so many times as confident. A fill that is
+# carried wrongly spoils planes that were continued rightly, so it must be far better.
+SURER = 10.0
 
 
-def surface_fill(context: Sequence[ContextView], guidance: Guidance) -> tuple[Float32, Float32]:
-    """Colour (V, H, W, 3) and depth (V, H, W), memory's pixels unchanged.
+def surface_fill(
+    context: Sequence[ContextView], guidance: Guidance, *, shared: bool = False
+) -> Filled:
+    """Colour, depth and confidence of all pixels, memory's pixels unchanged.
 
-    A view without a valid pixel keeps its zeros.
+    A view without a valid pixel keeps its zeros, unless something is carried there.
 
     Args:
         context: photographs to look hole points up in.
         guidance: the projections.
+        shared: carry fills from view to view; their order does not matter.
     """
     made = InpaintCompleter().complete(context, guidance)
-    rgb, depth = made.rgb.copy(), made.depth.copy()
-    holes = ~(depth > 0) & guidance.valid.any(axis=(1, 2), keepdims=True)
+    known = guidance.valid
+    if shared and len(guidance) > 1:
+        known = _shared(context, guidance, made)
+    rgb, depth, confidence = made.rgb.copy(), made.depth.copy(), made.confidence.copy()
+    holes = ~(depth > 0) & known.any(axis=(1, 2), keepdims=True)
     for index in np.flatnonzero(holes.any(axis=(1, 2))):
-        known = torch.from_numpy(depth[index] > 0)[None, None]
+        hole = holes[index]
+        filled = torch.from_numpy(depth[index] > 0)[None, None]
         color = torch.from_numpy(rgb[index]).permute(2, 0, 1)[None]
         lengths = torch.from_numpy(depth[index])[None, None]
-        averaged = push_pull(color, known)[0].permute(1, 2, 0).numpy()
-        rgb[index][holes[index]] = averaged[holes[index]]
-        depth[index][holes[index]] = push_pull_depth(lengths, known)[0, 0].numpy()[holes[index]]
-    return rgb, depth
+        averaged = push_pull(color, filled)[0].permute(1, 2, 0).numpy()
+        rgb[index][hole] = averaged[hole]
+        depth[index][hole] = push_pull_depth(lengths, filled)[0, 0].numpy()[hole]
+        confidence[index][hole] = AVERAGED
+    return Filled(rgb, depth, confidence)
+
+
+def _shared(
+    context: Sequence[ContextView], guidance: Guidance, made: Completion
+) -> NDArray[np.bool_]:
+    """Carry fills from view to view, the best known view first; ``made`` is written into.
+
+    Returns:
+        (V, H, W) where memory or another view's fill knows.
+    """
+    known = guidance.valid.copy()
+    memory: SpatialMemory | None = None
+    best_first = np.argsort(-known.mean(axis=(1, 2)), kind="stable")
+    order = [int(index) for index in best_first if not known[index].all()]
+    for index in order:
+        view = guidance[index]
+        if memory is not None:
+            carried = memory.project(view.cameras)
+            surer = ~view.valid & carried.valid
+            surer &= carried.confidence > SURER * made.confidence[index]
+            if surer.any():
+                view = _with(view, carried, surer)
+                again = InpaintCompleter().complete(context, view)
+                made.rgb[index], made.depth[index] = again.rgb[0], again.depth[0]
+                made.confidence[index] = again.confidence[0]
+                known[index] = view.valid[0]
+        if index != order[-1]:
+            memory = _lifted(memory, view, made, index)
+    return known
+
+
+def _with(view: Guidance, carried: Guidance, where: NDArray[np.bool_]) -> Guidance:
+    """A view that knows what is carried there, too."""
+    return replace(
+        view,
+        rgb=np.where(where[..., None], carried.rgb, view.rgb),
+        depth=np.where(where, carried.depth, view.depth),
+        valid=view.valid | where,
+        confidence=np.where(where, carried.confidence, view.confidence),
+    )
+
+
+def _lifted(
+    memory: SpatialMemory | None, view: Guidance, made: Completion, index: int
+) -> SpatialMemory | None:
+    """The memory of the fills, with what this view filled itself."""
+    confidence = made.confidence[index]
+    own = ~view.valid[0] & (confidence >= CARRIED)
+    if not own.any():
+        return memory
+    if memory is None:
+        memory = SpatialMemory(
+            _footprint(made.depth[index], view.cameras), origin=view.cameras.centers[0]
+        )
+    points = back_project(
+        np.rint(np.clip(made.rgb[index], 0, 1) * 255).astype(np.uint8),
+        made.depth[index],
+        view.cameras,
+        frame=memory.frame,
+        # Unused outside the mask, where it must still be positive.
+        confidence=np.where(own, confidence, np.float32(1)),
+        mask=own,
+    )
+    memory.fuse(points, round=1, generated=True)
+    return memory
+
+
+def _footprint(depth: NDArray[np.float32], camera: Cameras) -> float:
+    """A pixel's edge at the median depth, scene units."""
+    focal = float(np.sqrt(camera.K[0, 0, 0] * camera.K[0, 1, 1]))
+    return float(np.median(depth[depth > 0])) / focal
