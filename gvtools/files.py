@@ -44,6 +44,30 @@ def _discard(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def check_parent(path: Path) -> None:
+    """Before a long computation: whether its result can be written to ``path`` in the end.
+
+    Raises:
+        ProjectError: its folder is absent.
+    """
+    if not path.parent.is_dir():
+        raise ProjectError(f"{path}: no folder {path.parent}; make it first")
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder for results, where there is none yet.
+
+    Raises:
+        ProjectError: a file is in the way, or it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ProjectError(
+            f"{path}: cannot be made a folder ({error.strerror or error}); choose another"
+        ) from error
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a whole text file (UTF-8) under its final name only when it is complete."""
     with replaced_when_written(path) as temporary:

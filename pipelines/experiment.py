@@ -64,7 +64,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         GvError: weights that are absent or do not fit, or a wrong number.
     """
     from gvtools.evaluation.tables import markdown
-    from gvtools.files import write_text
+    from gvtools.files import check_parent, write_text
     from pipelines.console import write_json
     from pipelines.experiments.options import ExperimentOptions
 
@@ -91,8 +91,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
         )
     options = ExperimentOptions(**given)
     for path in (args.json, args.markdown):
-        if path is not None and not path.parent.is_dir():
-            raise OptionError(f"{path}: no folder {path.parent}; make it first")
+        if path is not None:
+            check_parent(path)
     figures, tables = module.run(options)
     text = "\n\n".join(markdown(table).strip() for table in tables) + "\n"
     console.line(text)

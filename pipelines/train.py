@@ -72,6 +72,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: a wrong setting, a state of another training, or weights that do not fit.
     """
+    from gvtools.files import check_parent, make_folder, write_text
     from gvtools.training.names import STAGES
     from gvtools.training.options import shipped_or_read, with_settings
     from gvtools.training.processes import started
@@ -88,6 +89,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
         if init is not None and not _is_own(init):
             # A published encoder has its training behind it.
             stages = tuple(stage for stage in stages if stage != "encoder")
+    if args.json is not None:
+        check_parent(args.json)
+    make_folder(args.out)
     figures: dict[str, dict[str, float]] = {}
     with started(args.device) as processes:
         for stage in stages:
@@ -109,7 +113,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
                 # --until: the next stage has nothing to start from yet.
                 break
         if args.json is not None and processes.first:
-            args.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+            write_text(args.json, json.dumps(figures, indent=2) + "\n")
 
 
 def _init_folder(words: list[str] | None) -> Path | None:

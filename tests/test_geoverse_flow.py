@@ -162,7 +162,7 @@ def test_a_shift_that_is_none_is_refused(shift):
 def test_training_times_follow_the_shifted_uniform_distribution():
     generator = torch.Generator().manual_seed(3)
     uniform = torch.rand(20000, generator=generator)
-    times = training_times(uniform, shift=19.6)
+    times = training_times(uniform, shift=19.6, most=0.999)
     assert times.shape == (20000,)
     assert float(times.min()) >= 0 and float(times.max()) <= shift_time(0.999, 19.6)
     uniform = unshift_time(times.double(), 19.6).sort().values / 0.999

@@ -37,7 +37,7 @@ def test_a_completer_without_weights_uses_it():
     assert config_of(SHIPPED).trained and not completer.notes
 
 
-def test_it_sees_cameras_in_held_out_rooms():
+def test_its_rays_give_back_the_cameras_that_it_was_told():
     found, _ = poses.run(ExperimentOptions(scenes=3))
     figures = found["true pictures, cameras told"]
     assert figures["rotation_deg_median"] < 6

@@ -64,10 +64,16 @@ def test_one_thread_makes_the_same_samples() -> None:
     numba.set_num_threads(1)
     try:
         again = ProceduralViews().sample(7)
+        torch.set_num_threads(2)
+        filled = [ProceduralViews(fill="surfaces").sample(3)]
+        assert torch.get_num_threads() == 2
+        torch.set_num_threads(1)
+        filled.append(ProceduralViews(fill="surfaces").sample(3))
     finally:
         torch.set_num_threads(before[0])
         numba.set_num_threads(before[1])
     assert _equal(again, _samples("train", False)[7])
+    assert _equal(*filled)
 
 
 def test_splits_have_other_scenes_and_photographs() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -167,6 +168,22 @@ def test_ones_own_start_is_that_of_the_first_stage(published, training, tmp_path
     said = capsys.readouterr().out
     assert f"encoder: starts from {own}" in said
     assert f"denoiser: starts from {tmp_path / 'out' / 'encoder' / 'weights'}" in said
+
+
+def test_a_training_goes_on_from_the_published_files_that_it_began_with(
+    published, training, tmp_path, capsys
+):
+    other = tmp_path / "other"
+    shutil.copytree(published, other)
+    [changed] = (other / "checkpoints").glob("da3_level1.pt")
+    values = bytearray(changed.read_bytes())
+    values[len(values) // 2] ^= 1
+    changed.write_bytes(values)
+    init = ["--init", "gld", str(published)]
+    assert train(training, tmp_path / "out", "denoiser", *init, "--until", "1") == 0
+    again = ["--init", "gld", str(other), "--resume"]
+    assert train(training, tmp_path / "out", "denoiser", *again) == 2
+    assert "start" in capsys.readouterr().err
 
 
 def test_other_starts_are_one_clear_line(published, training, tmp_path, capsys):

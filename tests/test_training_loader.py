@@ -1,6 +1,11 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import time
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -117,6 +122,52 @@ class Refusing:
 
     def describe(self):
         return {}
+
+
+_ORPHANS = """
+import os, time
+from gvtools.training.context_choice import ContextOptions
+from gvtools.training.dataset import ProceduralViews
+from gvtools.training.loader import BatchLoader
+
+if __name__ == "__main__":
+    data = ProceduralViews(views=3, size=(24, 24), context=ContextOptions(most=2, group=4))
+    loader = BatchLoader(data, 2, workers=1)
+    loader(range(2))
+    import multiprocessing
+    print(*(child.pid for child in multiprocessing.active_children()), flush=True)
+    time.sleep(600)
+"""
+
+
+def test_workers_end_with_a_process_that_is_killed(tmp_path):
+    (tmp_path / "parent.py").write_text(_ORPHANS)
+    root = Path(__file__).resolve().parent.parent
+    parent = subprocess.Popen(
+        [sys.executable, str(tmp_path / "parent.py")],
+        env={**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert parent.stdout is not None
+    workers = [int(word) for word in parent.stdout.readline().split()]
+    assert workers
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline and any(_runs(worker) for worker in workers):
+        time.sleep(0.1)
+    assert not any(_runs(worker) for worker in workers)
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except (ProcessLookupError, FileNotFoundError):
+        return False
+    return state != "Z"
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 
 import pytest
@@ -13,6 +14,7 @@ from gvtools.training.options import (
     shipped_or_read,
     with_settings,
 )
+from gvtools.training.samples import TrainingSamples
 
 
 def test_the_rate_rises_and_falls_once_a_cycle():
@@ -47,6 +49,19 @@ def test_a_setting_reaches_a_stage_that_the_training_does_not_have():
     assert changed.heads.optimizer.steps == 3 and changed.heads.origin == 1.5
 
 
+def test_the_faults_of_observations_are_settings():
+    text = ["data.faults.projection=0.1", "data.faults.clean=0", "data.faults.absent=0"]
+    config, folder = shipped_or_read("tiny")
+    noisy, plain = (
+        TrainingSamples(changed, config.model_config(folder))._data_set("train").describe()
+        for changed in (with_settings(config, text), config)
+    )
+    assert noisy["faults"]["projection"] == 0.1 and plain["faults"]["projection"] == 0
+    assert {k: v for k, v in noisy.items() if k != "faults"} == {
+        k: v for k, v in plain.items() if k != "faults"
+    }
+
+
 @pytest.mark.parametrize("text", ["seed.deep=3", "heads.origin.deep=3", "model.name=tiny"])
 def test_a_setting_of_what_has_none_is_refused(text):
     with pytest.raises(OptionError, match="settings of its own"):
@@ -66,8 +81,21 @@ def test_a_setting_of_what_has_none_is_refused(text):
         "reflow.guidance=-1",
         "heads.drop_level0=2",
         "heads.temperature=-1",
+        "data.size=[0,0]",
     ],
 )
 def test_values_outside_their_range_are_refused_before_anything_is_trained(text):
     with pytest.raises(OptionError, match=text.partition("=")[0].replace(".", r"\.")):
+        with_settings(shipped_or_read("tiny")[0], [text])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("encoder.optimizer.betas=[2,3]", "optimizer.betas 2.0"),
+        ("reflow.bounds=[1,0.9,0.5]", "end at 0.5; expected 1 = tau_0 > tau_1 > ... > tau_K = 0"),
+    ],
+)
+def test_what_would_leave_noise_or_never_learn_is_refused(text, said):
+    with pytest.raises(OptionError, match=re.escape(said)):
         with_settings(shipped_or_read("tiny")[0], [text])

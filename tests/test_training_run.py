@@ -10,8 +10,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from gvtools.completers.geoverse import from_pretrained
 from gvtools.training.records import read_log
@@ -104,6 +106,7 @@ def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
     assert set(read_log(tmp_path / "heads")[-1]).isdisjoint({"rgb", "depth"})
 
 
+@pytest.mark.slow
 def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
     """Over many steps on the same few samples."""
     shutil.copytree(trained / "reflow", tmp_path / "reflow")
@@ -202,6 +205,40 @@ def test_what_learns_from_an_untrained_denoiser_is_refused(trained, tmp_path, ca
     assert train(tmp_path, stage) == 2
     assert "its denoisers are untrained" in capsys.readouterr().err
     assert not (tmp_path / stage).exists()
+
+
+def test_an_unfinished_stage_is_not_passed_over(trained, tmp_path, capsys):
+    shutil.copytree(trained / "denoiser", tmp_path / "denoiser")
+    assert train(tmp_path, "reflow", *steps("reflow", 3), "--until", "1") == 0
+    assert train(tmp_path, "heads", *steps("heads", 1)) == 2
+    said = capsys.readouterr().err
+    assert "stage reflow was begun and is not finished" in said and said.count("\n") == 1
+
+
+def test_every_stage_draws_what_it_makes(trained, tmp_path):
+    shutil.copytree(trained / "encoder", tmp_path / "encoder")
+    sheets = [word for word in SHORT if word not in ("--sheets", "0")] + ["--sheets", "1"]
+    for stage, out in (("encoder", tmp_path / "own"), ("denoiser", tmp_path)):
+        command = ["train", "micro", "--stage", stage, "--out", str(out), *sheets]
+        assert main([*command, *steps(stage, 2), "--until", "1"]) == 0
+        with Image.open(out / stage / "sheets" / "step_000001.png") as sheet:
+            picture = np.asarray(sheet)
+        assert picture.shape[2] == 3 and picture.std() > 10
+
+
+@pytest.mark.parametrize("where", ["out", "json"])
+def test_results_that_cannot_be_written_are_refused_before_anything_is_trained(
+    tmp_path, capsys, where
+):
+    (tmp_path / "file").write_text("")
+    options = {
+        "out": ["--out", str(tmp_path / "file")],
+        "json": ["--out", str(tmp_path / "x"), "--json", str(tmp_path / "absent" / "x.json")],
+    }
+    assert main(["train", "micro", *SHORT, *options[where]]) == 2
+    said = capsys.readouterr().err
+    assert str(tmp_path) in said and said.count("\n") == 1
+    assert not (tmp_path / "x").exists()
 
 
 def test_batches_across_different_context_counts_are_refused_at_once(tmp_path, capsys):

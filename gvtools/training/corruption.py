@@ -59,6 +59,8 @@ class CorruptionOptions:
             check_range(f"corruption.{name}", getattr(self, name), most=1)
 
 
+# Of recorded views, whose depth has faults of its own.
+GENTLE = CorruptionOptions(depth_noise=0.01, holes=0.05, flying=0.0)
 NOTHING = CorruptionOptions(
     **{entry.name: 0.0 for entry in fields(CorruptionOptions) if entry.name not in ("clean",)}
 )

@@ -109,4 +109,5 @@ class DenoiserStage(nn.Module):
     def _time(self, draws: Draws, name: str, device: torch.device) -> Tensor:
         """(B,) times, uniform before the shift."""
         uniform = draws.uniform(name, 1)[:, 0]
-        return training_times(uniform, shift=self.model.config.flow.shift).to(device)
+        flow = self.model.config.flow
+        return training_times(uniform, shift=flow.shift, most=flow.most_time).to(device)

@@ -5,6 +5,9 @@ A sample follows from its number, so that the only state of a loader is the numb
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from typing import Any
@@ -128,7 +131,7 @@ class BatchLoader:
             sampler=_Order(self, start),  # type: ignore[arg-type]
             num_workers=self.workers,
             collate_fn=_unchanged,
-            worker_init_fn=_one_thread,
+            worker_init_fn=_begun,
             prefetch_factor=max(2, -(-self.ahead * self.batch // self.workers)),
             # Threads of a compiled kernel do not survive a fork.
             multiprocessing_context="spawn",
@@ -173,5 +176,14 @@ def _unchanged(item: Any) -> Any:
     return item
 
 
-def _one_thread(worker: int) -> None:
+def _begun(worker: int) -> None:
     numba.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A worker whose parent was killed would wait for ever to hand its sample over."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -14,6 +14,7 @@ from gvtools.completers.geoverse.flow import check_bounds
 from gvtools.completers.geoverse.objective.objective import LossWeights
 from gvtools.errors import OptionError
 from gvtools.options import check_range
+from gvtools.training.corruption import GENTLE, CorruptionOptions
 
 # Trainings that ship; NAME_model.json beside one is a model's configuration of its own.
 SHIPPED = Path(__file__).parent / "configs"
@@ -63,6 +64,8 @@ class OptimizerOptions:
         check_range("optimizer.rate", self.rate, above=0)
         check_range("optimizer.warmup", self.warmup, least=0, most=1)
         check_range("optimizer.final", self.final, least=0, most=1)
+        for beta in self.betas:
+            check_range("optimizer.betas", beta, least=0, below=1)
         check_range("optimizer.cycles", self.cycles, least=1, most=self.steps)
         check_range("optimizer.weight_decay", self.weight_decay, least=0)
         check_range("optimizer.clip", self.clip, above=0)
@@ -180,7 +183,7 @@ class ReflowStageOptions:
         check_range("reflow.guidance", self.guidance, least=0)
         check_range("reflow.context_weight", self.context_weight, least=0)
         if self.bounds is not None:
-            check_bounds(self.bounds)
+            check_bounds(self.bounds, whole=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,6 +243,8 @@ class DataOptions:
         pool: so many samples are made and seen again and again; 0: every sample is new.
         cache: folder where a pool's samples are kept; None makes them anew each time.
         projections: False: nothing of the memory is projected into the targets.
+        faults: of procedural observations, see CorruptionOptions.
+        scene_faults: of those from ``scenes``, on top of what recorded depth has anyway.
         scenes: paths of projects that gvtools reads, mixed in by ``scene_share``.
         scene_share: share of samples from ``scenes``.
         scene_select: which of their views are used, a selection such as "every:20".
@@ -252,6 +257,8 @@ class DataOptions:
     pool: int = 0
     cache: str | None = None
     projections: bool = True
+    faults: CorruptionOptions = field(default_factory=CorruptionOptions)
+    scene_faults: CorruptionOptions = GENTLE
     scenes: tuple[str, ...] = ()
     scene_share: float = 0.0
     scene_select: str = "all"
@@ -259,6 +266,8 @@ class DataOptions:
 
     def __post_init__(self) -> None:
         check_range("data.views", self.views, least=2)
+        for side in self.size:
+            check_range("data.size", side, least=1)
         check_range("data.workers", self.workers, least=0)
         check_range("data.pool", self.pool, least=0)
         if self.cache is not None and not self.pool:
@@ -278,7 +287,7 @@ class TrainingConfig:
             of all parameters, gradients, averages and moments each (FSDP2), for large models. The
             result is the same, and a training may go on in the other way.
         data: see DataOptions.
-        encoder: stage 0.
+        encoder: stage 0; None leaves it out, where the encoder is a published one.
         denoiser: stage 1.
         reflow: stage 2.
         heads: the last stage; None leaves it out.
@@ -288,7 +297,7 @@ class TrainingConfig:
     seed: int = 0
     parallel: str = "data"
     data: DataOptions = field(default_factory=DataOptions)
-    encoder: EncoderStageOptions = field(default_factory=EncoderStageOptions)
+    encoder: EncoderStageOptions | None = field(default_factory=EncoderStageOptions)
     denoiser: DenoiserStageOptions = field(default_factory=DenoiserStageOptions)
     reflow: ReflowStageOptions = field(default_factory=ReflowStageOptions)
     heads: HeadsStageOptions | None = None

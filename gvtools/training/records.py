@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from gvtools.files import write_text
+
 LOG = "log.jsonl"
 
 
@@ -22,7 +24,7 @@ class TrainingLog:
         self.path = folder / LOG
         kept = [line for line in read_log(folder) if line["step"] <= step]
         text = "".join(json.dumps(line) + "\n" for line in kept)
-        self.path.write_text(text, encoding="utf-8")
+        write_text(self.path, text)
         self._board = _tensorboard(folder, step)
 
     def write(self, step: int, values: dict[str, float]) -> None:

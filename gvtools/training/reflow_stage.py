@@ -87,7 +87,10 @@ class ReflowStage(nn.Module):
             shift=model.config.flow.shift,
         )
         student = model.velocity1(prepared, pair.state, pair.t)
-        time = training_times(draws.uniform("t", 1)[:, 0], shift=model.config.flow.shift).to(device)
+        settings = model.config.flow
+        time = training_times(
+            draws.uniform("t", 1)[:, 0], shift=settings.shift, most=settings.most_time
+        ).to(device)
         state = interpolate(clean, noise, time)
         plain = model.velocity1(prepared, state, time)
         weight = options.context_weight

@@ -32,7 +32,7 @@ from gvtools.training.processes import Processes
 from gvtools.training.records import TrainingLog, read_log
 from gvtools.training.reflow_stage import ReflowStage
 from gvtools.training.samples import TrainingSamples
-from gvtools.training.sheets import write_sheet
+from gvtools.training.sheets import completion_sheet, encoder_sheet, write_png
 from gvtools.training.state import FILE
 
 WEIGHTS = "weights"
@@ -136,7 +136,7 @@ class StageRun:
             shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if not k.endswith(COUNTS))
             say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
 
-        drawing = sheet_every and self.stage in GENERATIVE and (held.together or log is not None)
+        drawing = sheet_every and (held.together or log is not None)
         held_out = samples.held_out(SHEET_SAMPLES) if drawing else None
 
         def sheet(step: int) -> None:
@@ -144,10 +144,11 @@ class StageRun:
                 return
             batch = held_out.to(self.processes.device)
             with held.usable():
+                # What processes hold parts of, all of them have to run.
+                draw = encoder_sheet if self.stage == "encoder" else completion_sheet
+                drawn = draw(model, batch)
                 if self.processes.first:
-                    write_sheet(model, batch, self.folder / "sheets" / f"step_{step:06d}.png")
-                else:
-                    model.generate(batch.views)
+                    write_png(self.folder / "sheets" / f"step_{step:06d}.png", drawn)
 
         try:
             trainer.train(
@@ -165,6 +166,8 @@ class StageRun:
         from gvtools.completers.geoverse.weights.folder import from_pretrained
 
         before = [name for name in STAGES[: STAGES.index(self.stage)]]
+        if not self.init:
+            self._refuse_unfinished(before)
         sources = [self.init] if self.init else [self.out / n / WEIGHTS for n in reversed(before)]
         for source in sources:
             if source is not None and (self.init or source.exists()):
@@ -187,6 +190,22 @@ class StageRun:
             )
         torch.manual_seed(self.config.seed)
         return GeoVerse(self.model_config)
+
+    def _refuse_unfinished(self, before: list[str]) -> None:
+        """A stage that was begun and not finished must not be passed over for one before it.
+
+        Raises:
+            CheckpointError: there is one.
+        """
+        for name in reversed(before):
+            folder = self.out / name
+            if (folder / WEIGHTS).exists():
+                return
+            if (folder / FILE).exists():
+                raise CheckpointError(
+                    f"{folder}: stage {name} was begun and is not finished; run --stage {name} "
+                    f"--resume to its end, remove that folder, or name weights with --init DIR"
+                )
 
     def _module(self, model: GeoVerse) -> nn.Module:
         if self.stage == "encoder":
@@ -285,9 +304,12 @@ def _last(folder: Path) -> dict[str, float]:
 def _fingerprint(folder: Path) -> str:
     """Of the weights that a stage starts from, the video prior's left out; ends of large files."""
     digest = hashlib.sha256()
-    for path in sorted(path for path in folder.glob("*") if path.is_file()):
+    video = folder / VIDEO_FOLDER
+    for path in sorted(folder.rglob("*")):
+        if not path.is_file() or video in path.parents:
+            continue
         size = path.stat().st_size
-        digest.update(f"{path.name} {size} ".encode())
+        digest.update(f"{path.relative_to(folder).as_posix()} {size} ".encode())
         with path.open("rb") as file:
             digest.update(file.read(READ))
             file.seek(max(0, size - READ))

@@ -102,6 +102,7 @@ class TrainingSamples:
             views=data.views,
             size=data.size,
             context=self._context,
+            faults=data.faults,
             fill=self._fill,
         )
         if not data.scenes or data.scene_share == 0 or split != "train":
@@ -117,6 +118,7 @@ class TrainingSamples:
             views=data.views,
             size=data.size,
             context=self._context,
+            faults=data.scene_faults,
             fill=self._fill,
         )
         return MixedViews(rooms, recorded, data.scene_share, group=self._context.group)

@@ -18,7 +18,7 @@ from gvtools.options import check_range
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import select
 from gvtools.training.context_choice import ContextOptions
-from gvtools.training.corruption import CorruptionOptions, drawn
+from gvtools.training.corruption import GENTLE, CorruptionOptions, drawn
 from gvtools.training.dataset import FAULTS, PATH, RECORDED
 from gvtools.training.hints import Clip, HintOptions
 from gvtools.training.view_sample import Sample, make_sample
@@ -69,9 +69,7 @@ class SceneViews:
     stride: tuple[int, int] = (1, 6)
     overlap: float = 0.4
     context: ContextOptions = field(default_factory=ContextOptions)
-    faults: CorruptionOptions | None = field(
-        default_factory=lambda: CorruptionOptions(depth_noise=0.01, holes=0.05, flying=0.0)
-    )
+    faults: CorruptionOptions | None = GENTLE
     hints: HintOptions = field(default_factory=HintOptions)
     fill: str = "none"
     _kept: OrderedDict[tuple[int, int], _Reduced] = field(

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gvtools.completers.geoverse.conditioning import filled
+from gvtools.completers.geoverse.conditioning import encode_views, filled
 from gvtools.completers.geoverse.correction import composed
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.files import replaced_when_written
@@ -19,7 +19,7 @@ GAP = 4
 
 
 @torch.no_grad()
-def write_sheet(model: GeoVerse, batch: TrainingBatch, path: Path, *, seed: int = 0) -> None:
+def completion_sheet(model: GeoVerse, batch: TrainingBatch, *, seed: int = 0) -> NDArray[np.uint8]:
     """A row for each sample: its views as the model gets them, what it makes of them, the truth.
 
     Three bands a sample: given pictures and projections, completions (context pictures stay), true
@@ -28,8 +28,10 @@ def write_sheet(model: GeoVerse, batch: TrainingBatch, path: Path, *, seed: int 
     Args:
         model: in any mode; put back into the one that it was in.
         batch: a few samples.
-        path: of the PNG.
         seed: of the noise.
+
+    Returns:
+        (H, W, 3).
     """
     training = model.training
     model.eval()
@@ -52,7 +54,37 @@ def write_sheet(model: GeoVerse, batch: TrainingBatch, path: Path, *, seed: int 
             _depth_band(depth[index]),
             _depth_band(batch.depth[index]),
         ]
-    write_png(path, np.concatenate(rows))
+    return np.concatenate(rows)
+
+
+@torch.no_grad()
+def encoder_sheet(model: GeoVerse, batch: TrainingBatch) -> NDArray[np.uint8]:
+    """Four bands a sample: pictures decoded from their own features, true ones, depth likewise.
+
+    Args:
+        model: its encoder and heads are used alone.
+        batch: a few samples.
+
+    Returns:
+        (H, W, 3).
+    """
+    encoder = model.geometry.encoder
+    grid = encoder.grid(*batch.views.size)
+    levels = encode_views(model.geometry, batch.true_views, slice(None), model.config.hints)
+    pyramid = [*levels, *encoder.propagate(levels[1], grid)]
+    normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
+    depth = model.geometry.head(normed, grid).depth[:, :, None]
+    rgb = model.rgb_head(torch.cat(normed, dim=-1).flatten(0, 1), grid)
+    rgb = rgb.unflatten(0, batch.images.shape[:2]).clamp(0, 1)
+    rows = []
+    for index in range(len(batch)):
+        rows += [
+            _band(rgb[index]),
+            _band(batch.images[index]),
+            _depth_band(depth[index]),
+            _depth_band(batch.depth[index]),
+        ]
+    return np.concatenate(rows)
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:

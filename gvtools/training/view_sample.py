@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -61,7 +62,7 @@ def make_sample(
     hints: HintOptions | None = None,
     fill: str = "none",
 ) -> Sample:
-    """A sample from views in the order of their path.
+    """A sample from views in the order of their path, the same on any number of threads.
 
     Args:
         clip: what is observed and lifted, in any size.
@@ -76,8 +77,9 @@ def make_sample(
     observation = observed(clip, context, strength, rng)
     guidance = projected(observation, clip.cameras[targets], hints)
     size = truth.depth.shape[1], truth.depth.shape[2]
-    over = surface_fill(observation.views, guidance) if fill == "surfaces" else None
-    views, cameras = view_batch(observation.views, guidance, size, fill=over)
+    with _one_thread():
+        over = surface_fill(observation.views, guidance) if fill == "surfaces" else None
+        views, cameras = view_batch(observation.views, guidance, size, fill=over)
     order = [*context, *targets]
     true_depth = torch.from_numpy(truth.depth[order])[:, None]
     unit = _mean_known([_at_size(view.depth, size) for view in observation.views])
@@ -104,6 +106,17 @@ def make_sample(
         place=torch.tensor(order),
         context=len(context),
     )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch's averages differ in the last digit by how many threads share them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _at_size(depth: Float32 | None, size: tuple[int, int]) -> Float32:

@@ -1,8 +1,13 @@
-"""Cameras that the ray head sees in pictures: true ones, and those that the model generated."""
+"""Cameras that the ray head gives back, and how much of that is in the pictures.
+
+The encoder is told the cameras where a model's configuration says so (``hints.cameras``). Grey
+pictures and those of another scene then show what comes from being told alone.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -38,15 +43,28 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         fill=model.config.hints.fill,
     )
     device = next(model.parameters()).device
+    told = "cameras told" if model.config.hints.cameras else "no cameras told"
+    other: list[Tensor] = []
     sources: dict[str, Callable[[GeoVerse, TrainingBatch], Geometry]] = {
-        "true pictures, cameras told": _of_truth,
-        "generated pictures, cameras told": lambda model, batch: (
+        f"true pictures, {told}": lambda model, batch: _of_pictures(model, batch, batch.images),
+        f"generated pictures, {told}": lambda model, batch: (
             model.generate(batch.views, seed=options.seed).decoded.geometry
         ),
+        f"pictures of another scene, {told}": lambda model, batch: _of_pictures(
+            model, batch, other[0]
+        ),
+        f"grey pictures, {told}": lambda model, batch: _of_pictures(
+            model, batch, torch.full_like(batch.images, 0.5)
+        ),
     }
+    if model.config.hints.cameras:
+        sources["true pictures, no cameras told"] = lambda model, batch: _of_pictures(
+            model, batch, batch.images, cameras=False
+        )
     errors: dict[str, list[Tensor]] = {name: [] for name in sources}
     for index in range(options.scenes):
         batch = collated([data.sample(index)]).to(device)
+        other[:] = [data.sample(index + options.scenes).images[None].to(device)]
         for name, source in sources.items():
             errors[name].append(_errors(source(model, batch), batch))
     found: dict[str, Any] = {"scenes": options.scenes, "seed": options.seed}
@@ -78,10 +96,16 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
 
 
 @torch.no_grad()
-def _of_truth(model: GeoVerse, batch: TrainingBatch) -> Geometry:
-    """Geometry of the true pictures' own features."""
+def _of_pictures(
+    model: GeoVerse, batch: TrainingBatch, pictures: Tensor, *, cameras: bool = True
+) -> Geometry:
+    """Geometry of the features of pictures (1, V, 3, H, W); ``cameras`` False tells none."""
     grid = model.geometry.encoder.grid(*batch.views.size)
-    levels = encode_views(model.geometry, batch.true_views, slice(None), model.config.hints)
+    views = replace(batch.true_views, images=pictures)
+    hints = model.config.hints
+    if not cameras:
+        hints = replace(hints, cameras=False)
+    levels = encode_views(model.geometry, views, slice(None), hints)
     return model.geometry.geometry(
         [*levels, *model.geometry.encoder.propagate(levels[1], grid)], grid
     )

@@ -34,6 +34,8 @@ class FlowConfig:
         level1: interval bounds of level 1, from 1 to 0; one denoiser evaluation an interval.
         cascade: interval bounds of level 0.
         shift: of the training times, t' = s t / (1 + (s - 1) t); 1 for none (the paper).
+        most_time: training times are drawn below it, before the shift; 1 for the paper's U(0, 1),
+            0.999 is Geometric Latent Diffusion's.
         guidance: classifier-free guidance scale over the cameras; 1 for none (the paper).
         temperature: of the noise that level 1 starts from, its standard deviation; 1 draws from
             what the model has learned (the paper), less stays nearer to its mean.
@@ -45,6 +47,7 @@ class FlowConfig:
     level1: tuple[float, ...] = (1.0, 2 / 3, 1 / 3, 0.0)
     cascade: tuple[float, ...] = (1.0, 0.0)
     shift: float = 1.0
+    most_time: float = 0.999
     guidance: float = 1.0
     temperature: float = 1.0
 
@@ -59,8 +62,9 @@ class FlowConfig:
         check_range("flow.shift", self.shift, above=0)
         check_range("flow.guidance", self.guidance, least=0)
         check_range("flow.temperature", self.temperature, least=0)
-        check_bounds(self.level1)
-        check_bounds(self.cascade)
+        check_range("flow.most_time", self.most_time, above=0, most=1)
+        check_bounds(self.level1, whole=True)
+        check_bounds(self.cascade, whole=True)
 
 
 @dataclass(frozen=True)

@@ -96,14 +96,18 @@ def interval_bounds(intervals: int | Sequence[float], *, shift: float = 1.0) -> 
     return check_bounds(intervals)
 
 
-def check_bounds(bounds: Sequence[float]) -> tuple[float, ...]:
+def check_bounds(bounds: Sequence[float], *, whole: bool = False) -> tuple[float, ...]:
     """The bounds as floats.
+
+    Args:
+        bounds: K + 1 times.
+        whole: they have to end at 0, where no noise is left.
 
     Raises:
         OptionError: not 1 = tau_0 > tau_1 > ... > tau_K >= 0 with K >= 1.
     """
     tau = tuple(float(bound) for bound in bounds)
-    wanted = "expected 1 = tau_0 > tau_1 > ... > tau_K >= 0"
+    wanted = f"expected 1 = tau_0 > tau_1 > ... > tau_K {'=' if whole else '>='} 0"
     if len(tau) < 2:
         raise OptionError(f"interval bounds {list(tau)}: {len(tau)} value(s); {wanted}")
     if tau[0] != 1:
@@ -114,12 +118,12 @@ def check_bounds(bounds: Sequence[float]) -> tuple[float, ...]:
                 f"interval bounds {list(tau)}: tau_{index} = {tau[index]:g} is not below "
                 f"tau_{index - 1} = {tau[index - 1]:g}; {wanted}"
             )
-    if tau[-1] < 0:
+    if tau[-1] < 0 or (whole and tau[-1] != 0):
         raise OptionError(f"interval bounds {list(tau)} end at {tau[-1]:g}; {wanted}")
     return tau
 
 
-def training_times(uniform: Tensor, *, shift: float = 1.0, most: float = 0.999) -> Tensor:
+def training_times(uniform: Tensor, *, shift: float = 1.0, most: float = 1.0) -> Tensor:
     """Training times (B,) of uniform draws (B,) in [0, 1): scaled to [0, ``most``), then shifted.
 
     The paper's t ~ U(0, 1) is ``most`` 1, ``shift`` 1; Geometric Latent Diffusion has 0.999 and
