@@ -13,8 +13,9 @@ from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
 from gvtools.memory.culling import SAMPLE
 from gvtools.memory.occlusion import in_free_space
+from gvtools.memory.projection import NEAREST, OCCLUDER_SIDE
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.splat import NEAREST, OCCLUDER_SIDE, SplatOptions
+from gvtools.memory.splat import SplatOptions
 
 
 @dataclass

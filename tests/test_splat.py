@@ -11,8 +11,9 @@ from reference_splat import reference_project
 from gvtools.cameras import concatenate
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
+from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.splat import SplatOptions, project
+from gvtools.memory.splat import SplatOptions
 
 IMAGES = ("rgb", "depth", "valid", "confidence", "generated")
 OTHERS = (

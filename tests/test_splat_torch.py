@@ -10,7 +10,7 @@ from test_splat import IMAGES, OTHERS, assert_same
 from gvtools.cameras import concatenate
 from gvtools.errors import OptionError
 from gvtools.memory import splat_torch
-from gvtools.memory.splat import project
+from gvtools.memory.projection import project
 from gvtools.memory.splat_torch import project_torch, torch_device
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]

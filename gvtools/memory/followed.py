@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
+from gvtools.memory.projection import Observed, project_again
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.splat import ONE_PIXEL, Observed, SplatOptions, project_again
+from gvtools.memory.splat import ONE_PIXEL, SplatOptions
 
 
 class FollowedCamera:

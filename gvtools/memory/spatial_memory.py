@@ -371,8 +371,8 @@ class SpatialMemory:
         )  # fmt: skip
 
     def project(self, cameras: Cameras, *, options: SplatOptions | None = None) -> Guidance:
-        """Project the memory into cameras of one size; see gvtools.memory.splat.project."""
-        from gvtools.memory.splat import project
+        """Project the memory into cameras of one size; see gvtools.memory.projection.project."""
+        from gvtools.memory.projection import project
 
         return project(self, cameras, options=options)
 

@@ -35,7 +35,7 @@ def project_torch(
     options: SplatOptions | None = None,
     device: str = "auto",
 ) -> Guidance:
-    """Project the memory with torch; see gvtools.memory.splat.project.
+    """Project the memory with torch; see gvtools.memory.projection.project.
 
     Args:
         memory: what is projected.
@@ -47,7 +47,8 @@ def project_torch(
         OptionError: CUDA is asked for and torch sees none.
         ShapeError: the cameras have images of several sizes, or there is none.
     """
-    from gvtools.memory.splat import SplatOptions, project
+    from gvtools.memory.projection import project
+    from gvtools.memory.splat import SplatOptions
 
     options = replace(options or SplatOptions(), backend="torch", device=device)
     return project(memory, cameras, options=options)
