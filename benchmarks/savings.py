@@ -34,6 +34,7 @@ OFF = {
     },
     "observed content projected once": {"savings.reuse": False},
     "small holes left to inpaint": {"savings.minor_holes": 0.0},
+    "middle holes in one step": {"savings.one_step": 0.0},
     "explained views without computed depth": {"savings.explained": None},
 }
 COSTLY = ("geoverse", "exemplar")
@@ -68,6 +69,8 @@ def rows_of(config: RunConfig, *, computed: bool) -> dict[str, Row]:
     idle = set()
     if config.completer not in COSTLY:
         idle.add("small holes left to inpaint")
+    if config.completer != "geoverse":
+        idle.add("middle holes in one step")
     if not computed:
         idle.add("explained views without computed depth")
 

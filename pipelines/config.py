@@ -63,17 +63,22 @@ class SavingsOptions:
         minor_holes: a view with no unknown pixel farther than this share of the image diagonal from
             a known one is left to ``inpaint`` where the completer is a costly one (geoverse,
             exemplar); 0 leaves it none.
+        one_step: targets that are completed together take one step of the generative core instead
+            of the model's own number where none of their unknown pixels is farther than this share
+            of the diagonal from a known one; 0 spares none.
         explained: a context view whose depth would have to be computed takes memory's instead where
             the views before it explain this share of its pixels; None computes all.
     """
 
     reuse: bool = True
     minor_holes: float = 0.02
+    one_step: float = 0.1
     explained: float | None = 0.9
 
     def __post_init__(self) -> None:
         check_range("savings.explained", self.explained, above=0, most=1)
         check_range("savings.minor_holes", self.minor_holes, least=0)
+        check_range("savings.one_step", self.one_step, least=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +157,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "fusion.voxel_percentile": 25.0,
         "fusion.voxel_loss": None,
         "savings.minor_holes": 0.0,
+        "savings.one_step": 0.0,
         "savings.explained": None,
         "memory.same_direction": 0.0,
         "memory.observations_per_voxel": 64,

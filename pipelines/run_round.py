@@ -130,7 +130,9 @@ def _complete(
         results, total = rounds.complete_targets(
             targets, number, memory=memory,
             completer=sparing(
-                create(config.completer, **config.completer_options), config.savings.minor_holes
+                create(config.completer, **config.completer_options),
+                config.savings.minor_holes,
+                config.savings.one_step,
             ),
             context=context, config=config, clock=clock, progress=console.track,
             done=lambda at, result: writing.append(

@@ -9,8 +9,10 @@ import pytest
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completion, create
+from gvtools.completers.geoverse.completer import GeoVerseCompleter
+from gvtools.completers.holes import hole_reach
 from gvtools.completers.inpaint import InpaintCompleter
-from gvtools.completers.sparing import SparingCompleter, hole_reach, sparing
+from gvtools.completers.sparing import SparingCompleter, sparing
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 from pipelines.config import RunConfig, with_setting
@@ -110,6 +112,18 @@ def test_only_costly_completers_are_spared_and_only_where_that_is_on():
     assert sparing(modest, 0.02) is modest
     for name, spared in (("inpaint", False), ("none", False), ("exemplar", True)):
         assert isinstance(sparing(create(name), 0.02), SparingCompleter) == spared
+
+
+def test_a_completer_of_several_steps_is_told_where_one_will_do():
+    core = create("geoverse")
+    assert isinstance(core, GeoVerseCompleter)
+    assert sparing(core, 0.0, 0.1) == replace(core, one_step_holes=0.1)
+    wrapped = sparing(core, 0.02, 0.1)
+    assert isinstance(wrapped, SparingCompleter)
+    assert wrapped.costly == replace(core, one_step_holes=0.1)
+    assert sparing(core, 0.0, 0.0) is core
+    inpaint = create("inpaint")
+    assert sparing(inpaint, 0.02, 0.1) is inpaint
 
 
 def test_support_is_absent_where_neither_has_a_scale_to_find():

@@ -3,32 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.completers.base import Completer, Completion, ContextView, create
+from gvtools.completers.holes import hole_reach
 from gvtools.guidance import Guidance
-
-
-def hole_reach(valid: NDArray[np.bool_]) -> float:
-    """How far the pixel farthest from what is known lies from it, as a share of the diagonal.
-
-    Args:
-        valid: (H, W) bool, where something is known.
-
-    Returns:
-        0 without holes, infinity where nothing is known.
-    """
-    if valid.all():
-        return 0.0
-    if not valid.any():
-        return float("inf")
-    distance = cv2.distanceTransform((~valid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return float(distance.max()) / float(np.hypot(*valid.shape))
 
 
 @dataclass
@@ -73,8 +56,17 @@ class SparingCompleter:
         return _merged(guidance, parts, len(spared))
 
 
-def sparing(completer: Completer, minor: float) -> Completer:
-    """``completer``, spared the views with small holes where it is costly and ``minor`` > 0."""
+def sparing(completer: Completer, minor: float, one_step: float = 0.0) -> Completer:
+    """``completer``, spared what small holes do not need, where it is costly.
+
+    Args:
+        completer: any.
+        minor: views whose holes reach no farther are left to ``inpaint``; 0 leaves it none.
+        one_step: passes whose holes reach no farther take one step, where the completer makes
+            several; 0 leaves them all.
+    """
+    if one_step > 0 and is_dataclass(completer) and hasattr(completer, "one_step_holes"):
+        completer = replace(completer, one_step_holes=one_step)
     if minor > 0 and getattr(completer, "costly", False):
         return SparingCompleter(completer, minor)
     return completer

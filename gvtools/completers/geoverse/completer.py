@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -27,6 +28,7 @@ from gvtools.completers.geoverse.resampling import model_size
 from gvtools.completers.geoverse.weights.folder import from_pretrained
 from gvtools.completers.geoverse.weights.folder_check import check_headers
 from gvtools.completers.geoverse.weights.folder_parts import config_of
+from gvtools.completers.holes import hole_reach
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 from gvtools.options import check_range
@@ -61,6 +63,10 @@ class GeoVerseCompleter:
         composition: "decoded" shows the decoding itself where a model's form is "correction", see
             ``correction``; None for the model's own.
         shared_fill: whether targets share what their holes are filled with, see ``surface_fill``.
+        one_step_holes: a pass takes one level-1 step where no unknown pixel of its targets lies
+            farther from a known one than this share of the image diagonal, and ``steps`` is None;
+            0 never.
+        no_prior_holes: likewise, a pass that does without the video prior.
         precision: "auto" is bfloat16 on a GPU and float32 on a CPU.
         device: "auto" takes a GPU where there is one.
     """
@@ -81,6 +87,8 @@ class GeoVerseCompleter:
     color_alignment: str | None = None
     composition: str | None = None
     shared_fill: bool = True
+    one_step_holes: float = 0.0
+    no_prior_holes: float = 0.0
     precision: str = "auto"
     device: str = "auto"
 
@@ -89,6 +97,8 @@ class GeoVerseCompleter:
         check_range("completer.cascade_steps", self.cascade_steps, least=1)
         check_range("completer.guidance", self.guidance, least=0)
         check_range("completer.temperature", self.temperature, least=0)
+        check_range("completer.one_step_holes", self.one_step_holes, least=0)
+        check_range("completer.no_prior_holes", self.no_prior_holes, least=0)
         check_range("completer.context_views", self.context_views, least=1)
         check_range("completer.views", self.views, least=2)
         for name, value, known in (
@@ -160,7 +170,7 @@ class GeoVerseCompleter:
         views = self.views or model.config.views
         most = min(self.context_views or model.config.context, views - 1)
         room = views - min(most, len(context))
-        passes = 0
+        passes = steps = 0
         filled = self._filled(model, context, guidance.rows(holes)) if holes else None
         for first in range(0, len(holes), room):
             rows = holes[first : first + room]
@@ -168,12 +178,20 @@ class GeoVerseCompleter:
             fill = None if filled is None else filled.rows(range(first, first + len(rows)))
             shown = part.depth if fill is None else fill.depth
             chosen = chosen_views(context, part.cameras, shown, most, by=self.context_by)
-            canvas.put(rows, self._pass(model, device, chosen, part, fill, seed), part)
+            reach = math.inf
+            if self.one_step_holes or self.no_prior_holes:
+                reach = max(hole_reach(valid) for valid in part.valid)
+            bounds = self._bounds(model, reach)
+            made = self._pass(
+                model, device, chosen, part, fill, seed, bounds, reach > self.no_prior_holes
+            )
+            canvas.put(rows, made, part)
             passes += 1
+            steps += max(len(bounds) - 1, 0)
         spent = {
             "seconds": time.perf_counter() - start,
             "passes": float(passes),
-            "steps": float(max(len(self._bounds(model)) - 1, 0)),
+            "steps": float(steps),
         }
         return canvas.completion(spent)
 
@@ -196,6 +214,8 @@ class GeoVerseCompleter:
         part: Guidance,
         fill: Filled | None,
         seed: int,
+        bounds: tuple[float, ...],
+        prior: bool,
     ) -> Completed:
         """One pass of the model over context views and a few targets."""
         full = part.depth.shape[1:]
@@ -215,10 +235,11 @@ class GeoVerseCompleter:
                 batch,
                 seed=seed,
                 names=[names],
-                bounds=self._bounds(model),
+                bounds=bounds,
                 cascade_bounds=self._cascade_bounds(model),
                 guidance=self.guidance,
                 temperature=self.temperature,
+                prior=prior,
                 targets_alone=told,
             )
 
@@ -234,12 +255,12 @@ class GeoVerseCompleter:
         made = seamless(made, model.config.patch)
         return corrected(made, part, filled, back=None if told else brought("none"))
 
-    def _bounds(self, model: GeoVerse) -> tuple[float, ...]:
-        flow = model.config.flow
+    def _bounds(self, model: GeoVerse, reach: float) -> tuple[float, ...]:
+        """Of level 1, in a pass whose holes reach so far."""
         if self.steps == 0:
             return ()
         if self.steps is None:
-            return flow.level1
+            return interval_bounds(1) if reach <= self.one_step_holes else model.config.flow.level1
         return interval_bounds(self.steps)
 
     def _cascade_bounds(self, model: GeoVerse) -> tuple[float, ...]:

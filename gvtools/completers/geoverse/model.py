@@ -121,6 +121,7 @@ class GeoVerse(nn.Module):
         *,
         seed: int | Sequence[Sequence[int]] = 0,
         video: VideoFeatures | None = None,
+        prior: bool = True,
         clock: Clock = no_clock,
     ) -> Prepared:
         """Everything that the denoising steps share, computed once.
@@ -130,6 +131,7 @@ class GeoVerse(nn.Module):
             seed: of the video prior's noise; one number, or B rows of V.
             video: features computed before, for the same views; taken from the attached prior
                 when None.
+            prior: False does without the video prior, as a model without one does.
             clock: receives the stages' names.
 
         Raises:
@@ -158,7 +160,7 @@ class GeoVerse(nn.Module):
             grid = (hints.level1.shape[-2], hints.level1.shape[-1])
             positions = Positions(config.level1, camera, grid)
             prepared = Prepared(batch, hints, conditions, positions)
-        if config.injection == "none":
+        if config.injection == "none" or not prior:
             return prepared
         with clock(stages.VIDEO):
             features = self._video_features(source, seed) if video is None else video
@@ -360,6 +362,7 @@ class GeoVerse(nn.Module):
         guidance: float | None = None,
         temperature: float | None = None,
         video: VideoFeatures | None = None,
+        prior: bool = True,
         targets_alone: bool = False,
         clock: Clock = no_clock,
     ) -> Generated:
@@ -376,6 +379,7 @@ class GeoVerse(nn.Module):
             guidance: scale; the configuration's by default.
             temperature: of level 1; the configuration's by default.
             video: features computed before, for the same views.
+            prior: see ``prepare``.
             targets_alone: without all views' geometry; the same pictures and depth, sooner.
             clock: receives the stages' names.
         """
@@ -384,7 +388,7 @@ class GeoVerse(nn.Module):
         def seeds(draw: str) -> list[list[int]]:
             return [[view_seed(seed, draw, name) for name in row] for row in rows]
 
-        prepared = self.prepare(batch, seed=seeds("video"), video=video, clock=clock)
+        prepared = self.prepare(batch, seed=seeds("video"), video=video, prior=prior, clock=clock)
         like = prepared.hints.level1
 
         def noise(level: str) -> Tensor:
