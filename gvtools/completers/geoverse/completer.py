@@ -16,6 +16,7 @@ import torch
 
 from gvtools.completers.base import Completion, ContextView, check_views
 from gvtools.completers.geoverse.color_field import COLOR_ALIGNMENTS
+from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.context_views import CHOICES, chosen_views
 from gvtools.completers.geoverse.correction import seamless
 from gvtools.completers.geoverse.depth_scale import ALIGNMENTS
@@ -125,8 +126,7 @@ class GeoVerseCompleter:
                 "completer.weights=DIR"
             )
         # A folder that cannot be a model is refused before anything is computed.
-        check_headers(self.folder)
-        form = config_of(self.folder).composition
+        form = _checked(str(self.folder.resolve()), self._times()).composition
         if self.composition == "correction" and form != "correction":
             raise OptionError(
                 f"completer.composition = 'correction', and the model in {self.folder} is of the "
@@ -323,6 +323,12 @@ class _Canvas:
             spent={**self.spent, **spent},
             support=tuple(self.support),
         )
+
+
+@lru_cache(maxsize=8)
+def _checked(folder: str, times: tuple[float, ...]) -> GeoVerseConfig:
+    """A folder's configuration, once it is known that it can be loaded; each round asks for it."""
+    return check_headers(folder)
 
 
 @lru_cache(maxsize=2)
