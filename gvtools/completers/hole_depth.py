@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Float64
 from gvtools.completers.hole_median import median_of_fill
+from gvtools.completers.holes import rim_distance
 
 # Eight directions (dy, dx); direction k + 8 is the opposite of k.
 _HALF = ((0, 1), (1, 2), (1, 1), (2, 1), (1, 0), (2, -1), (1, -1), (1, -2))
@@ -96,7 +97,7 @@ def fill_depth(
     # Index -1, no hit, marks the extra last entry.
     rim = np.flatnonzero(touched[:-1])
     plane_of.reshape(-1)[rim] = np.arange(len(rim), dtype=np.int32)
-    spread, distance = np.zeros(depth.shape), _rim_distance(known)
+    spread, distance = np.zeros(depth.shape), rim_distance(known).astype(np.float64)
     if not len(rim):
         return HoleDepth(inverse, hits, np.zeros((0, 5)), plane_of, spread, distance, 0)
     slope = math.tan(math.radians(steepest_deg)) / focal
@@ -108,15 +109,6 @@ def fill_depth(
         for step in (8, 4, 2, 1, 1):
             inverse = median_of_fill(inverse, known, distance, step)
     return HoleDepth(inverse, hits, planes, plane_of, spread, distance, int(clipped))
-
-
-def _rim_distance(known: NDArray[np.bool_]) -> Float64:
-    """(H, W) distance of each pixel to the nearest known one, pixels; infinite without any."""
-    from scipy.ndimage import distance_transform_edt
-
-    if not known.any():
-        return np.full(known.shape, math.inf)
-    return np.asarray(distance_transform_edt(~known), np.float64)
 
 
 @numba.njit(cache=True)
