@@ -119,26 +119,32 @@ def _links(holes, inverse):
 @numba.njit(cache=True)
 def _relax(rgb, holes, neighbors, links, hint, weight, sweeps):
     """Successive over-relaxation of the membrane with data terms, in row-major order."""
+    count = len(holes)
     hinted = len(weight) > 1
+    # What each pixel is drawn to is a mean: of four neighbours, whose shares are found once, and
+    # of what the data say.
+    share = np.zeros((count, 4))
+    given = np.zeros((count, 3))
+    step = np.zeros(count)
+    for m in range(count):
+        i = holes[m]
+        data = weight[i] if hinted else 0.0
+        total = links[m].sum() + data
+        # A pixel cut off from all neighbours keeps its seed.
+        if total > 1e-3:
+            step[m] = RELAXATION
+            share[m] = links[m] / total
+            for c in range(3):
+                given[m, c] = data * hint[i, c] / total if hinted else 0.0
     for _ in range(sweeps):
-        for m in range(len(holes)):
+        for m in range(count):
             i = holes[m]
-            total = red = green = blue = 0.0
+            red, green, blue = given[m, 0], given[m, 1], given[m, 2]
             for k in range(4):
-                link = links[m, k]
-                if link > 0:
-                    j = neighbors[m, k]
-                    total += link
-                    red += link * rgb[j, 0]
-                    green += link * rgb[j, 1]
-                    blue += link * rgb[j, 2]
-            if hinted and weight[i] > 0:
-                total += weight[i]
-                red += weight[i] * hint[i, 0]
-                green += weight[i] * hint[i, 1]
-                blue += weight[i] * hint[i, 2]
-            # A pixel cut off from all neighbours keeps its seed.
-            if total > 1e-3:
-                rgb[i, 0] += RELAXATION * (red / total - rgb[i, 0])
-                rgb[i, 1] += RELAXATION * (green / total - rgb[i, 1])
-                rgb[i, 2] += RELAXATION * (blue / total - rgb[i, 2])
+                link, j = share[m, k], neighbors[m, k]
+                red += link * rgb[j, 0]
+                green += link * rgb[j, 1]
+                blue += link * rgb[j, 2]
+            rgb[i, 0] += step[m] * (red - rgb[i, 0])
+            rgb[i, 1] += step[m] * (green - rgb[i, 1])
+            rgb[i, 2] += step[m] * (blue - rgb[i, 2])
