@@ -24,6 +24,7 @@ from gvtools.memory.thinning import thinned
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.transforms_json import FILE as TRANSFORMS
 from gvtools.scenes.transforms_json import write_transforms
+from viz.run_view import inside
 
 GENERATED = "generated.txt"
 HEADER = "# views that a completer made: name, and its picture where the run kept it; exports:"
@@ -85,7 +86,8 @@ def write_colmap_export(
         run: where the memory came from, for the paths of generated pictures.
 
     Raises:
-        ProjectError: two observed cameras have one name, or the folder cannot be written.
+        ProjectError: two observed cameras have one name, a picture lies outside the run, or the
+            folder cannot be written.
     """
     distinct = distinct_cameras(memory, run)
     kept = thinned(memory, max_points)
@@ -122,14 +124,15 @@ def write_transforms_export(
         run: where the memory came from; pictures of generated views are those of its rounds.
 
     Raises:
-        ProjectError: two observed cameras have one name, or the file cannot be written.
+        ProjectError: two observed cameras have one name, a picture lies outside the run, or the
+            file cannot be written.
     """
     file = transforms_file(path)
     distinct = distinct_cameras(memory, run)
     paths: list[str | Path] = []
     for name in distinct.cameras.names:
         made = distinct.generated.get(name)
-        paths.append(Path(images) / name if made is None else made.resolve())
+        paths.append(Path(images) / name if made is None else made)
     write_transforms(file, distinct.cameras, image_paths=paths)
     _write_generated(file.with_name(GENERATED), file.name, distinct.generated)
     return Written(len(distinct.cameras), len(distinct.generated), distinct.renamed)
@@ -257,11 +260,11 @@ def _tracks(
 
 
 def _picture(memory: SpatialMemory, view: int, run: Path) -> Path | None:
-    """The picture that a run kept of a generated view."""
+    """The picture that a run kept of a generated view, absolute."""
     source = memory.views[view]
     folder = run / f"round_{source.round:03d}"
     picture = folder / f"generated_{_stem(folder, source.camera.names[0])}.png"
-    return picture if picture.is_file() else None
+    return inside(run, picture).resolve() if picture.is_file() else None
 
 
 def _stem(folder: Path, name: str) -> str:
@@ -270,8 +273,8 @@ def _stem(folder: Path, name: str) -> str:
 
     try:
         views = json.loads((folder / "report.json").read_text(encoding="utf-8"))["views"]
-        return next(view["stem"] for view in views if view["name"] == name)
-    except (OSError, ValueError, KeyError, StopIteration):
+        return str(next(view["stem"] for view in views if view["name"] == name))
+    except (OSError, ValueError, KeyError, TypeError, StopIteration):
         return target_stems((name,))[0]
 
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,10 +22,20 @@ if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene, View
 
 
-_RECORDED = (
-    "project", "reading", "targets_project", "targets_kind", "schedule", "context", "targets",
-    "config", "versions",
+# What records and reports hold at least, and of what type, as JSON has them.
+_RECORDED: dict[str, type | tuple[type, ...]] = {
+    "project": str, "reading": dict, "targets_project": (str, NoneType), "targets_kind": str,
+    "schedule": list, "context": list, "targets": list, "config": dict, "versions": dict,
+}  # fmt: skip
+_CONFIGURED: dict[str, type | tuple[type, ...]] = {
+    "completer": str, "voxel": (int, float), "seed": int
+}  # fmt: skip
+_COUNTS = (
+    "points", "observed", "generated", "voxels", "added", "merged", "rejected", "bytes"
 )  # fmt: skip
+_SHARES = ("coverage_before", "coverage_after")
+_SHARES_OF_A_VIEW = ("coverage", "coverage_after")
+_CAMERA = {"K": (3, 3), "cam_from_world": (4, 4), "width": (), "height": ()}
 _OF_A_VIEW = ("name", "coverage", "coverage_after", "camera", "stem", "scale")
 
 
@@ -113,11 +124,20 @@ def read_record(path: Path) -> dict[str, Any]:
         raise ProjectError(f"{path}: holds no run.json; expected the folder of a run")
     try:
         record: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(record, dict):
+            raise TypeError("no JSON object")
         lacking = [key for key in _RECORDED if key not in record]
         if lacking:
             raise KeyError(", ".join(lacking))
-        if not isinstance(record["project"], str):
-            raise TypeError("project is no path")
+        for part, kinds in ((record, _RECORDED), (record["config"], _CONFIGURED)):
+            for key, kind in kinds.items():
+                if not isinstance(part[key], kind):
+                    raise TypeError(f"{key} is {part[key]!r}")
+        if not all(isinstance(rows, list) for rows in record["schedule"]):
+            raise TypeError("schedule holds more than lists")
+        for key in ("context", "targets"):
+            if not all(isinstance(name, str) for name in record[key]):
+                raise TypeError(f"{key} holds more than names")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ProjectError(
             f"{file}: no record of a run of this version ({error!r}); run reconstruct again"
@@ -156,14 +176,45 @@ def read_reports(path: Path) -> tuple[Mapping[str, Any], ...]:
     """
     reports = tuple(RunDirectory(path).reports())
     for number, report in enumerate(reports):
-        views = report.get("views")
-        whole = isinstance(views, list) and "seconds" in report
-        if not whole or any(key not in view for view in views or () for key in _OF_A_VIEW):
+        if not _is_report(report, number):
             raise ProjectError(
                 f"{RunDirectory(path).round_path(number)}/report.json: no report of this version; "
                 "run reconstruct again"
             )
     return reports
+
+
+def _is_report(report: Any, number: int) -> bool:
+    """Whether it has what readers of a round's report stand on."""
+    return (
+        isinstance(report, dict)
+        and report.get("round") == number
+        and all(isinstance(report.get(key), int) for key in _COUNTS)
+        and all(isinstance(report.get(key, ""), (int, float, NoneType)) for key in _SHARES)
+        and isinstance(report.get("seconds"), dict)
+        and all(isinstance(value, (int, float)) for value in report["seconds"].values())
+        and isinstance(report.get("views"), list)
+        and all(_is_view(view) for view in report["views"])
+    )
+
+
+def _is_view(view: Any) -> bool:
+    return (
+        isinstance(view, dict)
+        and all(key in view for key in _OF_A_VIEW)
+        and all(isinstance(view[key], str) for key in ("name", "stem"))
+        and all(isinstance(view[key], (int, float)) for key in _SHARES_OF_A_VIEW)
+        and isinstance(view["scale"], dict)
+        and isinstance(view["camera"], dict)
+        and all(_is_array(view["camera"].get(key), shape) for key, shape in _CAMERA.items())
+    )
+
+
+def _is_array(value: Any, shape: tuple[int, ...]) -> bool:
+    try:
+        return np.array(value, np.float64).shape == shape
+    except (TypeError, ValueError):
+        return False
 
 
 def _same_camera(view: View, target: TargetFiles) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,7 +86,7 @@ def collect(
         truths=sources.truths,
     )
     poses = report_poses(reports, sources.scene, record["context"], measures.poses)
-    trade_off, unread = _trade_off(path)
+    trade_off, unread = _trade_off(path, record)
     settings = dict(flat_settings(record["config"]))
     return RunReport(
         title=f"{path.resolve().name}: a run of gvtools",
@@ -114,24 +115,42 @@ def collect(
     )
 
 
-def read_sweep(path: Path) -> TradeOff | None:
+def read_sweep(path: Path, *, of: Mapping[str, Any] | None = None) -> TradeOff | None:
     """The trade-off in a folder or one above it, such as that of a trial's run; None without one.
 
+    For a run it may stand beside the run's folder as well, of several there the last written, and
+    has to be of the run's project.
+
+    Args:
+        path: the folder.
+        of: the run's record; None takes any project's.
+
     Raises:
-        ProjectError: it cannot be read.
+        ProjectError: one in the folder or above cannot be read.
     """
     from pipelines.tradeoffs.points import FILE, read_trade_off
 
     folder = path.resolve()
     for candidate in (folder, *folder.parents)[:ABOVE]:
         if (candidate / FILE).is_file():
-            return read_trade_off(candidate / FILE)
+            found = read_trade_off(candidate / FILE, of=of)
+            if found is not None:
+                return found
+    if of is None:
+        return None
+    beside = sorted(folder.parent.glob(f"*/{FILE}"), key=lambda file: file.stat().st_mtime_ns)
+    for file in reversed(beside):
+        # What cannot be read there is no more this run's than anybody's.
+        with suppress(ProjectError):
+            found = read_trade_off(file, of=of)
+            if found is not None:
+                return found
     return None
 
 
-def _trade_off(path: Path) -> tuple[TradeOff | None, list[str]]:
+def _trade_off(path: Path, record: Mapping[str, Any]) -> tuple[TradeOff | None, list[str]]:
     try:
-        return read_sweep(path), []
+        return read_sweep(path, of=record), []
     except ProjectError as error:
         return None, [str(error)]
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 METRICS = "metrics.json"
 EVALUATION = "evaluation/evaluation.json"
+# What reading a file of another version, or one that was changed by hand, comes upon.
+MALFORMED = (KeyError, TypeError, ValueError, AttributeError)
 
 
 @dataclass(frozen=True)
@@ -58,14 +61,52 @@ def read_measures(
     names = [str(view["name"]) for report in reports for view in report["views"]]
     warnings: list[str] = []
     evaluation = _read(path / EVALUATION, warnings)
-    entry = None if evaluation is None else _of_this_run(evaluation, record, names)
-    if evaluation is not None and entry is None:
-        warnings.append(f"{EVALUATION} is of another state of this run; gvtools evaluate renews it")
-    poses = None if entry is None else entry.get("poses")
-    if entry is not None and "images" in entry:
-        images = entry["images"]
-        means = {name: images["mean"].get(name) or {} for name in FIGURES}
-        return Measures(
+    found: Measures | None = None
+    if evaluation is not None:
+        try:
+            found = _evaluated(evaluation, record, names)
+        except MALFORMED as error:
+            warnings.append(f"{EVALUATION} is of another version ({error!r}); evaluate again")
+        else:
+            if found is None:
+                warnings.append(
+                    f"{EVALUATION} is of another state of this run; gvtools evaluate renews it"
+                )
+    if found is not None and found.source is not None:
+        return replace(found, warnings=warnings)
+    poses = None if found is None else found.poses
+    metrics = _read(path / METRICS, warnings)
+    if metrics is None:
+        note = (
+            f"There is no {METRICS} yet; a run writes it at its end, gvtools evaluate at any time"
+        )
+        return Measures(notes=[note], poses=poses, warnings=warnings)
+    try:
+        if _measured(metrics, names):
+            return replace(_of_metrics(metrics), poses=poses, warnings=warnings)
+        warnings.append(f"{METRICS} is of another state of this run; gvtools evaluate renews it")
+    except MALFORMED as error:
+        warnings.append(f"{METRICS} is of another version ({error!r}); gvtools evaluate renews it")
+    return Measures(poses=poses, warnings=warnings)
+
+
+def _evaluated(
+    evaluation: Mapping[str, Any], record: Mapping[str, Any], names: Sequence[str]
+) -> Measures | None:
+    """Of an evaluation: without a source where it has poses alone, None where it is not of this."""
+    entry = _of_this_run(evaluation, record, names)
+    if entry is None:
+        return None
+    poses = entry.get("poses")
+    if poses is not None:
+        _poses_of(poses)
+        _errors(poses)
+    if "images" not in entry:
+        return Measures(poses=poses)
+    images = entry["images"]
+    means = {name: images["mean"].get(name) or {} for name in FIGURES}
+    return _checked(
+        Measures(
             EVALUATION,
             {name: mean.get("mean") for name, mean in means.items()},
             {
@@ -76,21 +117,35 @@ def read_measures(
             images["views"],
             list(images["notes"].values()),
             poses,
-            warnings,
         )
-    metrics = _read(path / METRICS, warnings)
-    if metrics is None:
-        note = (
-            f"There is no {METRICS} yet; a run writes it at its end, gvtools evaluate at any time"
-        )
-        return Measures(notes=[note], poses=poses, warnings=warnings)
-    if not _measured(metrics, names):
-        warnings.append(f"{METRICS} is of another state of this run; gvtools evaluate renews it")
-        return Measures(poses=poses, warnings=warnings)
-    figures = {name: metrics.get(name) for name in FIGURES}
-    return Measures(
-        METRICS, figures, {}, metrics["views"], metrics.get("notes", ()), poses, warnings
     )
+
+
+def _of_metrics(metrics: Mapping[str, Any]) -> Measures:
+    figures = {name: metrics.get(name) for name in FIGURES}
+    return _checked(Measures(METRICS, figures, {}, metrics["views"], metrics.get("notes", ())))
+
+
+def _checked(found: Measures) -> Measures:
+    """The same.
+
+    Raises:
+        TypeError: a figure is none.
+        KeyError: a target lacks what every target has.
+    """
+    numbers = [*found.figures.values(), *(end for ends in found.intervals.values() for end in ends)]
+    for view in found.views:
+        numbers += [view.get(name) for name in FIGURES]
+        numbers += [view["coverage"], view["coverage_after"]]
+        if not isinstance(view["round"], int):
+            raise TypeError(f"{view['round']!r} is no round")
+    for number in numbers:
+        if not isinstance(number, (int, float, NoneType)):
+            raise TypeError(f"{number!r} is no figure")
+    for note in found.notes:
+        if not isinstance(note, str):
+            raise TypeError(f"{note!r} is no note")
+    return found
 
 
 def _read(file: Path, warnings: list[str]) -> dict[str, Any] | None:
@@ -160,10 +215,9 @@ def report_poses(
     note = "Lines from the marks: viewing directions. "
     if scene is None:
         note += "The context's cameras are missing, since the project cannot be read. "
-    views = {} if found is None else {view["name"]: view for view in found.get("views", ())}
-    if views:
-        poses = [views.get(view["name"], {}).get("cam_from_world") for view in entries]
-        estimated = _inverted(poses)
+    known = {} if found is None else _poses_of(found)
+    if known:
+        estimated = _inverted([known.get(view["name"]) for view in entries])
         note += (
             "Estimated: where the completed pictures look from, found from the pictures alone; a "
             "grey line leads to the requested camera. "
@@ -173,6 +227,15 @@ def report_poses(
     if not len(requested) + len(given):
         return Poses(None, note.strip(), ())
     return Poses(Trajectories(given, requested, estimated), note.strip(), _errors(found))
+
+
+def _poses_of(found: Mapping[str, Any]) -> dict[str, NDArray[np.float64] | None]:
+    """cam_from_world (4, 4) by the target's name; None where it was not located."""
+    out = {}
+    for view in found.get("views", ()):
+        pose = view.get("cam_from_world")
+        out[view["name"]] = None if pose is None else np.array(pose, np.float64).reshape(4, 4)
+    return out
 
 
 def _inverted(poses: Sequence[Any]) -> NDArray[np.float64]:

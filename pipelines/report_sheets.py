@@ -16,6 +16,7 @@ from pipelines.round_files import SUPPORT_OBSERVED, read_png
 from pipelines.run_directory import RunDirectory
 from viz.contact_sheet import TargetPictures, contact_row
 from viz.report_content import SheetRow
+from viz.run_view import inside
 
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras
@@ -108,9 +109,7 @@ def contact_sheets(
         if psnr.get(name) is not None:
             heading += f", PSNR {psnr[name]:.2f} dB"
         try:
-            pictures = _pictures(
-                RunDirectory(path).round_path(number), entry, truths.get(name), nearest
-            )
+            pictures = _pictures(path, number, entry, truths.get(name), nearest)
             return SheetRow(heading, contact_row(pictures))
         except (GvError, OSError, ValueError) as error:
             return f"pictures of {name} (round {number}) cannot be shown: {error}"
@@ -137,14 +136,23 @@ def contact_sheets(
 
 
 def _pictures(
-    folder: Path,
+    path: Path,
+    number: int,
     entry: Mapping[str, Any],
     truth: View | None,
     nearest: Callable[[Mapping[str, Any]], tuple[str, Any] | None],
 ) -> TargetPictures:
-    stem = entry["stem"]
-    support = read_png(folder / f"valid_{stem}.png")
-    completion = read_png(folder / f"generated_{stem}.png")
+    folder = RunDirectory(path).round_path(number)
+    hint, support, completion = (
+        read_png(inside(path, folder / f"{kind}_{entry['stem']}.png"))
+        for kind in ("guidance", "valid", "generated")
+    )
+    size = completion.shape[:2]
+    if hint.shape != (*size, 3) or completion.shape != (*size, 3) or support.shape != size:
+        raise ValueError(
+            f"guidance {hint.shape}, completion {completion.shape}, validity {support.shape}; "
+            "expected colour, colour and grey of one size"
+        )
     frame = None if truth is None else truth.load()
     if frame is not None and frame.rgb.shape != completion.shape:
         raise ValueError(
@@ -154,7 +162,7 @@ def _pictures(
     given = nearest(entry["camera"])
     return TargetPictures(
         name=str(entry["name"]),
-        hint=read_png(folder / f"guidance_{stem}.png"),
+        hint=hint,
         observed=support == SUPPORT_OBSERVED,
         supported=support > 0,
         completion=completion,

@@ -117,7 +117,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         changed = settings.changed_settings(whole)
         return {key: changed[key] for key in changed if key not in ("context", "targets")}
 
-    _write(search, args.out, scene.root.name, kind, budget, fits, profile, console)
+    _write(search, args.out, scene.root.name, identity, kind, budget, fits, profile, console)
 
 
 def parse_budget(text: str | None) -> tuple[str, float | None]:
@@ -141,6 +141,7 @@ def _write(
     search: Search,
     out: Path,
     name: str,
+    identity: Mapping[str, Any],
     kind: str,
     budget: float | None,
     fits: Callable[[Outcome], bool],
@@ -151,7 +152,7 @@ def _write(
     from gvtools.files import replaced_when_written, write_text
     from pipelines.console import write_json
     from pipelines.tradeoffs.outcome import front
-    from pipelines.tradeoffs.points import trial_point
+    from pipelines.tradeoffs.points import project_of, trial_point
     from pipelines.tradeoffs.search import marginal_values, recommended
     from pipelines.tradeoffs.tables import front_table, marginal_table, trial_table
     from viz.pareto import draw_pareto
@@ -182,6 +183,7 @@ def _write(
     write_json(
         out / "tradeoff.json",
         {
+            **project_of(identity),
             "targets": search.targets,
             "budget": budget,
             "budget_of": kind,

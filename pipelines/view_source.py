@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import GvError, MemoryFileError, ProjectError
-from pipelines.finished_run import open_scenes, read_record
+from pipelines.finished_run import open_scenes, read_record, read_reports
 from pipelines.memory_source import open_memory
 from pipelines.run_directory import RunDirectory
 from viz.run_view import RunView, cameras_of
@@ -49,7 +49,7 @@ class ViewSource:
             return RunView(self.path, memory, (), cameras_of(memory, ()), self._frames)
         record = read_record(self.path) if (self.path / "run.json").is_file() else {}
         for attempt in range(ATTEMPTS):
-            reports = RunDirectory(self.path).reports()
+            reports = read_reports(self.path)
             try:
                 memory = open_memory(self.path)
             except MemoryFileError:
@@ -64,12 +64,12 @@ class ViewSource:
         planned = len(record["schedule"]) + 1 if "schedule" in record else None
         try:
             cameras = cameras_of(memory, reports)
-        except (KeyError, TypeError, GvError) as error:
+        except GvError as error:
             raise ProjectError(
-                f"{self.path}: its rounds' reports are not of this version ({error!r}); run "
+                f"{self.path}: its rounds' reports hold a camera that is none ({error}); run "
                 "reconstruct again"
             ) from None
-        return RunView(self.path, memory, tuple(reports), cameras, self._frames, planned)
+        return RunView(self.path, memory, reports, cameras, self._frames, planned)
 
     def lacking(self) -> str | None:
         """Why the project's own pictures cannot be shown; None when they can."""

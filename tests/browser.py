@@ -60,20 +60,6 @@ class Browser:
         ]
         return [url for url in addresses if not _is_local(url)]
 
-    def received_bytes(self) -> int:
-        """What came over web sockets and as documents so far."""
-        total = 0
-        for event in self.events():
-            params = event["params"]
-            if event["method"] == "Network.webSocketFrameReceived":
-                frame = params["response"]
-                text = frame["payloadData"]
-                # Binary frames come as base64.
-                total += len(text) * 3 // 4 if frame["opcode"] == 2 else len(text)
-            elif event["method"] == "Network.loadingFinished":
-                total += int(params["encodedDataLength"])
-        return total
-
     def console_errors(self) -> list[str]:
         """What the console holds at the level of errors."""
         return [e["message"] for e in self.driver.get_log("browser") if e["level"] == "SEVERE"]

@@ -52,6 +52,23 @@ def shared() -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two rounds with two targets each, its project ``scan`` beside it; not to be changed.
+
+    Context: views 0 to 2; targets: 4 to 7.
+    """
+    from tiny_scan import write_scan
+
+    from pipelines.cli import main
+
+    root = tmp_path_factory.mktemp("small")
+    scan, run = write_scan(root / "scan", views=8), root / "run"
+    options = ("--context", "first:3", "--targets", "range:4-7", "--views-per-round", "2")
+    assert main(["reconstruct", str(scan), "--out", str(run), *options, "--quiet"]) == 0
+    return run
+
+
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
     """Threads cost more than they give on a tiny network, most of all where others work, too."""

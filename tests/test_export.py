@@ -8,12 +8,14 @@ import numpy as np
 import pycolmap
 import pytest
 from box_project import VOXEL, fused, write_box
+from memory_scenes import points
 from PIL import Image
 from plyfile import PlyData
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.local_frame import LocalFrame
 from gvtools.memory.ply import export_memory_ply
+from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.thinning import thinned
 from gvtools.scenes.project import open_project
 from pipelines import export
@@ -69,6 +71,15 @@ def test_thinning_to_a_number(memory, limit):
     kept = thinned(memory, limit)
     assert limit / 6 < len(kept.rows) <= limit
     assert kept.edge > VOXEL
+
+
+@pytest.mark.parametrize("limit", [1, 5, 7])
+def test_points_all_around_the_origin_are_thinned_to_few(limit):
+    memory = SpatialMemory(0.1)
+    memory.fuse(points(np.random.default_rng(0).uniform(-3, 3, (500, 3))), round=0)
+    kept = thinned(memory, limit)
+    assert 1 <= len(kept.rows) <= limit
+    assert kept.edge < 12 and kept.group.max() == len(kept.rows) - 1
 
 
 def test_ply_is_what_plyfile_reads(memory, saved, tmp_path):

@@ -195,6 +195,30 @@ def test_a_view_observed_and_generated_shows_its_photograph(scene, saved, tmp_pa
     assert len((tmp_path / "out" / "generated.txt").read_text().splitlines()) == 1
 
 
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_pictures_are_named_from_anywhere(saved, tmp_path, monkeypatch, kind):
+    (saved / "round_002").mkdir(exist_ok=True)
+    picture = saved / "round_002" / "generated_view_4.png"
+    Image.new("RGB", (96, 72)).save(picture)
+    monkeypatch.chdir(tmp_path)
+    run(saved.relative_to(tmp_path), "--format", kind, "--out", "out")
+    line = (tmp_path / "out" / "generated.txt").read_text().splitlines()[1]
+    assert line.split("\t") == ["view_4.png", str(picture.resolve())]
+
+
+@pytest.mark.parametrize("stem", ["x/../../../secret", "link"])
+def test_no_picture_outside_the_run_is_named(saved, tmp_path, stem):
+    folder = saved / "round_002"
+    (folder / "generated_x").mkdir(parents=True)
+    Image.new("RGB", (96, 72)).save(tmp_path / "secret.png")
+    (folder / "generated_link.png").symlink_to(tmp_path / "secret.png")
+    report = {"views": [{"name": "view_4.png", "stem": stem}]}
+    (folder / "report.json").write_text(json.dumps(report))
+    with pytest.raises(ProjectError, match="lies outside"):
+        run(saved, "--format", "transforms", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def contents(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 

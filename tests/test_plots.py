@@ -47,6 +47,14 @@ def moved(world_from_cam: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -
     return motion @ world_from_cam
 
 
+def test_dollar_signs_in_names_are_no_formulas():
+    name = "proj $x_{$"
+    with_sign = png(draw_growth(rounds(), title=name))
+    assert with_sign != png(draw_growth(rounds(), title="proj x_{"))
+    records = [{"step": k, "loss": 1.0, name: 2.0} for k in range(3)]
+    assert png(draw_losses({"stage $^$": records}, title=name))
+
+
 def test_coverage_is_in_percent_of_each_round():
     axes: Any = draw_coverage(rounds()).axes[0]
     np.testing.assert_allclose(points(axes, "before"), [[1, 60], [2, 70]])

@@ -79,7 +79,8 @@ def test_thinning_keeps_the_most_confident_of_each_larger_voxel(most, tmp_path):
     kept = read_ply(tmp_path / "thin.ply")
     assert len(kept) == written <= most
     assert edge >= memory.voxel
-    cells = np.floor(memory.records.position.astype(float) / edge)
+    positions = memory.records.position.astype(float)
+    cells = np.floor((positions - positions.min(axis=0)) / edge)
     best: dict[tuple, float] = {}
     for cell, trust in zip(map(tuple, cells), memory.confidence, strict=True):
         best[cell] = max(best.get(cell, 0.0), float(trust))

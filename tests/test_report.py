@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Browser, open_browser
+from PIL import Image
 from test_cli import refused
 from tiny_scan import write_scan
 
@@ -20,7 +21,7 @@ from pipelines.cli import main
 from pipelines.config import RunConfig
 from pipelines.plan import make_plan
 from pipelines.report import write_report
-from pipelines.report_data import collect
+from pipelines.report_data import collect, read_sweep
 from pipelines.report_sheets import chosen_targets, nearest_camera
 from viz.contact_sheet import TargetPictures, contact_row
 from viz.report import report_html
@@ -206,6 +207,62 @@ def test_pictures_that_are_damaged_are_named(own):
     assert "frame-000003.color.png (round 1) cannot be shown" in page.said
 
 
+@pytest.mark.parametrize(
+    "change",
+    [lambda report: [1, 2], lambda report: {**report, "observed": None},
+     lambda report: {k: v for k, v in report.items() if k != "observed"},
+     lambda report: {**report, "views": [1]}, lambda report: {**report, "seconds": 3},
+     lambda report: {**report, "views": [{**report["views"][0], "camera": {}}]}],
+)  # fmt: skip
+def test_a_damaged_report_is_one_line(own, capsys, change):
+    path = own / "round_001" / "report.json"
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    assert "round_001/report.json: no report of this version" in refused(capsys, "report", own)
+
+
+@pytest.mark.parametrize("key", ["schedule", "context", "config", "project"])
+def test_a_damaged_record_is_one_line(own, capsys, key):
+    record = json.loads((own / "run.json").read_text())
+    (own / "run.json").write_text(json.dumps({**record, key: None}))
+    assert "no record of a run of this version" in refused(capsys, "report", own)
+
+
+@pytest.mark.parametrize("content", ['{"runs": [1]}', '{"runs": 3}', "[1, 2]", '{"runs": [{}]}'])
+def test_a_damaged_evaluation_leaves_the_runs_own_figures(own, content):
+    (own / "evaluation").mkdir()
+    (own / "evaluation" / "evaluation.json").write_text(content)
+    report = collect(own)
+    assert report.figures_from == "metrics.json"
+    assert len(report.warnings) == 1 and "evaluation.json" in report.warnings[0]
+
+
+def test_damaged_metrics_are_left_out(own):
+    metrics = json.loads((own / "metrics.json").read_text())
+    for change in ({"views": 3}, {"psnr": "high"}, {"notes": [3]}):
+        (own / "metrics.json").write_text(json.dumps({**metrics, **change}))
+        report = collect(own)
+        assert report.figures_from is None
+        assert any("metrics.json" in warning for warning in report.warnings)
+
+
+def test_a_picture_of_another_kind_costs_no_more_than_its_target(own):
+    Image.new("RGB", (96, 72)).save(own / "round_001" / "valid_frame-000003.color.png")
+    page = written(own)
+    assert page.captions == LABELS * 3
+    assert "frame-000003.color.png (round 1) cannot be shown" in page.said
+
+
+def test_no_picture_outside_the_run_is_shown(own, tmp_path):
+    for kind in ("guidance", "valid", "generated"):
+        inside = own / "round_001" / f"{kind}_frame-000003.color.png"
+        outside = tmp_path / f"{kind}.png"
+        inside.rename(outside)
+        inside.symlink_to(outside)
+    page = written(own)
+    assert page.captions == LABELS * 3
+    assert "lies outside" in page.said
+
+
 def test_what_is_no_run_is_refused(own, tmp_path, capsys):
     assert "run.json" in refused(capsys, "report", tmp_path)
     assert ".html" in refused(capsys, "report", own, "--out", tmp_path / "memory.npz")
@@ -229,8 +286,19 @@ def test_a_sweep_beside_the_run_is_drawn(own):
     trials = [{"label": label, "share": 1.0, **trial} for label, trial in names.items()]
     # Trials on a share of the targets are no figures of whole runs.
     trials.append({"label": "voxel 4", "share": 0.25, **outcome, "psnr": 99.0})
-    sweep = {"targets": 4, "budget": 60, "budget_of": "seconds", "trials": trials,
+    record = json.loads((own / "run.json").read_text())
+    sweep = {"project": record["project"], "reading": record["reading"], "targets": 4,
+             "budget": 60, "budget_of": "seconds", "trials": trials,
              "recommended": better}  # fmt: skip
+    # Beside the run, as README has it, and above it, as a trial has it.
+    beside = own.parent / "sweep"
+    beside.mkdir()
+    (beside / "tradeoff.json").write_text(json.dumps(sweep))
+    assert read_sweep(own, of=record) is not None
+    for key, other in (("project", "/elsewhere"), ("reading", {"depth_unit": 2})):
+        (beside / "tradeoff.json").write_text(json.dumps({**sweep, key: other}))
+        (own.parent / "tradeoff.json").write_text(json.dumps({**sweep, key: other}))
+        assert read_sweep(own, of=record) is None
     (own.parent / "tradeoff.json").write_text(json.dumps(sweep))
     found = collect(own).trade_off
     assert found is not None

@@ -14,11 +14,13 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_scan import write_scan
 
+from gvtools.errors import OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines import view
 from pipelines.cli import main
+from pipelines.console import Console
+from pipelines.view_source import ViewSource
 from viz.point_colors import MODES
 from viz.run_view_render import picture_of
 from viz.web_viewer import BUDGET, LOCAL, PORT
@@ -27,13 +29,8 @@ CAMERA = "frame-000004.color.png"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("command")
-    scan = write_scan(root / "scan", views=6)
-    options = ("--context", "first:3", "--targets", "range:4-5", "--views-per-round", "1")
-    run = root / "run"
-    assert main(["reconstruct", str(scan), "--out", str(run), *options, "--quiet"]) == 0
-    return run
+def folder(small_run):
+    return small_run
 
 
 @contextmanager
@@ -108,6 +105,7 @@ def test_bad_options_are_refused_in_one_line(folder, tmp_path, monkeypatch, caps
     assert not (tmp_path / "x.png").exists()
 
 
+@pytest.mark.slow
 def test_the_open3d_window_shows_the_run_and_steps_through_it(folder, tmp_path):
     code = f"""
 from pathlib import Path
@@ -172,22 +170,85 @@ def test_open3d_renders_a_picture_where_there_is_a_display(folder, tmp_path, cap
     assert np.abs(pictures[0] - pictures[1]).mean() < 20
 
 
-def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(folder, tmp_path):
+def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(folder, tmp_path, capsys):
     pytest.importorskip("viser", reason="viser is not installed")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     later = tmp_path / "run"
     threading.Timer(1.0, shutil.copytree, (folder, later)).start()
-    from pipelines.console import Console
 
     def reached() -> bool:
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", port)) == 0
 
-    with view.live_viewer(later, Console(quiet=True), "--port", str(port)):
+    with view.live_viewer(later, Console(), "--port", str(port)):
         end = time.monotonic() + 60
         while not reached():
             assert time.monotonic() < end
             time.sleep(0.2)
+        # Told by this process, whose progress bar it has to go around.
+        said = ""
+        while f"{later}: look at http://127.0.0.1:{port} (Ctrl-C ends)\n" not in said:
+            assert time.monotonic() < end
+            time.sleep(0.1)
+            said += capsys.readouterr().out
     assert not reached()
+
+
+def test_a_run_that_fails_at_once_says_no_more_than_why(tmp_path, capfd):
+    with pytest.raises(OptionError), view.live_viewer(tmp_path / "run", Console()):
+        # While the viewer is still starting.
+        time.sleep(0.3)
+        raise OptionError("no such project")
+    said = capfd.readouterr()
+    assert "Traceback" not in said.err and "KeyboardInterrupt" not in said.err
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_a_round_that_came_while_the_viewer_started_is_shown(folder, tmp_path, capsys):
+    growing, later = tmp_path / "growing", tmp_path / "later"
+    shutil.copytree(folder, growing)
+    (growing / "round_002").rename(later)
+    source = ViewSource(growing)
+    shown = source.read()
+    later.rename(growing / "round_002")
+    rounds: list[int] = []
+    following = view.Following(source, shown, lambda r: rounds.append(r.last_round), Console())
+    following.look()
+    following.look()
+    assert rounds == [2]
+    assert capsys.readouterr().out == "round 2 is there\n"
+
+
+@pytest.mark.parametrize("report", ['{"round": 2,', "[]", '{"round": 2, "views": []}'])
+def test_a_report_that_cannot_be_read_does_not_end_the_viewer(folder, tmp_path, capsys, report):
+    growing, kept = tmp_path / "growing", tmp_path / "kept"
+    shutil.copytree(folder, growing)
+    (growing / "round_002").rename(kept)
+    source, rounds = ViewSource(growing), list[int]()
+    following = view.Following(
+        source, source.read(), lambda run: rounds.append(run.last_round), Console()
+    )
+    (growing / "round_002").mkdir()
+    (growing / "round_002" / "report.json").write_text(report)
+    for _ in range(3):
+        following.look()
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and "round_002" in said
+    shutil.rmtree(growing / "round_002")
+    kept.rename(growing / "round_002")
+    following.look()
+    assert rounds == [2]
+
+
+def test_an_interrupted_start_is_no_interrupted_run(folder, monkeypatch, capsys):
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ViewSource, "read", interrupted)
+    assert main(["view", str(folder)]) == 0
+    assert capsys.readouterr() == ("viewer ended\n", "")

@@ -9,12 +9,11 @@ import sys
 
 import numpy as np
 import pytest
+from memory_scenes import points
 from PIL import Image
-from tiny_scan import write_scan
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
-from pipelines.cli import main
 from pipelines.view_source import ViewSource
 from viz.palette import COLORS, GREY
 from viz.point_colors import MODES, VIRIDIS, depth_errors, point_colors, view_counts, viridis
@@ -24,14 +23,8 @@ from viz.run_view_render import RunRenderer, picture_of
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A run of two rounds with two targets each."""
-    root = tmp_path_factory.mktemp("view")
-    scan = write_scan(root / "scan", views=8)
-    out = root / "run"
-    options = ("--context", "first:3", "--targets", "range:4-7", "--views-per-round", "2")
-    assert main(["reconstruct", str(scan), "--out", str(out), *options, "--quiet"]) == 0
-    return out
+def folder(small_run):
+    return small_run
 
 
 @pytest.fixture(scope="module")
@@ -197,6 +190,17 @@ def test_what_is_drawn_is_even_and_does_not_change_as_the_memory_grows(run, fold
     now, before = detail(memory, budget), detail(earlier, budget)
     assert now.edge == before.edge == memory.voxel
     assert set(before.rows.tolist()) < set(now.rows.tolist())
+
+
+@pytest.mark.parametrize("budget", [1, 2, 5, 16])
+def test_a_budget_below_the_cells_around_the_origin_is_kept(budget):
+    memory = SpatialMemory(0.1)
+    corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    memory.fuse(points(corners), round=0)
+    memory.fuse(points(np.array(corners) * 0.9), round=1, generated=True)
+    drawn = detail(memory, budget)
+    assert 1 <= len(drawn.rows) <= budget
+    assert np.isfinite([drawn.edge, drawn.size]).all()
 
 
 def test_rendering_goes_back_and_forth_between_rounds_exactly(run, folder):

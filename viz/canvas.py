@@ -47,9 +47,17 @@ def figure_of(panels: Sequence[Panel], *, title: str | None = None, columns: int
         panel(axes)
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_axisbelow(True)
+        _take_literally(axes)
     if title is not None:
-        figure.suptitle(title)
+        figure.suptitle(title, parse_math=False)
     return figure
+
+
+def _take_literally(axes: Axes) -> None:
+    """Names of projects and of stages are no formulas, even with dollar signs in them."""
+    legend = axes.get_legend()
+    for words in (axes.title, *(legend.get_texts() if legend else ())):
+        words.set_parse_math(False)
 
 
 def chosen(panels: Mapping[str, Panel], names: Sequence[str] | None) -> list[Panel]:

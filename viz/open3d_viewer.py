@@ -13,6 +13,7 @@ from viz.point_colors import MODES, point_colors
 from viz.run_view import RunView
 from viz.run_view_detail import detail, point_pixels
 from viz.web_viewer_cameras import KINDS
+from viz.web_viewer_frame import PageFrame, home
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -97,8 +98,12 @@ class Open3dViewer:
         self._refresh()
 
     def look_from(self, number: int) -> None:
-        """Stand where a camera of the run stood."""
+        """Stand where a camera of the run stood; without cameras, in front of the whole cloud."""
         if not self.run.cameras:
+            position, look_at = home(self.run, PageFrame.of(self.run))
+            view, turn = self.window.get_view_control(), self.run.memory.frame.axes.T
+            view.set_front(turn @ (position - look_at))
+            view.set_up(turn @ self.run.up())
             return
         import open3d as o3d
 

@@ -25,6 +25,10 @@ CONTEXT, TARGET = "context", "target"
 # What a round leaves of a target, by the title that a viewer gives it.
 PICTURES = {"guidance": "guidance", "completion": "generated", "memory after": "after"}
 TRUTH = "truth"
+# Percent of the points at each end that may lie far off.
+STRAY = 0.5
+# Lower by so much is no accident.
+FLATTER = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,25 +142,43 @@ class RunView:
         return None if frame is None else frame.depth
 
     def up(self) -> NDArray[np.float64]:
-        """(3,) unit vector, world frame: what most of the context's cameras hold to be up."""
+        """(3,) unit vector, world frame: what most of the context's cameras hold to be up.
+
+        Without cameras it is a guess: scenes are wider than high, so it is z where the points
+        reach less far in z than in y, else -y, as in the frame of a camera.
+        """
         chosen = [c for c in self.cameras if c.kind == CONTEXT] or list(self.cameras)
         if not chosen:
-            return np.array([0.0, -1.0, 0.0])
+            _, y, z = np.diff(self.bounds, axis=0)[0]
+            return np.array([0.0, 0.0, 1.0]) if z < FLATTER * y else np.array([0.0, -1.0, 0.0])
         # Image rows run downwards.
         total = -np.sum([c.camera.cam_from_world[0, 1, :3] for c in chosen], axis=0)
         length = float(np.linalg.norm(total))
         return total / length if length > 1e-6 else -chosen[0].camera.cam_from_world[0, 1, :3]
 
     @cached_property
-    def typical_depth(self) -> float:
-        """The median distance of observations from the camera that saw them, scene units."""
+    def bounds(self) -> NDArray[np.float64]:
+        """(2, 3) the least and the greatest coordinates, world frame; stray points left out."""
+        _, local = self._sample()
+        if not len(local):
+            return np.zeros((2, 3))
+        world = self.memory.frame.to_world(local)
+        return np.percentile(world, [STRAY, 100 - STRAY], axis=0)
+
+    def _sample(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Rows of some observations, and where they are, (P, 3) in the memory's frame."""
         memory = self.memory
         rows = np.arange(0, len(memory), max(1, len(memory) // 100_000))
+        records = memory.records
+        return rows, np.stack([records.x[rows], records.y[rows], records.z[rows]], axis=1)
+
+    @cached_property
+    def typical_depth(self) -> float:
+        """The median distance of observations from the camera that saw them, scene units."""
+        rows, positions = self._sample()
         if not len(rows):
             return 1.0
-        records = memory.records
-        positions = np.stack([records.x[rows], records.y[rows], records.z[rows]], axis=1)
-        away = positions - memory.views.centers[records.view[rows]]
+        away = positions - self.memory.views.centers[self.memory.records.view[rows]]
         return float(np.median(np.linalg.norm(away, axis=1))) or 1.0
 
 
@@ -200,7 +222,7 @@ def inside(folder: Path, path: Path) -> Path:
         ProjectError: it does not.
     """
     if not path.resolve().is_relative_to(folder.resolve()):
-        raise ProjectError(f"{path}: lies outside {folder}; a viewer shows a run's own files alone")
+        raise ProjectError(f"{path}: lies outside {folder}; only a run's own files are shown")
     return path
 
 

@@ -50,10 +50,12 @@ def detail(memory: SpatialMemory, budget: int) -> Detail:
         return Detail(np.arange(count), 0.0, size)
     generated = memory.generated
     edge = memory.voxel
+    reach = max(float(np.abs(axis[:count]).max()) for axis in _axes(memory))
     while True:
         _, first = np.unique((cell_keys(memory, edge) << 1) | generated, return_index=True)
-        if len(first) <= budget:
-            return Detail(np.sort(first), edge, max(size, edge))
+        # Cells that meet at the origin do not become one however large they are.
+        if len(first) <= budget or edge > reach:
+            return Detail(np.sort(first)[:budget], edge, max(size, edge))
         edge *= max(1.1, float(np.sqrt(len(first) / budget)))
 
 
@@ -69,10 +71,10 @@ def cell_keys(memory: SpatialMemory, edge: float) -> NDArray[np.int64]:
         memory: whose observations.
         edge: of a cell, scene units; doubled until the cells can be numbered.
     """
-    records, count = memory.records, len(memory)
+    count = len(memory)
     while True:
         keys = np.zeros(count, np.int64)
-        for axis in (records.x, records.y, records.z):
+        for axis in _axes(memory):
             # Times the inverse, as the memory counts its voxels.
             cell = np.floor(axis[:count] * (1.0 / np.float64(edge)))
             cell -= cell.min(initial=0.0)
@@ -82,3 +84,7 @@ def cell_keys(memory: SpatialMemory, edge: float) -> NDArray[np.int64]:
         else:
             return keys
         edge *= 2.0
+
+
+def _axes(memory: SpatialMemory) -> tuple[NDArray[np.float32], ...]:
+    return memory.records.x, memory.records.y, memory.records.z

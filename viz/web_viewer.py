@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import socket
 import threading
 from contextlib import redirect_stdout
 from typing import TYPE_CHECKING
@@ -11,19 +10,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError
 from viz.point_colors import MODES, Legend, point_colors
 from viz.run_view import RunView, ShownCamera
 from viz.run_view_detail import detail
-from viz.web_viewer_cameras import CameraNodes, fly_to, placement
+from viz.web_viewer_cameras import CameraNodes, fly_to
+from viz.web_viewer_frame import FIELD_OF_VIEW, PageFrame, home
+from viz.web_viewer_guard import LOCAL, address_of, make_server
 from viz.web_viewer_panel import Panel
+from viz.web_viewer_pictures import shown_pictures
 from viz.web_viewer_points import PointNodes
 from viz.web_viewer_splats import SplatLook
 
 if TYPE_CHECKING:
     import viser
 
-LOCAL = "127.0.0.1"
 PORT = 8080
 # 15 bytes each; with all colour modes looked at once, 30 MB.
 BUDGET = 1_000_000
@@ -32,7 +32,8 @@ BUDGET = 1_000_000
 class WebViewer:
     """Serves one run.
 
-    Positions are sent relative to the memory's origin, so that float32 keeps its digits.
+    Positions are sent in the page's own frame, so that float32 keeps its digits and scenes of any
+    scale fit its units.
 
     Args:
         run: as it is now.
@@ -43,7 +44,7 @@ class WebViewer:
         mode: colours to begin with, of viz.point_colors.MODES.
 
     Raises:
-        OptionError: the web viewer's package is not installed, or the address is none of ours.
+        OptionError: as of make_server.
     """
 
     def __init__(
@@ -60,10 +61,15 @@ class WebViewer:
         self.budget = budget
         # Callbacks come from several threads.
         self._lock = threading.RLock()
-        self.server = _serve(host, port, run.title)
-        self._points = PointNodes(self.server)
-        self._cameras = CameraNodes(self.server, self._clicked)
-        self._splats = SplatLook(self.server)
+        # Of the cameras selected so far the last, over all and of each client.
+        self._selecting = threading.Lock()
+        self._selected = 0
+        self._flights: dict[int, int] = {}
+        self.frame = PageFrame.of(run)
+        self.server = make_server(host, port, run.title)
+        self._points = PointNodes(self.server, self.frame)
+        self._cameras = CameraNodes(self.server, self.frame, self._clicked)
+        self._splats = SplatLook(self.server, self.frame)
         self._panel = Panel(
             self.server,
             mode=mode,
@@ -83,7 +89,7 @@ class WebViewer:
     @property
     def url(self) -> str:
         """Where the page is."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        return address_of(self.server.get_host(), self.server.get_port())
 
     def update(self, run: RunView) -> None:
         """Show a run as it is by now; whoever looks at the last round goes on to the new one."""
@@ -142,60 +148,43 @@ class WebViewer:
             self._splats.set_on(splats)
 
     def _clicked(self, shown: ShownCamera, client: viser.ClientHandle | None) -> None:
-        self._panel.select(shown)
-        self._select(shown, client)
+        self._select(shown, client, clicked=True)
 
-    def _select(self, shown: ShownCamera, client: viser.ClientHandle | None) -> None:
-        self._cameras.mark(shown)
-        self._panel.set_pictures(self.run, shown)
+    def _select(
+        self, shown: ShownCamera, client: viser.ClientHandle | None, *, clicked: bool = False
+    ) -> None:
+        """Show a camera and fly there, unless another one has been selected meanwhile."""
+        with self._selecting:
+            self._selected += 1
+            number = self._selected
+            if clicked:
+                self._panel.select(shown)
+            self._cameras.mark(shown)
+            if client is not None:
+                self._flights[client.client_id] = number
+        # Photographs may take their time.
+        pictures = shown_pictures(self.run, shown)
+        with self._selecting:
+            if number != self._selected:
+                return
+            self._panel.set_pictures(pictures)
+            if client is not None:
+                self._cameras.enter(self.frame.placement(shown.camera)[1])
         if client is not None:
-            self._cameras.enter(placement(shown.camera, self.run)[1])
-            fly_to(client, shown.camera, self.run)
+            flight = client.client_id
+            fly_to(
+                client,
+                shown.camera,
+                self.frame,
+                goes_on=lambda: self._flights[flight] == number,
+            )
 
     def _follow(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda seen: self._cameras.moved(np.array(seen.position)))
 
     def _set_home(self) -> None:
-        """Start, and return to, a place behind the first camera from which the scene is in view."""
-        run = self.run
-        if not run.cameras:
-            return
-        pose = run.cameras[0].camera.world_from_cam[0]
-        depth = run.typical_depth
-        center = pose[:3, 3] - run.memory.origin
-        home = self.server.initial_camera
-        home.position = center - 0.5 * depth * pose[:3, 2] + 0.25 * depth * run.up()
-        home.look_at = center + depth * pose[:3, 2]
-        home.up = run.up()
-
-
-def _serve(host: str, port: int, title: str) -> viser.ViserServer:
-    try:
-        import viser
-    except ImportError:
-        raise OptionError(
-            "the web viewer needs viser, which is not installed; pip install 'gvtools[web]', or "
-            "use --open3d"
-        ) from None
-
-    class Server(viser.ViserServer):
-        """Does not offer itself to the world, whatever a page asks for."""
-
-        def request_share_url(self, verbose: bool = True) -> str | None:
-            return None
-
-    # The server itself would look for a free port for ever.
-    try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.create_server((host, 0), family=family):
-            pass
-    except OSError as error:
-        raise OptionError(
-            f"--host {host}: cannot listen there ({error.strerror or error}); expected an address "
-            "of this machine"
-        ) from None
-    # It announces itself; the command that starts it says more.
-    with redirect_stdout(io.StringIO()):
-        server = Server(host=host, port=port, label=title, verbose=False)
-    server.gui.configure_theme(show_logo=False, show_share_button=False)
-    return server
+        """Where a page starts, and returns to."""
+        home_view = self.server.initial_camera
+        home_view.position, home_view.look_at = home(self.run, self.frame)
+        home_view.up = self.run.up()
+        home_view.fov = FIELD_OF_VIEW

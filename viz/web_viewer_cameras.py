@@ -14,6 +14,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import GvError
 from viz.palette import COLORS, RED
 from viz.run_view import CONTEXT, TARGET, TRUTH, RunView, ShownCamera
+from viz.web_viewer_frame import TYPICAL, PageFrame
 
 if TYPE_CHECKING:
     import viser
@@ -34,11 +35,13 @@ class CameraNodes:
 
     Args:
         server: that shows them.
+        frame: to show them in.
         on_click: told which camera was clicked, and by whom.
     """
 
-    def __init__(self, server: viser.ViserServer, on_click: Clicked) -> None:
+    def __init__(self, server: viser.ViserServer, frame: PageFrame, on_click: Clicked) -> None:
         self._server = server
+        self._frame = frame
         self._on_click = on_click
         self._nodes: dict[tuple[str, str, int], viser.CameraFrustumHandle] = {}
         self._marked: tuple[str, str, int] | None = None
@@ -65,7 +68,10 @@ class CameraNodes:
             node.visible = self._shows(kind, round)
 
     def enter(self, position: NDArray[np.float64]) -> None:
-        """Hide all frusta from a viewer who goes to (3,) ``position``, until they have left it."""
+        """Hide all frusta from a viewer who goes to (3,) ``position``, until they have left it.
+
+        Of the page, as that of ``moved``.
+        """
         self._inside, self._arrived = position, False
         self.show(self._round)
 
@@ -105,15 +111,15 @@ class CameraNodes:
     def _add(self, run: RunView, shown: ShownCamera) -> viser.CameraFrustumHandle:
         camera = shown.camera
         width, height = int(camera.width[0]), int(camera.height[0])
-        wxyz, position = placement(camera, run)
-        self._depth = SHARE * run.typical_depth * min(1.0, (MANY / len(run.cameras)) ** 0.5)
+        wxyz, position = self._frame.placement(camera)
+        self._depth = SHARE * TYPICAL * min(1.0, (MANY / len(run.cameras)) ** 0.5)
         node = self._server.scene.add_camera_frustum(
             f"/cameras/{shown.kind}/{len(self._nodes):05d}",
             fov=vertical_field_of_view(camera),
             aspect=width / height,
             scale=self._depth,
             thickness=0.02 * self._depth,
-            color=_rgb(KINDS[shown.kind]),
+            color=_rgb(RED if _key(shown) == self._marked else KINDS[shown.kind]),
             wxyz=wxyz,
             position=position,
             visible=self._shows(shown.kind, shown.round),
@@ -148,32 +154,35 @@ class CameraNodes:
                 self._nodes[_key(shown)].image = thumbnail(picture, THUMBNAIL)
 
 
-def fly_to(client: viser.ClientHandle, camera: Cameras, run: RunView) -> None:
-    """Move a client's camera to where a camera of the run stands, within half a second."""
+def fly_to(
+    client: viser.ClientHandle, camera: Cameras, frame: PageFrame, *, goes_on: Callable[[], bool]
+) -> None:
+    """Move a client's camera to where a camera of the run stands, within half a second.
+
+    Args:
+        client: whose.
+        camera: a batch of one.
+        frame: of the page.
+        goes_on: asked before each step; False ends the flight.
+    """
     from viser.transforms import SO3
 
-    wxyz, position = placement(camera, run)
+    wxyz, position = frame.placement(camera)
     start, goal = SO3(np.array(client.camera.wxyz)), SO3(wxyz)
     turn = (start.inverse() @ goal).log()
     origin = np.array(client.camera.position)
-    client.camera.fov = vertical_field_of_view(camera)
+    field_of_view = vertical_field_of_view(camera)
     for step in range(1, FLIGHT_STEPS + 1):
+        if not goes_on():
+            return
         share = step / FLIGHT_STEPS
         share = share * share * (3 - 2 * share)
         with client.atomic():
+            client.camera.fov = field_of_view
             client.camera.wxyz = (start @ SO3.exp(share * turn)).wxyz
             client.camera.position = (1 - share) * origin + share * position
         client.flush()
         time.sleep(FLIGHT_SECONDS / FLIGHT_STEPS)
-
-
-def placement(camera: Cameras, run: RunView) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (4,) as w, x, y, z and position (3,) of a camera in the viewer's frame."""
-    from viser.transforms import SO3
-
-    pose = camera.world_from_cam[0]
-    wxyz = np.asarray(SO3.from_matrix(pose[:3, :3]).wxyz, np.float64)
-    return wxyz, pose[:3, 3] - run.memory.origin
 
 
 def vertical_field_of_view(camera: Cameras) -> float:

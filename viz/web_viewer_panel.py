@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gvtools.errors import GvError
 from viz.point_colors import MODES, VIRIDIS, Legend
-from viz.run_view import CONTEXT, TARGET, TRUTH, RunView, ShownCamera
+from viz.run_view import CONTEXT, TARGET, RunView, ShownCamera
 from viz.run_view_detail import Detail
-from viz.web_viewer_cameras import KINDS, thumbnail
+from viz.web_viewer_cameras import KINDS
+from viz.web_viewer_pictures import ShownPictures
 
 if TYPE_CHECKING:
     import viser
@@ -23,11 +23,9 @@ if TYPE_CHECKING:
 NO_CAMERA = "none"
 # As points, or as the project's splatter renders the viewer's own view.
 LOOKS = ("points", "splats")
-# Of the pictures that stand side by side, in order.
-SHOWN = ("guidance", "completion", TRUTH)
-PICTURE_SIDE = 640
-PICTURES_WIDTH = 760
-GAP = 8
+# Of the panel with the selected camera's pictures, CSS pixels: a little over half of the scene in a
+# window of 1280. It can be moved, made larger and folded away.
+PICTURES_WIDTH = 500
 
 
 class Panel:
@@ -143,7 +141,7 @@ class Panel:
         if self._drawn.edge:
             lines.append(f"{drawn:,} points drawn, one a cell of {self._drawn.edge:.3g}")
         if not run.whole:
-            lines.append(f"round {run.last_round + 1} of {(run.planned or 1) - 1} is at work")
+            lines.append(f"not finished: {run.last_round} of {(run.planned or 1) - 1} rounds done")
         self._counts.content = _small("<br>".join(lines))
 
     def set_legend(self, legend: Legend) -> None:
@@ -164,30 +162,15 @@ class Panel:
         if _label(shown) in self._by_label:
             _set(self._camera, _label(shown))
 
-    def set_pictures(self, run: RunView, shown: ShownCamera) -> None:
+    def set_pictures(self, pictures: ShownPictures) -> None:
         """Show what there is to see of a camera."""
-        title = f"<b>{escape(shown.name)}</b>, {shown.kind}, round {shown.round}"
-        if shown.coverage is not None:
-            before, after = (f"{100 * share:.1f} %" for share in shown.coverage)
-            title += f", coverage {before} before the round, {after} after it"
-        try:
-            pictures = run.pictures(shown)
-        except GvError as error:
-            pictures = {}
-            title += f"<br>{escape(str(error))}"
-        there = [name for name in SHOWN if name in pictures]
-        absent = [name for name in SHOWN if name not in pictures and shown.kind == TARGET]
-        if absent:
-            title += f"<br>not there: {', '.join(absent)}"
-        names = {TRUTH: "given picture"} if shown.kind == CONTEXT else {}
-        if there:
-            self._strip.image = side_by_side([pictures[name] for name in there])
-        self._strip.visible = bool(there)
+        if pictures.row is not None:
+            self._strip.image = pictures.row
+        self._strip.visible = pictures.row is not None
         cells = "".join(
-            f'<span style="flex:1;text-align:center">{names.get(name, name)}</span>'
-            for name in (*there, *[""] * (len(SHOWN) - len(there)))
+            f'<span style="flex:1;text-align:center">{name}</span>' for name in pictures.names
         )
-        self._caption.content = _small(f'{title}<div style="display:flex">{cells}</div>')
+        self._caption.content = _small(f'{pictures.title}<div style="display:flex">{cells}</div>')
         self._pictures.visible = True
 
     def set_note(self, text: str) -> None:
@@ -206,28 +189,6 @@ class Panel:
                 client.add_notification("No PLY", str(error), color="red")
                 return
         client.send_file_download(path.name, content, save_immediately=True)
-
-
-def side_by_side(pictures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Up to three pictures (H, W, 3) in a row of three, as high as the first.
-
-    Small ones are enlarged by a whole factor, so that the row fills its panel.
-    """
-    small = [thumbnail(picture, PICTURE_SIDE) for picture in pictures]
-    factor = -(-PICTURES_WIDTH // (len(SHOWN) * small[0].shape[1]))
-    first = small[0].repeat(factor, axis=0).repeat(factor, axis=1)
-    height = len(first)
-    cells = [first, *(_of_height(picture, height) for picture in small[1:])]
-    cells += [np.full_like(first, 255)] * (len(SHOWN) - len(cells))
-    gap = np.full((height, GAP, 3), 255, np.uint8)
-    return np.concatenate([part for cell in cells for part in (cell, gap)][:-1], axis=1)
-
-
-def _of_height(picture: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:
-    from PIL import Image
-
-    width = max(1, round(picture.shape[1] * height / picture.shape[0]))
-    return np.array(Image.fromarray(picture).resize((width, height), Image.Resampling.NEAREST))
 
 
 def _set(control: Any, value: object) -> None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from viz.run_view import RunView
 from viz.run_view_detail import Detail
+from viz.web_viewer_frame import PageFrame
 
 if TYPE_CHECKING:
     import viser
@@ -19,10 +20,12 @@ class PointNodes:
 
     Args:
         server: that shows them.
+        frame: to show them in.
     """
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, frame: PageFrame) -> None:
         self._server = server
+        self._frame = frame
         self._nodes: dict[int, viser.PointCloudHandle] = {}
         # Per round, places within ``rows``.
         self._places: dict[int, NDArray[np.int64]] = {}
@@ -55,9 +58,9 @@ class PointNodes:
             local = np.stack([records.x[rows], records.y[rows], records.z[rows]], axis=1)
             self._nodes[number] = self._server.scene.add_point_cloud(
                 f"/points/round_{number:03d}",
-                local @ memory.frame.axes.T.astype(np.float32),
+                self._frame.points(local),
                 rgb[places],
-                point_size=self.size * self._scale,
+                point_size=self._point_size(),
                 point_shape="square",
                 point_shading="flat",
                 precision="float32",
@@ -89,7 +92,10 @@ class PointNodes:
         """Draw points ``scale`` times their spacing wide."""
         self._scale = scale
         for node in self._nodes.values():
-            node.point_size = self.size * scale
+            node.point_size = self._point_size()
+
+    def _point_size(self) -> float:
+        return self._frame.scale * self.size * self._scale
 
     def drawn(self, number: int) -> int:
         """How many points are drawn of the rounds up to ``number``."""

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gvtools.cameras import Cameras
 from gvtools.errors import GvError
 from viz.run_view import RunView
 from viz.run_view_render import RunRenderer, picture_of
+from viz.web_viewer_frame import PageFrame
 
 if TYPE_CHECKING:
     import viser
 
 # Longer side of a rendered picture, pixels.
 LONGEST = 960
-# The client's depth maps end there; what lies behind is drawn there.
+# The page's depth maps end there, in its units; what lies behind is drawn there.
 FARTHEST = 167.0
 
 
@@ -26,10 +26,12 @@ class SplatLook:
 
     Args:
         server: whose clients look.
+        frame: that they look in.
     """
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, frame: PageFrame) -> None:
         self._server = server
+        self._frame = frame
         self._renderer: RunRenderer | None = None
         self._round, self._mode, self._on = 0, "color", False
         self._asked = threading.Event()
@@ -86,7 +88,7 @@ class SplatLook:
         renderer, number, mode = self._renderer, self._round, self._mode
         if renderer is None:
             return
-        camera = client_camera(client, renderer.run)
+        camera = self._frame.client_camera(client, longest=LONGEST)
         state = (number, mode, id(renderer), camera.K.tobytes(), camera.cam_from_world.tobytes())
         if self._seen.get(client.client_id) == state:
             return
@@ -96,24 +98,7 @@ class SplatLook:
         except GvError as error:
             client.add_notification("Not rendered", str(error), color="red")
             return
-        depth = np.where(guidance.valid[0], guidance.depth[0], FARTHEST)
+        depth = np.where(guidance.valid[0], self._frame.scale * guidance.depth[0], FARTHEST)
         client.scene.set_background_image(
             picture_of(guidance), format="jpeg", jpeg_quality=90, depth=np.minimum(depth, FARTHEST)
         )
-
-
-def client_camera(client: viser.ClientHandle, run: RunView) -> Cameras:
-    """A client's camera in the run's frame: a batch of one of at most LONGEST pixels a side."""
-    from viser.transforms import SO3
-
-    seen = client.camera
-    factor = min(1.0, LONGEST / max(seen.image_width, seen.image_height, 1))
-    width = max(1, round(seen.image_width * factor))
-    height = max(1, round(seen.image_height * factor))
-    focal = height / (2 * np.tan(seen.fov / 2))
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    rotation = SO3(np.array(seen.wxyz)).as_matrix().T
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = -rotation @ (np.array(seen.position) + run.memory.origin)
-    return Cameras(K[None], pose[None], np.array([width]), np.array([height]), ("viewer",))

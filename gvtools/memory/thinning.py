@@ -33,6 +33,9 @@ class Thinned:
 def thinned(memory: SpatialMemory, max_points: int | None) -> Thinned:
     """One point per voxel; voxels grow from the memory's own until at most ``max_points`` remain.
 
+    Larger ones are counted from the points' least corner: around the origin eight of them would
+    stay apart however large they are.
+
     Args:
         memory: with at least one observation.
         max_points: at least 1; None keeps the memory's voxels.
@@ -40,10 +43,10 @@ def thinned(memory: SpatialMemory, max_points: int | None) -> Thinned:
     positions = memory.records.position.astype(np.float64)
     # The most confident first; of equals, the earlier observation.
     order = np.argsort(-memory.confidence, kind="stable")
-    edge = memory.voxel
+    edge, corner = memory.voxel, np.zeros(3)
     while True:
         # Times the inverse, as the memory counts its voxels.
-        cells = np.floor(positions * (1.0 / edge)).astype(np.int64)
+        cells = np.floor((positions - corner) * (1.0 / edge)).astype(np.int64)
         cells -= cells.min(axis=0)
         if int(cells.max()) < 1 << KEY_BITS:
             keys = (cells[:, 0] << (2 * KEY_BITS)) | (cells[:, 1] << KEY_BITS) | cells[:, 2]
@@ -53,6 +56,7 @@ def thinned(memory: SpatialMemory, max_points: int | None) -> Thinned:
             edge *= max(1.1, float(np.sqrt(len(first) / max_points)))
         else:
             edge *= 2.0
+        corner = positions.min(axis=0)
     # Points in the order of their observations, so that equal memories give equal files.
     rank = np.argsort(order[first], kind="stable")
     place = np.empty(len(rank), np.int64)

@@ -13,6 +13,8 @@ from pipelines.tradeoffs.outcome import Outcome, front
 from viz.pareto import TradeOff
 
 FILE = "tradeoff.json"
+# What tells one project from another, of a run's identity.
+PROJECT = ("project", "reading")
 
 
 def trial_point(label: str, outcome: Outcome, targets: int) -> dict[str, Any]:
@@ -33,14 +35,32 @@ def trial_point(label: str, outcome: Outcome, targets: int) -> dict[str, Any]:
     }
 
 
-def read_trade_off(file: Path) -> TradeOff:
+def project_of(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """What a sweep remembers of its project.
+
+    Args:
+        identity: of a run, as run.json holds it.
+    """
+    return {key: identity[key] for key in PROJECT}
+
+
+def read_trade_off(file: Path, *, of: Mapping[str, Any] | None = None) -> TradeOff | None:
     """The sweep of a tradeoff.json.
+
+    Args:
+        file: the JSON.
+        of: identity of the run whose project is to be the sweep's; None takes any.
+
+    Returns:
+        None where it is the sweep of another project.
 
     Raises:
         ProjectError: it cannot be read, or is of another version.
     """
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
+        if of is not None and {key: found[key] for key in PROJECT} != project_of(of):
+            return None
         targets = int(found["targets"])
         share = max(entry["share"] for entry in found["trials"])
         entries = [entry for entry in found["trials"] if entry["share"] == share]
