@@ -97,7 +97,7 @@ def fill_depth(
     # Index -1, no hit, marks the extra last entry.
     rim = np.flatnonzero(touched[:-1])
     plane_of.reshape(-1)[rim] = np.arange(len(rim), dtype=np.int32)
-    spread, distance = np.zeros(depth.shape), rim_distance(known).astype(np.float64)
+    spread, distance = np.zeros(depth.shape), rim_distance(known)
     if not len(rim):
         return HoleDepth(inverse, hits, np.zeros((0, 5)), plane_of, spread, distance, 0)
     slope = math.tan(math.radians(steepest_deg)) / focal

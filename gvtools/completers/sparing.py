@@ -65,7 +65,8 @@ def sparing(completer: Completer, minor: float, one_step: float = 0.0) -> Comple
         one_step: passes whose holes reach no farther take one step, where the completer makes
             several; 0 leaves them all.
     """
-    if one_step > 0 and is_dataclass(completer) and hasattr(completer, "one_step_holes"):
+    # What the completer was told itself stands: only a 0 is replaced.
+    if one_step > 0 and is_dataclass(completer) and getattr(completer, "one_step_holes", 1) == 0:
         completer = replace(completer, one_step_holes=one_step)
     if minor > 0 and getattr(completer, "costly", False):
         return SparingCompleter(completer, minor)

@@ -1,4 +1,4 @@
-"""Push-pull filling of holes, in torch: averages of the known pixels, coarse to fine.
+"""Filled projections, and push-pull filling in torch: averages of known pixels, coarse to fine.
 
 Of use where a network should see a plausible picture instead of black holes. (Gortler et al. 1996,
 The Lumigraph.)
