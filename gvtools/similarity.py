@@ -283,8 +283,10 @@ def align_depth_scale(
     ratio = np.log(reference[mask]) - np.log(depth[mask])
     weight = weight[mask] / weight[mask].max()
     weight /= weight.sum()
-    center = _weighted_median(ratio, weight)
-    for _ in range(20):
+    # A completer that leaves the known pixels alone has a depth equal to the memory's.
+    equal = not ratio.any()
+    center = 0.0 if equal else _weighted_median(ratio, weight)
+    for _ in range(0 if equal else 20):
         gap = np.abs(ratio - center)
         # 1.4826 · median is the standard deviation of a normal core; Tukey's 4.685 keeps 95 %
         # of its efficiency. The floor keeps exact data from dividing by zero.
@@ -298,7 +300,7 @@ def align_depth_scale(
         deviation, scale = np.abs(np.expm1(ratio - center)), float(np.exp(center))
     inlier = deviation <= inlier_band
     share = float(weight[inlier].sum())
-    residual = _weighted_median(deviation, weight)
+    residual = 0.0 if equal else _weighted_median(deviation, weight)
     reason = ""
     if share < min_inlier_share:
         reason = f"{share:.0%} of the pixels agree within {inlier_band:.0%}, " + (

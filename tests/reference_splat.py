@@ -53,9 +53,15 @@ class Reference:
 
     def run(self) -> Guidance:
         if self._rank_views():
-            self._tiers()
-            if self.options.occluders:
-                self._occluders()
+            self.tiers = self._ranked_tiers()
+            for tier in self.tiers:
+                if tier[0] in self.observed:
+                    self._tier(tier)
+            if self.observed and self.options.occluders:
+                self._occluders(self.tiers[0])
+            for tier in self.tiers:
+                if tier[0] in self.made:
+                    self._tier(tier)
         return Guidance(
             self.camera,
             self.rgb[None].astype(np.float32),
@@ -132,21 +138,23 @@ class Reference:
             run, runs.view[run],
         )  # fmt: skip
 
-    def _tiers(self) -> None:
+    def _ranked_tiers(self) -> list[list[int]]:
         """Tiers of views, nearest first, twice as many each time; observed and generated apart."""
         size = self.options.nearest_views
-        self.first: list[int] = []
+        tiers = []
         for ranked in (self.observed, self.made):
             at = 0
             while at < len(ranked):
-                tier = ranked[at : at + size]
-                self.first = self.first or tier
+                tiers.append(ranked[at : at + size])
                 at += size
                 size *= 2
-                chosen = np.isin(self.points.view, tier) & np.isin(self.points.run, self.seen)
-                limit = np.where(self.valid, 0, np.inf)
-                weight = self._proximity(min(self.distance[i] for i in tier))
-                self._write(chosen, limit, ~self.valid, weight)
+        return tiers
+
+    def _tier(self, tier: list[int]) -> None:
+        chosen = np.isin(self.points.view, tier) & np.isin(self.points.run, self.seen)
+        limit = np.where(self.valid, 0, np.inf)
+        weight = self._proximity(min(self.distance[i] for i in tier))
+        self._write(chosen, limit, ~self.valid, weight)
 
     def _proximity(self, nearest: float) -> np.ndarray:
         return np.exp(-self.options.proximity * (self.distance - nearest))
@@ -188,8 +196,8 @@ class Reference:
         self.generated[done] = made[done] > 0.5 * total[done]
         self.valid |= done
 
-    def _occluders(self) -> None:
-        """Observed things clearly in front, unless a first-tier view saw their place free."""
+    def _occluders(self, first: list[int]) -> None:
+        """Observed things clearly in front, unless a view of tier ``first`` saw their place free."""
         p, K, memory = self.points, self.camera.K[0], self.memory
         margin = 1 - 2 * self.options.band
         sampled = np.zeros(len(p.z), bool)
@@ -198,13 +206,13 @@ class Reference:
             sampled[start : start + memory.runs.length[r] : SAMPLE] = True
         col, row = np.floor(p.u + 0.5), np.floor(p.v + 0.5)
         sampled &= (col >= 0) & (col < self.width) & (row >= 0) & (row < self.height) & (p.z > 0)
-        sampled &= ~np.isin(p.view, self.first) & ~memory.views.generated[p.view]
+        sampled &= ~np.isin(p.view, first) & ~memory.views.generated[p.view]
         at = np.flatnonzero(sampled)
         front = p.z[at] < margin * self.depth[row[at].astype(int), col[at].astype(int)]
         n = len(p.z)
         front &= ~in_free_space(
             memory.records.position[:n][at],
-            memory.observed_grids(self.first),
+            memory.observed_grids(first),
             tolerance=memory.options.free_space_tolerance,
         )
         chosen = np.isin(p.run, p.run[at[front]])
@@ -218,7 +226,7 @@ class Reference:
         world = (local - pose[:3, 3]) @ pose[:3, :3]
         free = in_free_space(
             (world - memory.origin).astype(np.float32),
-            memory.observed_grids(self.first),
+            memory.observed_grids(first),
             tolerance=memory.options.free_space_tolerance,
         )
         keep[keep] = ~free
@@ -230,6 +238,6 @@ class Reference:
                 if keep[square].all():
                     opened[square] = True
         if opened.any():
-            nearest = min(self.distance[i] for i in self.observed + self.made)
+            nearest = min(self.distance[i] for i in self.observed)
             limit = np.where(opened, margin * self.depth, 0)
             self._write(chosen, limit, opened, self._proximity(nearest))

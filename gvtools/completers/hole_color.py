@@ -42,23 +42,24 @@ def fill_color(
     Returns:
         (H, W, 3) float32; 0 where no depth was filled.
     """
-    result = np.where(known[..., None], rgb, np.float32(0)).astype(np.float64)
+    filled = np.where(known[..., None], rgb, np.float32(0))
     holes = np.flatnonzero(~known & (surface.inverse > 0))
     if not len(holes):
-        return result.astype(np.float32)
+        return filled
+    result = filled.astype(np.float64)
     _seed_colors(
         result, holes, surface.inverse, surface.hits, surface.planes, surface.plane_of, DIRECTIONS
     )
     hint, weight = np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32)
     if evidence is not None:
         hint, weight = evidence
-        share = (weight / (1 + weight))[..., None]
-        result = np.where(known[..., None], result, result * (1 - share) + hint * share)
+        share = (weight.ravel()[holes] / (1 + weight.ravel()[holes]))[:, None]
+        seeds = result.reshape(-1, 3)
+        seeds[holes] = seeds[holes] * (1 - share) + hint.reshape(-1, 3)[holes] * share
     neighbors, links = _links(holes, surface.inverse)
     _relax(result.reshape(-1, 3), holes, neighbors, links, hint.reshape(-1, 3), weight.ravel(),
            sweeps)  # fmt: skip
-    filled = np.clip(result, 0, 1).astype(np.float32)
-    filled[known] = rgb[known]
+    filled.reshape(-1, 3)[holes] = np.clip(result.reshape(-1, 3)[holes], 0, 1)
     return filled
 
 

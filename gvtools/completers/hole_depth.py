@@ -93,7 +93,7 @@ def fill_depth(
     hits = _first_hits(known, DIRECTIONS)
     plane_of = np.full(depth.shape, -1, np.int32)
     touched = np.zeros(known.size + 1, bool)
-    touched[hits[:, ~known]] = True
+    touched[hits.reshape(len(hits), -1)[:, np.flatnonzero(~known)]] = True
     # Index -1, no hit, marks the extra last entry.
     rim = np.flatnonzero(touched[:-1])
     plane_of.reshape(-1)[rim] = np.arange(len(rim), dtype=np.int32)

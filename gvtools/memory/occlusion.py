@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
 from gvtools.memory.back_projection import FREE_CELL
 from gvtools.memory.compiled import compiled
+
+# K (3, 3), cam_from_world (4, 4) and free-space grid (h, w) of one view (see PointSet).
+FreeGrid = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]
 
 
 @compiled()
@@ -40,19 +45,25 @@ def seen_through(x, y, z, K, cam_from_world, free_depth, tolerance):
     return depth < free_depth[np.int64(row), np.int64(column)] * (1 - tolerance)
 
 
+# Views that are looked at in one call: a call costs as much as some thousand points.
+TOGETHER = 32
+
+
 @compiled(parallel=True)
-def _mark(positions, K, cam_from_world, free_depth, tolerance, out):
+def _mark(positions, K, cam_from_world, grids, tolerance, out):
     for i in prange(len(positions)):
-        if not out[i]:
+        for t in range(len(grids)):
+            if out[i]:
+                break
             out[i] = seen_through(
                 positions[i, 0], positions[i, 1], positions[i, 2],
-                K, cam_from_world, free_depth, tolerance,
+                K[t], cam_from_world[t], grids[t], tolerance,
             )  # fmt: skip
 
 
 def in_free_space(
     positions: NDArray[np.float32],
-    views: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]],
+    views: Sequence[FreeGrid],
     *,
     tolerance: float,
 ) -> NDArray[np.bool_]:
@@ -60,15 +71,25 @@ def in_free_space(
 
     Args:
         positions: (N, 3) float32, scene units.
-        views: per observed view K (3, 3), cam_from_world (4, 4) in the positions' frame and its
-            free-space grid (h, w) (see PointSet).
+        views: observed ones, their cam_from_world in the positions' frame.
         tolerance: relative margin that depth noise is allowed.
 
     Returns:
         (N,) bool.
     """
     out = np.zeros(len(positions), np.bool_)
-    for K, cam_from_world, free_depth in views:
-        if free_depth.size:
-            _mark(positions, K, cam_from_world, free_depth, tolerance, out)
+    for first in range(0, len(views), TOGETHER):
+        _mark(positions, *stacked(views[first : first + TOGETHER]), tolerance, out)
     return out
+
+
+def stacked(
+    grids: Sequence[FreeGrid],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
+    """K (T, 3, 3), cam_from_world (T, 4, 4) and the grids (T, h, w), padded with 0 = unknown."""
+    shape = np.max([(1, 1), *(grid.shape for _, _, grid in grids)], axis=0)
+    stack = np.zeros((len(grids), *shape), np.float32)
+    for row, (_, _, grid) in zip(stack, grids, strict=True):
+        row[: grid.shape[0], : grid.shape[1]] = grid
+    K = np.array([K for K, _, _ in grids]).reshape(-1, 3, 3)
+    return K, np.array([M for _, M, _ in grids]).reshape(-1, 4, 4), stack

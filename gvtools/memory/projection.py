@@ -2,9 +2,9 @@
 
 Views near the target know best how it looks from there, so observations are splatted in tiers,
 nearest views first, and a later tier writes only pixels that are still open; runs whose rectangle
-holds no open pixel are not touched at all. Generated views come in tiers of their own after all
-observed ones. Last, what observed views of later tiers know to stand clearly in front is let
-through, unless a view of the first tier saw that space to be free.
+holds no open pixel are not touched at all. Then what observed views of later tiers know to stand
+clearly in front is let through, unless a view of the first tier saw that space to be free. Last
+come generated views, in tiers of their own: they fill what is open still.
 
 Which runs go into which pixels is decided here; a back end (``Splatter``) does the splatting.
 """
@@ -21,6 +21,7 @@ from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, together
 from gvtools.memory import culling
+from gvtools.memory.occlusion import stacked
 from gvtools.memory.splat import ONE_PIXEL, SplatOptions, Splatter, Target
 
 if TYPE_CHECKING:
@@ -72,22 +73,37 @@ def project(
 
         return project_one_pixel(memory, cameras, open3d=options.backend == "open3d")
     splatter = _splatter(memory, options)
-    return together([_Projection(memory, c, options, splatter).run() for c in cameras])
+    views = []
+    for camera in cameras:
+        projection = _Projection(memory, camera, options, splatter)
+        projection.observe()
+        views.append(projection.guidance())
+    return together(views)
 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What the observed tiers alone wrote of a camera's images; see Target."""
+    """What observed views show of a camera; nothing generated changes it.
+
+    Attributes:
+        rgb: see Target, as the others of its images.
+        scale: typical depth, scene units; 0 where no observed view shows anything.
+        tiers: how many tiers of views there are.
+        size: of the next one.
+    """
 
     rgb: NDArray[np.float32]
     depth: NDArray[np.float32]
     valid: NDArray[np.bool_]
     confidence: NDArray[np.float32]
+    scale: float
+    tiers: int
+    size: int
 
 
 def project_again(
     memory: SpatialMemory, camera: Cameras, observed: Observed | None, *, options: SplatOptions
-) -> tuple[Guidance, Observed | None]:
+) -> tuple[Guidance, Observed]:
     """``project`` into one camera, and what the observed views show there.
 
     Args:
@@ -98,12 +114,15 @@ def project_again(
         options: of a back end that blends.
 
     Returns:
-        The same guidance, to the bit, as ``project`` gives, and what the observed views show;
-        None where they show nothing.
+        The same guidance, to the bit, as ``project`` gives, and what the observed views show.
     """
     check_usable(camera)
     projection = _Projection(memory, camera, options, _splatter(memory, options))
-    return projection.run(observed, keep=True), projection.observed
+    if observed is None:
+        observed = projection.observe()
+    else:
+        projection.take_over(observed)
+    return projection.guidance(), observed
 
 
 def _splatter(memory: SpatialMemory, options: SplatOptions) -> Splatter:
@@ -117,7 +136,7 @@ def _splatter(memory: SpatialMemory, options: SplatOptions) -> Splatter:
 
 
 class _Projection:
-    """The steps that write one target camera's images."""
+    """The steps that write one target camera's images: what was observed, then the rest."""
 
     def __init__(
         self, memory: SpatialMemory, camera: Cameras, options: SplatOptions, splatter: Splatter
@@ -138,30 +157,33 @@ class _Projection:
             np.zeros(shape, np.float32),
             np.zeros(shape, np.bool_),
         )
-        self.observed: Observed | None = None
+        self.scale, self.tiers, self.size = 0.0, 0, options.nearest_views
+        self.tier = np.full(len(memory.views), -1)
 
-    def run(self, observed: Observed | None = None, *, keep: bool = False) -> Guidance:
-        """The images.
-
-        Args:
-            observed: what the observed tiers write, where that is known.
-            keep: leave a copy of that in ``observed``.
-        """
-        t = self.target
-        if self._cull():
-            tiers, split = self._tiers()
-            if observed is None:
-                self._splat_tiers(tiers[:split], 0)
-            else:
-                t.rgb[:], t.depth[:] = observed.rgb, observed.depth
-                t.valid[:], t.confidence[:] = observed.valid, observed.confidence
-            if keep:
-                self.observed = observed or Observed(
-                    t.rgb.copy(), t.depth.copy(), t.valid.copy(), t.confidence.copy()
-                )
-            self._splat_tiers(tiers[split:], split)
+    def observe(self) -> Observed:
+        """Write what observed views show; a copy of it."""
+        if self._select(generated=False):
+            self._splat_tiers()
             if self.options.occluders:
                 self._splat_occluders()
+        t = self.target
+        images = (image.copy() for image in (t.rgb, t.depth, t.valid, t.confidence))
+        return Observed(*images, self.scale, self.tiers, self.size)
+
+    def take_over(self, observed: Observed) -> None:
+        """Write what observed views show, as an earlier projection found it."""
+        t = self.target
+        t.rgb[:], t.depth[:] = observed.rgb, observed.depth
+        t.valid[:], t.confidence[:] = observed.valid, observed.confidence
+        self.tiers, self.size = observed.tiers, observed.size
+        if observed.scale:
+            self._set_scale(observed.scale)
+
+    def guidance(self) -> Guidance:
+        """The images, after what was generated has been written where nothing was observed."""
+        t = self.target
+        if self.memory.views.generated.any() and self._select(generated=True):
+            self._splat_tiers()
         return Guidance(
             self.camera,
             t.rgb[None],
@@ -171,8 +193,13 @@ class _Projection:
             t.generated[None],
         )
 
-    def _cull(self) -> bool:
-        """Find the runs in view and rank the views that they come from."""
+    def _set_scale(self, scale: float) -> None:
+        self.scale = scale
+        self.target.near = np.float32(min(NEAREST * scale, self.memory.voxel))
+        self.target.unit = np.float32(np.ldexp(1.0, int(np.frexp(scale)[1])))
+
+    def _select(self, *, generated: bool) -> bool:
+        """Find the runs in view, of one kind, and rank the views that they come from."""
         memory, runs, target = self.memory, self.memory.runs, self.target
         self.z_range = np.empty((runs.count, 2), np.float32)
         groups = np.arange(runs.groups)
@@ -181,24 +208,20 @@ class _Projection:
         rows = groups[group_rect[:, 1] >= 0, None] * runs.GROUP + np.arange(runs.GROUP)
         rows = rows.ravel()
         rows = rows[rows < runs.count]
+        rows = rows[memory.views.generated[runs.view[rows]] == generated]
         self._cull_boxes(runs.box, rows, target.rect, self.z_range)
         self.seen = rows[target.rect[rows, 1] >= 0]
         if not len(self.seen):
             return False
         # Of what was observed where there is any: it must not hang on what was added to it.
-        far = self.z_range[self.seen, 1]
-        made = memory.views.generated[runs.view[self.seen]]
-        scale = float(np.median(far if made.all() else far[~made]))
-        target.near = np.float32(min(NEAREST * scale, memory.voxel))
-        target.unit = np.float32(np.ldexp(1.0, int(np.frexp(scale)[1])))
-        self.distance = view_distance(memory, self.camera, scale)
+        if not self.scale:
+            self._set_scale(float(np.median(self.z_range[self.seen, 1])))
+        self.distance = view_distance(memory, self.camera, self.scale)
         present = np.bincount(
             runs.view[self.seen], runs.length[self.seen], minlength=len(memory.views)
         )
-        # Observed views come before generated ones, however near those are.
-        order = np.lexsort((self.distance, memory.views.generated))
+        order = np.argsort(self.distance, kind="stable")
         self.ranked = order[present[order] > 0]
-        self.tier = np.full(len(memory.views), -1)
         return True
 
     def _cull_boxes(
@@ -214,34 +237,24 @@ class _Projection:
             self.options.blend_reach, rect, z_range,
         )  # fmt: skip
 
-    def _tiers(self) -> tuple[list[NDArray[np.int64]], int]:
-        """The ranked views cut into tiers that double in size, and how many are of observed views.
+    def _splat_tiers(self) -> None:
+        """Nearest views first, in tiers that double in size; each writes what is still open.
 
-        Generated views come in tiers of their own.
-        """
-        made = self.memory.views.generated[self.ranked]
-        tiers: list[NDArray[np.int64]] = []
-        size, split = self.options.nearest_views, 0
-        for part in (self.ranked[~made], self.ranked[made]):
-            split = len(tiers)
-            at = 0
-            while at < len(part):
-                self.tier[part[at : at + size]] = len(tiers)
-                tiers.append(part[at : at + size])
-                at += size
-                size *= 2
-        return tiers, split
-
-    def _splat_tiers(self, tiers: list[NDArray[np.int64]], first: int) -> None:
-        """Nearest views first; each later tier writes what is still open.
-
-        ``first`` is the number of the first of these tiers.
+        Generated views come in tiers of their own, after all observed ones.
         """
         target = self.target
+        members = []
+        at, first = 0, self.tiers
+        while at < len(self.ranked):
+            members.append(self.ranked[at : at + self.size])
+            self.tier[members[-1]] = self.tiers
+            self.tiers += 1
+            at += self.size
+            self.size *= 2
         view = self.memory.runs.view[self.seen]
         open_ = np.empty(target.shape, np.bool_)
         limit = np.empty(target.shape, np.float32)
-        for number, members in enumerate(tiers, first):
+        for number, views in enumerate(members, first):
             culling.still_open(target.valid, open_, limit)
             chosen = self.seen[self.tier[view] == number]
             table = None
@@ -250,7 +263,7 @@ class _Projection:
                 if not table[-1, -1]:
                     return
                 chosen = culling.touching(target.rect, table, chosen)
-            self._write(chosen, limit, open_, members=members, table=table)
+            self._write(chosen, limit, open_, members=views, table=table)
 
     def _write(
         self,
@@ -273,15 +286,14 @@ class _Projection:
 
         A view of the first tier may have looked past an object that only others saw. Where a
         first-tier view saw the object's place to be free, the object is noise or has moved.
-        Generated content is never let through: it must not stand before what was observed.
         """
         memory, target = self.memory, self.target
         runs, records, K = memory.runs, memory.records, self.camera.K[0]
         view = runs.view[self.seen]
-        later = self.seen[(self.tier[view] != 0) & ~memory.views.generated[view]]
+        later = self.seen[self.tier[view] != 0]
         if not len(later):
             return
-        seen_free = _stacked(memory.observed_grids(np.flatnonzero(self.tier == 0)))
+        seen_free = stacked(memory.observed_grids(np.flatnonzero(self.tier == 0)))
         tolerance = memory.options.free_space_tolerance
         chosen = culling.in_front(
             later, runs.start, runs.length, target.rect, self.z_range,
@@ -301,17 +313,4 @@ class _Projection:
         if table[-1, -1]:
             chosen = culling.touching(target.rect, table, chosen)
             limit = np.where(front, limit, np.float32(0))
-            observed = self.ranked[~memory.views.generated[self.ranked]]
-            self._write(chosen, limit, front, members=observed, table=table)
-
-
-def _stacked(
-    grids: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
-    """K (T, 3, 3), cam_from_local (T, 4, 4) and the grids (T, h, w), padded with 0 = unknown."""
-    shape = np.max([(1, 1), *(grid.shape for _, _, grid in grids)], axis=0)
-    stack = np.zeros((len(grids), *shape), np.float32)
-    for row, (_, _, grid) in zip(stack, grids, strict=True):
-        row[: grid.shape[0], : grid.shape[1]] = grid
-    K = np.array([K for K, _, _ in grids]).reshape(-1, 3, 3)
-    return K, np.array([M for _, M, _ in grids]).reshape(-1, 4, 4), stack
+            self._write(chosen, limit, front, members=self.ranked, table=table)

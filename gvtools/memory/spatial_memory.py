@@ -14,7 +14,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ShapeError
 from gvtools.memory import fusion
 from gvtools.memory.local_frame import LocalFrame
-from gvtools.memory.occlusion import in_free_space
+from gvtools.memory.occlusion import FreeGrid, in_free_space
 from gvtools.memory.points import PointSet
 from gvtools.memory.records import Records, Runs
 from gvtools.memory.views import SourceView, ViewTable
@@ -244,9 +244,7 @@ class SpatialMemory:
             out_of_reach=report.out_of_reach + unusable,
         )
 
-    def observed_grids(
-        self, rows: Iterable[int]
-    ) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]]:
+    def observed_grids(self, rows: Iterable[int]) -> list[FreeGrid]:
         """K, cam_from_local and free-space grid of the observed views among ``rows``."""
         views = self.views
         return [
