@@ -17,6 +17,7 @@ import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
@@ -26,12 +27,13 @@ from pipelines.reconstruct import reconstruct
 from pipelines.run_directory import RunDirectory
 
 # Each saving's settings when it is off.
-OFF = {
+OFF: dict[str, dict[str, Any]] = {
     "voxel edge measured": {"fusion.voxel_loss": None},
     "alike observations merged": {
         "memory.same_direction": 0.0,
         "memory.observations_per_voxel": 64,
     },
+    "four pixels a point where voxels are coarser": {"savings.joined": 0.0},
     "observed content projected once": {"savings.reuse": False},
     "small holes left to inpaint": {"savings.minor_holes": 0.0},
     "middle holes in one step": {"savings.one_step": 0.0},

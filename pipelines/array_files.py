@@ -1,6 +1,6 @@
-"""Named arrays in a file that ``numpy.load`` reads, compressed as little as pays.
+"""Named arrays in a file that ``numpy.load`` reads, compressed where it pays.
 
-Depth maps hardly get smaller with more effort, and zlib's least takes half of the time.
+Depth maps in float32 lose a fifth of their size by it, and take ten times as long to write.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ def save_arrays(target: Path | IO[bytes], **arrays: NDArray[Any]) -> None:
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive:
         for name, array in arrays.items():
             info = zipfile.ZipInfo(f"{name}.npy", ZIP_EPOCH)
-            info.compress_type = zipfile.ZIP_DEFLATED
+            if np.asarray(array).dtype.kind != "f":
+                info.compress_type = zipfile.ZIP_DEFLATED
             info._compresslevel = LEVEL  # type: ignore[attr-defined]
             with archive.open(info, "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, np.asarray(array), allow_pickle=False)

@@ -60,6 +60,8 @@ class SavingsOptions:
     Attributes:
         reuse: what observed views show of a target is not projected again after completions were
             fused; the pictures are the same.
+        joined: 2 x 2 pixels become one point, their mean, where they are together at most this many
+            voxel edges wide; 0 lifts each by itself.
         minor_holes: a view with no unknown pixel farther than this share of the image diagonal from
             a known one is left to ``inpaint`` where the completer is a costly one (geoverse,
             exemplar); 0 leaves it none.
@@ -71,12 +73,14 @@ class SavingsOptions:
     """
 
     reuse: bool = True
+    joined: float = 1.0
     minor_holes: float = 0.02
     one_step: float = 0.1
     explained: float | None = 0.9
 
     def __post_init__(self) -> None:
         check_range("savings.explained", self.explained, above=0, most=1)
+        check_range("savings.joined", self.joined, least=0)
         check_range("savings.minor_holes", self.minor_holes, least=0)
         check_range("savings.one_step", self.one_step, least=0)
 

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvtools.evaluation.view_figures import FIGURES, view_figures
-from pipelines.round_files import read_target
+from pipelines.ahead import ahead
+from pipelines.round_files import TargetFiles, read_target
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.scenes.scene import Frame, View
     from pipelines.console import Console
     from pipelines.plan import Plan
     from pipelines.run_directory import RunDirectory
@@ -31,27 +33,38 @@ def measure_run(
     """
     views: list[dict[str, Any]] = []
     reports = directory.reports()
-    for number, rows in enumerate(plan.schedule, start=1):
-        # Reports stand in the order of the rows, one entry a target.
-        entries = reports[number]["views"] if number < len(reports) else []
-        for row, entry in zip(rows, entries, strict=False):
-            truth = plan.targets.truth[row]
-            figures = {
-                "name": entry["name"],
-                "round": number,
-                "coverage": entry["coverage"],
-                "coverage_after": entry["coverage_after"],
-            }
-            if truth is not None:
-                target = read_target(directory.round_path(number), entry)
-                figures |= view_figures(
-                    target.picture,
-                    truth.load(),
-                    observed=target.observed,
-                    generated=target.generated,
-                    depth=target.depth,
-                )
-            views.append(figures)
+    # Reports stand in the order of the rows, one entry a target.
+    shown = [
+        (number, entry, plan.targets.truth[row])
+        for number, rows in enumerate(plan.schedule, start=1)
+        for row, entry in zip(
+            rows, reports[number]["views"] if number < len(reports) else [], strict=False
+        )
+    ]
+
+    def read(item: tuple[int, dict[str, Any], View | None]) -> tuple[TargetFiles, Frame] | None:
+        number, entry, truth = item
+        if truth is None:
+            return None
+        return read_target(directory.round_path(number), entry), truth.load()
+
+    for (number, entry, _), files in zip(shown, ahead(read, shown), strict=True):
+        figures = {
+            "name": entry["name"],
+            "round": number,
+            "coverage": entry["coverage"],
+            "coverage_after": entry["coverage_after"],
+        }
+        if files is not None:
+            target, truth = files
+            figures |= view_figures(
+                target.picture,
+                truth,
+                observed=target.observed,
+                generated=target.generated,
+                depth=target.depth,
+            )
+        views.append(figures)
     notes = [NO_LPIPS]
     if not any("psnr" in view for view in views):
         notes.append("no target has a true picture, so there are no image figures")

@@ -17,8 +17,9 @@ from gvtools.guidance import Guidance, together
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.followed import FollowedCamera
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
-from gvtools.scenes.scene import Scene
+from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.similarity import ScaleFit, align_depth_scale
+from pipelines.ahead import ahead
 from pipelines.config import RunConfig
 from pipelines.context_depth import KeptDepth, depth_report
 
@@ -77,13 +78,14 @@ def observe_context(
     total = FuseReport()
     dropped: dict[str, int] = {}
     reports = []
+    frames = ahead(_load, [view for view in map(scene.__getitem__, names) if source.covers(view)])
     for name in progress(names, "context views"):
         view = scene[name]
         if not source.covers(view):
             dropped["views without depth"] = dropped.get("views without depth", 0) + 1
             continue
         with clock.stage("depth"):
-            frame = view.load()
+            frame = next(frames)
             depth_map = source.depth(view, frame)
             reports.append(depth_report(scene, name, depth_map))
         with clock.stage("fuse"):
@@ -95,6 +97,7 @@ def observe_context(
                 confidence=depth_map.confidence,
                 mask=frame.mask,
                 options=config.back_projection,
+                joined=config.savings.joined * memory.voxel,
             )
             total += memory.fuse(points, round=0)
         for reason, count in points.dropped.items():
@@ -117,12 +120,15 @@ def observe_context(
     return total, dropped, reports
 
 
+def _load(view: View) -> Frame:
+    return view.load()
+
+
 def load_context(scene: Scene, names: Sequence[str], source: KeptDepth) -> list[ContextView]:
     """The context as completers see it."""
     out = []
-    for name in names:
-        view = scene[name]
-        frame = view.load()
+    views = [scene[name] for name in names]
+    for name, view, frame in zip(names, views, ahead(_load, views), strict=True):
         depth = source.depth(view, frame) if source.covers(view) else None
         out.append(
             ContextView(
@@ -261,6 +267,7 @@ def _align_and_fuse(
                 confidence=np.where(fused, confidence, np.float32(1)),
                 mask=fused,
                 options=config.back_projection,
+                joined=config.savings.joined * memory.voxel,
             )
             report = memory.fuse(points, round=number, generated=True)
     figures = {

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 # Edges that are tried, in shares of the one given.
 SCALES = (1.0, 1.5, 2.0, 3.0, 4.0)
+# The first of them.
+START = 2.0
 # Views that are predicted, and neighbours that each is predicted from.
 PROBES, NEIGHBOURS = 3, 4
 # Fewer valid pixels of a view tell nothing.
@@ -57,32 +59,57 @@ def sufficient_scale(
         return 1.0
     frames: dict[str, Frame] = {}
     probes = [(name, _nearest(scene, names, name)) for name in sampled(names, PROBES)]
-    found: dict[float, float] = {}
-    valid: list[NDArray[np.bool_]] = []
-    for scale in SCALES:
-        errors, masks = [], []
-        for name, others in probes:
-            error, mask = _predicted(scene, name, others, scale * voxel, config, frames)
-            errors.append(error)
-            masks.append(mask)
-        # On what the finest memory knows: coarser ones know more.
-        valid = valid or masks
-        figures = [
-            -10 * np.log10(max(float(error[mask].mean()), UNSEEN))
-            for error, mask in zip(errors, valid, strict=True)
-            if mask.sum() >= LEAST
+    shown: dict[float, list[tuple[NDArray[np.float32], NDArray[np.bool_]]]] = {}
+
+    def look(scale: float) -> dict[float, float]:
+        """PSNR of each scale looked at so far; none where there is too little to compare."""
+        shown[scale] = [
+            _predicted(scene, name, others, scale * voxel, config, frames)
+            for name, others in probes
         ]
-        if not figures:
+        # What the finest of these memories knows; coarser ones know more.
+        masks = [mask for _, mask in shown[min(shown)]]
+        return {at: _psnr(pairs, masks) for at, pairs in shown.items()} if _enough(masks) else {}
+
+    # Of finer edges the PSNR rises, then falls: no more are looked at than it takes to see that.
+    found = look(START)
+    for scale in [scale for scale in reversed(SCALES) if scale < START]:
+        found = look(scale)
+        if not found:
             return 1.0
-        found[scale] = float(np.mean(figures))
-        if found[scale] < max(found.values()) - loss:
+        if found[scale] < max(found.values()):
             break
+    for scale in [scale for scale in SCALES if scale > START]:
+        if not found or found[max(found)] < max(found.values()) - loss:
+            break
+        found = look(scale)
+    if not found:
+        return 1.0
     best = max(found.values())
     chosen = max(scale for scale, psnr in found.items() if psnr >= best - loss)
     if say is not None:
-        said = ", ".join(f"{scale * voxel:.3g}: {psnr:.2f} dB" for scale, psnr in found.items())
+        said = ", ".join(
+            f"{scale * voxel:.3g}: {psnr:.2f} dB" for scale, psnr in sorted(found.items())
+        )
         say(f"voxel edge by {len(probes)} context views predicted from their neighbours ({said})")
     return chosen
+
+
+def _enough(masks: Sequence[NDArray[np.bool_]]) -> bool:
+    return any(mask.sum() >= LEAST for mask in masks)
+
+
+def _psnr(
+    pairs: Sequence[tuple[NDArray[np.float32], NDArray[np.bool_]]],
+    masks: Sequence[NDArray[np.bool_]],
+) -> float:
+    """Mean over the views whose mask holds enough pixels."""
+    errors = [
+        float(error[mask].mean())
+        for (error, _), mask in zip(pairs, masks, strict=True)
+        if mask.sum() >= LEAST
+    ]
+    return float(np.mean([-10 * np.log10(max(error, UNSEEN)) for error in errors]))
 
 
 def _nearest(scene: Scene, names: Sequence[str], name: str) -> list[str]:
@@ -122,6 +149,7 @@ def _predicted(
             frame=frame,
             mask=seen.mask,
             options=config.back_projection,
+            joined=config.savings.joined * voxel,
         )
         memory.fuse(points, round=0)
     guidance = memory.project(view.camera, options=config.splat)

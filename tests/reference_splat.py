@@ -197,7 +197,7 @@ class Reference:
         self.valid |= done
 
     def _occluders(self, first: list[int]) -> None:
-        """Observed things clearly in front, unless a view of tier ``first`` saw their place free."""
+        """Observed things clearly in front, unless a view of ``first`` saw their place free."""
         p, K, memory = self.points, self.camera.K[0], self.memory
         margin = 1 - 2 * self.options.band
         sampled = np.zeros(len(p.z), bool)

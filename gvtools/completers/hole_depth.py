@@ -42,6 +42,8 @@ FAR_QUANTILE = 0.45
 CONTINUED = 0.15
 # A continued plane stays within these multiples of the extreme inverse depths of the view.
 FARTHEST, NEAREST = 0.5, 2.0
+# Known pixels that tell the extremes.
+ENOUGH = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +104,8 @@ def fill_depth(
         return HoleDepth(inverse, hits, np.zeros((0, 5)), plane_of, spread, distance, 0)
     slope = math.tan(math.radians(steepest_deg)) / focal
     planes = _fit_rim(inverse, rim, slope)
-    low, high = np.percentile(inverse[known], (1, 99))
+    some = inverse[known]
+    low, high = np.percentile(some[:: max(1, some.size // ENOUGH)], (1, 99))
     limits = np.array((FARTHEST * low, NEAREST * high))
     clipped = _combine(inverse, known, hits, planes, plane_of, slope, limits, spread)
     if smoothing:
@@ -111,12 +114,12 @@ def fill_depth(
     return HoleDepth(inverse, hits, planes, plane_of, spread, distance, int(clipped))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, parallel=True)
 def _first_hits(known, directions):
     """(16, H, W) int32: the first known pixel in each direction, by one sweep per direction."""
     height, width = known.shape
     hits = np.full((len(directions), height, width), -1, np.int32)
-    for k in range(len(directions)):
+    for k in numba.prange(len(directions)):
         dy, dx = directions[k]
         for row in range(height):
             y = height - 1 - row if dy >= 0 else row
@@ -138,13 +141,13 @@ def _first_hits(known, directions):
     return hits
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, parallel=True)
 def _fit_rim(inverse, rim, slope):
     """(R, 5): a robust plane at each rim pixel, from the widest window that one plane explains."""
     planes = np.zeros((len(rim), 5))
     width = inverse.shape[1]
-    trial = np.zeros(5)
-    for i in range(len(rim)):
+    for i in numba.prange(len(rim)):
+        trial = np.zeros(5)
         y, x = rim[i] // width, rim[i] % width
         for radius in (24, 12, 6):
             _fit_plane(inverse, y, x, radius, slope, trial)
@@ -283,15 +286,15 @@ def _unhidden(planes, flat, hits, h, x, y, width, slope):
     return left
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, parallel=True)
 def _combine(inverse, known, hits, planes, plane_of, slope, limits, spread):
     """Write the answer of the eight pairs into each hole pixel; the number of clipped pixels."""
     height, width = known.shape
     flat = plane_of.ravel()
-    values = np.zeros(8)
-    weights = np.zeros(8)
     clipped = 0
-    for y in range(height):
+    for y in numba.prange(height):
+        values = np.zeros(8)
+        weights = np.zeros(8)
         for x in range(width):
             if known[y, x]:
                 continue

@@ -30,7 +30,7 @@ def _middle(values, count):
     return values[middle]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, parallel=True)
 def median_of_fill(inverse, known, distance, step):
     """5x5 median with holes of ``step`` pixels between its taps, over the fill alone.
 
@@ -39,8 +39,8 @@ def median_of_fill(inverse, known, distance, step):
     """
     height, width = inverse.shape
     result = inverse.copy()
-    values = np.zeros(25)
-    for y in range(height):
+    for y in numba.prange(height):
+        values = np.zeros(25)
         for x in range(width):
             if inverse[y, x] == 0 or distance[y, x] < (1 if step == 1 else 4 * step):
                 continue

@@ -11,6 +11,7 @@ from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
 from gvtools.memory.compiled import compiled
 from gvtools.memory.local_frame import LocalFrame
+from gvtools.memory.pixel_blocks import join_blocks
 from gvtools.memory.points import PointSet
 from gvtools.options import check_range
 
@@ -49,6 +50,7 @@ def back_project(
     confidence: NDArray[np.float32] | None = None,
     mask: NDArray[np.bool_] | None = None,
     options: BackProjectionOptions | None = None,
+    joined: float = 0.0,
 ) -> PointSet:
     """Lift the pixels of one view to points.
 
@@ -64,6 +66,8 @@ def back_project(
         confidence: (H, W) float32 of the source, > 0; None means 1.
         mask: (H, W) bool, True = use.
         options: see BackProjectionOptions.
+        joined: where 2 x 2 pixels together are at most so wide, scene units, they become one point,
+            their mean; 0 keeps every pixel's.
 
     Raises:
         ShapeError: the images and the camera disagree in size, or the camera is unusable.
@@ -94,11 +98,17 @@ def back_project(
     colors = np.empty((height * width, 3), np.uint8)
     weight = np.empty(height * width, np.float32)
     spacing = np.empty(height * width, np.float32)
+    pixels = np.empty(height * width if joined > 0 else 0, np.int64)
     count, invalid, edges, masked = _lift(
         np.ascontiguousarray(rgb, np.uint8), z, trust, use, camera.K[0], local_from_cam,
         options.edge, np.inf if options.depth_max is None else options.depth_max, options.grazing,
-        positions, colors, weight, spacing,
+        positions, colors, weight, spacing, pixels,
     )  # fmt: skip
+    if joined > 0:
+        count = join_blocks(
+            pixels[:count], (height, width), np.float32(joined),
+            positions[:count], colors[:count], weight[:count], spacing[:count],
+        )  # fmt: skip
     far = np.inf if options.depth_max is None else options.depth_max
     # A depth that is not trusted says nothing of the space before it.
     sure = z if confidence is None else np.where(trust > 0, z, np.float32(0))
@@ -121,7 +131,7 @@ def _usable(z):
 
 @compiled()
 def _lift(rgb, depth, trust, mask, K, local_from_cam, edge, depth_max, grazing,
-          positions, colors, weight, spacing):  # fmt: skip
+          positions, colors, weight, spacing, pixels):  # fmt: skip
     height, width = depth.shape
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     skew = K[0, 1]
@@ -160,6 +170,8 @@ def _lift(rgb, depth, trust, mask, K, local_from_cam, edge, depth_max, grazing,
                 colors[n, k] = rgb[row, col, k]
             weight[n] = w
             spacing[n] = z / focal
+            if pixels.size:
+                pixels[n] = row * width + col
             n += 1
     return n, invalid, edges, masked
 

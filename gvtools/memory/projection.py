@@ -167,8 +167,10 @@ class _Projection:
             if self.options.occluders:
                 self._splat_occluders()
         t = self.target
-        images = (image.copy() for image in (t.rgb, t.depth, t.valid, t.confidence))
-        return Observed(*images, self.scale, self.tiers, self.size)
+        return Observed(
+            t.rgb.copy(), t.depth.copy(), t.valid.copy(), t.confidence.copy(),
+            self.scale, self.tiers, self.size,
+        )  # fmt: skip
 
     def take_over(self, observed: Observed) -> None:
         """Write what observed views show, as an earlier projection found it."""

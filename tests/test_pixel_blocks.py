@@ -1,0 +1,65 @@
+"""Pixels finer than voxels become one point, four at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gvtools.cameras import Cameras
+from gvtools.memory.back_projection import back_project
+
+FOCAL, NEAR, FAR = 50.0, 1.0, 4.0
+
+
+def camera(width: int, height: int) -> Cameras:
+    K = np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1]])
+    return Cameras(K[None], np.eye(4)[None], np.array([width]), np.array([height]), ("view",))
+
+
+def wall(width: int, height: int, z: float) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(width)
+    rgb = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
+    return rgb, np.full((height, width), z, np.float32)
+
+
+def test_a_joined_point_is_the_mean_of_its_four_pixels():
+    rgb, depth = wall(8, 6, NEAR)
+    every = back_project(rgb, depth, camera(8, 6))
+    joined = back_project(rgb, depth, camera(8, 6), joined=2 * NEAR / FOCAL)
+    assert len(every) == 48 and len(joined) == 12
+    blocks = (3, 2, 4, 2)
+    for name in ("positions", "colors", "confidence", "spacing"):
+        values = getattr(every, name).astype(np.float64)
+        mean = values.reshape(*blocks, -1).mean((1, 3)).reshape(12, -1)
+        tolerance = 0.5 if name == "colors" else 1e-6
+        found = getattr(joined, name).reshape(12, -1)
+        np.testing.assert_allclose(found, mean, atol=tolerance)
+    assert joined.dropped == every.dropped
+    np.testing.assert_array_equal(joined.free_depth, every.free_depth)
+
+
+def test_only_blocks_that_are_narrow_enough_are_joined():
+    rgb, depth = wall(16, 8, NEAR)
+    depth[:, 8:] = FAR
+    between = back_project(rgb, depth, camera(16, 8), joined=3 * NEAR / FOCAL)
+    near = between.positions[:, 2] == NEAR
+    assert np.all(between.spacing == between.positions[:, 2] / np.float32(FOCAL))
+    assert near.sum() < len(back_project(rgb, depth, camera(16, 8))) / 4
+    every = back_project(rgb, depth, camera(16, 8))
+    assert (~near).sum() == (every.positions[:, 2] == FAR).sum()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 3), (5, 2), (7, 5)])
+def test_what_is_not_whole_is_kept_pixel_by_pixel(size):
+    rgb, depth = wall(*size, NEAR)
+    mask = np.ones(depth.shape, bool)
+    mask[0, 0] = False
+    every = back_project(rgb, depth, camera(*size), mask=mask)
+    joined = back_project(rgb, depth, camera(*size), mask=mask, joined=1.0)
+    blocks = {}
+    for row, col in np.argwhere(mask & (depth > 0)):
+        blocks.setdefault((row // 2, col // 2), []).append((row, col))
+    lone = size == (1, 1)
+    expected = sum(1 if len(pixels) == 4 else len(pixels) for pixels in blocks.values())
+    assert len(joined) == (0 if lone else expected)
+    assert joined.confidence.sum() <= every.confidence.sum() + 1e-6
