@@ -151,15 +151,14 @@ class RunConfig:
 # What each profile changes; "balanced" is the defaults.
 PROFILES: dict[str, dict[str, Any]] = {
     "fast": {
-        "fusion.voxel_scale": 2.0,
-        "memory.same_direction": 8.0,
-        "memory.observations_per_voxel": 4,
-        "splat.blend_reach": 1.25,
+        "max_side": 480,
+        "views_per_round": 12,
+        "savings.minor_holes": 0.05,
+        "savings.one_step": 0.3,
     },
     "balanced": {},
     "accurate": {
-        "fusion.voxel_percentile": 25.0,
-        "fusion.voxel_loss": None,
+        "fusion.voxel_loss": 0.0,
         "savings.minor_holes": 0.0,
         "savings.one_step": 0.0,
         "savings.explained": None,

@@ -104,8 +104,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
     search = Search(
         knobs_of(plan), trials.outcome, len(trials.names), limit=limit, say=console.line
     )
+    # A profile finds its own voxel edge.
     profiles = [
-        (f"profile {name}", changes) for name, changes in settings.PROFILES.items() if changes
+        (f"profile {name}", {"voxel": None, **changes})
+        for name, changes in settings.PROFILES.items()
+        if changes
     ]
     search.sweep(profiles, fits)
 
@@ -153,12 +156,13 @@ def _write(
     from pipelines.console import write_json
     from pipelines.tradeoffs.outcome import front
     from pipelines.tradeoffs.points import project_of, trial_point
-    from pipelines.tradeoffs.search import marginal_values, recommended
+    from pipelines.tradeoffs.knobs import delivers_less
+    from pipelines.tradeoffs.search import marginal_values
     from pipelines.tradeoffs.tables import front_table, marginal_table, trial_table
     from viz.pareto import draw_pareto
 
     whole = search.whole() or search.tried
-    chosen = recommended(whole, fits)
+    chosen = search.recommended(fits)
     best = front([entry.outcome for entry in whole], search.targets)
     marginal = marginal_values(search)
     trials, edge, effects = (
@@ -220,4 +224,13 @@ def _write(
         f"{chosen.outcome.seconds(search.targets):.1f} s, {chosen.outcome.bytes / 2**20:.0f} MiB; "
         f"gvtools reconstruct ... --config {out / 'profile.json'}"
     )
+    if delivers_less(search.knobs, chosen.outcome.settings):
+        console.warn("within the budget the pictures are smaller than what was asked for")
+    better = max(whole, key=lambda entry: entry.outcome.psnr)
+    if fits(better.outcome) and better.outcome.psnr > chosen.outcome.psnr:
+        console.line(
+            f"smaller pictures, enlarged again, are measured to be nearer to the true ones "
+            f"({better.outcome.psnr:.2f} dB in {better.outcome.seconds(search.targets):.1f} s): "
+            f"max_side={better.outcome.settings.get('max_side')}"
+        )
     console.line(f"results in {out}: front.png, front.csv, trials.csv, tradeoff.json, profile.json")

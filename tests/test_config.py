@@ -65,10 +65,10 @@ def test_a_saved_configuration_reads_back_equal(tmp_path):
 
 def test_the_file_s_own_settings_win_over_its_profile(tmp_path):
     path = tmp_path / "c.json"
-    path.write_text(json.dumps({"fusion": {"voxel_scale": 3.5}, "profile": "fast"}))
+    path.write_text(json.dumps({"memory": {"same_direction": 3.5}, "profile": "accurate"}))
     config = with_file(RunConfig(), path)
-    assert config.fusion.voxel_scale == 3.5
-    assert config.memory.observations_per_voxel == 4
+    assert config.memory.same_direction == 3.5
+    assert config.memory.observations_per_voxel == 64
 
 
 @pytest.mark.parametrize("text", ["[1]", "{", '{"nosuch": 1}'])

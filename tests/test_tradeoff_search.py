@@ -16,7 +16,7 @@ from pipelines.plan import Plan
 from pipelines.tradeoff import parse_budget
 from pipelines.tradeoffs.knobs import Knob, Level, knobs_of, neighbours, settings_of, usual
 from pipelines.tradeoffs.outcome import Outcome, front
-from pipelines.tradeoffs.search import SHARES, Search, marginal_values, recommended
+from pipelines.tradeoffs.search import FINAL, SHARES, Search, marginal_values
 
 TARGETS = 40
 KNOBS = [
@@ -52,6 +52,7 @@ class Runs:
             psnr=20 - math.log2(edge) + 0.7 * (steps == 3) + 0.01 * share,
             psnr_valid=None,
             psnr_generated=None,
+            ssim=0.5 + 0.1 * (steps == 3),
             depth_rel=None,
             coverage=None,
         )
@@ -79,10 +80,37 @@ def fits(outcome: Outcome, budget: float) -> bool:
 def test_the_recommendation_is_the_best_combination_within_the_budget(budget, best):
     """None of them was tried before its knobs were known one by one."""
     search, runs = swept(budget)
-    chosen = recommended(search.whole(), lambda outcome: fits(outcome, budget))
+    chosen = search.recommended(lambda outcome: fits(outcome, budget))
     assert chosen is not None and chosen.outcome.settings == best
     assert chosen.share == 1.0
-    assert len([1 for _, share in runs.made if share == 1.0]) <= 5
+    assert len([1 for _, share in runs.made if share == 1.0]) <= 2 + FINAL
+
+
+@pytest.mark.parametrize(("budget", "less"), [(100, False), (1.0, True)])
+def test_what_delivers_less_is_recommended_only_where_nothing_else_is_within_the_budget(
+    budget, less
+):
+    size = Knob("size", (Level("half", {"size": 1}), Level("whole")), 1, delivered=True)
+    runs = Runs()
+
+    def run(settings, share):
+        outcome = runs(settings, share)
+        half = "size" in settings
+        return replace(
+            outcome,
+            fixed=outcome.fixed / (1 + 3 * half),
+            per_target=outcome.per_target / (1 + 3 * half),
+            psnr=outcome.psnr + half,
+        )
+
+    search = Search(
+        [*KNOBS, size], run, TARGETS, limit=1e6, say=lambda _: None, clock=lambda: runs.now
+    )
+    search.sweep([], lambda outcome: fits(outcome, budget))
+    chosen = search.recommended(lambda outcome: fits(outcome, budget))
+    assert chosen is not None and ("size" in chosen.outcome.settings) == less
+    best = max(search.whole(), key=lambda entry: entry.outcome.psnr)
+    assert "size" in best.outcome.settings
 
 
 def test_early_trials_are_small_and_each_knob_is_tried_alone():
@@ -134,7 +162,7 @@ def test_a_refused_setting_is_named_and_the_sweep_goes_on():
 
 def test_no_trial_within_the_budget_gives_no_recommendation():
     search, _ = swept(0.1)
-    assert recommended(search.whole(), lambda outcome: fits(outcome, 0.1)) is None
+    assert search.recommended(lambda outcome: fits(outcome, 0.1)) is None
 
 
 def test_the_front_holds_what_no_other_beats():

@@ -102,6 +102,16 @@ def _points(axes: Axes, key: str, trials: Sequence[Trial], recommended: Trial | 
                 zorder=3,
                 **style,
             )
+    for trial in trials:
+        if trial["kind"] == "profile":
+            axes.annotate(
+                str(trial["label"]).removeprefix("profile "),
+                (trial[key] / scale, trial["psnr"]),
+                xytext=(6, -3),
+                textcoords="offset points",
+                fontsize="small",
+                parse_math=False,
+            )
     if recommended is not None:
         axes.scatter(
             [recommended[key] / scale],

@@ -43,11 +43,14 @@ class Knob:
         name: what it is.
         levels: from cheap to dear.
         usual: index of the level that the sweep starts from.
+        delivered: whether its cheaper levels deliver less, such as smaller pictures, rather than
+            the same with less effort.
     """
 
     name: str
     levels: tuple[Level, ...]
     usual: int
+    delivered: bool = False
 
 
 def settings_of(knobs: Sequence[Knob], point: Point) -> dict[str, Any]:
@@ -56,6 +59,17 @@ def settings_of(knobs: Sequence[Knob], point: Point) -> dict[str, Any]:
     for knob, level in zip(knobs, point, strict=True):
         out |= knob.levels[level].settings
     return out
+
+
+def delivers_less(knobs: Sequence[Knob], settings: Settings) -> bool:
+    """Whether a run with these settings delivers less than the one that the sweep starts from."""
+    return any(
+        key in settings and settings[key] != knob.levels[knob.usual].settings.get(key)
+        for knob in knobs
+        if knob.delivered
+        for level in knob.levels
+        for key in level.settings
+    )
 
 
 def usual(knobs: Sequence[Knob]) -> Point:
@@ -101,6 +115,11 @@ def knobs_of(plan: Plan) -> list[Knob]:
         completers,
         _numbers("views a round", "views_per_round", (3, 6, 12), config.views_per_round),
     ]  # fmt: skip
+    if "none" != config.completer:
+        knobs.append(
+            _numbers("least confidence that is fused", "fusion.min_confidence",
+                     (0.35, 0.2, 0.08), config.fusion.min_confidence)
+        )  # fmt: skip
     side = max(int(plan.targets.cameras.width.max()), int(plan.targets.cameras.height.max()))
     sides = [size for size in (side // 2, 3 * side // 4) if size >= 2 * SMALLEST]
     knobs.append(
@@ -108,6 +127,7 @@ def knobs_of(plan: Plan) -> list[Knob]:
             "picture size",
             (*(Level(f"{size} px", {"max_side": size}) for size in sides), Level(f"{side} px")),
             len(sides),
+            delivered=True,
         )
     )
     if "geoverse" in [level.settings["completer"] for level in completers.levels]:

@@ -21,6 +21,7 @@ class Outcome:
         psnr: mean over its targets, dB, whole pictures at their full size.
         psnr_valid: of pixels that observations support, dB.
         psnr_generated: of pixels that were generated, dB.
+        ssim: mean over its targets, whole pictures at their full size.
         depth_rel: median relative depth error of whole pictures' known depth.
         coverage: share of the pictures that observations support.
     """
@@ -34,6 +35,7 @@ class Outcome:
     psnr: float
     psnr_valid: float | None
     psnr_generated: float | None
+    ssim: float | None
     depth_rel: float | None
     coverage: float | None
 

@@ -18,13 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import GvError
-from pipelines.tradeoffs.knobs import Knob, Point, Settings, neighbours, settings_of, usual
+from pipelines.tradeoffs.knobs import (
+    Knob,
+    Point,
+    Settings,
+    delivers_less,
+    neighbours,
+    settings_of,
+    usual,
+)
 from pipelines.tradeoffs.outcome import Outcome, front
 
 # Shares of the targets, by stage.
 SHARES = (0.25, 0.5, 1.0)
 # Combinations of the predicted front that are tried, and those of them that are on all targets.
-COMBINED, FINAL = 6, 3
+COMBINED, FINAL = 8, 5
 # Combinations that are looked at; more are drawn at random.
 LOOKED_AT = 50_000
 # Pull of the effects towards 0, so that combinations cannot be explained by two knobs at once.
@@ -132,8 +140,16 @@ class Search:
         return np.array(row)
 
     def _promising(self) -> list[Point]:
-        """Points on the predicted front, spread over its times."""
+        """Points on the predicted front, half of them of what delivers as much as the start."""
         points = list(self._combinations())
+        whole = [p for p in points if not delivers_less(self.knobs, settings_of(self.knobs, p))]
+        if len(whole) == len(points):
+            return self._spread(points, COMBINED)
+        found = [*self._spread(whole, COMBINED // 2), *self._spread(points, COMBINED // 2)]
+        return list(dict.fromkeys(found))
+
+    def _spread(self, points: Sequence[Point], count: int) -> list[Point]:
+        """``count`` points on the predicted front of some, spread over its times."""
         values = self.predicted(points)
         order = np.lexsort((-values[:, 2], values[:, 0]))
         best = -np.inf
@@ -144,7 +160,7 @@ class Search:
                 found.append(int(index))
         # Evenly over the front's log-time, its ends included.
         times = np.log(values[found, 0])
-        wanted = np.linspace(times[0], times[-1], COMBINED)
+        wanted = np.linspace(times[0], times[-1], count)
         chosen = sorted({int(np.abs(times - time).argmin()) for time in wanted})
         return [points[found[i]] for i in chosen]
 
@@ -165,13 +181,29 @@ class Search:
     def _finalists(self, fits: Callable[[Outcome], bool]) -> list[Tried]:
         """What is tried on all targets: the start, profiles, and the best of the larger share."""
         larger = [entry for entry in self.tried if entry.share == SHARES[1]]
-        best = front([entry.outcome for entry in larger], self.targets)
-        within = [outcome for outcome in best if fits(outcome)] or best[:1]
-        # The most accurate within the budget first, then the others of the front.
-        ranked = list(reversed(within)) + [o for o in reversed(best) if o not in within]
+        ranked: list[Outcome] = []
+        # Of what delivers as much as the start first.
+        for entries in ([e for e in larger if not self._less(e)], larger):
+            best = front([entry.outcome for entry in entries], self.targets)
+            within = [outcome for outcome in best if fits(outcome)] or best[:1]
+            # The most accurate within the budget first, then the others of the front.
+            of_these = list(reversed(within)) + [o for o in reversed(best) if o not in within]
+            ranked += [o for o in of_these if o not in ranked][: (FINAL + 1) // 2]
         chosen = [entry for o in ranked[:FINAL] for entry in larger if entry.outcome is o]
         given = [e for e in self.tried if e.share == SHARES[0] and e.label in self._given]
         return given + chosen
+
+    def _less(self, entry: Tried) -> bool:
+        return delivers_less(self.knobs, entry.outcome.settings)
+
+    def recommended(self, fits: Callable[[Outcome], bool]) -> Tried | None:
+        """The most accurate trial within the budget; None when none is.
+
+        One that delivers less than the start only where no other is within it.
+        """
+        within = [entry for entry in self.whole() or self.tried if fits(entry.outcome)]
+        full = [entry for entry in within if not self._less(entry)]
+        return max(full or within, key=lambda entry: entry.outcome.psnr, default=None)
 
     def _change(self, point: Point) -> str:
         for knob, level in zip(self.knobs, point, strict=True):
@@ -210,17 +242,11 @@ class Search:
         return known[-1].outcome.seconds(round(share * self.targets)) if known else 0.0
 
 
-def recommended(tried: Sequence[Tried], fits: Callable[[Outcome], bool]) -> Tried | None:
-    """The most accurate trial within the budget; None when none is."""
-    within = [entry for entry in tried if fits(entry.outcome)]
-    return max(within, key=lambda entry: entry.outcome.psnr, default=None)
-
-
 def marginal_values(search: Search) -> list[dict[str, Any]]:
     """What each knob alone gives and takes, from one level to the next dearer one.
 
-    All on the smallest share's targets: PSNR as a difference, time, memory and observations as
-    factors.
+    All on the smallest share's targets: PSNR and SSIM as differences, time, memory and observations
+    as factors.
     """
     start = usual(search.knobs)
     smallest = {
@@ -242,6 +268,7 @@ def marginal_values(search: Search) -> list[dict[str, Any]]:
                     "from": knob.levels[level].name,
                     "to": knob.levels[level + 1].name,
                     "psnr": two.psnr - one.psnr,
+                    "ssim": two.ssim - one.ssim if one.ssim and two.ssim else None,
                     "time": two.seconds(search.targets) / one.seconds(search.targets),
                     "bytes": two.bytes / max(one.bytes, 1.0),
                     "observations": two.observations / max(one.observations, 1),

@@ -16,6 +16,7 @@ MEASURED = (
     Column("memory", "MiB", "lower", 1),
     Column("observations", "", "lower", 0),
     Column("PSNR", "dB", "higher", 2),
+    Column("SSIM", "", "higher", 4),
     Column("observed", "dB", "higher", 2),
     Column("generated", "dB", "higher", 2),
     Column("depth error", "median", "lower", 4),
@@ -51,11 +52,12 @@ def marginal_table(marginal: Sequence[Mapping[str, Any]]) -> Table:
         Column("from"),
         Column("to"),
         Column("PSNR", "dB more", "higher", 2),
+        Column("SSIM", "more", "higher", 4),
         Column("time", "x", "lower", 2),
         Column("memory", "x", "lower", 2),
         Column("observations", "x", "lower", 2),
     )
-    keys = ("knob", "from", "to", "psnr", "time", "bytes", "observations")
+    keys = ("knob", "from", "to", "psnr", "ssim", "time", "bytes", "observations")
     rows = tuple(tuple(row[key] for key in keys) for row in marginal)
     return Table(columns, rows, "What each setting gives and takes by itself")
 
@@ -66,6 +68,7 @@ def _measured(outcome: Outcome, targets: int) -> tuple[float | int | None, ...]:
         outcome.bytes / 2**20,
         outcome.observations,
         outcome.psnr,
+        outcome.ssim,
         outcome.psnr_valid,
         outcome.psnr_generated,
         outcome.depth_rel,

@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,8 @@ class Trials:
     def _key(self, settings: Mapping[str, Any], names: Sequence[str]) -> str:
         import gvtools
 
-        said = [self.identity, dict(settings), list(names), gvtools.__version__]
+        kept = [field.name for field in fields(Outcome)]
+        said = [self.identity, dict(settings), list(names), gvtools.__version__, kept]
         text = json.dumps(said, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -120,6 +122,7 @@ class Trials:
             psnr=psnr,
             psnr_valid=mean_of(figures, "psnr_valid"),
             psnr_generated=mean_of(figures, "psnr_generated"),
+            ssim=mean_of(figures, "ssim"),
             depth_rel=mean_of(figures, "depth_rel_valid"),
             coverage=mean_of(figures, "coverage"),
         )
