@@ -154,10 +154,10 @@ def _write(
     from gvtools.evaluation.tables import csv_text, markdown
     from gvtools.files import replaced_when_written, write_text
     from pipelines.console import write_json
+    from pipelines.tradeoffs.knobs import delivers_less
     from pipelines.tradeoffs.outcome import front
     from pipelines.tradeoffs.points import project_of, trial_point
-    from pipelines.tradeoffs.knobs import delivers_less
-    from pipelines.tradeoffs.search import marginal_values
+    from pipelines.tradeoffs.search import EQUAL, marginal_values
     from pipelines.tradeoffs.tables import front_table, marginal_table, trial_table
     from viz.pareto import draw_pareto
 
@@ -227,7 +227,7 @@ def _write(
     if delivers_less(search.knobs, chosen.outcome.settings):
         console.warn("within the budget the pictures are smaller than what was asked for")
     better = max(whole, key=lambda entry: entry.outcome.psnr)
-    if fits(better.outcome) and better.outcome.psnr > chosen.outcome.psnr:
+    if fits(better.outcome) and better.outcome.psnr > chosen.outcome.psnr + EQUAL:
         console.line(
             f"smaller pictures, enlarged again, are measured to be nearer to the true ones "
             f"({better.outcome.psnr:.2f} dB in {better.outcome.seconds(search.targets):.1f} s): "

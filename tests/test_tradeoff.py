@@ -11,6 +11,7 @@ from tiny_scan import write_scan
 
 from gvtools.errors import OptionError
 from pipelines.cli import main
+from pipelines.tradeoffs.search import EQUAL
 from viz.pareto import draw_pareto
 
 
@@ -34,8 +35,13 @@ def test_a_sweep_leaves_table_front_plot_and_profile(swept):
     front = found["front"]
     assert front and [row["psnr"] for row in front] == sorted(row["psnr"] for row in front)
     best = found["recommended"]
-    whole = [trial for trial in found["trials"] if trial["share"] == 1]
-    assert whole and best["psnr"] == max(trial["psnr"] for trial in whole)
+    # Smaller pictures are another product.
+    whole = [
+        trial
+        for trial in found["trials"]
+        if trial["share"] == 1 and "max_side" not in trial["settings"]
+    ]
+    assert whole and best["psnr"] >= max(trial["psnr"] for trial in whole) - EQUAL
     names = {row["knob"] for row in found["marginal"]}
     assert {"voxel edge", "completer", "projection"} <= names
     for row in found["marginal"]:

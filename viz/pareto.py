@@ -103,7 +103,7 @@ def _points(axes: Axes, key: str, trials: Sequence[Trial], recommended: Trial | 
                 **style,
             )
     for trial in trials:
-        if trial["kind"] == "profile":
+        if trial["kind"] == "profile" and key == "seconds":
             axes.annotate(
                 str(trial["label"]).removeprefix("profile "),
                 (trial[key] / scale, trial["psnr"]),

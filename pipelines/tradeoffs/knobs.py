@@ -115,7 +115,7 @@ def knobs_of(plan: Plan) -> list[Knob]:
         completers,
         _numbers("views a round", "views_per_round", (3, 6, 12), config.views_per_round),
     ]  # fmt: skip
-    if "none" != config.completer:
+    if config.completer != "none":
         knobs.append(
             _numbers("least confidence that is fused", "fusion.min_confidence",
                      (0.35, 0.2, 0.08), config.fusion.min_confidence)

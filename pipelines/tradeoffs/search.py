@@ -33,6 +33,10 @@ from pipelines.tradeoffs.outcome import Outcome, front
 SHARES = (0.25, 0.5, 1.0)
 # Combinations of the predicted front that are tried, and those of them that are on all targets.
 COMBINED, FINAL = 8, 5
+# dB that tell no two trials apart.
+EQUAL = 0.02
+# dB below the start that nobody wants, where anything else is within the budget.
+POOR = 2.0
 # Combinations that are looked at; more are drawn at random.
 LOOKED_AT = 50_000
 # Pull of the effects towards 0, so that combinations cannot be explained by two knobs at once.
@@ -155,7 +159,7 @@ class Search:
         best = -np.inf
         found: list[int] = []
         for index in order:
-            if values[index, 2] > best + 1e-3:
+            if values[index, 2] > best + EQUAL:
                 best = values[index, 2]
                 found.append(int(index))
         # Evenly over the front's log-time, its ends included.
@@ -181,6 +185,9 @@ class Search:
     def _finalists(self, fits: Callable[[Outcome], bool]) -> list[Tried]:
         """What is tried on all targets: the start, profiles, and the best of the larger share."""
         larger = [entry for entry in self.tried if entry.share == SHARES[1]]
+        good = [e for e in larger if e.outcome.psnr > self.tried[0].outcome.psnr - POOR]
+        if any(fits(entry.outcome) for entry in good):
+            larger = good
         ranked: list[Outcome] = []
         # Of what delivers as much as the start first.
         for entries in ([e for e in larger if not self._less(e)], larger):
@@ -199,11 +206,14 @@ class Search:
     def recommended(self, fits: Callable[[Outcome], bool]) -> Tried | None:
         """The most accurate trial within the budget; None when none is.
 
-        One that delivers less than the start only where no other is within it.
+        Of several that are as accurate the fastest, and one that delivers less than the start only
+        where no other is within the budget.
         """
         within = [entry for entry in self.whole() or self.tried if fits(entry.outcome)]
         full = [entry for entry in within if not self._less(entry)]
-        return max(full or within, key=lambda entry: entry.outcome.psnr, default=None)
+        most = max((entry.outcome.psnr for entry in full or within), default=0.0)
+        best = [entry for entry in full or within if entry.outcome.psnr >= most - EQUAL]
+        return min(best, key=lambda entry: entry.outcome.seconds(self.targets), default=None)
 
     def _change(self, point: Point) -> str:
         for knob, level in zip(self.knobs, point, strict=True):
