@@ -31,9 +31,9 @@ class FusionOptions:
         voxel_percentile: the automatic voxel edge follows this percentile of the context's pixel
             footprints; near surfaces are what a coarse voxel blurs.
         voxel_scale: how many such footprints the edge is.
-        voxel_loss: dB by which context views, predicted from their neighbours, may be worse than
-            with the best edge for a coarser one to be taken; None keeps the footprints'. Only views
-            with recorded depth are asked.
+        voxel_loss: of edges from half to four times the footprints', dB by which context views,
+            predicted from their neighbours, may be worse than with the best one for a coarser one
+            to be taken; None keeps the footprints'. Only views with recorded depth are asked.
     """
 
     min_confidence: float = 0.08

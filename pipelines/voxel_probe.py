@@ -1,7 +1,8 @@
 """How coarse a memory may be: context views, predicted from their neighbours at several edges.
 
 A footprint says what a pixel could show, not what the pictures do: blur, noise and the mixing of
-views often leave less, and coarser voxels then store a fraction of it and look the same.
+views often leave less, and coarser voxels then store a fraction of it and look the same. Where
+pictures and depth are sharp, several views together show more than one pixel could.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from pipelines.config import RunConfig
 
 # Edges that are tried, in shares of the one given.
-SCALES = (1.0, 1.5, 2.0, 3.0, 4.0)
+SCALES = (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0)
 # The first of them.
 START = 2.0
 # Views that are predicted, and neighbours that each is predicted from.

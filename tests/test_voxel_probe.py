@@ -61,7 +61,8 @@ def scale_of(scene: Scene, loss: float, said: list[str] | None = None) -> float:
 def test_smooth_surfaces_take_coarse_voxels_and_detailed_ones_do_not(scan):
     scene = open_project(scan)
     said: list[str] = []
-    assert scale_of(repainted(scene, fine), 0.05, said) <= 1.5
+    # Finer than a pixel's footprint: several views together show more than one.
+    assert scale_of(repainted(scene, fine), 0.05, said) < 1
     assert scale_of(repainted(scene, smooth), 1.0) >= 3
     assert "context views predicted from their neighbours" in said[0] and "dB" in said[0]
 
@@ -86,12 +87,13 @@ def test_a_run_takes_the_measured_edge_unless_told_otherwise(scan):
         name: make_plan(scene, with_settings(RunConfig(), [*texts, *more])).config.voxel or 0
         for name, more in {
             "footprint": ["fusion.voxel_loss=none"],
+            "balanced": [],
             "accurate": ["profile=accurate"],
             "any": ["fusion.voxel_loss=100"],
             "given": ["voxel=0.0123", "fusion.voxel_loss=100"],
         }.items()
     }
     assert edges["any"] == pytest.approx(SCALES[-1] * edges["footprint"], rel=0.01)
-    assert edges["accurate"] <= edges["footprint"] and edges["given"] == 0.0123
+    assert edges["accurate"] <= edges["balanced"] and edges["given"] == 0.0123
     with pytest.raises(OptionError, match=r"fusion\.voxel_loss"):
         with_settings(RunConfig(), ["fusion.voxel_loss=-1"])
