@@ -37,6 +37,7 @@ OFF: dict[str, dict[str, Any]] = {
     "observed content projected once": {"savings.reuse": False},
     "small holes left to inpaint": {"savings.minor_holes": 0.0},
     "middle holes in one step": {"savings.one_step": 0.0},
+    "middle holes in half the size": {"savings.half_size": 0.0},
     "explained views without computed depth": {"savings.explained": None},
 }
 COSTLY = ("geoverse", "exemplar")
@@ -72,7 +73,7 @@ def rows_of(config: RunConfig, *, computed: bool) -> dict[str, Row]:
     if config.completer not in COSTLY:
         idle.add("small holes left to inpaint")
     if config.completer != "geoverse":
-        idle.add("middle holes in one step")
+        idle |= {"middle holes in one step", "middle holes in half the size"}
     if not computed:
         idle.add("explained views without computed depth")
 

@@ -68,6 +68,7 @@ class SavingsOptions:
         one_step: targets that are completed together take one step of the generative core instead
             of the model's own number where none of their unknown pixels is farther than this share
             of the diagonal from a known one; 0 spares none.
+        half_size: likewise, they are completed in pictures of half the model's size.
         explained: a context view whose depth would have to be computed takes memory's instead where
             the views before it explain this share of its pixels; None computes all.
     """
@@ -76,6 +77,7 @@ class SavingsOptions:
     joined: float = 1.0
     minor_holes: float = 0.02
     one_step: float = 0.1
+    half_size: float = 0.1
     explained: float | None = 0.9
 
     def __post_init__(self) -> None:
@@ -83,6 +85,7 @@ class SavingsOptions:
         check_range("savings.joined", self.joined, least=0)
         check_range("savings.minor_holes", self.minor_holes, least=0)
         check_range("savings.one_step", self.one_step, least=0)
+        check_range("savings.half_size", self.half_size, least=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,12 +158,14 @@ PROFILES: dict[str, dict[str, Any]] = {
         "views_per_round": 12,
         "savings.minor_holes": 0.05,
         "savings.one_step": 0.3,
+        "savings.half_size": 0.3,
     },
     "balanced": {},
     "accurate": {
         "fusion.voxel_loss": 0.0,
         "savings.minor_holes": 0.0,
         "savings.one_step": 0.0,
+        "savings.half_size": 0.0,
         "savings.explained": None,
         "memory.same_direction": 0.0,
         "memory.observations_per_voxel": 64,

@@ -133,6 +133,7 @@ def _complete(
                 create(config.completer, **config.completer_options),
                 config.savings.minor_holes,
                 config.savings.one_step,
+                config.savings.half_size,
             ),
             context=context, config=config, clock=clock, progress=console.track,
             done=lambda at, result: writing.append(

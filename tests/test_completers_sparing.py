@@ -122,6 +122,7 @@ def test_a_completer_of_several_steps_is_told_where_one_will_do():
     assert isinstance(wrapped, SparingCompleter)
     assert wrapped.costly == replace(core, one_step_holes=0.1)
     assert sparing(core, 0.0, 0.0) is core
+    assert sparing(core, 0.0, 0.1, 0.2) == replace(core, one_step_holes=0.1, half_size_holes=0.2)
     told = create("geoverse", one_step_holes=0.05)
     assert sparing(told, 0.0, 0.1) is told
     inpaint = create("inpaint")

@@ -278,7 +278,7 @@ def test_a_sweep_beside_the_run_is_drawn(own):
     outcome = {
         "settings": {}, "targets": 4, "fixed": 1.0, "per_target": 0.5, "bytes": 1e6,
         "observations": 10, "psnr": 20.0, "psnr_valid": None, "psnr_generated": None,
-        "depth_rel": None, "coverage": 1.0,
+        "ssim": None, "depth_rel": None, "coverage": 1.0,
     }  # fmt: skip
     better = {**outcome, "psnr": 25.0, "per_target": 2.0}
     worse = {**outcome, "psnr": 19.0, "per_target": 3.0}

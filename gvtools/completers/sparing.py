@@ -56,7 +56,9 @@ class SparingCompleter:
         return _merged(guidance, parts, len(spared))
 
 
-def sparing(completer: Completer, minor: float, one_step: float = 0.0) -> Completer:
+def sparing(
+    completer: Completer, minor: float, one_step: float = 0.0, half_size: float = 0.0
+) -> Completer:
     """``completer``, spared what small holes do not need, where it is costly.
 
     Args:
@@ -64,10 +66,13 @@ def sparing(completer: Completer, minor: float, one_step: float = 0.0) -> Comple
         minor: views whose holes reach no farther are left to ``inpaint``; 0 leaves it none.
         one_step: passes whose holes reach no farther take one step, where the completer makes
             several; 0 leaves them all.
+        half_size: passes whose holes reach no farther are made in pictures of half the size, where
+            the completer has a size of its own; 0 leaves them all.
     """
-    # What the completer was told itself stands: only a 0 is replaced.
-    if one_step > 0 and is_dataclass(completer) and getattr(completer, "one_step_holes", 1) == 0:
-        completer = replace(completer, one_step_holes=one_step)
+    for name, share in (("one_step_holes", one_step), ("half_size_holes", half_size)):
+        # What the completer was told itself stands: only a 0 is replaced.
+        if share > 0 and is_dataclass(completer) and getattr(completer, name, 1) == 0:
+            completer = replace(completer, **{name: share})
     if minor > 0 and getattr(completer, "costly", False):
         return SparingCompleter(completer, minor)
     return completer

@@ -12,6 +12,7 @@ from gvtools.errors import GvError
 from gvtools.scenes.reduced import SMALLEST
 
 if TYPE_CHECKING:
+    from pipelines.config import RunConfig
     from pipelines.plan import Plan
 
 # Of the voxel edge that the run has.
@@ -140,6 +141,8 @@ def knobs_of(plan: Plan) -> list[Knob]:
         knobs += [
             _values("cascade steps", "completer.cascade_steps", (1, 2, 4, None),
                     given.get("cascade_steps")),
+            _values("model resolution, px", "completer.image_size", _sizes(config),
+                    given.get("image_size")),
             _values("precision", "completer.precision", ("bfloat16", "float32"),
                     given.get("precision", "auto")),
         ]  # fmt: skip
@@ -157,6 +160,17 @@ def knobs_of(plan: Plan) -> list[Knob]:
             _numbers("stereo iterations", "stereo.iterations", (0, 1, 2), config.stereo.iterations),
         ]  # fmt: skip
     return [knob for knob in knobs if len(knob.levels) > 1]
+
+
+def _sizes(config: RunConfig) -> tuple[int | None, ...]:
+    """Half and three quarters of the generative core's own picture size, and that itself."""
+    from gvtools.completers.geoverse.completer import GeoVerseCompleter
+    from gvtools.completers.geoverse.weights.folder_parts import config_of
+
+    core = create("geoverse", **config.completer_options)
+    assert isinstance(core, GeoVerseCompleter)
+    size = config_of(core.folder).image_size
+    return size // 2, 3 * size // 4, None
 
 
 def _numbers(name: str, key: str, values: Sequence[float], start: float) -> Knob:

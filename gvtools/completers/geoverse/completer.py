@@ -68,6 +68,9 @@ class GeoVerseCompleter:
             farther from a known one than this share of the image diagonal, and ``steps`` is None;
             0 never.
         no_prior_holes: likewise, a pass that does without the video prior.
+        half_size_holes: likewise, a pass in pictures of half the size.
+        image_size: longer side of the pictures in a pass, pixels, rounded to whole patches; None
+            for the model's own, which is also the most.
         precision: "auto" is bfloat16 on a GPU and float32 on a CPU.
         device: "auto" takes a GPU where there is one.
     """
@@ -90,6 +93,8 @@ class GeoVerseCompleter:
     shared_fill: bool = True
     one_step_holes: float = 0.0
     no_prior_holes: float = 0.0
+    half_size_holes: float = 0.0
+    image_size: int | None = None
     precision: str = "auto"
     device: str = "auto"
 
@@ -100,6 +105,8 @@ class GeoVerseCompleter:
         check_range("completer.temperature", self.temperature, least=0)
         check_range("completer.one_step_holes", self.one_step_holes, least=0)
         check_range("completer.no_prior_holes", self.no_prior_holes, least=0)
+        check_range("completer.half_size_holes", self.half_size_holes, least=0)
+        check_range("completer.image_size", self.image_size, least=1)
         check_range("completer.context_views", self.context_views, least=1)
         check_range("completer.views", self.views, least=2)
         for name, value, known in (
@@ -179,12 +186,12 @@ class GeoVerseCompleter:
             shown = part.depth if fill is None else fill.depth
             chosen = chosen_views(context, part.cameras, shown, most, by=self.context_by)
             reach = math.inf
-            if self.one_step_holes or self.no_prior_holes:
+            if self.one_step_holes or self.no_prior_holes or self.half_size_holes:
                 reach = max(hole_reach(valid) for valid in part.valid)
             bounds = self._bounds(model, reach)
-            made = self._pass(
-                model, device, chosen, part, fill, seed, bounds, reach > self.no_prior_holes
-            )
+            size = self._size(model, part, reach)
+            prior = reach > self.no_prior_holes
+            made = self._pass(model, device, chosen, part, fill, seed, size, bounds, prior)
             canvas.put(rows, made, part)
             passes += 1
             steps += max(len(bounds) - 1, 0)
@@ -214,12 +221,11 @@ class GeoVerseCompleter:
         part: Guidance,
         fill: Filled | None,
         seed: int,
+        size: tuple[int, int],
         bounds: tuple[float, ...],
         prior: bool,
     ) -> Completed:
         """One pass of the model over context views and a few targets."""
-        full = part.depth.shape[1:]
-        size = model_size(*full, longest=model.config.image_size, patch=model.config.patch)
         batch, cameras = view_batch(context, part, size, fill=fill)
         batch = batch.to(device)
         # A photograph and a target of one name must not start from the same noise.
@@ -254,6 +260,13 @@ class GeoVerseCompleter:
             return brought(self.color_alignment or model.config.color_alignment)
         made = seamless(made, model.config.patch)
         return corrected(made, part, filled, back=None if told else brought("none"))
+
+    def _size(self, model: GeoVerse, part: Guidance, reach: float) -> tuple[int, int]:
+        """(H, W) of the pictures in a pass whose holes reach so far."""
+        longest = min(self.image_size or model.config.image_size, model.config.image_size)
+        if reach <= self.half_size_holes:
+            longest = longest // 2
+        return model_size(*part.depth.shape[1:], longest=longest, patch=model.config.patch)
 
     def _bounds(self, model: GeoVerse, reach: float) -> tuple[float, ...]:
         """Of level 1, in a pass whose holes reach so far."""
