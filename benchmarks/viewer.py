@@ -1,11 +1,13 @@
-"""How long the web viewer takes to the first drawn point, and how much it sends.
+"""How long the web viewer takes to the first drawn point and to near ones, and how much it sends.
 
     python benchmarks/viewer.py
     python benchmarks/viewer.py --points 1e6 1e7 --repeats 3
 
 A box with a point in each voxel of its walls is saved as a memory and shown by ``gvtools view`` to
-a headless Chromium. Bytes are counted by a proxy between the two. Needs chromium and chromedriver,
-and what the tests need.
+a headless Chromium, which then drags the scene to and fro a few times. Bytes are counted by a proxy
+between the two, frames by the page. Chromium computes every picture in software here, so frames per
+second tell nothing of a machine with a graphics card. Needs chromium and chromedriver, and what the
+tests need.
 """
 
 from __future__ import annotations
@@ -39,6 +41,32 @@ DRAWN = 0.02
 PATIENCE = 300.0
 # Nothing more comes once so many seconds have passed without a byte.
 REST = 5.0
+# How often the scene is dragged, and for how long, seconds.
+MOVES, DRAG = 5, 4.0
+# Calls back with the page's frames per second while the scene is dragged; no further each time than
+# a person who looks around a little.
+ORBIT = """
+    const [seconds, done] = arguments;
+    const canvas = document.elementFromPoint(400, 300);
+    const fire = (type, x, buttons) => canvas.dispatchEvent(new PointerEvent(type, {
+        bubbles: true, clientX: x, clientY: 300, button: type == "pointermove" ? -1 : 0, buttons,
+        pointerId: 1, pointerType: "mouse", isPrimary: true}));
+    const begun = performance.now();
+    let frames = 0;
+    fire("pointerdown", 400, 1);
+    requestAnimationFrame(function next() {
+        const passed = (performance.now() - begun) / 1000;
+        fire("pointermove", 400 + 150 * Math.min(1, passed / seconds), 1);
+        if (passed < seconds) { frames++; requestAnimationFrame(next); return; }
+        fire("pointerup", 550, 0);
+        done(frames / passed);
+    });
+"""
+
+MEASURES = (
+    "command to address, s", "command to first point, s", "page to first point, s", "sent, MB",
+    "frames a second in software", "stop to last near point sent, s", "sent for a move, MB",
+)  # fmt: skip
 
 
 class CountingProxy:
@@ -88,8 +116,8 @@ def main() -> None:
     parser.add_argument("--points", type=float, nargs="+", default=[1e6, 1e7])
     parser.add_argument("--repeats", type=int, default=3)
     args = parser.parse_args()
-    print("| points | command to address, s | command to first point, s | page to first point, s "
-          "| sent, MB |\n|---|---|---|---|---|")  # fmt: skip
+    columns = ("points", *MEASURES)
+    print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
     with tempfile.TemporaryDirectory() as folder:
         for count in args.points:
             file = Path(folder) / "memory.npz"
@@ -111,8 +139,8 @@ def save_box(count: int, file: Path) -> int:
     return len(memory)
 
 
-def measured(file: Path) -> tuple[float, float, float, float]:
-    """Seconds to the address, from command and from page to the first point, and megabytes."""
+def measured(file: Path) -> tuple[float, ...]:
+    """One value for each of MEASURES; medians over the moves."""
     # A browser that is open already, as a user's is.
     with open_browser() as browser:
         begun = time.monotonic()
@@ -122,26 +150,41 @@ def measured(file: Path) -> tuple[float, float, float, float]:
             assert viewer.stdout is not None
             found = re.search(r"http://127\.0\.0\.1:(\d+)", viewer.stdout.readline())
             assert found is not None
-            address = time.monotonic()
+            address = time.monotonic() - begun
             proxy = CountingProxy(int(found[1]))
             opened = time.monotonic()
             browser.driver.get(f"http://127.0.0.1:{proxy.port}")
             wait_for_points(browser)
-            drawn = time.monotonic()
-            before, quiet = -1, 0.0
-            while quiet < REST:
-                quiet = quiet + 0.5 if proxy.sent == before else 0.0
-                before = proxy.sent
-                time.sleep(0.5)
-            return (
-                address - begun,
-                (address - begun) + (drawn - opened),
-                drawn - opened,
-                (proxy.sent / 1e6),
-            )
+            drawn = time.monotonic() - opened
+            last_byte(proxy)
+            sent = proxy.sent
+            moves = [moved(browser, proxy) for _ in range(MOVES)]
+            return address, address + drawn, drawn, sent / 1e6, *np.median(moves, axis=0).tolist()
         finally:
             viewer.send_signal(signal.SIGINT)
             viewer.wait()
+
+
+def moved(browser: Browser, proxy: CountingProxy) -> tuple[float, float, float]:
+    """Frames a second while the scene is dragged; seconds from its end to the last byte; MB."""
+    before, picture = proxy.sent, browser.picture()[SCENE]
+    browser.driver.set_script_timeout(PATIENCE)
+    frames = float(browser.driver.execute_async_script(ORBIT, DRAG))
+    stopped = time.monotonic()
+    last = last_byte(proxy)
+    if np.array_equal(browser.picture()[SCENE], picture):
+        raise RuntimeError("the scene was dragged, but its picture is what it was")
+    return frames, max(0.0, last - stopped), (proxy.sent - before) / 1e6
+
+
+def last_byte(proxy: CountingProxy) -> float:
+    """When the last byte came, once nothing more comes."""
+    last, sent = time.monotonic(), proxy.sent
+    while time.monotonic() - last < REST:
+        time.sleep(0.01)
+        if proxy.sent != sent:
+            last, sent = time.monotonic(), proxy.sent
+    return last
 
 
 def wait_for_points(browser: Browser) -> None:

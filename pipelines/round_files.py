@@ -17,6 +17,7 @@ from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance
 from pipelines.array_files import save_arrays
 from pipelines.render_files import file_stems
+from viz.run_view import inside
 
 if TYPE_CHECKING:
     from pipelines.rounds import TargetResult
@@ -94,12 +95,17 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
     """One target of a round.
 
     Args:
-        folder: the round's.
+        folder: the round's, in the run's.
         entry: the target's, of the round's report.
 
     Raises:
-        ProjectError: files of the round are absent or damaged, or of an older version.
+        ProjectError: files of the round are absent, damaged, of an older version or outside the
+            run's folder.
     """
+
+    def own(name: str) -> Path:
+        return inside(folder.parent, folder / name)
+
     try:
         stem, view = entry["stem"], entry["camera"]
         camera = Cameras(
@@ -109,9 +115,9 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
             np.array([view["height"]]),
             (entry["name"],),
         )
-        picture = read_png(folder / f"generated_{stem}.png")
-        support = read_png(folder / f"valid_{stem}.png")
-        with np.load(folder / f"depth_{stem}.npz", allow_pickle=False) as stored:
+        picture = read_png(own(f"generated_{stem}.png"))
+        support = read_png(own(f"valid_{stem}.png"))
+        with np.load(own(f"depth_{stem}.npz"), allow_pickle=False) as stored:
             depth = stored["completion"]
         scale = entry["scale"]["scale"]
     except (OSError, EOFError, BadZipFile, ValueError, KeyError, TypeError) as error:

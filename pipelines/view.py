@@ -53,7 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=MAX_POINTS,
         metavar="N",
-        help="draw at most so many points on the page, one a cell (%(default)s)",
+        help="draw at most so many points of the whole on the page, one a cell (%(default)s), and "
+        "of all those near the viewer's camera three tenths as many",
     )
     parser.add_argument(
         "--screenshot",

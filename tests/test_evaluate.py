@@ -280,3 +280,21 @@ def test_damage_and_contradictions_end_in_one_line(damage, finished, scan, tmp_p
         words[1] = write_scan(tmp_path / "wide", views=9)
     assert told[damage] in refused(capsys, *words)
     assert not (tmp_path / "p" / "split.json").exists()
+
+
+@pytest.mark.parametrize("stem", ["x/../../../secret", "link"])
+def test_files_outside_the_run_are_refused(finished, tmp_path, capsys, stem):
+    run, out = tmp_path / "run", tmp_path / "figures"
+    shutil.copytree(finished, run)
+    report = run / "round_001" / "report.json"
+    content = json.loads(report.read_text())
+    own = report.parent / f"generated_{content['views'][0]['stem']}.png"
+    # generated_x/../../../secret.png is outside; so is what a link leads to.
+    secret = own.rename(tmp_path / "secret.png")
+    (report.parent / "generated_x").mkdir()
+    (report.parent / "generated_link.png").symlink_to(secret)
+    content["views"][0]["stem"] = stem
+    report.write_text(json.dumps(content))
+    arguments = ("evaluate", run, "--out", out, "--parts", "images", "--quiet")
+    assert "lies outside" in refused(capsys, *arguments)
+    assert not out.exists()

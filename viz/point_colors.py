@@ -67,14 +67,16 @@ def point_colors(
     *,
     rows: NDArray[np.int64] | None = None,
     true_depth: TrueDepth | None = None,
+    counts: NDArray[np.int64] | None = None,
 ) -> PointColors:
-    """Colours of observations.
+    """Colours of observations; an observation's is the same whichever others are asked for.
 
     Args:
         memory: whose they are.
         mode: one of MODES.
         rows: (P,) which observations; None for all.
         true_depth: the recorded depth (H, W) of a view by its name, or None; for "depth-error".
+        counts: the memory's view_counts, for "views"; None: they are counted.
 
     Raises:
         OptionError: an unknown mode.
@@ -89,10 +91,10 @@ def point_colors(
     if mode == "confidence":
         return _by_confidence(memory, chosen)
     if mode == "views":
-        count = view_counts(memory)[chosen]
-        top = max(2, int(count.max(initial=1)))
+        counts = view_counts(memory) if counts is None else counts
+        top = max(2, int(counts.max(initial=1)))
         legend = Legend("views with observations in the point's voxel", scale=("1", str(top)))
-        return PointColors(viridis((count - 1) / (top - 1)), legend)
+        return PointColors(viridis((counts[chosen] - 1) / (top - 1)), legend)
     if mode == "depth-error":
         return _by_depth_error(memory, chosen, true_depth)
     raise OptionError(f"colour mode {mode!r}; expected one of {', '.join(MODES)}")

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
+from viz.point_colors import PointColors, point_colors, view_counts
+from viz.upright import STRAY, guessed_up
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -25,10 +27,6 @@ CONTEXT, TARGET = "context", "target"
 # What a round leaves of a target, by the title that a viewer gives it.
 PICTURES = {"guidance": "guidance", "completion": "generated", "memory after": "after"}
 TRUTH = "truth"
-# Percent of the points at each end that may lie far off.
-STRAY = 0.5
-# Lower by so much is no accident.
-FLATTER = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +112,13 @@ class RunView:
         voxels = self.memory.voxels if round >= self.last_round else None
         return Counts(int(there.sum()) - generated, generated, voxels)
 
+    def colors(self, mode: str, rows: NDArray[np.int64]) -> PointColors:
+        """Colours of observations, those in ``rows`` (P,), as viz.point_colors has them."""
+        counts = self._view_counts if mode == "views" else None
+        return point_colors(
+            self.memory, mode, rows=rows, true_depth=self.recorded_depth, counts=counts
+        )
+
     def pictures(self, shown: ShownCamera) -> dict[str, NDArray[np.uint8]]:
         """What there is to see of a camera, by title.
 
@@ -144,17 +149,23 @@ class RunView:
     def up(self) -> NDArray[np.float64]:
         """(3,) unit vector, world frame: what most of the context's cameras hold to be up.
 
-        Without cameras it is a guess: scenes are wider than high, so it is z where the points
-        reach less far in z than in y, else -y, as in the frame of a camera.
+        Without cameras it is a guess, see guessed_up.
         """
         chosen = [c for c in self.cameras if c.kind == CONTEXT] or list(self.cameras)
         if not chosen:
-            _, y, z = np.diff(self.bounds, axis=0)[0]
-            return np.array([0.0, 0.0, 1.0]) if z < FLATTER * y else np.array([0.0, -1.0, 0.0])
+            return self._guessed_up
         # Image rows run downwards.
         total = -np.sum([c.camera.cam_from_world[0, 1, :3] for c in chosen], axis=0)
         length = float(np.linalg.norm(total))
         return total / length if length > 1e-6 else -chosen[0].camera.cam_from_world[0, 1, :3]
+
+    @cached_property
+    def _view_counts(self) -> NDArray[np.int64]:
+        return view_counts(self.memory)
+
+    @cached_property
+    def _guessed_up(self) -> NDArray[np.float64]:
+        return guessed_up(self.memory.frame.to_world(self._sample()[1]))
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
@@ -222,7 +233,7 @@ def inside(folder: Path, path: Path) -> Path:
         ProjectError: it does not.
     """
     if not path.resolve().is_relative_to(folder.resolve()):
-        raise ProjectError(f"{path}: lies outside {folder}; only a run's own files are shown")
+        raise ProjectError(f"{path}: lies outside {folder}; only a run's own files are read")
     return path
 
 

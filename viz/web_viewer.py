@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from viz.point_colors import MODES, Legend, point_colors
+from viz.point_colors import MODES, Legend
 from viz.run_view import RunView, ShownCamera
-from viz.run_view_detail import detail
+from viz.run_view_chunks import Chunks
+from viz.run_view_detail import Detail, detail
 from viz.web_viewer_cameras import CameraNodes, fly_to
 from viz.web_viewer_frame import FIELD_OF_VIEW, PageFrame, home
 from viz.web_viewer_guard import LOCAL, address_of, make_server
+from viz.web_viewer_near import NEAR_CHUNKS, NEAR_SHARE, NearPoints, Source
 from viz.web_viewer_panel import Panel
 from viz.web_viewer_pictures import shown_pictures
 from viz.web_viewer_points import PointNodes
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     import viser
 
 PORT = 8080
-# 15 bytes each; with all colour modes looked at once, 30 MB.
+# Of the whole run, 15 bytes each; with all colour modes looked at once, 30 MB.
 BUDGET = 1_000_000
 
 
@@ -39,7 +41,8 @@ class WebViewer:
         run: as it is now.
         host: address to listen at.
         port: the first one tried; where it is taken, the next free one is used.
-        budget: points drawn at most.
+        budget: points of the whole run drawn at most; near a viewer's own camera all observations
+            take their place, NEAR_SHARE of the budget at most.
         round: to begin with; None for the last.
         mode: colours to begin with, of viz.point_colors.MODES.
 
@@ -70,6 +73,14 @@ class WebViewer:
         self._points = PointNodes(self.server, self.frame)
         self._cameras = CameraNodes(self.server, self.frame, self._clicked)
         self._splats = SplatLook(self.server, self.frame)
+        self._chunks: Chunks | None = None
+        self._near = NearPoints(
+            self.server,
+            self.frame,
+            budget=int(NEAR_SHARE * budget),
+            colors=lambda run, mode, rows: run.colors(mode, rows).rgb,
+            on_change=self._count_near,
+        )
         self._panel = Panel(
             self.server,
             mode=mode,
@@ -77,7 +88,7 @@ class WebViewer:
             on_mode=self._show_mode,
             on_look=self._show_look,
             on_camera=self._select,
-            on_size=self._points.set_size,
+            on_size=self._set_size,
             on_kinds=self._cameras.set_kinds,
         )
         self.server.scene.set_up_direction(tuple(run.up()))
@@ -103,9 +114,14 @@ class WebViewer:
             drawn = detail(run.memory, self.budget)
             self._splats.set_run(run)
             self._panel.set_run(run, drawn, go_to=go_to)
-            self._points.set_points(run, drawn, self._colors(drawn.rows))
+            chunks = self._divided(run, drawn)
+            if chunks is not self._chunks:
+                self._near.set_source(None)
+                self._chunks = chunks
+            self._points.set_points(run, drawn, chunks, self._colors(drawn.rows))
             self._panel.set_size(self._points.size)
             self._show_round(self._panel.round)
+            self._set_near()
             self._cameras.set_cameras(run)
 
     def set_note(self, text: str) -> None:
@@ -114,16 +130,30 @@ class WebViewer:
 
     def stop(self) -> None:
         """End the server."""
+        self._near.stop()
         self._splats.stop()
         self._cameras.stop()
         with redirect_stdout(io.StringIO()):
             self.server.stop()
 
+    def _divided(self, run: RunView, drawn: Detail) -> Chunks:
+        """The chunks of the points; as they were while the run has not grown much."""
+        memory, before = run.memory, self._chunks
+        if not drawn.edge:
+            return Chunks.of(memory, max(1, len(memory)), cell=memory.voxel)
+        if before is not None and len(before) > 1 and len(memory) <= 2 * before.held:
+            return before
+        size = max(1, int(NEAR_SHARE * self.budget) // NEAR_CHUNKS)
+        return Chunks.of(memory, size, cell=drawn.edge)
+
+    def _set_near(self) -> None:
+        """Let near points come from the run in the colours looked at; not where all are drawn."""
+        chunks = self._chunks
+        if chunks is not None and len(chunks) > 1:
+            self._near.set_source(Source(self.run, chunks, self._points.size, self._panel.mode))
+
     def _colors(self, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
-        run = self.run
-        colors = point_colors(
-            run.memory, self._panel.mode, rows=rows, true_depth=run.recorded_depth
-        )
+        colors = self.run.colors(self._panel.mode, rows)
         self._panel.set_legend(colors.legend)
         return colors.rgb
 
@@ -132,20 +162,36 @@ class WebViewer:
             with self.server.atomic():
                 self._points.show(number)
                 self._cameras.show(number)
+            self._near.show(number)
             self._panel.set_counts(self.run, number, self._points.drawn(number))
             self._splats.set_state(number, self._panel.mode)
+            for client in self.server.get_clients().values():
+                self._count_near(client)
+
+    def _count_near(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            number = self._panel.round
+            near, chunks = self._near.drawn(client, number)
+            self._panel.set_near(client, near, self._points.drawn(number, chunks))
 
     def _show_mode(self, mode: str) -> None:
         with self._lock:
             if mode in MODES:
                 self._panel.set_legend(Legend("..."))
                 self._points.recolor(self._colors(self._points.rows))
+                self._set_near()
                 self._splats.set_state(self._panel.round, mode)
 
     def _show_look(self, splats: bool) -> None:
         with self._lock:
             self._points.set_visible(not splats)
+            self._near.set_visible(not splats)
             self._splats.set_on(splats)
+
+    def _set_size(self, scale: float) -> None:
+        with self._lock:
+            self._points.set_size(scale)
+            self._near.set_size(scale)
 
     def _clicked(self, shown: ShownCamera, client: viser.ClientHandle | None) -> None:
         self._select(shown, client, clicked=True)
@@ -180,7 +226,12 @@ class WebViewer:
             )
 
     def _follow(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(lambda seen: self._cameras.moved(np.array(seen.position)))
+        def moved(seen: viser.CameraHandle) -> None:
+            self._cameras.moved(np.array(seen.position))
+            self._near.moved(client)
+
+        client.camera.on_update(moved)
+        self._near.moved(client)
 
     def _set_home(self) -> None:
         """Where a page starts, and returns to."""

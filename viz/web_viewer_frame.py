@@ -103,9 +103,11 @@ def home(run: RunView, frame: PageFrame) -> tuple[Float64, Float64]:
     middle = (low + high) / 2
     radius = float(np.linalg.norm(high - low)) / 2 or run.typical_depth
     # Level and along the axis in which the cloud reaches least, so that its broad side is in view.
-    reach = np.where(np.abs(up) > 0.5, np.inf, high - low)
-    ahead = np.zeros(3)
-    ahead[int(np.argmin(reach))] = 1.0
+    reach = high - low
+    reach[np.argmax(np.abs(up))] = np.inf
+    ahead = np.eye(3)[np.argmin(reach)]
+    ahead = ahead - (ahead @ up) * up
+    ahead /= np.linalg.norm(ahead)
     away = ROOM * radius / np.sin(FIELD_OF_VIEW / 2)
     position = middle + away * (np.sin(ABOVE) * up - np.cos(ABOVE) * ahead)
     return frame.position(position), frame.position(middle)
