@@ -84,7 +84,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"gvtools: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("gvtools: interrupted; --resume continues a run", file=sys.stderr)
+        goes_on = "reconstruct goes on with --resume, tradeoff by itself"
+        print(f"gvtools: interrupted; {goes_on}", file=sys.stderr)
         return 1
     except Exception as error:
         if args.debug:

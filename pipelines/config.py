@@ -61,7 +61,7 @@ class SavingsOptions:
         reuse: what observed views show of a target is not projected again after completions were
             fused; the pictures are the same.
         joined: 2 x 2 pixels become one point, their mean, where they are together at most this many
-            voxel edges wide; 0 lifts each by itself.
+            voxel edges wide, unless the surface is steep; 0 lifts each by itself.
         minor_holes: a view with no unknown pixel farther than this share of the image diagonal from
             a known one is left to ``inpaint`` where the completer is a costly one (geoverse,
             exemplar); 0 leaves it none.
@@ -186,8 +186,13 @@ def with_profile(config: RunConfig, name: str) -> RunConfig:
     return replace(config, profile=name)
 
 
-def with_file(config: RunConfig, path: Path) -> RunConfig:
-    """``config`` with the settings of a JSON file (nested or dotted keys).
+def with_file(config: RunConfig, path: Path, *, profile: str | None = None) -> RunConfig:
+    """``config`` with the settings of a JSON file (nested or dotted keys) over those of a profile.
+
+    Args:
+        config: to start from.
+        path: the file.
+        profile: in place of the one that the file may name.
 
     Raises:
         OptionError: unreadable, no JSON object, an unknown key or a wrong value.
@@ -198,8 +203,8 @@ def with_file(config: RunConfig, path: Path) -> RunConfig:
         raise OptionError(f"{path}: no readable JSON configuration ({error})") from None
     if not isinstance(data, dict):
         raise OptionError(f"{path}: holds a {type(data).__name__}; expected an object of settings")
-    if "profile" in data:
-        config = with_profile(config, str(data["profile"]))
+    if profile is not None or "profile" in data:
+        config = with_profile(config, str(data["profile"]) if profile is None else profile)
     for key, value in flat_settings(data):
         if key != "profile":
             config = with_setting(config, key, value)
@@ -234,7 +239,9 @@ def with_setting(config: RunConfig, key: str, value: Any) -> RunConfig:
         return replace(config, completer_options=options)
     if head == "completer_options" and rest:
         return with_setting(config, f"completer.{rest}", value)
-    if head not in names:
+    if key == "completer_options" and not value:
+        return replace(config, completer_options={})
+    if head not in names or key == "completer_options":
         raise _unknown(key, config)
     current = getattr(config, head)
     if is_dataclass(current) and not isinstance(current, type):

@@ -98,7 +98,8 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
             edge *= sufficient_scale(
                 scene, recorded, edge, config=config, loss=config.fusion.voxel_loss, say=say
             )
-        config = replace(config, voxel=float(f"{edge:.3g}"))
+        # Not rounded: it has to follow the world's scale.
+        config = replace(config, voxel=edge)
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = replace(config, rounds=len(schedule))
     weights = [*getattr(chosen.source, "files", ()), *getattr(completer, "files", ())]

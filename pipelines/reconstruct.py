@@ -103,13 +103,13 @@ def copy_figures(args: argparse.Namespace, out: Path) -> None:
 
 
 def config_from(args: argparse.Namespace) -> RunConfig:
-    """Defaults, then --config, then --profile, then the options, then --set."""
+    """Defaults, then the profile, then --config, then the options, then --set."""
     from pipelines import config as settings
 
     config = settings.RunConfig()
     if args.config:
-        config = settings.with_file(config, args.config)
-    if args.profile:
+        config = settings.with_file(config, args.config, profile=args.profile)
+    elif args.profile:
         config = settings.with_profile(config, args.profile)
     names = ("context", "targets", "views_per_round", "rounds", "max_side", "depth", "completer",
              "voxel", "device", "seed")  # fmt: skip

@@ -22,6 +22,7 @@ import gvtools
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
 from pipelines.console import write_json
+from pipelines.held_folder import held_folder
 
 
 def versions() -> dict[str, str]:
@@ -78,31 +79,8 @@ class RunDirectory:
                 a run and ``resume`` is off; nothing is touched then.
         """
         self.refuse_foreign()
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            handle = os.open(self.path, os.O_RDONLY)
-        except OSError as error:
-            raise ProjectError(
-                f"{self.path}: cannot be made ({error.strerror}); give another --out"
-            ) from None
-        try:
-            self._lock(handle)
+        with held_folder(self.path):
             yield self._start(identity, resume=resume)
-        finally:
-            os.close(handle)
-
-    def _lock(self, handle: int) -> None:
-        try:
-            import fcntl
-
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ProjectError(
-                f"{self.path}: another process is at work on this run; wait for it, or give "
-                "another --out"
-            ) from None
-        except (ImportError, OSError):
-            return  # Where the system or the file system knows no locks, the user has to take care.
 
     def check(self, identity: dict[str, Any], *, resume: bool) -> bool:
         """Whether a run is there that ``taken_up`` would continue; touches nothing.

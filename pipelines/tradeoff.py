@@ -66,13 +66,16 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from dataclasses import replace
 
     from pipelines import config as settings
+    from pipelines.held_folder import held_folder
     from pipelines.plan import make_plan
     from pipelines.run_identity import run_identity
     from pipelines.scene_arguments import open_scene, reading_of
     from pipelines.tradeoffs.knobs import knobs_of
     from pipelines.tradeoffs.search import Search
-    from pipelines.tradeoffs.trial import Trials
+    from pipelines.tradeoffs.trial import Trials, applied
 
+    if args.out.exists() and not args.out.is_dir():
+        raise OptionError(f"--out {args.out}: is a file; give a folder")
     kind, budget = parse_budget(args.budget)
     limit_kind, limit = parse_budget(args.limit)
     if limit_kind != "seconds" or limit is None:
@@ -90,37 +93,39 @@ def run(args: argparse.Namespace, console: Console) -> None:
             "since a trial is measured against their pictures"
         )
     config = replace(config, voxel=plan.config.voxel)
-    args.out.mkdir(parents=True, exist_ok=True)
-    identity = run_identity(plan, reading_of(args))
-    trials = Trials(scene, config, plan.targets.cameras.names, args.out / "trials", identity)
-    trials.folder.mkdir(exist_ok=True)
+    with held_folder(args.out):
+        identity = run_identity(plan, reading_of(args))
+        trials = Trials(scene, config, plan.targets.cameras.names, args.out / "trials", identity)
+        trials.folder.mkdir(exist_ok=True)
 
-    def fits(outcome: Outcome) -> bool:
-        if budget is None:
-            return True
-        spent = outcome.bytes if kind == "bytes" else outcome.seconds(len(trials.names))
-        return spent <= budget
+        def fits(outcome: Outcome) -> bool:
+            if budget is None:
+                return True
+            spent = outcome.bytes if kind == "bytes" else outcome.seconds(len(trials.names))
+            return spent <= budget
 
-    search = Search(
-        knobs_of(plan), trials.outcome, len(trials.names), limit=limit, say=console.line
-    )
-    # A profile finds its own voxel edge.
-    profiles = [
-        (f"profile {name}", {"voxel": None, **changes})
-        for name, changes in settings.PROFILES.items()
-        if changes
-    ]
-    search.sweep(profiles, fits)
+        search = Search(
+            knobs_of(plan),
+            trials.outcome,
+            len(trials.names),
+            limit=limit,
+            say=console.line,
+            kept=trials.kept,
+        )
+        # A profile finds its own voxel edge.
+        profiles = [
+            (f"profile {name}", {"voxel": None, **changes})
+            for name, changes in settings.PROFILES.items()
+            if changes
+        ]
+        search.sweep(profiles, fits)
 
-    def profile(outcome: Outcome) -> Mapping[str, Any]:
-        """Everything but which views are given and which are completed."""
-        whole = config
-        for key, value in outcome.settings.items():
-            whole = settings.with_setting(whole, key, value)
-        changed = settings.changed_settings(whole)
-        return {key: changed[key] for key in changed if key not in ("context", "targets")}
+        def profile(outcome: Outcome) -> Mapping[str, Any]:
+            """Everything but which views are given and which are completed."""
+            changed = settings.changed_settings(applied(config, outcome.settings))
+            return {key: changed[key] for key in changed if key not in ("context", "targets")}
 
-    _write(search, args.out, scene.root.name, identity, kind, budget, fits, profile, console)
+        _write(search, args.out, scene.root.name, identity, kind, budget, fits, profile, console)
 
 
 def parse_budget(text: str | None) -> tuple[str, float | None]:
@@ -161,7 +166,7 @@ def _write(
     from pipelines.tradeoffs.tables import front_table, marginal_table, trial_table
     from viz.pareto import draw_pareto
 
-    whole = search.whole() or search.tried
+    whole = search.whole()
     chosen = search.recommended(fits)
     best = front([entry.outcome for entry in whole], search.targets)
     marginal = marginal_values(search)
@@ -219,8 +224,9 @@ def _write(
         )
         return
     write_json(out / "profile.json", profile(chosen.outcome))
+    on = "" if chosen.share == 1 else f" on {chosen.share:.0%} of the targets"
     console.line(
-        f"recommended: {chosen.outcome.psnr:.2f} dB in "
+        f"recommended: {chosen.outcome.psnr:.2f} dB{on} in "
         f"{chosen.outcome.seconds(search.targets):.1f} s, {chosen.outcome.bytes / 2**20:.0f} MiB; "
         f"gvtools reconstruct ... --config {out / 'profile.json'}"
     )

@@ -71,6 +71,20 @@ def test_the_file_s_own_settings_win_over_its_profile(tmp_path):
     assert config.memory.observations_per_voxel == 64
 
 
+def test_a_profile_named_beside_a_file_stands_below_the_file(tmp_path):
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps({"memory.same_direction": 8.0, "profile": "fast"}))
+    config = with_file(RunConfig(), path, profile="accurate")
+    assert (config.profile, config.memory.same_direction) == ("accurate", 8.0)
+    assert config.memory.observations_per_voxel == 64
+
+
+def test_no_options_of_the_completer_are_options(tmp_path):
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps({"completer_options": None}))
+    assert with_file(RunConfig(), path) == RunConfig()
+
+
 @pytest.mark.parametrize("text", ["[1]", "{", '{"nosuch": 1}'])
 def test_a_bad_file_is_refused(tmp_path, text):
     path = tmp_path / "c.json"

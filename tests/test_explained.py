@@ -52,6 +52,25 @@ def test_a_view_between_two_is_explained_at_any_exposure(memory, gain):
     assert (found.confidence > 0).all() and (found.confidence <= 1).all()
 
 
+@pytest.mark.parametrize("what", ["black", "noise", "mirrored", "checks"])
+def test_a_dark_photograph_of_something_else_is_not_explained(what):
+    """Over a memory without much contrast, which a dark picture is near to in absolute terms."""
+    row, column = np.indices(SIZE)
+    smooth = np.repeat((100 + 1.5 * column).astype(np.uint8)[..., None], 3, -1)
+    depth = np.full(SIZE, 2, np.float32)
+    known = SpatialMemory(0.02)
+    known.fuse(back_project(smooth, depth, camera(), frame=known.frame), round=0)
+    pictures: dict[str, np.ndarray] = {
+        "black": np.zeros_like(smooth),
+        "noise": np.random.default_rng(0).integers(0, 50, smooth.shape),
+        "mirrored": smooth[:, ::-1] // 3,
+        "checks": np.where((row // 8 + column // 8) % 2, 80, 20)[..., None].repeat(3, -1),
+    }
+    rgb = pictures[what].astype(np.uint8)
+    assert explained_depth(known, camera(), rgb, least=0.85) is None
+    assert explained_depth(known, camera(), smooth // 3, least=0.85) is not None
+
+
 def test_what_looks_different_is_not_explained(memory):
     rgb, _ = wall()
     rgb = rgb.copy()

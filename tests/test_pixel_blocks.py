@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
-from gvtools.memory.back_projection import back_project
+from gvtools.memory.back_projection import BackProjectionOptions, back_project
 
 FOCAL, NEAR, FAR = 50.0, 1.0, 4.0
+# Keeps everything, steps too.
+STEEP = BackProjectionOptions(edge=10.0, grazing=0.0)
 
 
 def camera(width: int, height: int) -> Cameras:
@@ -59,3 +61,33 @@ def test_what_is_not_whole_is_kept_pixel_by_pixel(width: int, height: int):
     # The corner's block is not whole, nor are those at an odd side's end.
     whole = max((width // 2) * (height // 2) - 1, 0)
     assert len(joined) == lifted - 3 * whole
+
+
+def test_steep_surfaces_keep_their_points_and_nothing_is_joined_across_a_step():
+    width, height, limit = 24, 16, 2.5 * NEAR / FOCAL
+    x = (np.arange(width) + 0.5 - width / 2) / FOCAL
+    rgb, _ = wall(width, height, NEAR)
+    counts = []
+    for slope in (0.5, 8.0):
+        # The plane z = NEAR + slope x: pixels lie sqrt(1 + slope²) times as far apart along it.
+        depth = np.tile((NEAR / (1 - slope * x)).astype(np.float32), (height, 1))
+        depth[:, (depth[0] > 1.2) | (depth[0] < 0.8)] = 0
+        every = back_project(rgb, depth, camera(width, height), options=STEEP)
+        joined = back_project(rgb, depth, camera(width, height), options=STEEP, joined=limit)
+        counts.append(len(joined) / len(every))
+    assert counts[0] < 0.5 and counts[1] == 1
+    _, step = wall(width, height, 2.0)
+    step[:, 11:] = 2.6
+    joined = back_project(rgb, step, camera(width, height), options=STEEP, joined=2.5 * 2.6 / FOCAL)
+    assert np.isin(joined.positions[:, 2], np.array([2.0, 2.6], np.float32)).all()
+    assert len(joined) < width * height / 3
+
+
+@pytest.mark.parametrize("confidence", [1e-45, 1.0, 3e38])
+def test_any_confidence_is_kept(confidence):
+    rgb, depth = wall(8, 6, NEAR)
+    trust = np.full(depth.shape, confidence, np.float32)
+    with np.errstate(all="raise"):
+        joined = back_project(rgb, depth, camera(8, 6), confidence=trust, joined=1e300)
+    assert len(joined) == 12 and np.isfinite(joined.confidence).all()
+    assert (joined.confidence > 0).all()

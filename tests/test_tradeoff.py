@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from tiny_scan import write_scan
 
 from gvtools.errors import OptionError
 from pipelines.cli import main
+from pipelines.held_folder import held_folder
 from pipelines.tradeoffs.search import EQUAL
 from viz.pareto import draw_pareto
 
@@ -99,3 +101,32 @@ def test_what_cannot_be_swept_is_one_line(scan, tmp_path, capsys, more, said):
 def test_a_plot_without_trials_is_refused():
     with pytest.raises(OptionError, match="without trials"):
         draw_pareto([], front=[], title="nothing")
+
+
+def test_a_damaged_trial_is_made_anew(scan, swept, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(swept, out)
+    start = json.loads((out / "tradeoff.json").read_text())["trials"][0]
+    files = {path: json.loads(path.read_text())["outcome"] for path in (out / "trials").iterdir()}
+    # Sweeps of the same project that was read otherwise may lie there, too.
+    damaged = [
+        path
+        for path, outcome in files.items()
+        if (outcome["settings"], outcome["targets"]) == (start["settings"], start["targets"])
+    ]
+    for path in damaged:
+        path.write_text("{")
+    command = ["tradeoff", str(scan), "--out", str(out), "--budget", "1h", "--quiet"]
+    assert main(command) == 0
+    whole = [path for path in damaged if path.read_text() != "{"]
+    assert [json.loads(path.read_text())["outcome"]["psnr"] for path in whole] == [start["psnr"]]
+
+
+def test_a_folder_takes_one_sweep_at_a_time(scan, tmp_path, capsys):
+    with held_folder(tmp_path / "out"):
+        assert main(["tradeoff", str(scan), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "another process is at work" in capsys.readouterr().err
+    file = tmp_path / "file"
+    file.write_text("mine")
+    assert main(["tradeoff", str(scan), "--out", str(file), "--quiet"]) == 2
+    assert "is a file" in capsys.readouterr().err and file.read_text() == "mine"

@@ -10,13 +10,23 @@ from typing import cast
 import numpy as np
 import pytest
 
-from gvtools.errors import GvError, OptionError
-from pipelines.config import RunConfig, with_setting
+from gvtools.completers.base import create
+from gvtools.errors import GvError, OptionError, ProjectError
+from pipelines.config import RunConfig, with_setting, with_settings
 from pipelines.plan import Plan
 from pipelines.tradeoff import parse_budget
-from pipelines.tradeoffs.knobs import Knob, Level, knobs_of, neighbours, settings_of, usual
+from pipelines.tradeoffs.knobs import (
+    Knob,
+    Level,
+    delivers_less,
+    knobs_of,
+    neighbours,
+    settings_of,
+    usual,
+)
 from pipelines.tradeoffs.outcome import Outcome, front
 from pipelines.tradeoffs.search import FINAL, SHARES, Search, marginal_values
+from pipelines.tradeoffs.trial import applied
 
 TARGETS = 40
 KNOBS = [
@@ -90,12 +100,12 @@ def test_the_recommendation_is_the_best_combination_within_the_budget(budget, be
 def test_what_delivers_less_is_recommended_only_where_nothing_else_is_within_the_budget(
     budget, less
 ):
-    size = Knob("size", (Level("half", {"size": 1}), Level("whole")), 1, delivered=True)
+    size = Knob("size", (Level("half", {"max_side": 50}), Level("whole")), 1, delivered=99)
     runs = Runs()
 
     def run(settings, share):
         outcome = runs(settings, share)
-        half = "size" in settings
+        half = "max_side" in settings
         return replace(
             outcome,
             fixed=outcome.fixed / (1 + 3 * half),
@@ -108,9 +118,11 @@ def test_what_delivers_less_is_recommended_only_where_nothing_else_is_within_the
     )
     search.sweep([], lambda outcome: fits(outcome, budget))
     chosen = search.recommended(lambda outcome: fits(outcome, budget))
-    assert chosen is not None and ("size" in chosen.outcome.settings) == less
+    assert chosen is not None and ("max_side" in chosen.outcome.settings) == less
     best = max(search.whole(), key=lambda entry: entry.outcome.psnr)
-    assert "size" in best.outcome.settings
+    assert "max_side" in best.outcome.settings
+    # As a profile has it that no picture is too large for.
+    assert not delivers_less(search.knobs, {"max_side": 480})
 
 
 def test_early_trials_are_small_and_each_knob_is_tried_alone():
@@ -231,3 +243,74 @@ def test_what_is_swept_is_what_the_run_has():
         for level in knob.levels:
             for key, value in level.settings.items():
                 with_setting(RunConfig(), key, value)
+
+
+def test_a_knob_of_one_completer_says_nothing_of_the_others():
+    knobs = [
+        Knob("completer", (Level("a", {"completer": "a"}), Level("b", {"completer": "b"})), 0),
+        Knob("b's", (Level("1", {"completer.of_b": 1}), Level("2", {"completer.of_b": 2})), 0,
+             completer="b"),
+    ]  # fmt: skip
+    assert settings_of(knobs, (0, 1)) == {"completer": "a"}
+    assert settings_of(knobs, (1, 1)) == {"completer": "b", "completer.of_b": 2}
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [[], ["completer=geoverse"], ["completer=geoverse", "completer.steps=2"],
+     ["completer=exemplar", "completer.reach=0.1"]],
+)  # fmt: skip
+def test_every_completer_can_be_tried_from_any_start(texts):
+    config = with_settings(RunConfig(), texts)
+    knobs = list(knobs_in("recorded", config).values())
+    at = [knob.name for knob in knobs].index("completer")
+    names = [level.name for level in knobs[at].levels]
+    assert names[:2] == ["none", "inpaint"] and "geoverse 3+1" in names
+    if config.completer == "geoverse":
+        # Between those with fewer and with more steps.
+        assert names.index("geoverse as given") in (3, 4) and len(names) == 6
+    for level in range(len(names)):
+        point = tuple(level if i == at else knob.usual for i, knob in enumerate(knobs))
+        changed = applied(config, settings_of(knobs, point))
+        create(changed.completer, **changed.completer_options)
+    start = applied(config, settings_of(knobs, usual(knobs)))
+    assert start.completer == config.completer
+    assert start.completer_options.items() >= config.completer_options.items()
+
+
+def test_what_an_earlier_sweep_gave_takes_no_time():
+    whole, _ = swept(100)
+    given = {(str(e.outcome.settings), e.share): e.outcome for e in whole.tried}
+    again = Search(
+        KNOBS, Runs(), TARGETS, limit=1e-9, say=lambda _: None, clock=lambda: 0.0,
+        kept=lambda settings, share: given.get((str(dict(settings)), share)),
+    )  # fmt: skip
+    again.sweep([("profile odd", {"edge": 3})], lambda outcome: fits(outcome, 100))
+    assert len(again.tried) == len(whole.tried) and not again.left_out
+
+
+def test_no_time_for_a_single_trial_is_said():
+    now = iter([0.0, 1.0])
+    search = Search(KNOBS, Runs(), TARGETS, limit=0.5, say=print, clock=lambda: next(now))
+    with pytest.raises(GvError, match="leaves no time"):
+        search.sweep([], lambda outcome: True)
+
+
+def test_equal_pictures_can_be_predicted():
+    runs = Runs()
+    search = Search(
+        KNOBS, lambda settings, share: replace(runs(settings, share), psnr=math.inf), TARGETS,
+        limit=1e6, say=lambda _: None, clock=lambda: runs.now,
+    )  # fmt: skip
+    search.sweep([], lambda outcome: True)
+    chosen = search.recommended(lambda outcome: True)
+    assert chosen is not None and chosen.share == 1
+
+
+def test_a_full_disk_is_no_fault_of_the_settings():
+    def run(settings, share):
+        raise ProjectError("cannot be written") from OSError("no space")
+
+    search = Search(KNOBS, run, TARGETS, limit=1e6, say=print)
+    with pytest.raises(ProjectError, match="cannot be written"):
+        search.sweep([], lambda outcome: True)

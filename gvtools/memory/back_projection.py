@@ -66,8 +66,8 @@ def back_project(
         confidence: (H, W) float32 of the source, > 0; None means 1.
         mask: (H, W) bool, True = use.
         options: see BackProjectionOptions.
-        joined: where 2 x 2 pixels together are at most so wide, scene units, they become one point,
-            their mean; 0 keeps every pixel's.
+        joined: where 2 x 2 pixels together are at most so wide, scene units, they become
+            one point, their mean, unless the surface is steep; 0 keeps every pixel's.
 
     Raises:
         ShapeError: the images and the camera disagree in size, or the camera is unusable.
@@ -106,7 +106,7 @@ def back_project(
     )  # fmt: skip
     if joined > 0:
         count = join_blocks(
-            pixels[:count], (height, width), np.float32(joined),
+            pixels[:count], (height, width), float(joined),
             positions[:count], colors[:count], weight[:count], spacing[:count],
         )  # fmt: skip
     far = np.inf if options.depth_max is None else options.depth_max

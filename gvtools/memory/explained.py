@@ -11,9 +11,11 @@ from gvtools.depth.source import DepthMap
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat import SplatOptions
 
-# Colours in [0, 1] that differ by less, in the mean over a window, may be of one surface: pictures
-# have noise, edges are half a pixel off, and surfaces shine.
-SAME_COLOR, WINDOW = 0.2, 5
+# Colours that differ by less, in the mean over a window, may be of one surface: pictures have
+# noise, edges are half a pixel off, and surfaces shine. In a picture darker than BRIGHT it is less.
+SAME_COLOR, BRIGHT, WINDOW = 0.2, 0.5, 5
+# A photograph this many times brighter or darker than memory tells too little.
+MOST_GAIN = 4.0
 # What such depth names as its source.
 MEMORY = "memory"
 
@@ -29,7 +31,7 @@ def explained_depth(
     """The depth of a photograph by memory, where memory explains enough of it.
 
     Memory explains a pixel where its observed content shows the photograph's colour, but for a
-    gain per channel that all pixels share.
+    gain per channel that all pixels share; the darker the photograph, the less may be off.
 
     Args:
         memory: is projected.
@@ -49,11 +51,15 @@ def explained_depth(
         return None
     seen = (rgb / np.float32(255)).astype(np.float32)
     shown = known.rgb[0]
-    gain = np.median(seen[valid], axis=0) / np.maximum(np.median(shown[valid], axis=0), 1 / 255)
+    level = np.median(seen[valid], axis=0)
+    gain = level / np.maximum(np.median(shown[valid], axis=0), 1 / 255)
+    if gain.max() > MOST_GAIN or gain.min() < 1 / MOST_GAIN:
+        return None
+    tolerance = SAME_COLOR * min(1.0, float(level.mean()) / BRIGHT)
     off = np.abs(shown * gain.astype(np.float32) - seen).mean(-1) * valid
     size = (WINDOW, WINDOW)
     mean = cv2.blur(off, size) / np.maximum(cv2.blur(valid.astype(np.float32), size), 1e-6)
-    explained = valid & (mean < SAME_COLOR)
+    explained = valid & (mean < tolerance)
     if explained.mean() < least:
         return None
     depth = np.where(explained, known.depth[0], np.float32(0))

@@ -9,16 +9,22 @@ import numpy as np
 from gvtools.memory.compiled import compiled
 
 SIDE = 2
+# A block may be so many times wider along its surface than across the line of sight: slanted
+# surfaces keep their points, and nothing is joined across a step. Noise widens blocks, too.
+SLANTED = 4.0
 
 
 @compiled()
 def join_blocks(pixels, shape, largest, positions, colors, weight, spacing):
-    """Each block of 2 x 2 pixels that were all lifted, and is at most ``largest`` wide, is joined.
+    """Each block of 2 x 2 pixels that were all lifted is joined, where it is small enough.
+
+    Its width is that of its pixels across the line of sight; along the surface it may be SLANTED
+    times as wide.
 
     Args:
         pixels: (N,) int64 row-major, where the points come from, ascending.
         shape: (H, W) of the image.
-        largest: side of a block, scene units.
+        largest: width of a block, scene units.
         positions: (N, 3) float32, rearranged in place, as the others.
         colors: (N, 3) uint8.
         weight: (N,) float32.
@@ -39,19 +45,26 @@ def join_blocks(pixels, shape, largest, positions, colors, weight, spacing):
             a, b = point[row, col], point[row, col + 1]
             c, d = point[row + 1, col], point[row + 1, col + 1]
             if a >= 0 and b >= 0 and c >= 0 and d >= 0:
-                apart = (old_spacing[a] + old_spacing[b] + old_spacing[c] + old_spacing[d]) / 4
-                if SIDE * apart <= largest:
+                widest = max(
+                    _apart(old_positions[a], old_positions[b]),
+                    _apart(old_positions[c], old_positions[d]),
+                    _apart(old_positions[a], old_positions[c]),
+                    _apart(old_positions[b], old_positions[d]),
+                )
+                apart = _mean(old_spacing[a], old_spacing[b], old_spacing[c], old_spacing[d])
+                if SIDE * apart <= largest and SIDE * widest <= SLANTED * largest:
                     for k in range(3):
-                        positions[n, k] = (
-                            old_positions[a, k] + old_positions[b, k]
-                            + old_positions[c, k] + old_positions[d, k]
-                        ) / 4  # fmt: skip
-                        total = (
-                            np.int32(old_colors[a, k]) + np.int32(old_colors[b, k])
-                            + np.int32(old_colors[c, k]) + np.int32(old_colors[d, k])
+                        positions[n, k] = _mean(
+                            old_positions[a, k], old_positions[b, k],
+                            old_positions[c, k], old_positions[d, k],
                         )  # fmt: skip
-                        colors[n, k] = (total + 2) // 4
-                    weight[n] = (old_weight[a] + old_weight[b] + old_weight[c] + old_weight[d]) / 4
+                        colors[n, k] = np.uint8(
+                            _mean(
+                                old_colors[a, k], old_colors[b, k],
+                                old_colors[c, k], old_colors[d, k],
+                            ) + 0.5
+                        )  # fmt: skip
+                    weight[n] = _mean(old_weight[a], old_weight[b], old_weight[c], old_weight[d])
                     spacing[n] = apart
                     n += 1
                     continue
@@ -62,3 +75,18 @@ def join_blocks(pixels, shape, largest, positions, colors, weight, spacing):
                     weight[n], spacing[n] = old_weight[i], old_spacing[i]
                     n += 1
     return n
+
+
+@compiled(inline="always")
+def _apart(p, q):
+    """The distance of two points."""
+    total = 0.0
+    for k in range(3):
+        total += (np.float64(p[k]) - np.float64(q[k])) ** 2
+    return np.sqrt(total)
+
+
+@compiled(inline="always")
+def _mean(a, b, c, d):
+    """In float64, where the sum of the greatest float32 has room."""
+    return (np.float64(a) + np.float64(b) + np.float64(c) + np.float64(d)) / 4

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from gvtools.completers.base import create
@@ -12,7 +12,7 @@ from gvtools.errors import GvError
 from gvtools.scenes.reduced import SMALLEST
 
 if TYPE_CHECKING:
-    from pipelines.config import RunConfig
+    from gvtools.completers.geoverse.config import GeoVerseConfig
     from pipelines.plan import Plan
 
 # Of the voxel edge that the run has.
@@ -44,33 +44,33 @@ class Knob:
         name: what it is.
         levels: from cheap to dear.
         usual: index of the level that the sweep starts from.
-        delivered: whether its cheaper levels deliver less, such as smaller pictures, rather than
-            the same with less effort.
+        delivered: longer side of the start's pictures, pixels, where cheaper levels deliver smaller
+            ones rather than the same with less effort; 0 for any other knob.
+        completer: the one that it belongs to; with others it changes nothing.
     """
 
     name: str
     levels: tuple[Level, ...]
     usual: int
-    delivered: bool = False
+    delivered: int = 0
+    completer: str | None = None
 
 
 def settings_of(knobs: Sequence[Knob], point: Point) -> dict[str, Any]:
-    """The settings of one level of each knob."""
+    """The settings of one level of each knob; of a knob whose completer is not there none."""
+    levels = [knob.levels[level] for knob, level in zip(knobs, point, strict=True)]
+    named = [level.settings["completer"] for level in levels if "completer" in level.settings]
     out: dict[str, Any] = {}
-    for knob, level in zip(knobs, point, strict=True):
-        out |= knob.levels[level].settings
+    for knob, level in zip(knobs, levels, strict=True):
+        if knob.completer is None or knob.completer in named:
+            out |= level.settings
     return out
 
 
 def delivers_less(knobs: Sequence[Knob], settings: Settings) -> bool:
     """Whether a run with these settings delivers less than the one that the sweep starts from."""
-    return any(
-        key in settings and settings[key] != knob.levels[knob.usual].settings.get(key)
-        for knob in knobs
-        if knob.delivered
-        for level in knob.levels
-        for key in level.settings
-    )
+    side = settings.get("max_side")
+    return side is not None and any(side < knob.delivered for knob in knobs)
 
 
 def usual(knobs: Sequence[Knob]) -> Point:
@@ -128,23 +128,24 @@ def knobs_of(plan: Plan) -> list[Knob]:
             "picture size",
             (*(Level(f"{size} px", {"max_side": size}) for size in sides), Level(f"{side} px")),
             len(sides),
-            delivered=True,
+            delivered=side,
         )
     )
     if "geoverse" in [level.settings["completer"] for level in completers.levels]:
-        knobs.append(
-            _numbers("holes left to inpaint, share of the diagonal", "savings.minor_holes",
-                     (0.1, 0.05, 0.02, 0.0), config.savings.minor_holes)
-        )  # fmt: skip
-    if config.completer == "geoverse":
-        given = config.completer_options
+        given = config.completer_options if config.completer == "geoverse" else {}
         knobs += [
-            _values("cascade steps", "completer.cascade_steps", (1, 2, 4, None),
-                    given.get("cascade_steps")),
-            _values("model resolution, px", "completer.image_size", _sizes(config),
-                    given.get("image_size")),
-            _values("precision", "completer.precision", ("bfloat16", "float32"),
-                    given.get("precision", "auto")),
+            replace(knob, completer="geoverse")
+            for knob in (
+                _numbers("holes left to inpaint, share of the diagonal", "savings.minor_holes",
+                         (0.1, 0.05, 0.02, 0.0), config.savings.minor_holes),
+                _values("cascade steps", "completer.cascade_steps", (1, 2, 4, None),
+                        given.get("cascade_steps")),
+                _values("model resolution, px", "completer.image_size", _sizes(given),
+                        given.get("image_size")),
+                _values("precision", "completer.precision", ("bfloat16", "float32"),
+                        given.get("precision", "auto")),
+                *_priors(given),
+            )
         ]  # fmt: skip
     if plan.source.name != RecordedDepth.name:
         knobs.append(
@@ -162,15 +163,31 @@ def knobs_of(plan: Plan) -> list[Knob]:
     return [knob for knob in knobs if len(knob.levels) > 1]
 
 
-def _sizes(config: RunConfig) -> tuple[int | None, ...]:
-    """Half and three quarters of the generative core's own picture size, and that itself."""
+def _core(given: Mapping[str, Any]) -> GeoVerseConfig:
+    """The generative core's configuration, with a run's options of it."""
     from gvtools.completers.geoverse.completer import GeoVerseCompleter
     from gvtools.completers.geoverse.weights.folder_parts import config_of
 
-    core = create("geoverse", **config.completer_options)
+    core = create("geoverse", **given)
     assert isinstance(core, GeoVerseCompleter)
-    size = config_of(core.folder).image_size
+    return config_of(core.folder)
+
+
+def _sizes(given: Mapping[str, Any]) -> tuple[int | None, ...]:
+    """Half and three quarters of the generative core's own picture size, and that itself."""
+    size = _core(given).image_size
     return size // 2, 3 * size // 4, None
+
+
+def _priors(given: Mapping[str, Any]) -> list[Knob]:
+    """The video prior left out and used, where the core has one."""
+    if _core(given).video is None:
+        return []
+    every = 1e6
+    return [
+        _numbers("holes without video prior, share of the diagonal", "completer.no_prior_holes",
+                 (every, 0.1, 0.0), float(given.get("no_prior_holes", 0.0)))
+    ]  # fmt: skip
 
 
 def _numbers(name: str, key: str, values: Sequence[float], start: float) -> Knob:
@@ -198,19 +215,26 @@ def _edge(voxel: float, share: float) -> Level:
 
 
 def _completers(plan: Plan) -> Knob:
-    """Completers that this installation has; the run's own with its options."""
+    """Completers that this installation has, cheap to dear; the run's own with its options."""
     config = plan.config
     options = {f"completer.{key}": value for key, value in config.completer_options.items()}
-    own = {"completer": config.completer, **options}
-    weights = {key: value for key, value in options.items() if key == "completer.weights"}
+    own = Level(f"{config.completer} as given", {"completer": config.completer, **options})
     known: list[Level] = [Level(name, {"completer": name}) for name in ("none", "inpaint")]
+    at = len(known)
+    of_core = config.completer == "geoverse"
     for steps in STEPS:
-        settings = {"completer": "geoverse", "completer.steps": steps, **weights}
+        settings: dict[str, Any] = {"completer": "geoverse", "completer.steps": steps}
+        if of_core:
+            settings = {**own.settings, **settings}
+            if steps < len(_core(config.completer_options).flow.level1):
+                at = len(known) + 1
         known.append(Level(f"geoverse {steps}+1", settings))
-    levels = [level for level in known if _available(level)]
-    if own not in [level.settings for level in levels]:
-        levels.append(Level(f"{config.completer} as given", own))
-    return Knob("completer", tuple(levels), [level.settings for level in levels].index(own))
+    if own.settings not in [level.settings for level in known]:
+        known.insert(at if of_core else len(known), own)
+    levels = [level for level in known if level is own or _available(level)]
+    return Knob(
+        "completer", tuple(levels), [level.settings for level in levels].index(own.settings)
+    )
 
 
 def _available(level: Level) -> bool:

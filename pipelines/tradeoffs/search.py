@@ -35,8 +35,10 @@ SHARES = (0.25, 0.5, 1.0)
 COMBINED, FINAL = 8, 5
 # dB that tell no two trials apart.
 EQUAL = 0.02
-# dB below the start that nobody wants, where anything else is within the budget.
+# dB below the best that nobody wants, where anything else is within the budget.
 POOR = 2.0
+# dB, for predictions.
+MOST = 99.0
 # Combinations that are looked at; more are drawn at random.
 LOOKED_AT = 50_000
 # Pull of the effects towards 0, so that combinations cannot be explained by two knobs at once.
@@ -71,6 +73,7 @@ class Search:
         targets: of a whole run.
         limit: seconds that the sweep may take; trials that would not fit are left out.
         say: is told of each trial.
+        kept: what a trial gave in an earlier sweep, or None; such trials take no time.
         clock: seconds, for tests.
     """
 
@@ -79,6 +82,7 @@ class Search:
     targets: int
     limit: float
     say: Callable[[str], None] = print
+    kept: Callable[[Settings, float], Outcome | None] = lambda settings, share: None
     clock: Callable[[], float] = time.perf_counter
     tried: list[Tried] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)
@@ -98,7 +102,12 @@ class Search:
         base = usual(self.knobs)
         self._try("start", base, SHARES[0])
         if not self.tried:
-            raise GvError(f"the run that was asked for is refused: {self.refused['start']}")
+            why = self.refused.get("start")
+            raise GvError(
+                f"the run that was asked for is refused: {why}"
+                if why
+                else f"a limit of {self.limit:g} s leaves no time for a trial; expected more"
+            )
         for name, settings in named:
             self._try_settings(name, settings, None, SHARES[0])
         for point in neighbours(self.knobs, base):
@@ -109,8 +118,9 @@ class Search:
             self._try_settings(entry.label, entry.outcome.settings, entry.point, SHARES[-1])
 
     def whole(self) -> list[Tried]:
-        """Trials on all targets."""
-        return [entry for entry in self.tried if entry.share == SHARES[-1]]
+        """Trials on all targets, or on the greatest share that any was made on."""
+        most = max((entry.share for entry in self.tried), default=SHARES[-1])
+        return [entry for entry in self.tried if entry.share == most]
 
     def predicted(self, points: Sequence[Point]) -> NDArray[np.float64]:
         """(N, 3) seconds of a whole run, bytes, PSNR of points, by the sum of the knobs' effects.
@@ -132,7 +142,8 @@ class Search:
         return (
             float(np.log(outcome.seconds(self.targets))),
             float(np.log(max(outcome.bytes, 1.0))),
-            outcome.psnr,
+            # Equal pictures have infinitely many.
+            min(outcome.psnr, MOST),
         )
 
     def _row(self, point: Point, share: float) -> NDArray[np.float64]:
@@ -185,7 +196,8 @@ class Search:
     def _finalists(self, fits: Callable[[Outcome], bool]) -> list[Tried]:
         """What is tried on all targets: the start, profiles, and the best of the larger share."""
         larger = [entry for entry in self.tried if entry.share == SHARES[1]]
-        good = [e for e in larger if e.outcome.psnr > self.tried[0].outcome.psnr - POOR]
+        most = max((entry.outcome.psnr for entry in larger), default=0.0)
+        good = [entry for entry in larger if entry.outcome.psnr >= most - POOR]
         if any(fits(entry.outcome) for entry in good):
             larger = good
         ranked: list[Outcome] = []
@@ -209,7 +221,7 @@ class Search:
         Of several that are as accurate the fastest, and one that delivers less than the start only
         where no other is within the budget.
         """
-        within = [entry for entry in self.whole() or self.tried if fits(entry.outcome)]
+        within = [entry for entry in self.whole() if fits(entry.outcome)]
         full = [entry for entry in within if not self._less(entry)]
         most = max((entry.outcome.psnr for entry in full or within), default=0.0)
         best = [entry for entry in full or within if entry.outcome.psnr >= most - EQUAL]
@@ -230,12 +242,15 @@ class Search:
         if any(e.share == share and e.outcome.settings == settings for e in self.tried):
             return
         left = self._end - self.clock()
-        if self._expected(settings, share) > left:
+        if self.kept(settings, share) is None and self._expected(settings, share) > left:
             self.left_out.append(label)
             return
         try:
             outcome = self.run(settings, share)
         except GvError as error:
+            # A disk that is full is no fault of the settings.
+            if isinstance(error.__cause__, OSError):
+                raise
             self.refused[label] = str(error)
             self.say(f"{label}: refused, {error}")
             return

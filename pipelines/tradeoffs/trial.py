@@ -7,7 +7,7 @@ import json
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,15 @@ from pipelines.reconstruct import reconstruct
 from pipelines.round_files import TargetFiles, read_target
 from pipelines.run_directory import RunDirectory
 from pipelines.tradeoffs.outcome import Outcome
+
+
+def applied(config: RunConfig, settings: Mapping[str, Any]) -> RunConfig:
+    """A run's settings with a trial's; one that names a completer says all of its options."""
+    if "completer" in settings:
+        config = replace(config, completer_options={})
+    for key, value in settings.items():
+        config = with_setting(config, key, value)
+    return config
 
 
 class _Silent(Console):
@@ -66,19 +75,34 @@ class Trials:
         Raises:
             GvError: the run is refused.
         """
-        count = max(1, round(share * len(self.names)))
-        rows = sorted({round((i + 0.5) * len(self.names) / count - 0.5) for i in range(count)})
-        names = [self.names[row] for row in rows]
-        kept = self.folder / f"{self._key(settings, names)}.json"
-        if kept.exists():
-            return Outcome(**json.loads(kept.read_text(encoding="utf-8"))["outcome"])
+        names = self._names(share)
+        kept = self.kept(settings, share)
+        if kept is not None:
+            return kept
         if not self._warm:
             # Compiled kernels load, and files come into the cache, once.
             self._warm = True
             self._run({}, names[:1])
         found = self._run(settings, names)
-        write_json(kept, {"outcome": found.to_json(), "names": names})
+        write_json(self._file(settings, names), {"outcome": found.to_json(), "names": names})
         return found
+
+    def kept(self, settings: Mapping[str, Any], share: float) -> Outcome | None:
+        """What this trial gave before; None if it was not made, or its file is damaged."""
+        file = self._file(settings, self._names(share))
+        try:
+            return Outcome(**json.loads(file.read_text(encoding="utf-8"))["outcome"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
+    def _names(self, share: float) -> list[str]:
+        """An even share of the targets."""
+        count = max(1, round(share * len(self.names)))
+        rows = sorted({round((i + 0.5) * len(self.names) / count - 0.5) for i in range(count)})
+        return [self.names[row] for row in rows]
+
+    def _file(self, settings: Mapping[str, Any], names: Sequence[str]) -> Path:
+        return self.folder / f"{self._key(settings, names)}.json"
 
     def _key(self, settings: Mapping[str, Any], names: Sequence[str]) -> str:
         import gvtools
@@ -89,9 +113,7 @@ class Trials:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def _run(self, settings: Mapping[str, Any], names: Sequence[str]) -> Outcome:
-        config = with_setting(self.config, "targets", ",".join(names))
-        for key, value in settings.items():
-            config = with_setting(config, key, value)
+        config = with_setting(applied(self.config, settings), "targets", ",".join(names))
         out = self.folder / "running"
         shutil.rmtree(out, ignore_errors=True)
         start = time.perf_counter()
