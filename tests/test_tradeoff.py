@@ -16,7 +16,6 @@ from pipelines.held_folder import held_folder
 from pipelines.tradeoffs.search import EQUAL
 from viz.pareto import draw_pareto
 
-
 TIMES = ("fixed", "per_target")
 
 
