@@ -116,7 +116,6 @@ def run(args: argparse.Namespace, console: Console) -> None:
         profiles = [
             (f"profile {name}", {"voxel": None, **changes})
             for name, changes in settings.PROFILES.items()
-            if changes
         ]
         search.sweep(profiles, fits)
 
