@@ -38,6 +38,7 @@ OFF: dict[str, dict[str, Any]] = {
     "small holes left to inpaint": {"savings.minor_holes": 0.0},
     "middle holes in one step": {"savings.one_step": 0.0},
     "middle holes in half the size": {"savings.half_size": 0.0},
+    "later steps near holes alone": {"savings.near_holes": False},
     "explained views without computed depth": {"savings.explained": None},
 }
 COSTLY = ("geoverse", "exemplar")
@@ -74,6 +75,7 @@ def rows_of(config: RunConfig, *, computed: bool) -> dict[str, Row]:
         idle.add("small holes left to inpaint")
     if config.completer != "geoverse":
         idle |= {"middle holes in one step", "middle holes in half the size"}
+        idle.add("later steps near holes alone")
     if not computed:
         idle.add("explained views without computed depth")
 

@@ -69,6 +69,8 @@ class SavingsOptions:
             of the model's own number where none of their unknown pixels is farther than this share
             of the diagonal from a known one; 0 spares none.
         half_size: likewise, they are completed in pictures of half the model's size.
+        near_holes: steps of the generative core after the first one look at tokens near holes
+            alone, where there is no video prior.
         explained: a context view whose depth would have to be computed takes memory's instead where
             the views before it explain this share of its pixels; None computes all.
     """
@@ -78,6 +80,7 @@ class SavingsOptions:
     minor_holes: float = 0.02
     one_step: float = 0.1
     half_size: float = 0.1
+    near_holes: bool = True
     explained: float | None = 0.9
 
     def __post_init__(self) -> None:
@@ -166,6 +169,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "savings.minor_holes": 0.0,
         "savings.one_step": 0.0,
         "savings.half_size": 0.0,
+        "savings.near_holes": False,
         "savings.explained": None,
         "memory.same_direction": 0.0,
         "memory.observations_per_voxel": 64,

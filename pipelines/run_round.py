@@ -134,6 +134,7 @@ def _complete(
                 config.savings.minor_holes,
                 config.savings.one_step,
                 config.savings.half_size,
+                config.savings.near_holes,
             ),
             context=context, config=config, clock=clock, progress=console.track,
             done=lambda at, result: writing.append(

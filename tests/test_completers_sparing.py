@@ -123,6 +123,7 @@ def test_a_completer_of_several_steps_is_told_where_one_will_do():
     assert wrapped.costly == replace(core, one_step_holes=0.1)
     assert sparing(core, 0.0, 0.0) is core
     assert sparing(core, 0.0, 0.1, 0.2) == replace(core, one_step_holes=0.1, half_size_holes=0.2)
+    assert sparing(core, 0.0, near_holes=True) == replace(core, near_holes=True)
     told = create("geoverse", one_step_holes=0.05)
     assert sparing(told, 0.0, 0.1) is told
     inpaint = create("inpaint")

@@ -57,7 +57,11 @@ class SparingCompleter:
 
 
 def sparing(
-    completer: Completer, minor: float, one_step: float = 0.0, half_size: float = 0.0
+    completer: Completer,
+    minor: float,
+    one_step: float = 0.0,
+    half_size: float = 0.0,
+    near_holes: bool = False,
 ) -> Completer:
     """``completer``, spared what small holes do not need, where it is costly.
 
@@ -68,11 +72,14 @@ def sparing(
             several; 0 leaves them all.
         half_size: passes whose holes reach no farther are made in pictures of half the size, where
             the completer has a size of its own; 0 leaves them all.
+        near_holes: steps after the first look at what lies near holes alone, where the completer
+            can.
     """
-    for name, share in (("one_step_holes", one_step), ("half_size_holes", half_size)):
+    wanted = {"one_step_holes": one_step, "half_size_holes": half_size, "near_holes": near_holes}
+    for name, value in wanted.items():
         # What the completer was told itself stands: only a 0 is replaced.
-        if share > 0 and is_dataclass(completer) and getattr(completer, name, 1) == 0:
-            completer = replace(completer, **{name: share})
+        if value and is_dataclass(completer) and not getattr(completer, name, True):
+            completer = replace(completer, **{name: value})
     if minor > 0 and getattr(completer, "costly", False):
         return SparingCompleter(completer, minor)
     return completer

@@ -69,6 +69,7 @@ class GeoVerseCompleter:
             0 never.
         no_prior_holes: likewise, a pass that does without the video prior.
         half_size_holes: likewise, a pass in pictures of half the size.
+        near_holes: steps after the first look at what lies near holes alone, see ``near_tokens``.
         image_size: longer side of the pictures in a pass, pixels, rounded to whole patches; None
             for the model's own, which is also the most.
         precision: "auto" is bfloat16 on a GPU and float32 on a CPU.
@@ -94,6 +95,7 @@ class GeoVerseCompleter:
     one_step_holes: float = 0.0
     no_prior_holes: float = 0.0
     half_size_holes: float = 0.0
+    near_holes: bool = False
     image_size: int | None = None
     precision: str = "auto"
     device: str = "auto"
@@ -247,6 +249,7 @@ class GeoVerseCompleter:
                 temperature=self.temperature,
                 prior=prior,
                 targets_alone=told,
+                near_holes=self.near_holes,
             )
 
         def brought(color_alignment: str) -> Completed:

@@ -37,6 +37,7 @@ from gvtools.completers.geoverse.flow import (
     velocity_from_clean,
 )
 from gvtools.completers.geoverse.injection import check_features, video_keys
+from gvtools.completers.geoverse.near_tokens import NearTokens, near_tokens
 from gvtools.completers.geoverse.noise import seeded_noise, view_seed
 from gvtools.completers.geoverse.passes import Decoded, Generated, Prepared
 from gvtools.completers.geoverse.plucker import camera_condition
@@ -198,7 +199,13 @@ class GeoVerse(nn.Module):
         return self.video.features(batch.images, batch.valid, batch.context, seed=seeds)
 
     def velocity1(
-        self, prepared: Prepared, state: Tensor, t: Tensor, *, least: float | None = None
+        self,
+        prepared: Prepared,
+        state: Tensor,
+        t: Tensor,
+        *,
+        least: float | None = None,
+        near: NearTokens | None = None,
     ) -> Tensor:
         """The level-1 velocity (Eq. 2).
 
@@ -207,6 +214,7 @@ class GeoVerse(nn.Module):
             state: (B, V, C, h, w).
             t: (B,) or (B, V).
             least: instead of the configuration's ``flow.least_time``.
+            near: see ``Denoiser.forward``.
         """
         residuals = None
         if self.control is not None and prepared.adapted is not None:
@@ -225,6 +233,7 @@ class GeoVerse(nn.Module):
             residuals=residuals,
             video=prepared.keys,
             positions=prepared.positions,
+            near=near,
         )
         flow = self.config.flow
         if flow.prediction == "velocity":
@@ -255,6 +264,7 @@ class GeoVerse(nn.Module):
         bounds: Sequence[float] | None = None,
         guidance: float | None = None,
         temperature: float | None = None,
+        near: NearTokens | None = None,
         clock: Clock = no_clock,
     ) -> Tensor:
         """Level-1 latents from (B, V, C, h, w) noise, one Euler step an interval."""
@@ -269,7 +279,7 @@ class GeoVerse(nn.Module):
 
         def velocity(state: Tensor, t: Tensor) -> Tensor:
             with clock(stages.LEVEL1):
-                return self.velocity1(prepared, state, t, least=least)
+                return self.velocity1(prepared, state, t, least=least, near=near)
 
         def unconditional(state: Tensor, t: Tensor) -> Tensor:
             with clock(stages.LEVEL1):
@@ -364,6 +374,7 @@ class GeoVerse(nn.Module):
         video: VideoFeatures | None = None,
         prior: bool = True,
         targets_alone: bool = False,
+        near_holes: bool = False,
         clock: Clock = no_clock,
     ) -> Generated:
         """One pass: prepare, sample level 1 and level 0, decode.
@@ -381,6 +392,8 @@ class GeoVerse(nn.Module):
             video: features computed before, for the same views.
             prior: see ``prepare``.
             targets_alone: without all views' geometry; the same pictures and depth, sooner.
+            near_holes: steps of level 1 after the first look at tokens near holes alone, see
+                ``near_tokens``; where there is a video prior or a guidance scale, all look at all.
             clock: receives the stages' names.
         """
         rows = names or [list(range(batch.images.shape[1]))] * len(batch.images)
@@ -396,12 +409,19 @@ class GeoVerse(nn.Module):
 
         level1 = prepared.hints.unmasked
         if bounds is None or len(bounds):
+            near = None
+            scale = self.config.flow.guidance if guidance is None else guidance
+            alone = prepared.adapted is None and prepared.keys is None and scale == 1
+            if near_holes and alone and len(bounds or self.config.flow.level1) > 2:
+                grid = (like.shape[-2], like.shape[-1])
+                near = near_tokens(batch.valid, batch.context, grid)
             level1 = self.sample1(
                 prepared,
                 noise("level1"),
                 bounds=bounds,
                 guidance=guidance,
                 temperature=temperature,
+                near=near,
                 clock=clock,
             )
         level0 = self.sample0(prepared, level1, noise("level0"), bounds=cascade_bounds, clock=clock)
