@@ -243,6 +243,7 @@ def test_a_run_within_the_budget_is_drawn_whole_and_nothing_is_sent_twice(run):
         client.server.stop()
 
 
+@pytest.mark.slow
 def test_who_flies_near_sees_more(run, viewer):
     full = WebViewer(run, port=free_port())
     # Close enough that all that is in view is within the budget.
