@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from viz.run_view_detail import coordinates
+
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -48,7 +50,7 @@ class Chunks:
         most = (MOST_NODES // max(1, len(memory.rounds))).bit_length() - 1
         levels = min(max(0, most), max(0, -(-count // size) - 1).bit_length())
         sampled = slice(0, count, max(1, count // SAMPLED))
-        position = np.stack([axis[sampled] for axis in _coordinates(memory)], axis=1)
+        position = np.stack([axis[sampled] for axis in coordinates(memory)], axis=1)
         axes = np.zeros(2**levels - 1, np.int8)
         cuts = np.zeros(2**levels - 1)
         parts = {0: position}
@@ -68,10 +70,10 @@ class Chunks:
 
     def number(self, memory: SpatialMemory, rows: NDArray[np.int64] | slice) -> NDArray[np.uint16]:
         """(P,) uint16, the chunk of each of some observations."""
-        coordinates = [axis[rows] for axis in _coordinates(memory)]
-        at = np.zeros(len(coordinates[0]), np.int64)
+        position = [axis[rows] for axis in coordinates(memory)]
+        at = np.zeros(len(position[0]), np.int64)
         for _ in range(len(self).bit_length() - 1):
-            above = np.choose(self.axes[at], coordinates) >= self.cuts[at]
+            above = np.choose(self.axes[at], position) >= self.cuts[at]
             at = 2 * at + 1 + above
         return (at - len(self.cuts)).astype(np.uint16)
 
@@ -104,7 +106,7 @@ class ChunkRows:
         boxes = np.zeros((len(chunks), 2, 3), np.float32)
         filled = np.flatnonzero(held)
         if filled.size:
-            for k, axis in enumerate(_coordinates(memory)):
+            for k, axis in enumerate(coordinates(memory)):
                 sorted_ = axis[rows]
                 boxes[filled, 0, k] = np.minimum.reduceat(sorted_, starts[filled])
                 boxes[filled, 1, k] = np.maximum.reduceat(sorted_, starts[filled])
@@ -148,8 +150,3 @@ def _middle(values: NDArray[np.float32], cell: float) -> float:
     """Between two cells, so that about half of the values lie on each side."""
     below = float(np.floor(np.median(values) / cell) * cell)
     return min(below, below + cell, key=lambda cut: abs(float((values >= cut).mean()) - 0.5))
-
-
-def _coordinates(memory: SpatialMemory) -> tuple[NDArray[np.float32], ...]:
-    records, count = memory.records, len(memory)
-    return records.x[:count], records.y[:count], records.z[:count]

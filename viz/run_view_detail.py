@@ -50,7 +50,7 @@ def detail(memory: SpatialMemory, budget: int) -> Detail:
         return Detail(np.arange(count), 0.0, size)
     generated = memory.generated
     edge = memory.voxel
-    reach = max(float(np.abs(axis[:count]).max()) for axis in _axes(memory))
+    reach = max(float(np.abs(axis).max()) for axis in coordinates(memory))
     while True:
         _, first = np.unique((cell_keys(memory, edge) << 1) | generated, return_index=True)
         # Cells that meet at the origin do not become one however large they are.
@@ -74,9 +74,9 @@ def cell_keys(memory: SpatialMemory, edge: float) -> NDArray[np.int64]:
     count = len(memory)
     while True:
         keys = np.zeros(count, np.int64)
-        for axis in _axes(memory):
+        for axis in coordinates(memory):
             # Times the inverse, as the memory counts its voxels.
-            cell = np.floor(axis[:count] * (1.0 / np.float64(edge)))
+            cell = np.floor(axis * (1.0 / np.float64(edge)))
             cell -= cell.min(initial=0.0)
             if not cell.max(initial=0.0) < 1 << AXIS_BITS:
                 break
@@ -86,5 +86,7 @@ def cell_keys(memory: SpatialMemory, edge: float) -> NDArray[np.int64]:
         edge *= 2.0
 
 
-def _axes(memory: SpatialMemory) -> tuple[NDArray[np.float32], ...]:
-    return memory.records.x, memory.records.y, memory.records.z
+def coordinates(memory: SpatialMemory) -> tuple[NDArray[np.float32], ...]:
+    """x, y and z (N,) of the observations, in the memory's frame, scene units."""
+    records, count = memory.records, len(memory)
+    return records.x[:count], records.y[:count], records.z[:count]

@@ -119,7 +119,8 @@ def project_again(
     check_usable(camera)
     projection = _Projection(memory, camera, options, _splatter(memory, options))
     if observed is None:
-        observed = projection.observe()
+        projection.observe()
+        observed = projection.observed()
     else:
         projection.take_over(observed)
     return projection.guidance(), observed
@@ -160,12 +161,15 @@ class _Projection:
         self.scale, self.tiers, self.size = 0.0, 0, options.nearest_views
         self.tier = np.full(len(memory.views), -1)
 
-    def observe(self) -> Observed:
-        """Write what observed views show; a copy of it."""
+    def observe(self) -> None:
+        """Write what observed views show."""
         if self._select(generated=False):
             self._splat_tiers()
             if self.options.occluders:
                 self._splat_occluders()
+
+    def observed(self) -> Observed:
+        """A copy of what is written so far."""
         t = self.target
         return Observed(
             t.rgb.copy(), t.depth.copy(), t.valid.copy(), t.confidence.copy(),

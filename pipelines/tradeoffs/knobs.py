@@ -133,6 +133,7 @@ def knobs_of(plan: Plan) -> list[Knob]:
     )
     if "geoverse" in [level.settings["completer"] for level in completers.levels]:
         given = config.completer_options if config.completer == "geoverse" else {}
+        core = _core(given)
         knobs += [
             replace(knob, completer="geoverse")
             for knob in (
@@ -140,11 +141,12 @@ def knobs_of(plan: Plan) -> list[Knob]:
                          (0.1, 0.05, 0.02, 0.0), config.savings.minor_holes),
                 _values("cascade steps", "completer.cascade_steps", (1, 2, 4, None),
                         given.get("cascade_steps")),
-                _values("model resolution, px", "completer.image_size", _sizes(given),
+                _values("model resolution, px", "completer.image_size",
+                        (core.image_size // 2, 3 * core.image_size // 4, None),
                         given.get("image_size")),
                 _values("precision", "completer.precision", ("bfloat16", "float32"),
                         given.get("precision", "auto")),
-                *_priors(given),
+                *_priors(core, given),
             )
         ]  # fmt: skip
     if plan.source.name != RecordedDepth.name:
@@ -173,15 +175,9 @@ def _core(given: Mapping[str, Any]) -> GeoVerseConfig:
     return config_of(core.folder)
 
 
-def _sizes(given: Mapping[str, Any]) -> tuple[int | None, ...]:
-    """Half and three quarters of the generative core's own picture size, and that itself."""
-    size = _core(given).image_size
-    return size // 2, 3 * size // 4, None
-
-
-def _priors(given: Mapping[str, Any]) -> list[Knob]:
+def _priors(core: GeoVerseConfig, given: Mapping[str, Any]) -> list[Knob]:
     """The video prior left out and used, where the core has one."""
-    if _core(given).video is None:
+    if core.video is None:
         return []
     every = 1e6
     return [
@@ -222,11 +218,13 @@ def _completers(plan: Plan) -> Knob:
     known: list[Level] = [Level(name, {"completer": name}) for name in ("none", "inpaint")]
     at = len(known)
     of_core = config.completer == "geoverse"
+    # As many bounds as it has steps, and one more.
+    bounds = len(_core(config.completer_options).flow.level1) if of_core else 0
     for steps in STEPS:
         settings: dict[str, Any] = {"completer": "geoverse", "completer.steps": steps}
         if of_core:
             settings = {**own.settings, **settings}
-            if steps < len(_core(config.completer_options).flow.level1):
+            if steps < bounds:
                 at = len(known) + 1
         known.append(Level(f"geoverse {steps}+1", settings))
     if own.settings not in [level.settings for level in known]:

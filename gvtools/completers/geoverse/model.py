@@ -267,7 +267,18 @@ class GeoVerse(nn.Module):
         near: NearTokens | None = None,
         clock: Clock = no_clock,
     ) -> Tensor:
-        """Level-1 latents from (B, V, C, h, w) noise, one Euler step an interval."""
+        """Level-1 latents from (B, V, C, h, w) noise, one Euler step an interval.
+
+        Args:
+            prepared: what stays constant.
+            noise: (B, V, C, h, w).
+            bounds: see ``generate``, as the others.
+            guidance: scale.
+            temperature: of the noise.
+            near: the tokens that later steps look at; all do where there is a video prior or a
+                guidance scale.
+            clock: receives the stages' names.
+        """
         flow = self.config.flow
         noise = noise * (flow.temperature if temperature is None else temperature)
         scale = flow.guidance if guidance is None else guidance
@@ -276,6 +287,9 @@ class GeoVerse(nn.Module):
         # The floor is for training. A step from t goes (t - next) / t of the way to the clean
         # latents, however small t is; with the floor, short last steps would leave noise behind.
         least = min(flow.least_time, tau[-2])
+        whole = scale != 1 or prepared.adapted is not None or prepared.keys is not None
+        if whole or len(tau) < 3:
+            near = None
 
         def velocity(state: Tensor, t: Tensor) -> Tensor:
             with clock(stages.LEVEL1):
@@ -409,12 +423,8 @@ class GeoVerse(nn.Module):
 
         level1 = prepared.hints.unmasked
         if bounds is None or len(bounds):
-            near = None
-            scale = self.config.flow.guidance if guidance is None else guidance
-            alone = prepared.adapted is None and prepared.keys is None and scale == 1
-            if near_holes and alone and len(bounds or self.config.flow.level1) > 2:
-                grid = (like.shape[-2], like.shape[-1])
-                near = near_tokens(batch.valid, batch.context, grid)
+            grid = (like.shape[-2], like.shape[-1])
+            near = near_tokens(batch.valid, batch.context, grid) if near_holes else None
             level1 = self.sample1(
                 prepared,
                 noise("level1"),
