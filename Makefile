@@ -1,5 +1,5 @@
 # make demo    the main job on a sample that needs no download; ARGS="--sample motorcycle"
-# make test    the tests; ARGS="--runslow" for all of them
+# make test    the tests, side by side; ARGS="--runslow" for all of them
 # make lint    what continuous integration asks of the code's form
 # make wheel   dist/*.whl
 # make clean   removes what the above made, .venv included
@@ -16,7 +16,7 @@ demo: environment
 	$(BIN)/gvtools demo $(ARGS)
 
 test: environment
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 lint: environment
 	$(BIN)/python -m ruff check .
