@@ -29,6 +29,11 @@ from pipelines.run_directory import RunDirectory
 # Each saving's settings when it is off.
 OFF: dict[str, dict[str, Any]] = {
     "voxel edge measured": {"fusion.voxel_loss": None},
+    # With one edge throughout, the typical footprint's is the sensible one.
+    "voxels as wide as footprints": {
+        "memory.footprints": 0.0,
+        "fusion.voxel_percentile": 50.0,
+    },
     "alike observations merged": {
         "memory.same_direction": 0.0,
         "memory.observations_per_voxel": 64,

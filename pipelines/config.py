@@ -28,8 +28,8 @@ class FusionOptions:
         min_confidence: generated pixels below this are not fused.
         max_scale_residual: a completion whose depth fits the memory's worse than this relative
             residual is refused.
-        voxel_percentile: the automatic voxel edge follows this percentile of the context's pixel
-            footprints; near surfaces are what a coarse voxel blurs.
+        voxel_percentile: the automatic edge of the finest voxels follows this percentile of the
+            context's pixel footprints; what is farther gets wider ones (``memory.footprints``).
         voxel_scale: how many such footprints the edge is.
         voxel_loss: of edges from half to four times the footprints', dB by which context views,
             predicted from their neighbours, may be worse than with the best one for a coarser one
@@ -38,7 +38,7 @@ class FusionOptions:
 
     min_confidence: float = 0.08
     max_scale_residual: float = 0.1
-    voxel_percentile: float = 50.0
+    voxel_percentile: float = 10.0
     voxel_scale: float = 1.0
     voxel_loss: float | None = 0.05
 
@@ -54,8 +54,9 @@ class FusionOptions:
 class SavingsOptions:
     """What a run does not compute because the scene does not require it.
 
-    The voxel edge (``fusion.voxel_loss``) and what a voxel keeps (``memory.same_direction``,
-    ``memory.observations_per_voxel``) are savings, too.
+    The voxel edge (``fusion.voxel_loss``), wider voxels for what is far (``memory.footprints``) and
+    what a voxel keeps (``memory.same_direction``, ``memory.observations_per_voxel``) are savings,
+    too.
 
     Attributes:
         reuse: what observed views show of a target is not projected again after completions were

@@ -65,7 +65,7 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
     from gvtools.scenes.reduced import reduced
     from gvtools.scenes.selection import select
     from pipelines.targets import resolve_targets
-    from pipelines.voxel_probe import sufficient_scale
+    from pipelines.voxel_probe import at_scale, sufficient_scale
 
     errors = [finding.message for finding in scene.findings if finding.level == "error"]
     if errors:
@@ -92,14 +92,14 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
         edge = automatic_voxel(
             scene, context, chosen.source, percentile=config.fusion.voxel_percentile, say=say
         )
-        edge *= config.fusion.voxel_scale
+        # Not rounded: it has to follow the world's scale.
+        config = at_scale(replace(config, voxel=edge), config.fusion.voxel_scale)
         if config.fusion.voxel_loss is not None:
             recorded = [name for name in context if is_recorded(chosen.source, scene[name])]
-            edge *= sufficient_scale(
-                scene, recorded, edge, config=config, loss=config.fusion.voxel_loss, say=say
+            scale = sufficient_scale(
+                scene, recorded, config=config, loss=config.fusion.voxel_loss, say=say
             )
-        # Not rounded: it has to follow the world's scale.
-        config = replace(config, voxel=edge)
+            config = at_scale(config, scale)
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = replace(config, rounds=len(schedule))
     weights = [*getattr(chosen.source, "files", ()), *getattr(completer, "files", ())]

@@ -97,7 +97,8 @@ def observe_context(
                 confidence=depth_map.confidence,
                 mask=frame.mask,
                 options=config.back_projection,
-                joined=config.savings.joined * memory.voxel,
+                levels=memory.levels,
+                joined=config.savings.joined,
             )
             total += memory.fuse(points, round=0)
         for reason, count in points.dropped.items():
@@ -267,7 +268,8 @@ def _align_and_fuse(
                 confidence=np.where(fused, confidence, np.float32(1)),
                 mask=fused,
                 options=config.back_projection,
-                joined=config.savings.joined * memory.voxel,
+                levels=memory.levels,
+                joined=config.savings.joined,
             )
             report = memory.fuse(points, round=number, generated=True)
     figures = {

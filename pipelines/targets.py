@@ -78,7 +78,8 @@ def resolve_targets(
             return targets
         return _file(Path(path), known)
     try:
-        chosen = select(scene.names, spec)
+        # By name, as the context: what one target adds, the next ones are completed on.
+        chosen = tuple(sorted(select(scene.names, spec)))
     except OptionError as error:
         raise OptionError(f"targets {spec!r}: {error}; or give {FORMS}") from None
     if not allow_overlap:
@@ -134,7 +135,7 @@ def _project(path: Path, selection: str, max_side: int | None) -> Targets:
     from gvtools.scenes.reduced import reduced
 
     other = reduced(open_project(path), max_side)
-    chosen = select(other.names, selection)
+    chosen = tuple(sorted(select(other.names, selection)))
     views = tuple(other[name] for name in chosen)
     files = tuple(file for view in views for file in view.files)
     return Targets(other.subset(chosen).cameras, views, "project", files, path.resolve())

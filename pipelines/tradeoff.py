@@ -92,7 +92,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             f"--targets {args.targets}: no views of the project; expected a selection of them, "
             "since a trial is measured against their pictures"
         )
-    config = replace(config, voxel=plan.config.voxel)
+    config = replace(config, voxel=plan.config.voxel, memory=plan.config.memory)
     with held_folder(args.out):
         identity = run_identity(plan, reading_of(args))
         trials = Trials(scene, config, plan.targets.cameras.names, args.out / "trials", identity)

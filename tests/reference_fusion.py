@@ -12,6 +12,10 @@ from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 single = np.float32
 
 
+# Level and place of a voxel.
+Cell = tuple[int, int, int, int]
+
+
 @dataclass
 class Observation:
     position: np.ndarray
@@ -20,6 +24,7 @@ class Observation:
     spacing: float
     view: int
     agreement: float = 0.0
+    origin: int = -1
 
 
 class ReferenceMemory:
@@ -27,7 +32,7 @@ class ReferenceMemory:
 
     def __init__(self, voxel: float, options: MemoryOptions) -> None:
         self.voxel, self.options = voxel, options
-        self.chains: dict[tuple[int, int, int], list[Observation]] = {}
+        self.chains: dict[Cell, list[Observation]] = {}
         self.centers: list[np.ndarray] = []
         self.rounds: list[int] = []
         self.made: list[bool] = []
@@ -37,35 +42,57 @@ class ReferenceMemory:
         self.centers.append(points.frame.from_world(points.camera.centers)[0])
         self.rounds.append(round)
         self.made.append(generated)
-        cells: dict[tuple[int, int, int], list[int]] = {}
+        cells: dict[Cell, list[int]] = {}
         for i, p in enumerate(points.positions.astype(float)):
-            x, y, z = np.floor(p * (1.0 / self.voxel)).astype(int).tolist()
-            cells.setdefault((x, y, z), []).append(i)
+            ratio = self.options.footprints * float(points.spacing[i]) / self.voxel
+            level = max(0, min(7, int(np.floor(np.log2(max(ratio, 1e-9) * (1 + 2**-10))))))
+            cells.setdefault(self._cell(p, level), []).append(i)
         tally = {"added": 0, "merged": 0, "rejected_observed": 0, "voxels": 0, "agreed": 0}
-        for cell, rows in cells.items():
+        blocks: dict[Cell, list[Cell]] = {}
+        for level, x, y, z in cells:
+            blocks.setdefault((level, x >> 4, y >> 4, z >> 4), []).append((level, x, y, z))
+        for cell in (cell for members in blocks.values() for cell in members):
+            rows = cells[cell]
             w = points.confidence[rows].astype(float)
             fresh = Observation(
                 w @ points.positions[rows].astype(float) / w.sum(),
                 w @ points.colors[rows].astype(float) / w.sum(),
                 w.max(),
-                max(w @ points.spacing[rows].astype(float) / w.sum(), self.voxel),
+                max(w @ points.spacing[rows].astype(float) / w.sum(), self.voxel * 2 ** cell[0]),
                 len(self.centers) - 1,
+                origin=len(self.centers) - 1,
             )
-            tally["voxels"] += cell not in self.chains
-            self._take(self.chains.setdefault(cell, []), fresh, len(rows), tally)
+            self._take(cell[0], self.chains.setdefault(cell, []), fresh, len(rows), tally)
+            if not self.chains[cell]:
+                del self.chains[cell]
         return tally
 
-    def _take(self, chain: list[Observation], fresh: Observation, count: int, tally) -> None:
+    def _cell(self, p: np.ndarray, level: int) -> Cell:
+        x, y, z = np.floor(p * (1.0 / self.voxel) / 2**level).astype(int).tolist()
+        return level, x, y, z
+
+    def _take(
+        self, level: int, chain: list[Observation], fresh: Observation, count: int, tally
+    ) -> None:
         generated, options = self.made[-1], self.options
-        if generated and any(not self.made[o.view] for o in chain):
+        around = [self.chains.get(self._cell(fresh.position, other), []) for other in range(8)]
+        if generated and any(not self.made[o.view] for there in around for o in there):
             tally["rejected_observed"] += count
             return
-        rivals = [o for o in reversed(chain) if generated or not self.made[o.view]]
-        if rivals:
+        for other in (level, *range(level)):
+            there = chain if other == level else around[other]
+            rivals = [o for o in reversed(there) if generated or not self.made[o.view]]
+            if other != level:
+                # Within a view, each place has one level.
+                rivals = [o for o in rivals if o.origin != fresh.view]
+            if not rivals:
+                continue
             best = max(rivals, key=lambda o: self._likeness(o, fresh)[0])
             same = self._likeness(best, fresh)[1] >= np.cos(np.radians(options.same_direction))
-            fine = fresh.spacing >= options.finer * best.spacing
-            if len(rivals) >= options.observations_per_voxel or (same and fine):
+            takes = same and fresh.spacing >= options.finer * best.spacing
+            if other == level:
+                takes |= len(rivals) >= options.observations_per_voxel
+            if takes:
                 tally["merged"] += count
                 if self.rounds[best.view] == self.rounds[-1]:
                     self._average(best, fresh)
@@ -76,6 +103,7 @@ class ReferenceMemory:
         fresh.color = np.floor(fresh.color + 0.5)
         fresh.position = fresh.position.astype(single)
         fresh.confidence = min(fresh.confidence, options.weight_cap)
+        tally["voxels"] += not chain
         chain.append(fresh)
         tally["added"] += 1
         tally["merged"] += count - 1
@@ -97,13 +125,14 @@ class ReferenceMemory:
         old.confidence = min(old.confidence + fresh.confidence, self.options.weight_cap)
 
 
-def chains_of(memory: SpatialMemory) -> dict[tuple[int, int, int], list[Observation]]:
+def chains_of(memory: SpatialMemory) -> dict[Cell, list[Observation]]:
     """The same dictionary, read from the real memory's arrays."""
-    chains: dict[tuple[int, int, int], list[Observation]] = {}
+    chains: dict[Cell, list[Observation]] = {}
     records = memory.records
     for i, p in enumerate(records.position):
-        x, y, z = np.floor(p.astype(float) * (1.0 / memory.voxel)).astype(int).tolist()
-        chains.setdefault((x, y, z), []).append(
+        level = int(records.level[i])
+        x, y, z = np.floor(p.astype(float) * (1.0 / memory.voxel) / 2**level).astype(int).tolist()
+        chains.setdefault((level, x, y, z), []).append(
             Observation(
                 p,
                 records.color[i].astype(float),

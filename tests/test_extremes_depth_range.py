@@ -11,7 +11,7 @@ from memory_scenes import camera, plane_view, points
 from reference_splat import reference_project
 
 from gvtools.memory.back_projection import BackProjectionOptions, back_project
-from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat import SplatOptions
 from gvtools.memory.voxel_index import MAX_VOXEL
 
@@ -63,10 +63,24 @@ def test_what_is_nearer_than_a_voxel_is_left_open_and_not_misdrawn(backend):
     assert not seen.valid[0, :, : WIDE["width"] // 2 - 4].any()
 
 
-def test_nine_decades_are_too_many_and_the_far_end_is_counted():
+def test_what_is_too_far_is_counted_and_wide_voxels_go_farther():
+
     source = camera(**WIDE)
     memory = SpatialMemory(1e-4)
     assert memory.reach == MAX_VOXEL * 1e-4
+    report = memory.fuse(plane_view(source, _halves(1e-4, 1e6)), round=0)
+    # The column beside the step is a depth edge.
+    assert report.out_of_reach == (WIDE["width"] // 2 - 1) * WIDE["height"]
+    memory = SpatialMemory(1e-4)
+    assert memory.fuse(plane_view(source, _halves(1e-4, 5e4)), round=0).out_of_reach == 0
+    seen = memory.project(source)
+    assert finite(seen)
+    np.testing.assert_allclose(seen.depth[0, 2:-2, -60:-4], 5e4, rtol=1e-5)
+
+
+def test_with_one_edge_nine_decades_are_too_many():
+    source = camera(**WIDE)
+    memory = SpatialMemory(1e-4, options=MemoryOptions(footprints=0.0))
     report = memory.fuse(plane_view(source, _halves(1e-4, 1e5)), round=0)
     # The column beside the step is a depth edge.
     assert report.out_of_reach == (WIDE["width"] // 2 - 1) * WIDE["height"]

@@ -95,9 +95,9 @@ def test_utm_coordinates_change_no_picture(scale, far, home):
     assert share_that_differs(seen, home[2]["cpu"], scale=scale) < 1e-3
 
 
-@pytest.mark.parametrize("far", [1e3, 2.0**20, 2.0**23, 2.0**24 - 200])
+@pytest.mark.parametrize("far", [1e3, 2.0**20, 2.0**22, 2.0**23 - 200])
 def test_a_point_is_held_to_half_a_step_of_float32_as_far_as_voxels_go(far):
-    """Positions in voxels: the step is a sixteenth of one at 2²⁰ and a whole one at the end."""
+    """Positions in voxels: the step is a sixteenth of one at 2²⁰ and a half at the end."""
     rng = np.random.default_rng(1)
     where = rng.uniform(-100, 100, (300, 3)) + np.array((far, -far, 0))
     memory = SpatialMemory(1.0)

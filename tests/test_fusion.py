@@ -11,6 +11,8 @@ from gvtools.memory.fusion import group_by_block, voxel_keys
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.voxel_index import EMPTY_KEY, MAX_VOXEL
 
+ONE_EDGE = MemoryOptions(footprints=0.0)
+
 
 def _cloud(rng: np.random.Generator, count: int, source):
     """Points crowded into few voxels."""
@@ -29,10 +31,14 @@ def _cloud(rng: np.random.Generator, count: int, source):
     views=st.integers(1, 12),
     capacity=st.integers(1, 4),
     degrees=st.sampled_from([1.0, 5.0, 20.0]),
+    footprints=st.sampled_from([0.0, 0.5, 1.0, 3.0]),
 )
-def test_fusion_does_what_a_plain_dictionary_does(seed, views, capacity, degrees):
+def test_fusion_does_what_a_plain_dictionary_does(seed, views, capacity, degrees, footprints):
     rng = np.random.default_rng(seed)
-    options = MemoryOptions(same_direction=degrees, observations_per_voxel=capacity, weight_cap=4.0)
+    options = MemoryOptions(
+        same_direction=degrees, observations_per_voxel=capacity, weight_cap=4.0,
+        footprints=footprints,
+    )  # fmt: skip
     memory, reference = SpatialMemory(0.1, options=options), ReferenceMemory(0.1, options)
     for view in range(views):
         source = camera(center=rng.normal(0, 0.3, 3))
@@ -60,7 +66,7 @@ def test_fusion_does_what_a_plain_dictionary_does(seed, views, capacity, degrees
 def test_voxels_are_the_distinct_floors_of_position_over_edge(seed, voxel, far):
     rng = np.random.default_rng(seed)
     where = (rng.normal(0, 1, (300, 3)) + far * rng.normal(0, 1, 3)).astype(np.float32)
-    memory = SpatialMemory(voxel)
+    memory = SpatialMemory(voxel, options=ONE_EDGE)
     report = memory.fuse(points(where), round=0)
     cells = np.floor(where.astype(float) * (1.0 / voxel))
     assert memory.voxels == report.voxels == len(memory) == len(np.unique(cells, axis=0))
@@ -69,7 +75,7 @@ def test_voxels_are_the_distinct_floors_of_position_over_edge(seed, voxel, far):
 
 
 def test_points_of_one_voxel_are_averaged_by_confidence():
-    memory = SpatialMemory(1.0)
+    memory = SpatialMemory(1.0, options=ONE_EDGE)
     fresh = points(
         [(0.2, 0.2, 2.2), (0.6, 0.2, 2.2)], colors=[(0, 0, 0), (200, 100, 40)], confidence=(1, 3),
         spacing=(1.0, 5.0),
@@ -108,7 +114,7 @@ def test_directions_beyond_the_threshold_stand_side_by_side(degrees, kept):
 
 
 def test_a_close_up_is_not_averaged_into_a_distant_view():
-    memory = SpatialMemory(0.1)
+    memory = SpatialMemory(0.1, options=ONE_EDGE)
     memory.fuse(points([(0.05, 0.05, 8.05)], spacing=0.8), round=0)
     memory.fuse(points([(0.05, 0.05, 8.05)], spacing=0.2), round=0)
     assert len(memory) == 2
@@ -138,12 +144,17 @@ def test_keys_tell_voxels_apart_and_mark_what_is_out_of_reach():
          (0, -MAX_VOXEL * edge * 1.01, 0), (np.inf, 0, 0), (0, np.nan, 0)], np.float32,
     )  # fmt: skip
     keys, places = np.empty(8, np.int64), np.zeros(8, np.uint16)
-    assert voxel_keys(where, 1 / edge, keys, places) == 4
+    assert voxel_keys(where, np.zeros(8, np.uint8), 1 / edge, keys, places) == 4
     assert (keys[4:] == EMPTY_KEY).all()
     assert (keys[:4] != EMPTY_KEY).all()
     names = list(zip(keys[:4].tolist(), places[:4].tolist(), strict=True))
     assert names[0] == names[2]
     assert len(set(names)) == 3
+    # Voxels of the next level are twice as wide, go twice as far and are others.
+    above, there = np.empty(8, np.int64), np.zeros(8, np.uint16)
+    assert voxel_keys(where, np.ones(8, np.uint8), 1 / edge, above, there) == 2
+    assert above[0] == above[3] and there[0] == there[3]
+    assert not set(above[:6].tolist()) & set(keys[:4].tolist())
 
 
 def test_grouping_is_a_stable_sort_by_first_appearance():

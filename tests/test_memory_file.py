@@ -154,7 +154,8 @@ def _rewritten(path: Path, change) -> None:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (lambda h: h.update(version=3), "version 3; this gvtools reads version 2"),
+        (lambda h: h.update(version=4), "version 4; this gvtools reads versions 2 to 3"),
+        (lambda h: h.update(version=1), "version 1; this gvtools reads versions 2 to 3"),
         (lambda h: h.update(format="other"), "not a gvtools memory"),
         (lambda h: h["names"].append("x"), "do not fit together"),
         (lambda h: h.pop("voxel"), "do not fit together"),
@@ -169,6 +170,21 @@ def test_a_file_of_another_make_is_refused_by_name(change, complaint, tmp_path):
     _rewritten(path, change)
     with pytest.raises(MemoryFileError, match=complaint):
         SpatialMemory.load(path)
+
+
+def test_a_file_of_before_levels_is_read_with_one_edge(tmp_path):
+    memory = random_memory(4, options=MemoryOptions(footprints=0.0))
+    path = tmp_path / "memory.npz"
+    memory.save(path)
+
+    def older(header):
+        header["version"] = 2
+        del header["options"]["footprints"], header["arrays"]["record_level"]
+
+    _rewritten(path, older)
+    found = SpatialMemory.load(path)
+    assert found.options == memory.options
+    assert _same(found, memory, tmp_path)
 
 
 def test_other_files_are_refused(tmp_path):

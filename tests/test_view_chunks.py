@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from memory_scenes import camera, points
 
-from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from viz.run_view_chunks import MOST_NODES, ChunkRows, Chunks
 from viz.run_view_detail import cell_keys
 
@@ -17,7 +17,8 @@ SIZE, CELL = 100, 0.05
 def memory():
     """Two walls and stray points far off, in two rounds."""
     rng = np.random.default_rng(0)
-    found = SpatialMemory(0.01, origin=(5.0, 0.0, -2.0))
+    options = MemoryOptions(footprints=0.0)
+    found = SpatialMemory(0.01, origin=(5.0, 0.0, -2.0), options=options)
     for round, z in enumerate((2.0, 4.0)):
         wall = rng.uniform(-2, 2, (4000, 3))
         wall[:, 2] = z

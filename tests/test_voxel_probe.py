@@ -17,6 +17,7 @@ from pipelines.plan import make_plan
 from pipelines.voxel_probe import NEIGHBOURS, SCALES, sufficient_scale
 
 FOOTPRINT = WALL / FOCAL
+AT_FOOTPRINT = RunConfig(voxel=FOOTPRINT)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def fine(points: np.ndarray) -> np.ndarray:
 
 def scale_of(scene: Scene, loss: float, said: list[str] | None = None) -> float:
     say = None if said is None else said.append
-    return sufficient_scale(scene, scene.names, FOOTPRINT, config=RunConfig(), loss=loss, say=say)
+    return sufficient_scale(scene, scene.names, config=AT_FOOTPRINT, loss=loss, say=say)
 
 
 def test_smooth_surfaces_take_coarse_voxels_and_detailed_ones_do_not(scan):
@@ -77,7 +78,7 @@ def test_a_greater_loss_is_never_a_finer_edge(scan):
 def test_too_few_views_tell_nothing(scan):
     scene = open_project(scan)
     few = scene.names[:NEIGHBOURS]
-    assert sufficient_scale(scene, few, FOOTPRINT, config=RunConfig(), loss=9) == 1
+    assert sufficient_scale(scene, few, config=AT_FOOTPRINT, loss=9) == 1
 
 
 def test_a_run_takes_the_measured_edge_unless_told_otherwise(scan):
@@ -94,6 +95,8 @@ def test_a_run_takes_the_measured_edge_unless_told_otherwise(scan):
         }.items()
     }
     assert edges["any"] == pytest.approx(SCALES[-1] * edges["footprint"], rel=0.01)
+    wide = make_plan(scene, with_settings(RunConfig(), [*texts, "fusion.voxel_loss=100"])).config
+    assert wide.memory.footprints == SCALES[-1] * RunConfig().memory.footprints
     assert edges["accurate"] <= edges["balanced"] and edges["given"] == 0.0123
     with pytest.raises(OptionError, match=r"fusion\.voxel_loss"):
         with_settings(RunConfig(), ["fusion.voxel_loss=-1"])

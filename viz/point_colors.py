@@ -107,7 +107,7 @@ def view_counts(memory: SpatialMemory) -> NDArray[np.int64]:
     """
     records = memory.records
     view = records.view[: len(memory)].astype(np.int64)
-    _, voxel = np.unique(cell_keys(memory, memory.voxel), return_inverse=True)
+    _, voxel = np.unique(cell_keys(memory, memory.voxel, whole=True), return_inverse=True)
     views = max(1, len(memory.views))
     pairs = np.unique(voxel.astype(np.int64) * views + view)
     return np.bincount(pairs // views, minlength=int(voxel.max(initial=-1)) + 1)[voxel]

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.memory.voxel_index import MOST_LEVEL
+from gvtools.memory.voxel_levels import whole_voxels
+
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
     from viz.run_view import RunView
@@ -64,23 +67,26 @@ def point_pixels(focal: float, drawn: Detail, run: RunView) -> float:
     return float(np.clip(1.2 * focal * drawn.size / run.typical_depth, 2.0, 8.0))
 
 
-def cell_keys(memory: SpatialMemory, edge: float) -> NDArray[np.int64]:
+def cell_keys(memory: SpatialMemory, edge: float, *, whole: bool = False) -> NDArray[np.int64]:
     """(N,) int64 below 2⁶⁰, equal for observations of one cell.
 
     Args:
         memory: whose observations.
         edge: of a cell, scene units; doubled until the cells can be numbered.
+        whole: makes one cell of those that share a voxel.
     """
     count = len(memory)
+    level = memory.records.level[:count] if whole else np.zeros(count, np.uint8)
     while True:
         keys = np.zeros(count, np.int64)
         for axis in coordinates(memory):
             # Times the inverse, as the memory counts its voxels.
             cell = np.floor(axis * (1.0 / np.float64(edge)))
-            cell -= cell.min(initial=0.0)
-            if not cell.max(initial=0.0) < 1 << AXIS_BITS:
+            widest = cell.max(initial=0.0) - cell.min(initial=0.0)
+            if not widest < (1 << AXIS_BITS) - (1 << MOST_LEVEL):
                 break
-            keys = (keys << AXIS_BITS) | cell.astype(np.int64)
+            number = whole_voxels(cell.astype(np.int64), level, edge / memory.voxel)
+            keys = (keys << AXIS_BITS) | (number - number.min(initial=0))
         else:
             return keys
         edge *= 2.0

@@ -13,6 +13,7 @@ from gvtools.memory.compiled import compiled
 from gvtools.memory.local_frame import LocalFrame
 from gvtools.memory.pixel_blocks import join_blocks
 from gvtools.memory.points import PointSet
+from gvtools.memory.voxel_levels import VoxelLevels
 from gvtools.options import check_range
 
 # Side of a cell of the free-space grid, pixels.
@@ -50,6 +51,7 @@ def back_project(
     confidence: NDArray[np.float32] | None = None,
     mask: NDArray[np.bool_] | None = None,
     options: BackProjectionOptions | None = None,
+    levels: VoxelLevels | None = None,
     joined: float = 0.0,
 ) -> PointSet:
     """Lift the pixels of one view to points.
@@ -66,8 +68,10 @@ def back_project(
         confidence: (H, W) float32 of the source, > 0; None means 1.
         mask: (H, W) bool, True = use.
         options: see BackProjectionOptions.
-        joined: where 2 x 2 pixels together are at most so wide, scene units, they become
-            one point, their mean, unless the surface is steep; 0 keeps every pixel's.
+        levels: the voxels that the points are for (``memory.levels``); for ``joined``.
+        joined: where 2 x 2 pixels together are at most so many voxel edges wide, they become one
+            point, their mean, unless the surface is steep; 0 keeps every pixel's, and so does
+            leaving ``levels`` out.
 
     Raises:
         ShapeError: the images and the camera disagree in size, or the camera is unusable.
@@ -98,15 +102,15 @@ def back_project(
     colors = np.empty((height * width, 3), np.uint8)
     weight = np.empty(height * width, np.float32)
     spacing = np.empty(height * width, np.float32)
-    pixels = np.empty(height * width if joined > 0 else 0, np.int64)
+    pixels = np.empty(height * width if levels and joined > 0 else 0, np.int64)
     count, invalid, edges, masked = _lift(
         np.ascontiguousarray(rgb, np.uint8), z, trust, use, camera.K[0], local_from_cam,
         options.edge, np.inf if options.depth_max is None else options.depth_max, options.grazing,
         positions, colors, weight, spacing, pixels,
     )  # fmt: skip
-    if joined > 0:
+    if levels and joined > 0:
         count = join_blocks(
-            pixels[:count], (height, width), float(joined),
+            pixels[:count], (height, width), joined * levels.edge, levels.per_spacing,
             positions[:count], colors[:count], weight[:count], spacing[:count],
         )  # fmt: skip
     far = np.inf if options.depth_max is None else options.depth_max

@@ -3,7 +3,8 @@
 A voxel keeps a chain of observations. The view's own points in a voxel are averaged by
 confidence. The average then joins the chain: it merges with an observation seen from almost the
 same direction at no finer detail (agreement raises the confidence), or with the most similar one
-once the chain is full, and stands beside the others otherwise.
+once the chain is full, and stands beside the others otherwise. What a finer voxel at its place
+holds from that direction takes it in, too.
 """
 
 # mypy: no-check-untyped-defs
@@ -14,13 +15,12 @@ import numpy as np
 
 from gvtools.memory.compiled import compiled
 from gvtools.memory.voxel_index import (
-    BLOCK_BITS,
     EMPTY_KEY,
-    LOCAL_MASK,
-    MAX_VOXEL,
     NO_RECORD,
-    block_key,
+    find_block,
+    find_voxel,
     insert_voxel,
+    voxel_key,
 )
 
 # Rows of the kernel's report.
@@ -29,26 +29,13 @@ REPORT_SIZE = 6
 
 
 @compiled()
-def voxel_keys(positions, inverse_edge, keys, locals_):
+def voxel_keys(positions, levels, inverse_edge, keys, locals_):
     """Block key and place in the block of each point; EMPTY_KEY when it is out of reach."""
     outside = 0
     for i in range(len(positions)):
-        x = np.floor(np.float64(positions[i, 0]) * inverse_edge)
-        y = np.floor(np.float64(positions[i, 1]) * inverse_edge)
-        z = np.floor(np.float64(positions[i, 2]) * inverse_edge)
-        if not (abs(x) < MAX_VOXEL and abs(y) < MAX_VOXEL and abs(z) < MAX_VOXEL):
-            keys[i] = EMPTY_KEY
-            outside += 1
-            continue
-        ix = np.int64(x)
-        iy = np.int64(y)
-        iz = np.int64(z)
-        keys[i] = block_key(ix >> BLOCK_BITS, iy >> BLOCK_BITS, iz >> BLOCK_BITS)
-        locals_[i] = (
-            ((ix & LOCAL_MASK) << (2 * BLOCK_BITS))
-            | ((iy & LOCAL_MASK) << BLOCK_BITS)
-            | (iz & LOCAL_MASK)
-        )
+        level = np.int64(levels[i])
+        keys[i], locals_[i] = voxel_key(positions[i], inverse_edge / (1 << level), level)
+        outside += keys[i] == EMPTY_KEY
     return outside
 
 
@@ -85,10 +72,12 @@ def group_by_block(blocks, total):
 
 @compiled(fastmath={"nsz", "arcp", "contract"})
 def _most_similar(
-    head, p, spacing, center, view_centers, view_generated, generated, r_view, r_spacing, r_next
-):
+    head, p, spacing, before, center, view_centers, view_generated, generated,
+    r_view, r_spacing, r_next,
+):  # fmt: skip
     """The chain's observation seen from the most similar direction: (record, cosine, length).
 
+    Of its records, those below ``before`` count.
     Generated content never stands in for observed content: observed points pass it by.
     """
     ax = center[0] - p[0]
@@ -101,7 +90,7 @@ def _most_similar(
     length = 0
     m = head
     while m != NO_RECORD:
-        if view_generated[r_view[m]] and not generated:
+        if m >= before or (view_generated[r_view[m]] and not generated):
             m = r_next[m]
             continue
         length += 1
@@ -126,10 +115,10 @@ def _most_similar(
 
 @compiled()
 def fuse_blocks(
-    positions, colors, confidence, spacing, locals_, touched, starts, order,
-    pool_local, pool_head, pool_state, block_offset, block_log2, block_count,
-    r_x, r_y, r_z, r_color, r_confidence, r_spacing, r_view, r_next, count,
-    view, center, view_centers, view_round, view_generated,
+    positions, colors, confidence, spacing, levels, locals_, touched, starts, order,
+    keys, ids, pool_local, pool_head, pool_state, block_offset, block_log2, block_count, top,
+    r_x, r_y, r_z, r_color, r_confidence, r_spacing, r_view, r_level, r_next, count,
+    began, view, center, view_centers, view_round, view_generated,
     cosine_same, finer, capacity, weight_cap, inverse_edge,
     old_start, old_box, run_start, run_count, run_box, agreed_record, agreed_weight, report,
 ):  # fmt: skip
@@ -138,7 +127,9 @@ def fuse_blocks(
     New records are appended block by block, so each (block, view) is one contiguous run with a
     tight bounding box (``run_box``: min xyz, max xyz, largest spacing). Records of earlier rounds
     are never changed: what agrees with one is logged as (record, confidence). ``old_start`` and
-    ``old_box`` are those of the runs that were there before.
+    ``old_box`` are those of the runs that were there before; ``inverse_edge`` is of level 0,
+    ``top`` the highest level that the memory holds with these points, and records from ``began`` on
+    are this view's.
     """
     largest = 0
     for g in range(len(touched)):
@@ -158,16 +149,16 @@ def fuse_blocks(
     generated = view_generated[view]
     for g in range(len(touched)):
         block = touched[g]
+        level = np.int64(levels[order[starts[g]]])
+        inverse = inverse_edge / (1 << level)
         n = 0
         for o in range(starts[g], starts[g + 1]):
             i = order[o]
-            before = block_count[block]
             log2 = block_log2[block]
             slot = insert_voxel(
                 pool_local, pool_head, pool_state, block_offset, block_log2, block_count, block,
                 locals_[i],
             )  # fmt: skip
-            report[NEW_VOXELS] += block_count[block] - before
             if block_log2[block] != log2:
                 # The block's table moved: find the voxels of this view again.
                 for t in range(n):
@@ -206,28 +197,40 @@ def fuse_blocks(
                 p[k] = t_sum[t, k] / weight
             own = np.float64(t_best[t])
             # Where pixels are finer than voxels, neighbours stand a voxel apart.
-            width = max(t_spacing[t] / weight, 1.0 / inverse_edge)
+            width = max(t_spacing[t] / weight, 1.0 / inverse)
             best = NO_RECORD
             cosine = -2.0
             length = 0
+            if generated and _observed_there(
+                head, p, level, top, inverse_edge, keys, ids, pool_local, pool_head,
+                block_offset, block_log2, r_view, r_next, view_generated,
+            ):  # fmt: skip
+                pool_head[slot] = head
+                report[REJECTED_OBSERVED] += t_points[t]
+                continue
             if head != NO_RECORD:
-                if generated and _any_observed(head, r_view, r_next, view_generated):
-                    pool_head[slot] = head
-                    report[REJECTED_OBSERVED] += t_points[t]
-                    continue
                 best, cosine, length = _most_similar(
-                    head, p, width, center, view_centers, view_generated, generated,
+                    head, p, width, count, center, view_centers, view_generated, generated,
                     r_view, r_spacing, r_next,
                 )  # fmt: skip
-            if best != NO_RECORD and (
+            if best != NO_RECORD and not (
                 length >= capacity or (cosine >= cosine_same and width >= finer * r_spacing[best])
             ):
+                best = NO_RECORD
+            if best == NO_RECORD and level > 0:
+                best = _finer_there(
+                    p, width, level, inverse_edge, keys, ids, pool_local, pool_head,
+                    block_offset, block_log2, began, center, view_centers, view_generated,
+                    generated, cosine_same, finer, r_view, r_spacing, r_next,
+                )  # fmt: skip
+            if best != NO_RECORD:
                 pool_head[slot] = head
                 report[MERGED_POINTS] += t_points[t]
                 if view_round[r_view[best]] == view_round[view]:
                     report[MERGED] += 1
                     _merge(
-                        best, p, t_sum[t], weight, own, width, view, inverse_edge,
+                        best, p, t_sum[t], weight, own, width, view,
+                        inverse_edge / (1 << np.int64(r_level[best])),
                         r_x, r_y, r_z, r_color, r_confidence, r_spacing, r_view, weight_cap,
                     )  # fmt: skip
                     # Neighbours mostly merge into the same run.
@@ -243,16 +246,19 @@ def fuse_blocks(
                     agreed += 1
                 continue
             member = positions[t_first[t]]
-            r_x[count] = _inside(p[0], member[0], inverse_edge)
-            r_y[count] = _inside(p[1], member[1], inverse_edge)
-            r_z[count] = _inside(p[2], member[2], inverse_edge)
+            r_x[count] = _inside(p[0], member[0], inverse)
+            r_y[count] = _inside(p[1], member[1], inverse)
+            r_z[count] = _inside(p[2], member[2], inverse)
             for k in range(3):
                 r_color[count, k] = np.uint8(t_sum[t, 3 + k] / weight + 0.5)
             r_confidence[count] = min(own, weight_cap)
             r_spacing[count] = width
             r_view[count] = view
+            r_level[count] = level
             r_next[count] = head
             pool_head[slot] = count
+            # A voxel whose points all went elsewhere stays empty.
+            report[NEW_VOXELS] += head == NO_RECORD
             report[MERGED_POINTS] += t_points[t] - 1
             count += 1
         if count > first:
@@ -294,6 +300,63 @@ def _any_observed(head, r_view, r_next, view_generated):
             return True
         m = r_next[m]
     return False
+
+
+@compiled()
+def _head_at(p, level, inverse_edge, keys, ids, pool_local, pool_head, block_offset, block_log2):
+    """The head of the chain of a level's voxel around a point; ``inverse_edge`` of level 0."""
+    key, local = voxel_key(p, inverse_edge / (1 << level), level)
+    if key == EMPTY_KEY:
+        return NO_RECORD
+    block = find_block(keys, ids, key)
+    if block < 0:
+        return NO_RECORD
+    slot = find_voxel(pool_local, block_offset[block], np.int64(block_log2[block]), local)
+    return pool_head[slot] if slot >= 0 else NO_RECORD
+
+
+@compiled()
+def _observed_there(
+    head, p, level, top, inverse_edge, keys, ids, pool_local, pool_head, block_offset, block_log2,
+    r_view, r_next, view_generated,
+):  # fmt: skip
+    """Whether a voxel of any level around a point holds observed content; ``head`` is its own."""
+    if _any_observed(head, r_view, r_next, view_generated):
+        return True
+    for other in range(top + 1):
+        if other != level and _any_observed(
+            _head_at(
+                p, other, inverse_edge, keys, ids, pool_local, pool_head, block_offset, block_log2
+            ),
+            r_view, r_next, view_generated,
+        ):  # fmt: skip
+            return True
+    return False
+
+
+@compiled()
+def _finer_there(
+    p, width, level, inverse_edge, keys, ids, pool_local, pool_head, block_offset, block_log2,
+    began, center, view_centers, view_generated, generated, cosine_same, finer,
+    r_view, r_spacing, r_next,
+):  # fmt: skip
+    """The record of a finer voxel around a point that it merges with, finest first, or NO_RECORD.
+
+    Records from ``began`` on are of the point's own view, in which each place has one level.
+    """
+    for other in range(level):
+        head = _head_at(
+            p, other, inverse_edge, keys, ids, pool_local, pool_head, block_offset, block_log2
+        )
+        if head == NO_RECORD:
+            continue
+        best, cosine, _ = _most_similar(
+            head, p, width, began, center, view_centers, view_generated, generated,
+            r_view, r_spacing, r_next,
+        )  # fmt: skip
+        if best != NO_RECORD and cosine >= cosine_same and width >= finer * r_spacing[best]:
+            return best
+    return NO_RECORD
 
 
 @compiled()

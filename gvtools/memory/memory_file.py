@@ -21,14 +21,18 @@ from gvtools.cameras import Cameras
 from gvtools.errors import GvError, MemoryFileError
 from gvtools.files import ZIP_EPOCH, replaced_when_written
 from gvtools.memory.views import SourceView, ViewTable
+from gvtools.memory.voxel_index import MOST_LEVEL
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
 
 FORMAT = "gvtools memory"
-VERSION = 2
+VERSION = 3
+# The version whose voxels have one edge.
+ONE_EDGE = 2
+READABLE = (ONE_EDGE, VERSION)
 CONVENTION = "OpenCV axes (x right, y down, z forward); first pixel's centre at (0.5, 0.5)"
-_RECORD_ARRAYS = ("x", "y", "z", "color", "confidence", "spacing", "view", "agreement")
+_RECORD_ARRAYS = ("x", "y", "z", "color", "confidence", "spacing", "view", "level", "agreement")
 _RUN_ARRAYS = ("start", "length", "view", "box")
 
 
@@ -170,10 +174,11 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
             header = json.loads(archive.read("header.json"))
             if not isinstance(header, dict) or header.get("format") != FORMAT:
                 raise MemoryFileError(f"{path}: not a gvtools memory")
-            if header.get("version") != VERSION:
+            version = header.get("version")
+            if version not in READABLE:
                 raise MemoryFileError(
-                    f"{path}: memory format version {header.get('version')}; this gvtools reads "
-                    f"version {VERSION}; write it again with a matching release"
+                    f"{path}: memory format version {version}; this gvtools reads versions "
+                    f"{READABLE[0]} to {VERSION}; write it again with a matching release"
                 )
             arrays = {}
             for name, (dtype, shape) in header["arrays"].items():
@@ -182,6 +187,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
                 if array.dtype.str != dtype or list(array.shape) != shape:
                     raise MemoryFileError(f"{path}: array {name} is not what the header lists")
                 arrays[name] = array
+            if version == ONE_EDGE:
+                header["options"]["footprints"] = 0.0
+                arrays["record_level"] = np.zeros(len(arrays["record_view"]), np.uint8)
     except MemoryFileError:
         raise
     except Exception as error:  # any parser's complaint means the same to the user
@@ -197,7 +205,7 @@ def _check_consistency(arrays: dict[str, NDArray[Any]], views: int) -> None:
     columns = {
         "record_x": (count,), "record_y": (count,), "record_z": (count,),
         "record_color": (count, 3), "record_confidence": (count,),
-        "record_spacing": (count,), "record_agreement": (count,),
+        "record_spacing": (count,), "record_agreement": (count,), "record_level": (count,),
         "view_K": (views, 3, 3), "view_cam_from_world": (views, 4, 4), "view_size": (views, 2),
         "view_round": (views,), "view_generated": (views,), "grid_shape": (views, 2),
     }  # fmt: skip
@@ -207,6 +215,8 @@ def _check_consistency(arrays: dict[str, NDArray[Any]], views: int) -> None:
     rows = arrays["record_view"]
     if count and not (rows.min() >= 0 and rows.max() < views):
         raise ValueError("an observation names a view that is not there")
+    if count and arrays["record_level"].max() > MOST_LEVEL:
+        raise ValueError("an observation is of a level that is not there")
     start, length = arrays["run_start"], arrays["run_length"].astype(np.int64)
     if len(start) and not (start[0] == 0 and (start[1:] == (start + length)[:-1]).all()):
         raise ValueError("runs are not contiguous")

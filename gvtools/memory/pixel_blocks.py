@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from gvtools.memory.compiled import compiled
+from gvtools.memory.voxel_levels import level_of
 
 SIDE = 2
 # A block may be so many times wider along its surface than across the line of sight: slanted
@@ -15,7 +16,7 @@ SLANTED = 4.0
 
 
 @compiled()
-def join_blocks(pixels, shape, largest, positions, colors, weight, spacing):
+def join_blocks(pixels, shape, largest, per_spacing, positions, colors, weight, spacing):
     """Each block of 2 x 2 pixels that were all lifted is joined, where it is small enough.
 
     Its width is that of its pixels across the line of sight; along the surface it may be SLANTED
@@ -24,7 +25,8 @@ def join_blocks(pixels, shape, largest, positions, colors, weight, spacing):
     Args:
         pixels: (N,) int64 row-major, where the points come from, ascending.
         shape: (H, W) of the image.
-        largest: width of a block, scene units.
+        largest: width of a block where voxels are the finest, scene units; it doubles with them.
+        per_spacing: see VoxelLevels.
         positions: (N, 3) float32, rearranged in place, as the others.
         colors: (N, 3) uint8.
         weight: (N,) float32.
@@ -52,7 +54,8 @@ def join_blocks(pixels, shape, largest, positions, colors, weight, spacing):
                     _apart(old_positions[b], old_positions[d]),
                 )
                 apart = _mean(old_spacing[a], old_spacing[b], old_spacing[c], old_spacing[d])
-                if SIDE * apart <= largest and SIDE * widest <= SLANTED * largest:
+                most = largest * (1 << level_of(apart, per_spacing))
+                if SIDE * apart <= most and SIDE * widest <= SLANTED * most:
                     for k in range(3):
                         positions[n, k] = _mean(
                             old_positions[a, k], old_positions[b, k],

@@ -11,7 +11,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError
 from gvtools.memory.ply import read_ply
 from gvtools.memory.points import PointSet
-from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.voxel_index import rounded_origin
 
 # Nearest neighbours are looked up for this many points when the file gives no spacing.
@@ -53,7 +53,8 @@ def memory_from_ply(path: Path) -> SpatialMemory:
     )
     generated = vertices["generated"] != 0 if "generated" in names else np.zeros(count, np.bool_)
     origin = rounded_origin(positions.mean(axis=0), distance)
-    memory = SpatialMemory(distance, origin=origin)
+    # Points of one file were seen together as finely as they lie.
+    memory = SpatialMemory(distance, origin=origin, options=MemoryOptions(footprints=0.0))
     # Where the points were seen from is unknown; a camera in their midst stands for it.
     pose = np.eye(4)
     pose[:3, 3] = -positions.mean(axis=0)

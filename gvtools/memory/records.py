@@ -21,6 +21,7 @@ class Records:
         confidence: (C,) float32, from the views of the observation's own round.
         spacing: (C,) float32, scene units.
         view: (C,) int32, row of the view table.
+        level: (C,) uint8, of its voxel.
         next: (C,) int32, the next observation of the same voxel, -1 at the end.
         agreement: (C,) float32, confidence added by later rounds.
     """
@@ -33,10 +34,12 @@ class Records:
     confidence: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
     spacing: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
     view: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    level: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
     next: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     agreement: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
 
-    ARRAYS = ("x", "y", "z", "color", "confidence", "spacing", "view", "next", "agreement")
+    ARRAYS = ("x", "y", "z", "color", "confidence", "spacing", "view", "level", "next",
+              "agreement")  # fmt: skip
 
     def reserve(self, extra: int) -> None:
         """Make room for ``extra`` more rows, doubling the capacity."""
@@ -72,7 +75,7 @@ class Runs:
         count: rows in use.
         start: (C,) int64, first observation.
         length: (C,) int32, observations.
-        view: (C,) int32, row of the view table.
+        view: (C,) int32, row of the view table, ascending.
         box: (C, 7) float32, scene units: bounding box of the positions (min xyz, max xyz) and the
             largest spacing.
         groups: rows of ``group_box`` in use.
@@ -110,6 +113,11 @@ class Runs:
         first = self.count // self.GROUP
         self.count = need
         self._box_groups(first)
+
+    def first_of(self, view: int, none: int) -> int:
+        """The first observation that a view brought; ``none`` where it brought none."""
+        at = int(np.searchsorted(self.view[: self.count], view))
+        return int(self.start[at]) if at < self.count else none
 
     def _box_groups(self, first: int) -> None:
         """Bring the groups' boxes from group ``first`` on up to date."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from gvtools.memory.points import PointSet
 from gvtools.memory.records import Records, Runs
 from gvtools.memory.views import SourceView, ViewTable
 from gvtools.memory.voxel_index import EMPTY_KEY, MAX_VOXEL, VoxelIndex, check_grid
+from gvtools.memory.voxel_levels import VoxelLevels
 from gvtools.options import check_range
 
 if TYPE_CHECKING:
@@ -41,6 +43,9 @@ class MemoryOptions:
             new one in.
         weight_cap: confidence saturates here, 1e-20 to 1e20; so it does where what a view adds is
             below 2⁻²⁴ of what is there.
+        footprints: an observation goes into a voxel at most so many times as wide as its spacing
+            where that is wider than the memory's edge: twice, four times, ... to 128 times that
+            edge. 0 has one edge throughout.
         free_space_tolerance: share of depth that a generated point may stand in front of an
             observed surface.
     """
@@ -49,6 +54,7 @@ class MemoryOptions:
     finer: float = 0.7
     observations_per_voxel: int = 12
     weight_cap: float = 100.0
+    footprints: float = 1.0
     free_space_tolerance: float = 0.03
 
     def __post_init__(self) -> None:
@@ -56,6 +62,7 @@ class MemoryOptions:
         check_range("memory.finer", self.finer, least=0, most=1)
         check_range("memory.observations_per_voxel", self.observations_per_voxel, least=1)
         check_range("memory.weight_cap", self.weight_cap, least=1e-20, most=1e20)
+        check_range("memory.footprints", self.footprints, least=0, most=1e6)
         check_range("memory.free_space_tolerance", self.free_space_tolerance, least=0, below=1)
 
 
@@ -98,12 +105,13 @@ class FuseReport:
 class SpatialMemory:
     """A coloured point cloud that grows view by view.
 
-    Space is divided into voxels of one edge; a voxel keeps several observations, each of which
-    remembers the view it came from. Observations are appended and, once their round is over,
-    never changed, so that a round can be forgotten exactly.
+    Space is divided into voxels, wider ones (``MemoryOptions.footprints``) where it was seen
+    coarsely; a voxel keeps several observations, each of which remembers the view it came from.
+    Observations are appended and, once their round is over, never changed, so that a round can be
+    forgotten exactly.
 
     Args:
-        voxel: voxel edge, scene units.
+        voxel: edge of the finest voxels, scene units.
         origin: (3,) float64 world point that positions are held relative to, so that float32
             keeps millimetres in a georeferenced scene.
         axes: (3, 3) rotation whose columns are the voxel grid's axes in the world frame; None for
@@ -126,11 +134,14 @@ class SpatialMemory:
         self.records = Records()
         self.runs = Runs()
         self.views = ViewTable(self.frame)
+        self.levels = VoxelLevels(self.voxel, self.options.footprints)
         # Per round: (records, confidences) by which it agreed with observations of other rounds.
         self.agreements: dict[int, list[tuple[NDArray[np.int32], NDArray[np.float32]]]] = {}
         # How often something was fused or forgotten, and how often that touched observations.
         self.changes = self.observed_changes = 0
         self._index = VoxelIndex()
+        # The highest level of any voxel.
+        self._top = 0
 
     @property
     def origin(self) -> NDArray[np.float64]:
@@ -156,7 +167,7 @@ class SpatialMemory:
 
     @property
     def reach(self) -> float:
-        """How far from the origin, along each axis, voxels go, scene units."""
+        """How far from the origin, along each axis, the finest voxels go, scene units."""
         return MAX_VOXEL * self.voxel
 
     @property
@@ -258,7 +269,8 @@ class SpatialMemory:
         count = len(positions)
         keys = np.empty(count, np.int64)
         locals_ = np.empty(count, np.uint16)
-        outside = fusion.voxel_keys(positions, 1.0 / self.voxel, keys, locals_)
+        levels = self.levels.of(spacing)
+        outside = fusion.voxel_keys(positions, levels, 1.0 / self.voxel, keys, locals_)
         if outside:
             near = keys != EMPTY_KEY
             inside = [column[near] for column in (positions, colors, confidence, spacing)]
@@ -271,6 +283,7 @@ class SpatialMemory:
         touched, starts, order = fusion.group_by_block(blocks, index.blocks)
         index.reserve_voxels(count, touched)
         records.reserve(count)
+        self._top = max(self._top, int(levels.max()))
         first = records.count
         run_start = np.empty(len(touched), np.int64)
         run_length = np.empty(len(touched), np.int32)
@@ -279,17 +292,19 @@ class SpatialMemory:
         agreed_weight = np.empty(count, np.float32)
         tally = np.zeros(fusion.REPORT_SIZE, np.int64)
         records.count, runs, agreed = fusion.fuse_blocks(
-            positions, colors, confidence, spacing, locals_, touched, starts, order,
-            index.pool_local, index.pool_head, index.pool_state,
-            index.block_offset, index.block_log2, index.block_count,
+            positions, colors, confidence, spacing, levels, locals_, touched, starts, order,
+            index.keys, index.ids, index.pool_local, index.pool_head, index.pool_state,
+            index.block_offset, index.block_log2, index.block_count, self._top,
             records.x, records.y, records.z, records.color, records.confidence, records.spacing,
-            records.view, records.next, first,
+            records.view, records.level, records.next, first,
+            self.runs.first_of(view, first),
             view, views.centers[view], views.centers, views.round, views.generated,
             np.cos(np.radians(options.same_direction)), options.finer,
             options.observations_per_voxel, options.weight_cap, 1.0 / self.voxel,
             self.runs.start[: self.runs.count], self.runs.box[: self.runs.count],
             run_start, run_length, run_box, agreed_record, agreed_weight, tally,
         )  # fmt: skip
+        index.voxels += int(tally[fusion.NEW_VOXELS])
         records.agreement[first : records.count] = 0
         self.runs.append(
             run_start[:runs], run_length[:runs], np.full(runs, view, np.int32), run_box[:runs]
@@ -359,7 +374,10 @@ class SpatialMemory:
         records, count = self.records, self.records.count
         keys = np.empty(count, np.int64)
         locals_ = np.empty(count, np.uint16)
-        fusion.voxel_keys(records.position, 1.0 / self.voxel, keys, locals_)
+        levels = records.level[:count]
+        self._top = int(levels.max(initial=0))
+        if fusion.voxel_keys(records.position, levels, 1.0 / self.voxel, keys, locals_):
+            raise OptionError(f"observations lie beyond the reach of voxels of {self.voxel:g}")
         blocks = self._index.block_numbers(keys)
         self._index.reserve_voxels(count, np.unique(blocks))
         index = self._index
@@ -367,12 +385,24 @@ class SpatialMemory:
             locals_, index.pool_local, index.pool_head, index.pool_state,
             index.block_offset, index.block_log2, index.block_count, blocks, records.next,
         )  # fmt: skip
+        index.voxels = int(index.block_count[: index.blocks].sum())
 
     def project(self, cameras: Cameras, *, options: SplatOptions | None = None) -> Guidance:
         """Project the memory into cameras of one size; see gvtools.memory.projection.project."""
         from gvtools.memory.projection import project
 
         return project(self, cameras, options=options)
+
+    def snapshot(self) -> SpatialMemory:
+        """This memory as it is now, for looking at what was observed beside later fusions.
+
+        The arrays are shared, so generated observations may still change in it. Neither of the two
+        must be fused into or forgotten from but for generated content in the original.
+        """
+        other = copy(self)
+        other.records, other.runs = copy(self.records), copy(self.runs)
+        other.views = ViewTable(self.frame, [self.views[i] for i in range(len(self.views))])
+        return other
 
     def point_cloud(self) -> o3d.t.geometry.PointCloud:
         """The observations as an Open3D tensor point cloud.

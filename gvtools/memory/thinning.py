@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.memory.voxel_levels import whole_voxels
+
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
 
@@ -43,10 +45,12 @@ def thinned(memory: SpatialMemory, max_points: int | None) -> Thinned:
     positions = memory.records.position.astype(np.float64)
     # The most confident first; of equals, the earlier observation.
     order = np.argsort(-memory.confidence, kind="stable")
+    level = memory.records.level[: len(memory), None]
     edge, corner = memory.voxel, np.zeros(3)
     while True:
         # Times the inverse, as the memory counts its voxels.
         cells = np.floor((positions - corner) * (1.0 / edge)).astype(np.int64)
+        cells = whole_voxels(cells, level, edge / memory.voxel)
         cells -= cells.min(axis=0)
         if int(cells.max()) < 1 << KEY_BITS:
             keys = (cells[:, 0] << (2 * KEY_BITS)) | (cells[:, 1] << KEY_BITS) | cells[:, 2]

@@ -1,9 +1,10 @@
 """Which voxel holds which observations: a two-level hash that never looks at the whole memory.
 
-Space is cut into blocks of 16³ voxels. A hash of block coordinates gives a block number; each
-block owns a small open-addressing table from the voxel's place in the block (12 bits) to the head
-of a chain of observations. A frame touches some thousand blocks, so its cost follows the points
-that arrive, not the memory that is there, and the tables of one block lie together in the cache.
+Space is cut into blocks of 16³ voxels of one edge; blocks of voxels twice, four times, ... as wide
+lie beside them. A hash of block coordinates and level gives a block number; each block owns a small
+open-addressing table from the voxel's place in the block (12 bits) to the head of a chain of
+observations. A frame touches some thousand blocks, so its cost follows the points that arrive, not
+the memory that is there, and the tables of one block lie together in the cache.
 """
 
 # mypy: no-check-untyped-defs
@@ -21,10 +22,12 @@ LOCAL_MASK = (1 << BLOCK_BITS) - 1
 EMPTY_LOCAL = np.uint16(0xFFFF)
 EMPTY_KEY = np.int64(-1)
 NO_RECORD = np.int32(-1)
-COORDINATE_BITS = 21
+COORDINATE_BITS = 20
 COORDINATE_OFFSET = 1 << (COORDINATE_BITS - 1)
-# A point farther than this many voxels from the origin has no key.
+# A point farther than this many voxels of its level from the origin has no key.
 MAX_VOXEL = (COORDINATE_OFFSET - 1) << BLOCK_BITS
+# Voxels of level l are 2**l edges wide.
+MOST_LEVEL = 7
 # Edges within which float32 holds every product of a projection, whatever the points' distance.
 VOXEL_RANGE = (1e-25, 1e25)
 # The share of a voxel's edge that float64 has to resolve at the origin.
@@ -40,13 +43,37 @@ def _hash(key, mask):
 
 
 @compiled(inline="always")
-def block_key(bx, by, bz):
-    """int64 key of the block with integer coordinates (bx, by, bz)."""
+def block_key(bx, by, bz, level):
+    """int64 key of the block with integer coordinates (bx, by, bz) at a level."""
     return (
-        (np.int64(bx + COORDINATE_OFFSET) << (2 * COORDINATE_BITS))
+        (np.int64(level) << (3 * COORDINATE_BITS))
+        | (np.int64(bx + COORDINATE_OFFSET) << (2 * COORDINATE_BITS))
         | (np.int64(by + COORDINATE_OFFSET) << COORDINATE_BITS)
         | np.int64(bz + COORDINATE_OFFSET)
     )
+
+
+@compiled(inline="always")
+def voxel_key(p, inverse_edge, level):
+    """(block key, place in the block) of a point (3,); EMPTY_KEY when it is out of reach.
+
+    ``inverse_edge`` is of the level's voxels.
+    """
+    x = np.floor(np.float64(p[0]) * inverse_edge)
+    y = np.floor(np.float64(p[1]) * inverse_edge)
+    z = np.floor(np.float64(p[2]) * inverse_edge)
+    if not (abs(x) < MAX_VOXEL and abs(y) < MAX_VOXEL and abs(z) < MAX_VOXEL):
+        return EMPTY_KEY, np.uint16(0)
+    ix = np.int64(x)
+    iy = np.int64(y)
+    iz = np.int64(z)
+    local = (
+        ((ix & LOCAL_MASK) << (2 * BLOCK_BITS))
+        | ((iy & LOCAL_MASK) << BLOCK_BITS)
+        | (iz & LOCAL_MASK)
+    )
+    key = block_key(ix >> BLOCK_BITS, iy >> BLOCK_BITS, iz >> BLOCK_BITS, level)
+    return key, np.uint16(local)
 
 
 @compiled()
@@ -183,6 +210,8 @@ class VoxelIndex:
         self.keys: NDArray[np.int64] = np.full(1024, EMPTY_KEY, np.int64)
         self.ids: NDArray[np.int32] = np.full(1024, -1, np.int32)
         self.blocks = 0
+        # Those that hold something; kept by who fills them.
+        self.voxels = 0
         self.block_offset: NDArray[np.int64] = np.zeros(512, np.int64)
         self.block_log2: NDArray[np.uint8] = np.zeros(512, np.uint8)
         self.block_count: NDArray[np.int32] = np.zeros(512, np.int32)
@@ -190,11 +219,6 @@ class VoxelIndex:
         self.pool_head: NDArray[np.int32] = np.empty(4096, np.int32)
         self.pool_state: NDArray[np.int64] = np.full(SIZE_CLASSES, -1, np.int64)
         self.pool_state[0] = 0
-
-    @property
-    def voxels(self) -> int:
-        """Number of occupied voxels."""
-        return int(self.block_count[: self.blocks].sum())
 
     @property
     def nbytes(self) -> int:

@@ -99,6 +99,11 @@ def knobs_of(plan: Plan) -> list[Knob]:
     completers = _completers(plan)
     knobs = [
         Knob("voxel edge", tuple(_edge(config.voxel, share) for share in EDGES), EDGES.index(1.0)),
+        Knob(
+            "far voxels",
+            tuple(_footprints(config.memory.footprints, share) for share in (2.0, 1.0, 0.5, 0.0)),
+            1,
+        ),
         _numbers("observations a voxel", "memory.observations_per_voxel",
                  (2, 4, 12, 48), config.memory.observations_per_voxel),
         _numbers("merging angle, degrees", "memory.same_direction",
@@ -208,6 +213,12 @@ def _values(name: str, key: str, values: Sequence[Any], start: Any) -> Knob:
 def _edge(voxel: float, share: float) -> Level:
     """As an edge, not as a share of the footprints: the sweep's runs need not find it again."""
     return Level(f"{share:g} x {voxel:.3g}", {"voxel": float(f"{share * voxel:.4g}")})
+
+
+def _footprints(footprints: float, share: float) -> Level:
+    value = float(f"{share * footprints:.4g}")
+    name = f"at most {value:g} footprints wide" if value else "as wide as near ones"
+    return Level(name, {"memory.footprints": value})
 
 
 def _completers(plan: Plan) -> Knob:
