@@ -170,6 +170,9 @@ def _run_rounds(
     plan: Plan, directory: RunDirectory, done: int, console: Console, *, drawn: bool
 ) -> None:
     """The rounds from number ``done`` on, then the end products."""
+    from pipelines.context_depth import KeptDepth
+    from pipelines.round_targets import RoundTargets
+    from pipelines.rounds import load_context
     from pipelines.run_round import run_round
 
     memory = _start_memory(plan)
@@ -178,8 +181,8 @@ def _run_rounds(
         from gvtools.memory.spatial_memory import SpatialMemory
 
         console.line(f"resuming after round {done - 1}")
-        kept = directory.round_memory(done - 1)
-        last = kept if kept.exists() else directory.path / "memory.npz"
+        saved = directory.round_memory(done - 1)
+        last = saved if saved.exists() else directory.path / "memory.npz"
         if not last.exists():
             raise ProjectError(
                 f"{directory.path}: the memory after round {done - 1} is gone, as with a later "
@@ -190,18 +193,16 @@ def _run_rounds(
         for later in [number for number in reversed(memory.rounds) if number >= done]:
             memory.forget(round=later)
     context: list[ContextView] | None = None
-    for number in range(done, len(plan.schedule) + 1):
-        if number and context is None:
-            from pipelines.context_depth import KeptDepth
-            from pipelines.rounds import load_context
-
-            kept_depth = KeptDepth(plan.scene, plan.context, plan.source, directory.round_path(0))
-            context = load_context(plan.scene, plan.context, kept_depth)
-        with directory.writing_round(number) as folder:
-            report = run_round(plan, memory, number, context or [], folder, console)
-            memory.save(folder / "memory.npz")
-            write_json(folder / "report.json", report)
-        console.line(_round_line(report))
+    with RoundTargets(plan, memory) as targets:
+        for number in range(done, len(plan.schedule) + 1):
+            if number and context is None:
+                kept = KeptDepth(plan.scene, plan.context, plan.source, directory.round_path(0))
+                context = load_context(plan.scene, plan.context, kept)
+            with directory.writing_round(number) as folder:
+                report = run_round(plan, targets, number, context or [], folder, console)
+                memory.save(folder / "memory.npz")
+                write_json(folder / "report.json", report)
+            console.line(_round_line(report))
     _finish(plan, memory, directory, console, drawn=drawn)
 
 

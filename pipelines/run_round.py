@@ -14,7 +14,6 @@ from gvtools.completers.sparing import sparing
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap
 from gvtools.memory.explained import MEMORY, explained_depth
-from gvtools.memory.followed import FollowedCamera
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.scenes.scene import Frame, View
 from pipelines import rounds
@@ -22,6 +21,7 @@ from pipelines.console import Console
 from pipelines.context_depth import KeptDepth, warn_of_depth
 from pipelines.plan import Plan
 from pipelines.round_files import camera_entry, target_stems, write_after, write_target
+from pipelines.round_targets import RoundTargets
 
 # Targets whose files are written at once.
 WRITERS = 2
@@ -29,14 +29,14 @@ WRITERS = 2
 
 def run_round(
     plan: Plan,
-    memory: SpatialMemory,
+    targets: RoundTargets,
     number: int,
     context: Sequence[ContextView],
     folder: Path,
     console: Console,
 ) -> dict[str, Any]:
     """Run round ``number`` (0 is the context's), write its files, and report it, JSON-ready."""
-    clock = rounds.Clock()
+    memory, clock = targets.memory, rounds.Clock()
     start = time.perf_counter()
     voxels = memory.voxels
     about: dict[str, Any] = {"dropped": {}, "depth": [], "views": []}
@@ -44,7 +44,7 @@ def run_round(
     if number == 0:
         total, said = _lift_context(plan, memory, folder, clock, console)
     else:
-        total, said = _complete(plan, memory, number, context, folder, clock, console)
+        total, said = _complete(plan, targets, number, context, folder, clock, console)
     about |= said
     generated = int(memory.generated.sum())
     return {
@@ -107,23 +107,21 @@ def _lift_context(
 
 def _complete(
     plan: Plan,
-    memory: SpatialMemory,
+    followed: RoundTargets,
     number: int,
     context: Sequence[ContextView],
     folder: Path,
     clock: rounds.Clock,
     console: Console,
 ) -> tuple[FuseReport, dict[str, Any]]:
-    config, rows = plan.config, plan.schedule[number - 1]
+    config, memory, rows = plan.config, followed.memory, plan.schedule[number - 1]
     cameras = plan.targets.cameras[list(rows)]
     all_stems = target_stems(plan.targets.cameras.names)
     stems = [all_stems[row] for row in rows]
-    targets = [
-        FollowedCamera(memory, camera, options=config.splat, reuse=config.savings.reuse)
-        for camera in cameras
-    ]
     with clock.stage("project"):
+        targets = followed.of(number)
         known = [target.guidance() for target in targets]
+    followed.look_ahead(number + 1)
     # Files are compressed beside the work on the next targets.
     with ThreadPoolExecutor(WRITERS) as pool:
         writing: list[Future[None]] = []

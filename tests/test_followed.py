@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
+from gvtools.memory import compiled
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.followed import FollowedCamera
+from gvtools.memory.projection import _Projection
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat import SplatOptions
 from gvtools.memory.splat_cpu import CpuSplatter
@@ -105,3 +109,45 @@ def test_a_camera_that_sees_nothing_sees_what_comes(memory):
     fuse(memory, camera(0.0, np.pi), 5, generated=True, round=1)
     assert same(away.guidance(), memory.project(away.camera))
     assert away.guidance().generated.any()
+
+
+def test_looking_ahead_beside_fusions_gives_the_picture_of_a_whole_projection(memory):
+    """As a run does: generated content of a round arrives while the next round is looked at."""
+    fuse(memory, camera(-0.6, -0.2), 3, generated=True, round=1)
+    targets = [FollowedCamera(memory, camera(x, -0.2)) for x in np.linspace(-1.5, 1.5, 12)]
+    snapshot = memory.snapshot()
+
+    def look() -> None:
+        for target in targets:
+            target.look(snapshot)
+
+    with ThreadPoolExecutor(1) as pool:
+        looked = pool.submit(look)
+        for number in range(8):
+            # Into the runs that are there, and into new ones.
+            fuse(memory, camera(0.2 * number - 0.8, -0.2), 4 + number, generated=True, round=1)
+        looked.result()
+
+    def again(self) -> None:
+        raise AssertionError("what was looked at is projected again")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_Projection, "observe", again)
+        seen = [target.guidance() for target in targets]
+    for target, guidance in zip(targets, seen, strict=True):
+        assert same(guidance, memory.project(target.camera))
+    # What was observed since makes a look worthless.
+    targets[0].look(memory.snapshot())
+    fuse(memory, camera(-1.5, -0.2), 99, generated=False, round=2)
+    assert same(targets[0].guidance(), memory.project(targets[0].camera))
+
+
+@pytest.mark.parametrize("layer", ["workqueue", None])
+def test_no_round_is_looked_at_ahead_where_kernels_must_not_overlap(monkeypatch, layer):
+    def said() -> str:
+        if layer is None:
+            raise ValueError("Threading layer is not initialized.")
+        return str(layer)
+
+    monkeypatch.setattr(compiled, "threading_layer", said)
+    assert not compiled.run_beside_each_other()

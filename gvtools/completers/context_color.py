@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, Float64
+from gvtools.cameras import Cameras, Float64, concatenate
 from gvtools.completers.base import ContextView
 
 # A filled depth is taken to err by this share, plus this share per pixel from the rim.
@@ -61,8 +61,22 @@ def rank_views(
     rays = _rays(camera, rows, columns)
     z = depth[rows, columns].astype(np.float64)
     points = (camera.centers[0], rays, z, error[rows, columns])
-    scores = np.array([_visible(view, *points)[2].sum() for view in context])
+    scores = np.zeros(len(context))
+    for index in _in_view(context, camera.centers[0] + rays * z[:, None]):
+        scores[index] = _visible(context[index], *points)[2].sum()
     return [int(i) for i in np.argsort(-scores, kind="stable") if scores[i] > 0]
+
+
+def _in_view(context: Sequence[ContextView], points: Float64) -> list[int]:
+    """The photographs in whose pictures any of the points (N, 3) falls, hidden or not."""
+    if not context:
+        return []
+    cameras = concatenate([view.camera for view in context])
+    xy, _ = cameras.project(points)
+    size = np.stack([cameras.width, cameras.height], axis=-1)[:, None]
+    with np.errstate(invalid="ignore"):
+        inside = ((xy > 0) & (xy < size)).all(axis=-1).any(axis=-1)
+    return [int(index) for index in np.flatnonzero(inside)]
 
 
 def look_up(

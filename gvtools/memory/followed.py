@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
-from gvtools.memory.projection import Observed, project_again
+from gvtools.memory.projection import Observed, observed_of, project_again
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat import ONE_PIXEL, SplatOptions
 
@@ -37,6 +37,16 @@ class FollowedCamera:
         self._at = (-1, -1)
         self._observed: Observed | None = None
         self._guidance: Guidance | None = None
+
+    def look(self, snapshot: SpatialMemory) -> None:
+        """Project what observed views show ahead of ``guidance``, where that is reused.
+
+        Args:
+            snapshot: of the memory; so this may run beside fusions of generated content.
+        """
+        if self.reuse and self.options.backend == "cpu":
+            self._observed = observed_of(snapshot, self.camera, options=self.options)
+            self._at = (-1, snapshot.observed_changes)
 
     def guidance(self) -> Guidance:
         """The projection of the memory as it is now, a batch of one; the last one if unchanged."""

@@ -126,6 +126,14 @@ def project_again(
     return projection.guidance(), observed
 
 
+def observed_of(memory: SpatialMemory, camera: Cameras, *, options: SplatOptions) -> Observed:
+    """What observed views show of a camera, a batch of one; for ``project_again``."""
+    check_usable(camera)
+    projection = _Projection(memory, camera, options, _splatter(memory, options))
+    projection.observe()
+    return projection.observed()
+
+
 def _splatter(memory: SpatialMemory, options: SplatOptions) -> Splatter:
     if options.backend == "torch":
         from gvtools.memory.splat_torch import TorchSplatter
