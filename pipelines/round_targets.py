@@ -25,7 +25,7 @@ class RoundTargets:
     def __init__(self, plan: Plan, memory: SpatialMemory) -> None:
         self.plan, self.memory = plan, memory
         self._pool = ThreadPoolExecutor(1)
-        self._next: tuple[int, list[FollowedCamera], Future[None]] | None = None
+        self._next: tuple[int, list[FollowedCamera], list[Future[None]]] | None = None
 
     def __enter__(self) -> RoundTargets:
         return self
@@ -42,9 +42,10 @@ class RoundTargets:
         """The targets of round ``number``, from 1, in order."""
         if self._next is None or self._next[0] != number:
             return self._followed(number)
-        _, targets, looked = self._next
+        _, targets, looks = self._next
         self._next = None
-        looked.result()
+        for look in looks:
+            look.result()
         return targets
 
     def look_ahead(self, number: int) -> None:
@@ -53,12 +54,9 @@ class RoundTargets:
             return
         targets = self._followed(number)
         snapshot = self.memory.snapshot()
-
-        def look() -> None:
-            for target in targets:
-                target.look(snapshot)
-
-        self._next = (number, targets, self._pool.submit(look))
+        # One by one, so that a run that is stopped need not wait for all.
+        looks = [self._pool.submit(target.look, snapshot) for target in targets]
+        self._next = (number, targets, looks)
 
     def _followed(self, number: int) -> list[FollowedCamera]:
         config = self.plan.config

@@ -34,11 +34,11 @@ START = 2.0
 # Views that are predicted, and neighbours that each is predicted from.
 PROBES, NEIGHBOURS = 3, 4
 # A quarter of their pixels is looked at, in squares of this side, and what falls a little beside.
-TILE, MARGIN, BLOCK = 32, 4, 2
+TILE, MARGIN, BLOCK = 48, 6, 2
 # Memories that are fused at once.
 THREADS = 2
 # Fewer valid pixels of a view tell nothing.
-LEAST = 1000
+LEAST = 250
 # Mean squared errors below it, of one part in a hundred, are one: nobody sees them.
 UNSEEN = 1e-4
 

@@ -24,7 +24,6 @@ class Observation:
     spacing: float
     view: int
     agreement: float = 0.0
-    origin: int = -1
 
 
 class ReferenceMemory:
@@ -60,9 +59,8 @@ class ReferenceMemory:
                 w.max(),
                 max(w @ points.spacing[rows].astype(float) / w.sum(), self.voxel * 2 ** cell[0]),
                 len(self.centers) - 1,
-                origin=len(self.centers) - 1,
             )
-            self._take(cell[0], self.chains.setdefault(cell, []), fresh, len(rows), tally)
+            self._take(self.chains.setdefault(cell, []), fresh, len(rows), tally)
             if not self.chains[cell]:
                 del self.chains[cell]
         return tally
@@ -71,31 +69,23 @@ class ReferenceMemory:
         x, y, z = np.floor(p * (1.0 / self.voxel) / 2**level).astype(int).tolist()
         return level, x, y, z
 
-    def _take(
-        self, level: int, chain: list[Observation], fresh: Observation, count: int, tally
-    ) -> None:
+    def _take(self, chain: list[Observation], fresh: Observation, count: int, tally) -> None:
         generated, options = self.made[-1], self.options
-        around = [self.chains.get(self._cell(fresh.position, other), []) for other in range(8)]
-        if generated and any(not self.made[o.view] for there in around for o in there):
+        if generated and self._observed_at(fresh.position.astype(single)):
             tally["rejected_observed"] += count
             return
-        for other in (level, *range(level)):
-            there = chain if other == level else around[other]
-            rivals = [o for o in reversed(there) if generated or not self.made[o.view]]
-            if other != level:
-                # Within a view, each place has one level.
-                rivals = [o for o in rivals if o.origin != fresh.view]
-            if not rivals:
-                continue
+        rivals = [o for o in reversed(chain) if generated or not self.made[o.view]]
+        if rivals:
             best = max(rivals, key=lambda o: self._likeness(o, fresh)[0])
             same = self._likeness(best, fresh)[1] >= np.cos(np.radians(options.same_direction))
-            takes = same and fresh.spacing >= options.finer * best.spacing
-            if other == level:
-                takes |= len(rivals) >= options.observations_per_voxel
-            if takes:
+            fine = fresh.spacing >= options.finer * best.spacing
+            if len(rivals) >= options.observations_per_voxel or (same and fine):
                 tally["merged"] += count
                 if self.rounds[best.view] == self.rounds[-1]:
+                    old = best.position
                     self._average(best, fresh)
+                    if generated and self._observed_at(best.position):
+                        best.position = old
                 else:
                     best.agreement += fresh.confidence
                     tally["agreed"] += 1
@@ -107,6 +97,11 @@ class ReferenceMemory:
         chain.append(fresh)
         tally["added"] += 1
         tally["merged"] += count - 1
+
+    def _observed_at(self, p: np.ndarray) -> bool:
+        """Whether a voxel of any level around a point holds observed content."""
+        around = (self.chains.get(self._cell(p.astype(float), level), []) for level in range(8))
+        return any(not self.made[o.view] for there in around for o in there)
 
     def _likeness(self, old: Observation, fresh: Observation) -> tuple[float, float]:
         a = self.centers[fresh.view] - fresh.position

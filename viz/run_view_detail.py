@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory.voxel_index import MOST_LEVEL
-from gvtools.memory.voxel_levels import whole_voxels
+from gvtools.memory.voxel_levels import levels_above
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -68,24 +67,24 @@ def point_pixels(focal: float, drawn: Detail, run: RunView) -> float:
 
 
 def cell_keys(memory: SpatialMemory, edge: float, *, whole: bool = False) -> NDArray[np.int64]:
-    """(N,) int64 below 2⁶⁰, equal for observations of one cell.
+    """(N,) int64, equal for observations of one cell; below 2⁶⁰ unless ``whole``.
 
     Args:
         memory: whose observations.
         edge: of a cell, scene units; doubled until the cells can be numbered.
-        whole: makes one cell of those that share a voxel.
+        whole: makes one cell of each voxel that is wider.
     """
     count = len(memory)
     level = memory.records.level[:count] if whole else np.zeros(count, np.uint8)
     while True:
-        keys = np.zeros(count, np.int64)
+        above = levels_above(level, edge / memory.voxel)
+        keys = above
         for axis in coordinates(memory):
             # Times the inverse, as the memory counts its voxels.
             cell = np.floor(axis * (1.0 / np.float64(edge)))
-            widest = cell.max(initial=0.0) - cell.min(initial=0.0)
-            if not widest < (1 << AXIS_BITS) - (1 << MOST_LEVEL):
+            if not cell.max(initial=0.0) - cell.min(initial=0.0) < 1 << AXIS_BITS:
                 break
-            number = whole_voxels(cell.astype(np.int64), level, edge / memory.voxel)
+            number = cell.astype(np.int64) >> above
             keys = (keys << AXIS_BITS) | (number - number.min(initial=0))
         else:
             return keys

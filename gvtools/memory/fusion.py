@@ -3,8 +3,8 @@
 A voxel keeps a chain of observations. The view's own points in a voxel are averaged by
 confidence. The average then joins the chain: it merges with an observation seen from almost the
 same direction at no finer detail (agreement raises the confidence), or with the most similar one
-once the chain is full, and stands beside the others otherwise. What a finer voxel at its place
-holds from that direction takes it in, too.
+once the chain is full, and stands beside the others otherwise. Generated content enters no place
+where a voxel of any level holds observed content.
 """
 
 # mypy: no-check-untyped-defs
@@ -24,8 +24,8 @@ from gvtools.memory.voxel_index import (
 )
 
 # Rows of the kernel's report.
-ADDED, MERGED, AGREED, REJECTED_OBSERVED, NEW_VOXELS, MERGED_POINTS = range(6)
-REPORT_SIZE = 6
+ADDED, MERGED, AGREED, REJECTED_OBSERVED, NEW_VOXELS, MERGED_POINTS, FIRST_RUN = range(7)
+REPORT_SIZE = 7
 
 
 @compiled()
@@ -72,12 +72,10 @@ def group_by_block(blocks, total):
 
 @compiled(fastmath={"nsz", "arcp", "contract"})
 def _most_similar(
-    head, p, spacing, before, center, view_centers, view_generated, generated,
-    r_view, r_spacing, r_next,
-):  # fmt: skip
+    head, p, spacing, center, view_centers, view_generated, generated, r_view, r_spacing, r_next
+):
     """The chain's observation seen from the most similar direction: (record, cosine, length).
 
-    Of its records, those below ``before`` count.
     Generated content never stands in for observed content: observed points pass it by.
     """
     ax = center[0] - p[0]
@@ -90,7 +88,7 @@ def _most_similar(
     length = 0
     m = head
     while m != NO_RECORD:
-        if m >= before or (view_generated[r_view[m]] and not generated):
+        if view_generated[r_view[m]] and not generated:
             m = r_next[m]
             continue
         length += 1
@@ -118,7 +116,7 @@ def fuse_blocks(
     positions, colors, confidence, spacing, levels, locals_, touched, starts, order,
     keys, ids, pool_local, pool_head, pool_state, block_offset, block_log2, block_count, top,
     r_x, r_y, r_z, r_color, r_confidence, r_spacing, r_view, r_level, r_next, count,
-    began, view, center, view_centers, view_round, view_generated,
+    view, center, view_centers, view_round, view_generated,
     cosine_same, finer, capacity, weight_cap, inverse_edge,
     old_start, old_box, run_start, run_count, run_box, agreed_record, agreed_weight, report,
 ):  # fmt: skip
@@ -127,9 +125,9 @@ def fuse_blocks(
     New records are appended block by block, so each (block, view) is one contiguous run with a
     tight bounding box (``run_box``: min xyz, max xyz, largest spacing). Records of earlier rounds
     are never changed: what agrees with one is logged as (record, confidence). ``old_start`` and
-    ``old_box`` are those of the runs that were there before; ``inverse_edge`` is of level 0,
-    ``top`` the highest level that the memory holds with these points, and records from ``began`` on
-    are this view's.
+    ``old_box`` are those of the runs that were there before, ``report[FIRST_RUN]`` the first of
+    these that has changed; ``inverse_edge`` is of level 0, and ``top`` the highest level that the
+    memory holds with these points.
     """
     largest = 0
     for g in range(len(touched)):
@@ -143,6 +141,9 @@ def fuse_blocks(
     t_head = np.empty(largest, np.int32)
     t_first = np.empty(largest, np.int64)
     p = np.empty(3, np.float64)
+    # Where the point, and what it merged with, is kept.
+    at = np.empty(3, np.float32)
+    moved = np.empty(3, np.float32)
     runs = 0
     agreed = 0
     merged_into = 0
@@ -198,57 +199,52 @@ def fuse_blocks(
             own = np.float64(t_best[t])
             # Where pixels are finer than voxels, neighbours stand a voxel apart.
             width = max(t_spacing[t] / weight, 1.0 / inverse)
-            best = NO_RECORD
-            cosine = -2.0
-            length = 0
+            member = positions[t_first[t]]
+            for k in range(3):
+                at[k] = _inside(p[k], member[k], inverse)
             if generated and _observed_there(
-                head, p, level, top, inverse_edge, keys, ids, pool_local, pool_head,
+                head, at, level, top, inverse_edge, keys, ids, pool_local, pool_head,
                 block_offset, block_log2, r_view, r_next, view_generated,
             ):  # fmt: skip
                 pool_head[slot] = head
                 report[REJECTED_OBSERVED] += t_points[t]
                 continue
-            if head != NO_RECORD:
-                best, cosine, length = _most_similar(
-                    head, p, width, count, center, view_centers, view_generated, generated,
-                    r_view, r_spacing, r_next,
-                )  # fmt: skip
-            if best != NO_RECORD and not (
+            best, cosine, length = _most_similar(
+                head, p, width, center, view_centers, view_generated, generated,
+                r_view, r_spacing, r_next,
+            )  # fmt: skip
+            if best != NO_RECORD and (
                 length >= capacity or (cosine >= cosine_same and width >= finer * r_spacing[best])
             ):
-                best = NO_RECORD
-            if best == NO_RECORD and level > 0:
-                best = _finer_there(
-                    p, width, level, inverse_edge, keys, ids, pool_local, pool_head,
-                    block_offset, block_log2, began, center, view_centers, view_generated,
-                    generated, cosine_same, finer, r_view, r_spacing, r_next,
-                )  # fmt: skip
-            if best != NO_RECORD:
                 pool_head[slot] = head
                 report[MERGED_POINTS] += t_points[t]
                 if view_round[r_view[best]] == view_round[view]:
                     report[MERGED] += 1
+                    at[0], at[1], at[2] = r_x[best], r_y[best], r_z[best]
                     _merge(
-                        best, p, t_sum[t], weight, own, width, view,
-                        inverse_edge / (1 << np.int64(r_level[best])),
+                        best, p, t_sum[t], weight, own, width, view, inverse,
                         r_x, r_y, r_z, r_color, r_confidence, r_spacing, r_view, weight_cap,
                     )  # fmt: skip
+                    moved[0], moved[1], moved[2] = r_x[best], r_y[best], r_z[best]
+                    if generated and _observed_there(
+                        head, moved, level, top, inverse_edge, keys, ids, pool_local, pool_head,
+                        block_offset, block_log2, r_view, r_next, view_generated,
+                    ):  # fmt: skip
+                        r_x[best], r_y[best], r_z[best] = at[0], at[1], at[2]
                     # Neighbours mostly merge into the same run.
                     if old_start[merged_into] > best or (
                         merged_into + 1 < len(old_start) and old_start[merged_into + 1] <= best
                     ):
                         merged_into = int(np.searchsorted(old_start, best, side="right")) - 1
                     _include(old_box[merged_into], r_x[best], r_y[best], r_z[best], r_spacing[best])
+                    report[FIRST_RUN] = min(report[FIRST_RUN], merged_into)
                 else:
                     report[AGREED] += 1
                     agreed_record[agreed] = best
                     agreed_weight[agreed] = own
                     agreed += 1
                 continue
-            member = positions[t_first[t]]
-            r_x[count] = _inside(p[0], member[0], inverse)
-            r_y[count] = _inside(p[1], member[1], inverse)
-            r_z[count] = _inside(p[2], member[2], inverse)
+            r_x[count], r_y[count], r_z[count] = at[0], at[1], at[2]
             for k in range(3):
                 r_color[count, k] = np.uint8(t_sum[t, 3 + k] / weight + 0.5)
             r_confidence[count] = min(own, weight_cap)
@@ -332,31 +328,6 @@ def _observed_there(
         ):  # fmt: skip
             return True
     return False
-
-
-@compiled()
-def _finer_there(
-    p, width, level, inverse_edge, keys, ids, pool_local, pool_head, block_offset, block_log2,
-    began, center, view_centers, view_generated, generated, cosine_same, finer,
-    r_view, r_spacing, r_next,
-):  # fmt: skip
-    """The record of a finer voxel around a point that it merges with, finest first, or NO_RECORD.
-
-    Records from ``began`` on are of the point's own view, in which each place has one level.
-    """
-    for other in range(level):
-        head = _head_at(
-            p, other, inverse_edge, keys, ids, pool_local, pool_head, block_offset, block_log2
-        )
-        if head == NO_RECORD:
-            continue
-        best, cosine, _ = _most_similar(
-            head, p, width, began, center, view_centers, view_generated, generated,
-            r_view, r_spacing, r_next,
-        )  # fmt: skip
-        if best != NO_RECORD and cosine >= cosine_same and width >= finer * r_spacing[best]:
-            return best
-    return NO_RECORD
 
 
 @compiled()

@@ -75,7 +75,7 @@ class Runs:
         count: rows in use.
         start: (C,) int64, first observation.
         length: (C,) int32, observations.
-        view: (C,) int32, row of the view table, ascending.
+        view: (C,) int32, row of the view table.
         box: (C, 7) float32, scene units: bounding box of the positions (min xyz, max xyz) and the
             largest spacing.
         groups: rows of ``group_box`` in use.
@@ -101,8 +101,10 @@ class Runs:
         length: NDArray[np.int32],
         view: NDArray[np.int32],
         box: NDArray[np.float32],
+        *,
+        changed: int | None = None,
     ) -> None:
-        """Add rows of equal number."""
+        """Add rows of equal number; ``changed`` is the first earlier run whose box grew."""
         need = self.count + len(start)
         if need > len(self.start):
             size = max(need, 2 * len(self.start))
@@ -110,14 +112,9 @@ class Runs:
                 setattr(self, name, extended(getattr(self, name), size, self.count))
         for name, rows in zip(self.ARRAYS, (start, length, view, box), strict=True):
             getattr(self, name)[self.count : need] = rows
-        first = self.count // self.GROUP
+        first = min(self.count if changed is None else changed, self.count) // self.GROUP
         self.count = need
         self._box_groups(first)
-
-    def first_of(self, view: int, none: int) -> int:
-        """The first observation that a view brought; ``none`` where it brought none."""
-        at = int(np.searchsorted(self.view[: self.count], view))
-        return int(self.start[at]) if at < self.count else none
 
     def _box_groups(self, first: int) -> None:
         """Bring the groups' boxes from group ``first`` on up to date."""

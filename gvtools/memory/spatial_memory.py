@@ -62,7 +62,7 @@ class MemoryOptions:
         check_range("memory.finer", self.finer, least=0, most=1)
         check_range("memory.observations_per_voxel", self.observations_per_voxel, least=1)
         check_range("memory.weight_cap", self.weight_cap, least=1e-20, most=1e20)
-        check_range("memory.footprints", self.footprints, least=0, most=1e6)
+        check_range("memory.footprints", self.footprints, least=0)
         check_range("memory.free_space_tolerance", self.free_space_tolerance, least=0, below=1)
 
 
@@ -291,13 +291,13 @@ class SpatialMemory:
         agreed_record = np.empty(count, np.int32)
         agreed_weight = np.empty(count, np.float32)
         tally = np.zeros(fusion.REPORT_SIZE, np.int64)
+        tally[fusion.FIRST_RUN] = self.runs.count
         records.count, runs, agreed = fusion.fuse_blocks(
             positions, colors, confidence, spacing, levels, locals_, touched, starts, order,
             index.keys, index.ids, index.pool_local, index.pool_head, index.pool_state,
             index.block_offset, index.block_log2, index.block_count, self._top,
             records.x, records.y, records.z, records.color, records.confidence, records.spacing,
             records.view, records.level, records.next, first,
-            self.runs.first_of(view, first),
             view, views.centers[view], views.centers, views.round, views.generated,
             np.cos(np.radians(options.same_direction)), options.finer,
             options.observations_per_voxel, options.weight_cap, 1.0 / self.voxel,
@@ -307,8 +307,9 @@ class SpatialMemory:
         index.voxels += int(tally[fusion.NEW_VOXELS])
         records.agreement[first : records.count] = 0
         self.runs.append(
-            run_start[:runs], run_length[:runs], np.full(runs, view, np.int32), run_box[:runs]
-        )
+            run_start[:runs], run_length[:runs], np.full(runs, view, np.int32), run_box[:runs],
+            changed=int(tally[fusion.FIRST_RUN]),
+        )  # fmt: skip
         if agreed:
             entry = (agreed_record[:agreed].copy(), agreed_weight[:agreed].copy())
             self.agreements.setdefault(int(views.round[view]), []).append(entry)

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory.voxel_levels import whole_voxels
+from gvtools.memory.voxel_levels import levels_above
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
 
-# Three voxel indices fit one 64-bit key while the memory is below two million voxels a side.
-KEY_BITS = 21
+# A level and three voxel indices fit one signed 64-bit key while the memory is below a million
+# voxels a side.
+KEY_BITS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +46,17 @@ def thinned(memory: SpatialMemory, max_points: int | None) -> Thinned:
     positions = memory.records.position.astype(np.float64)
     # The most confident first; of equals, the earlier observation.
     order = np.argsort(-memory.confidence, kind="stable")
-    level = memory.records.level[: len(memory), None]
+    level = memory.records.level[: len(memory)]
     edge, corner = memory.voxel, np.zeros(3)
     while True:
         # Times the inverse, as the memory counts its voxels.
         cells = np.floor((positions - corner) * (1.0 / edge)).astype(np.int64)
-        cells = whole_voxels(cells, level, edge / memory.voxel)
+        above = levels_above(level, edge / memory.voxel)
+        cells >>= above[:, None]
         cells -= cells.min(axis=0)
         if int(cells.max()) < 1 << KEY_BITS:
-            keys = (cells[:, 0] << (2 * KEY_BITS)) | (cells[:, 1] << KEY_BITS) | cells[:, 2]
+            keys = (above << (3 * KEY_BITS)) | (cells[:, 0] << (2 * KEY_BITS))
+            keys |= (cells[:, 1] << KEY_BITS) | cells[:, 2]
             _, first, group = np.unique(keys[order], return_index=True, return_inverse=True)
             if max_points is None or len(first) <= max_points:
                 break

@@ -45,18 +45,14 @@ class VoxelLevels:
         return levels
 
 
-def whole_voxels(
-    cells: NDArray[np.int64], level: NDArray[np.uint8], edges: float
-) -> NDArray[np.int64]:
-    """Cells, of those that share a voxel of a higher level the first in place of each.
+def levels_above(level: NDArray[np.uint8], edges: float) -> NDArray[np.int64]:
+    """By how many doublings voxels are wider than cells; 0 where they are not.
 
     Args:
-        cells: (N, ...) how many cells from the origin along an axis.
-        level: (N, ...) of the voxels in them.
+        level: (N,) of the voxels.
         edges: width of a cell in finest edges.
     """
-    within = np.maximum(level.astype(np.int64) - int(np.floor(np.log2(max(edges, 1.0)))), 0)
-    return (cells >> within) << within
+    return np.maximum(level.astype(np.int64) - int(np.floor(np.log2(max(edges, 1.0)))), 0)
 
 
 @compiled(inline="always")

@@ -99,11 +99,7 @@ def knobs_of(plan: Plan) -> list[Knob]:
     completers = _completers(plan)
     knobs = [
         Knob("voxel edge", tuple(_edge(config.voxel, share) for share in EDGES), EDGES.index(1.0)),
-        Knob(
-            "far voxels",
-            tuple(_footprints(config.memory.footprints, share) for share in (2.0, 1.0, 0.5, 0.0)),
-            1,
-        ),
+        _far_voxels(config.memory.footprints),
         _numbers("observations a voxel", "memory.observations_per_voxel",
                  (2, 4, 12, 48), config.memory.observations_per_voxel),
         _numbers("merging angle, degrees", "memory.same_direction",
@@ -215,10 +211,18 @@ def _edge(voxel: float, share: float) -> Level:
     return Level(f"{share:g} x {voxel:.3g}", {"voxel": float(f"{share * voxel:.4g}")})
 
 
-def _footprints(footprints: float, share: float) -> Level:
-    value = float(f"{share * footprints:.4g}")
-    name = f"at most {value:g} footprints wide" if value else "as wide as near ones"
-    return Level(name, {"memory.footprints": value})
+def _far_voxels(footprints: float) -> Knob:
+    """How wide voxels may be, beyond the edge, in footprints of what they hold."""
+    values = [float(f"{share * footprints:.4g}") for share in (2.0, 1.0, 0.5)]
+    values = [*values, 0.0] if footprints else [1.0, 0.0]
+    levels = tuple(
+        Level(
+            f"at most {value:g} footprints wide" if value else "as wide as near ones",
+            {"memory.footprints": value},
+        )
+        for value in values
+    )
+    return Knob("far voxels", levels, 1)
 
 
 def _completers(plan: Plan) -> Knob:
