@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import importlib.util
 import json
 from dataclasses import replace
+from typing import Any
 
 import geoverse_models as micro
 import pytest
@@ -212,7 +214,11 @@ def test_growth_is_noted_by_stage_and_step():
 @pytest.mark.skipif(not CLEAR.exists(), reason="the growth of a process: Linux alone")
 def test_peak_memory_is_of_the_block_alone():
     device = torch.device("cpu")
+    waiting: list[Any] = [torch.ones(75_000_000)]
+    waiting.append(waiting)
+    del waiting
     with PeakMemory(device) as large:
+        gc.collect()
         torch.ones(50_000_000)
     with PeakMemory(device) as small:
         pass
