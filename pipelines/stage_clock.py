@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -101,8 +103,9 @@ class PeakMemory:
         self._before: int | None = None
 
     def __enter__(self) -> PeakMemory:
-        """Forget earlier peaks, and what only waits to be collected: its end hides what grows."""
+        """Forget earlier peaks, and give back what is held unused: what grows would hide in it."""
         gc.collect()
+        _trim()
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
             return self
@@ -120,6 +123,14 @@ class PeakMemory:
             self.bytes = torch.cuda.max_memory_allocated(self.device)
         elif self._before is not None:
             self.bytes = max(0, _resident("VmHWM") - self._before)
+
+
+def _trim() -> None:
+    """Freed memory that the C library kept for later goes back to the system, where glibc is it."""
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)
 
 
 def _resident(field: str) -> int:
