@@ -92,6 +92,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
             f"--targets {args.targets}: no views of the project; expected a selection of them, "
             "since a trial is measured against their pictures"
         )
+    # The search for the edge widens voxels by scaling both.
+    footprints = config.memory.footprints
     config = replace(config, voxel=plan.config.voxel, memory=plan.config.memory)
     with held_folder(args.out):
         identity = run_identity(plan, reading_of(args))
@@ -114,7 +116,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         )
         # A profile finds its own voxel edge.
         profiles = [
-            (f"profile {name}", {"voxel": None, **changes})
+            (f"profile {name}", {"voxel": None, "memory.footprints": footprints, **changes})
             for name, changes in settings.PROFILES.items()
         ]
         search.sweep(profiles, fits)

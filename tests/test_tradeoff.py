@@ -16,6 +16,8 @@ from pipelines.held_folder import held_folder
 from pipelines.tradeoffs.search import EQUAL
 from viz.pareto import draw_pareto
 
+# Another edge than the first guess, as if it had been measured.
+WIDER = ("--set", "fusion.voxel_scale=1.25")
 TIMES = ("fixed", "per_target")
 
 
@@ -27,7 +29,8 @@ def scan(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def swept(scan, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("sweep") / "out"
-    assert main(["tradeoff", str(scan), "--out", str(out), "--budget", "1h", "--quiet"]) == 0
+    command = ["tradeoff", str(scan), "--out", str(out), "--budget", "1h", "--quiet"]
+    assert main([*command, *WIDER]) == 0
     return out
 
 
@@ -66,11 +69,22 @@ def test_the_profile_is_what_reconstruct_takes_and_gives_its_figures(scan, swept
     assert found["psnr"] == pytest.approx(best["psnr"], abs=1e-6)
 
 
+def test_a_profile_is_tried_as_reconstruct_runs_it(scan, swept, tmp_path):
+    trials = json.loads((swept / "tradeoff.json").read_text())["trials"]
+    tried = next(t for t in trials if t["label"] == "profile accurate" and t["share"] == 1)
+    arguments = ["reconstruct", str(scan), "--context", "every:2", "--targets", "every:2+1"]
+    arguments += ["--profile", "accurate", "--out", str(tmp_path / "run"), "--quiet"]
+    assert main([*arguments, *WIDER]) == 0
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["observations"] == tried["observations"]
+    assert found["psnr"] == pytest.approx(tried["psnr"], abs=1e-6)
+
+
 def test_a_second_sweep_takes_over_what_is_there(scan, swept, capsys):
     before = {path: path.stat().st_mtime_ns for path in (swept / "trials").iterdir()}
     assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "1B"]) == 2
     assert "expected seconds" in capsys.readouterr().err
-    assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "1kB"]) == 0
+    assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "1kB", *WIDER]) == 0
     captured = capsys.readouterr()
     assert "no trial is within the budget" in captured.err
     after = {path: path.stat().st_mtime_ns for path in (swept / "trials").iterdir()}
@@ -81,7 +95,7 @@ def test_a_second_sweep_takes_over_what_is_there(scan, swept, capsys):
 def test_a_project_that_is_read_otherwise_is_tried_anew(scan, swept, capsys):
     before = set((swept / "trials").iterdir())
     arguments = ["tradeoff", str(scan), "--out", str(swept), "--limit", "1"]
-    assert main([*arguments, "--depth-unit", "0.002", "--quiet"]) == 0
+    assert main([*arguments, "--depth-unit", "0.002", "--quiet", *WIDER]) == 0
     assert set((swept / "trials").iterdir()) - before
     assert "trials were left out for --limit" in capsys.readouterr().err
 
@@ -119,7 +133,7 @@ def test_a_damaged_trial_is_made_anew(scan, swept, tmp_path):
     for path in damaged:
         path.write_text("{")
     command = ["tradeoff", str(scan), "--out", str(out), "--budget", "1h", "--quiet"]
-    assert main(command) == 0
+    assert main([*command, *WIDER]) == 0
     whole = [path for path in damaged if path.read_text() != "{"]
     again = [json.loads(path.read_text())["outcome"] for path in whole]
     assert again == [files[path] | {key: again[0][key] for key in TIMES} for path in whole] != []
