@@ -245,6 +245,16 @@ def test_what_is_swept_is_what_the_run_has():
                 with_setting(RunConfig(), key, value)
 
 
+@pytest.mark.parametrize("footprints", [0.0, 0.7, 1.0, 4.0])
+def test_far_voxels_are_swept_from_the_widest_to_those_of_near_ones(footprints):
+    config = with_setting(RunConfig(completer="none"), "memory.footprints", footprints)
+    knob = knobs_in("recorded", config)["far voxels"]
+    values = [level.settings["memory.footprints"] for level in knob.levels]
+    assert values == sorted(set(values), reverse=True)
+    assert values[-1] == 0 and values[knob.usual] == footprints
+    assert len({level.name for level in knob.levels}) == len(values) > 1
+
+
 def test_a_knob_of_one_completer_says_nothing_of_the_others():
     knobs = [
         Knob("completer", (Level("a", {"completer": "a"}), Level("b", {"completer": "b"})), 0),

@@ -47,10 +47,11 @@ def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
         return set(range(count))
     if spec.startswith("@"):
         return _by_name(names, _lines(Path(spec[1:])), f"{spec[1:]}")
-    # A view's own name wins over a form that looks like it.
+    # Views' own names win over a form that looks like them.
+    listed = _listed(names, spec)
     keyword, colon, rest = spec.partition(":")
-    if not colon or spec in names:
-        listed = [spec] if spec in names else [part.strip() for part in spec.split(",")]
+    if listed or not colon:
+        listed = listed or [part.strip() for part in spec.split(",")]
         return _by_name(names, listed, f"selection {whole!r}")
     if keyword == "not":
         return set(range(count)) - _chosen(names, rest.strip(), whole)
@@ -63,6 +64,25 @@ def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
         raise OptionError(f"selection {whole!r}: {rest!r} after {keyword!r}; expected {GRAMMAR}")
     numbers = [int(group) for group in match.groups(default="0")]
     return _counted(keyword, numbers, count, whole)
+
+
+def _listed(names: Sequence[str], spec: str) -> list[str]:
+    """The names that a text lists, some of which may have commas; none where it lists others."""
+    known = set(names)
+    longest = 1 + max((name.count(",") for name in names), default=0)
+    parts = spec.split(",")
+    found: list[str] = []
+    at = 0
+    while at < len(parts):
+        for end in range(min(at + longest, len(parts)), at, -1):
+            name = ",".join(parts[at:end]).strip()
+            if name in known or not name:
+                found.append(name)
+                at = end
+                break
+        else:
+            return []
+    return [name for name in found if name]
 
 
 def _counted(keyword: str, numbers: list[int], count: int, whole: str) -> set[int]:
