@@ -271,6 +271,13 @@ def changed_settings(config: RunConfig) -> dict[str, Any]:
     return {key: value for key, value in changed.items() if key != "profile"} | options
 
 
+def difference(config: RunConfig, other: RunConfig) -> dict[str, Any]:
+    """The dotted settings that make ``config`` the other one; not completers' nor the profile."""
+    plain = (flat_settings({**c.to_dict(), "completer_options": None}) for c in (config, other))
+    ours, theirs = map(dict, plain)
+    return {key: value for key, value in theirs.items() if key != "profile" and ours[key] != value}
+
+
 def _with(config: RunConfig, name: str, value: Any) -> RunConfig:
     changes: dict[str, Any] = {name: value}
     return replace(config, **changes)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gvtools.errors import OptionError
 
 if TYPE_CHECKING:
+    from pipelines.config import RunConfig
     from pipelines.console import Console
     from pipelines.tradeoffs.outcome import Outcome
     from pipelines.tradeoffs.search import Search
@@ -80,11 +81,12 @@ def run(args: argparse.Namespace, console: Console) -> None:
     limit_kind, limit = parse_budget(args.limit)
     if limit_kind != "seconds" or limit is None:
         raise OptionError(f"--limit {args.limit}; expected a time, such as 900 or 15m")
-    config = settings.RunConfig()
-    if args.config:
-        config = settings.with_file(config, args.config)
-    config = settings.with_settings(config, args.set)
-    config = replace(config, context=args.context, targets=args.targets)
+    config = asked_for(args)
+    if config.rounds is not None:
+        raise OptionError(
+            f"rounds {config.rounds}: a sweep completes all views that it holds out; give fewer "
+            "--targets instead"
+        )
     scene = open_scene(args.project, args)
     plan = make_plan(scene, config, say=console.line)
     if any(view is None for view in plan.targets.truth) or plan.targets.project is not None:
@@ -92,8 +94,6 @@ def run(args: argparse.Namespace, console: Console) -> None:
             f"--targets {args.targets}: no views of the project; expected a selection of them, "
             "since a trial is measured against their pictures"
         )
-    # The search for the edge widens voxels by scaling both.
-    footprints = config.memory.footprints
     config = replace(config, voxel=plan.config.voxel, memory=plan.config.memory)
     with held_folder(args.out):
         identity = run_identity(plan, reading_of(args))
@@ -113,11 +113,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
             limit=limit,
             say=console.line,
             kept=trials.kept,
+            of_bytes=kind == "bytes",
         )
-        # A profile finds its own voxel edge.
         profiles = [
-            (f"profile {name}", {"voxel": None, "memory.footprints": footprints, **changes})
-            for name, changes in settings.PROFILES.items()
+            (f"profile {name}", settings.difference(config, asked_for(args, name)))
+            for name in settings.PROFILES
         ]
         search.sweep(profiles, fits)
 
@@ -127,6 +127,26 @@ def run(args: argparse.Namespace, console: Console) -> None:
             return {key: changed[key] for key in changed if key not in ("context", "targets")}
 
         _write(search, args.out, scene.root.name, identity, kind, budget, fits, profile, console)
+
+
+def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunConfig:
+    """The run that the arguments ask for, or would with another profile.
+
+    A profile finds its own voxel edge, unless one is given.
+    """
+    from dataclasses import replace
+
+    from pipelines import config as settings
+
+    config = settings.RunConfig()
+    if args.config:
+        config = settings.with_file(config, args.config, profile=profile)
+    elif profile is not None:
+        config = settings.with_profile(config, profile)
+    named = [text for text in args.set if text.partition("=")[0].strip() == "profile"]
+    texts = args.set if profile is None else [text for text in args.set if text not in named]
+    config = settings.with_settings(config, texts)
+    return replace(config, context=args.context, targets=args.targets)
 
 
 def parse_budget(text: str | None) -> tuple[str, float | None]:
@@ -169,7 +189,7 @@ def _write(
 
     whole = search.whole()
     chosen = search.recommended(fits)
-    best = front([entry.outcome for entry in whole], search.targets)
+    best = front([entry.outcome for entry in whole], search.seconds)
     marginal = marginal_values(search)
     trials, edge, effects = (
         trial_table(search),
@@ -217,11 +237,10 @@ def _write(
         )
     if chosen is None:
         (out / "profile.json").unlink(missing_ok=True)
-        fastest = min(whole, key=lambda entry: entry.outcome.seconds(search.targets))
+        cheapest = min((entry.outcome for entry in whole), key=search.cost)
         console.warn(
-            f"no trial is within the budget; the cheapest takes "
-            f"{fastest.outcome.seconds(search.targets):.1f} s and "
-            f"{fastest.outcome.bytes / 2**20:.0f} MiB; no profile.json is written"
+            f"no trial is within the budget; the cheapest takes {search.seconds(cheapest):.1f} s "
+            f"and {cheapest.bytes / 2**20:.0f} MiB; no profile.json is written"
         )
         return
     write_json(out / "profile.json", profile(chosen.outcome))

@@ -187,6 +187,17 @@ def test_a_file_of_before_levels_is_read_with_one_edge(tmp_path):
     assert _same(found, memory, tmp_path)
 
 
+@pytest.mark.parametrize("kind", [np.int8, np.int64, np.float64])
+def test_levels_of_another_kind_are_refused(kind, tmp_path, monkeypatch):
+    memory = _small()
+    levels = memory.records.level.astype(kind)
+    levels[0] = -1
+    monkeypatch.setattr(memory.records, "level", levels)
+    memory.save(tmp_path / "memory.npz")
+    with pytest.raises(MemoryFileError, match="of a level that is not there"):
+        SpatialMemory.load(tmp_path / "memory.npz")
+
+
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(MemoryFileError, match="no such memory file"):
         SpatialMemory.load(tmp_path / "absent.npz")

@@ -5,15 +5,19 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from tiny_scan import write_scan
 
 from gvtools.errors import OptionError
-from pipelines.cli import main
+from pipelines.cli import build_parser, main
+from pipelines.config import PROFILES, RunConfig, difference, with_profile, with_settings
 from pipelines.held_folder import held_folder
+from pipelines.tradeoff import asked_for
 from pipelines.tradeoffs.search import EQUAL
+from pipelines.tradeoffs.trial import applied
 from viz.pareto import draw_pareto
 
 # Another edge than the first guess, as if it had been measured.
@@ -80,6 +84,25 @@ def test_a_profile_is_tried_as_reconstruct_runs_it(scan, swept, tmp_path):
     assert found["psnr"] == pytest.approx(tried["psnr"], abs=1e-6)
 
 
+@pytest.mark.parametrize("own", [[], ["max_side=200"], ["voxel=0.03", "profile=accurate"]])
+def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
+    file = tmp_path / "given.json"
+    file.write_text('{"profile": "accurate", "savings": {"minor_holes": 0.07}}')
+    arguments = ["tradeoff", "scan", "--out", "out", "--config", str(file)]
+    args = build_parser().parse_args(arguments + [word for text in own for word in ("--set", text)])
+    start = asked_for(args)
+    assert start.profile == "accurate" and start.memory.same_direction == 0
+    for name, changes in PROFILES.items():
+        wanted = with_settings(with_profile(RunConfig(), name), ["savings.minor_holes=0.07"])
+        wanted = with_settings(wanted, [text for text in own if "profile" not in text])
+        wanted = replace(wanted, context=start.context, targets=start.targets)
+        assert asked_for(args, name) == wanted, changes
+        # As a trial reaches it, from the start with the edge that it has.
+        found = replace(start, voxel=start.voxel or 0.02)
+        tried = applied(found, difference(found, wanted))
+        assert replace(tried, profile=name) == wanted
+
+
 def test_a_second_sweep_takes_over_what_is_there(scan, swept, capsys):
     before = {path: path.stat().st_mtime_ns for path in (swept / "trials").iterdir()}
     assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "1B"]) == 2
@@ -106,6 +129,7 @@ def test_a_project_that_is_read_otherwise_is_tried_anew(scan, swept, capsys):
         (["--targets", "orbit:3"], "no views of the project"),
         (["--limit", "100MB"], "expected a time"),
         (["--set", "splat.bandd=1"], "did you mean"),
+        (["--set", "rounds=1"], "give fewer --targets"),
     ],
 )
 def test_what_cannot_be_swept_is_one_line(scan, tmp_path, capsys, more, said):

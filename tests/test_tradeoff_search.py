@@ -125,6 +125,60 @@ def test_what_delivers_less_is_recommended_only_where_nothing_else_is_within_the
     assert not delivers_less(search.knobs, {"max_side": 480})
 
 
+@pytest.mark.parametrize(
+    ("budget", "best"),
+    [
+        (3e5, {"edge": 1, "steps": 1, "waste": 5, "dense": 0}),
+        (2.4e5, {"edge": 2, "steps": 1, "waste": 5, "dense": 0}),
+        (0.9e5, {"edge": 4, "steps": 1, "waste": 5, "dense": 0}),
+    ],
+)
+def test_a_budget_of_bytes_is_weighed_against_what_takes_memory_but_no_time(budget, best):
+    dense = Knob("dense", tuple(Level(str(v), {"dense": v}) for v in (0, 1)), 1)
+    runs = Runs()
+
+    def run(settings, share):
+        outcome = runs(settings, share)
+        thin = not settings.get("dense", 1)
+        return replace(
+            outcome, bytes=outcome.bytes / (1 + 3 * thin), psnr=outcome.psnr - 0.5 * thin
+        )
+
+    def within(outcome):
+        return outcome.bytes <= budget
+
+    search = Search(
+        [*KNOBS, dense], run, TARGETS, limit=1e6, say=lambda _: None, of_bytes=True,
+        clock=lambda: runs.now,
+    )  # fmt: skip
+    search.sweep([], within)
+    chosen = search.recommended(within)
+    assert chosen is not None and chosen.share == 1.0
+    keys = ("edge", "dense")
+    assert [chosen.outcome.settings[key] for key in keys] == [best[key] for key in keys]
+
+
+def test_one_knob_alone_is_tried_to_the_end_where_the_start_is_beyond_the_budget():
+    runs = Runs()
+
+    def run(settings, share):
+        # Together, two knobs cost what neither costs alone.
+        outcome = runs(settings, share)
+        changed = (settings["edge"] != 2) + (settings["steps"] != 1) + (settings["waste"] != 5)
+        return replace(outcome, bytes=2e6 if changed > 1 else outcome.bytes)
+
+    def within(outcome):
+        return outcome.bytes < 3e5
+
+    search = Search(
+        KNOBS, run, TARGETS, limit=1e6, say=lambda _: None, of_bytes=True, clock=lambda: runs.now
+    )
+    search.sweep([], within)
+    chosen = search.recommended(within)
+    assert chosen is not None and chosen.share == 1.0
+    assert chosen.outcome.settings == {"edge": 4, "steps": 1, "waste": 5}
+
+
 def test_early_trials_are_small_and_each_knob_is_tried_alone():
     _, runs = swept(100)
     first = [settings for settings, share in runs.made if share == SHARES[0]]
@@ -180,7 +234,7 @@ def test_no_trial_within_the_budget_gives_no_recommendation():
 def test_the_front_holds_what_no_other_beats():
     search, _ = swept(100)
     outcomes = [entry.outcome for entry in search.tried]
-    best = front(outcomes, TARGETS)
+    best = front(outcomes, lambda outcome: outcome.seconds(TARGETS))
     for outcome in outcomes:
         beaten = any(
             other.seconds(TARGETS) <= outcome.seconds(TARGETS) and other.psnr > outcome.psnr

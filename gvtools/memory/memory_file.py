@@ -215,7 +215,8 @@ def _check_consistency(arrays: dict[str, NDArray[Any]], views: int) -> None:
     rows = arrays["record_view"]
     if count and not (rows.min() >= 0 and rows.max() < views):
         raise ValueError("an observation names a view that is not there")
-    if count and arrays["record_level"].max() > MOST_LEVEL:
+    level = arrays["record_level"]
+    if level.dtype != np.uint8 or (count and level.max() > MOST_LEVEL):
         raise ValueError("an observation is of a level that is not there")
     start, length = arrays["run_start"], arrays["run_length"].astype(np.int64)
     if len(start) and not (start[0] == 0 and (start[1:] == (start + length)[:-1]).all()):

@@ -56,6 +56,9 @@ def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
     if keyword == "not":
         return set(range(count)) - _chosen(names, rest.strip(), whole)
     if keyword not in _FORMS:
+        listed = [part.strip() for part in spec.split(",")]
+        if not set(names).isdisjoint(listed):
+            return _by_name(names, listed, f"selection {whole!r}")
         near = difflib.get_close_matches(keyword, _KEYWORDS, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"expected {GRAMMAR}"
         raise OptionError(f"selection {whole!r}: unknown form {keyword!r}; {hint}")
@@ -68,21 +71,18 @@ def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
 
 def _listed(names: Sequence[str], spec: str) -> list[str]:
     """The names that a text lists, some of which may have commas; none where it lists others."""
-    known = set(names)
+    known = {*names, ""}
     longest = 1 + max((name.count(",") for name in names), default=0)
     parts = spec.split(",")
-    found: list[str] = []
-    at = 0
-    while at < len(parts):
+    # What the parts from each one on list, the longest names first.
+    rest: list[list[str] | None] = [*([None] * len(parts)), []]
+    for at in reversed(range(len(parts))):
         for end in range(min(at + longest, len(parts)), at, -1):
-            name = ",".join(parts[at:end]).strip()
-            if name in known or not name:
-                found.append(name)
-                at = end
+            name, after = ",".join(parts[at:end]).strip(), rest[end]
+            if name in known and after is not None:
+                rest[at] = [name, *after]
                 break
-        else:
-            return []
-    return [name for name in found if name]
+    return [name for name in rest[0] or [] if name]
 
 
 def _counted(keyword: str, numbers: list[int], count: int, whole: str) -> set[int]:

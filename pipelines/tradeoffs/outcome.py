@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -48,10 +48,10 @@ class Outcome:
         return asdict(self)
 
 
-def front(outcomes: Iterable[Outcome], targets: int) -> list[Outcome]:
-    """Those that no other beats in both time and PSNR, fastest first."""
+def front(outcomes: Iterable[Outcome], cost: Callable[[Outcome], float]) -> list[Outcome]:
+    """Those that no other beats in both cost and PSNR, the cheapest first."""
     out: list[Outcome] = []
-    for outcome in sorted(outcomes, key=lambda o: (o.seconds(targets), -o.psnr)):
+    for outcome in sorted(outcomes, key=lambda o: (cost(o), -o.psnr)):
         if not out or outcome.psnr > out[-1].psnr:
             out.append(outcome)
     return out

@@ -71,7 +71,8 @@ def read_trade_off(file: Path, *, of: Mapping[str, Any] | None = None) -> TradeO
         ]
         chosen = found["recommended"]
         of_time = found["budget_of"] == "seconds"
-        best = [points[outcomes.index(outcome)] for outcome in front(outcomes, targets)]
+        fastest = front(outcomes, lambda outcome: outcome.seconds(targets))
+        best = [points[outcomes.index(outcome)] for outcome in fastest]
         return TradeOff(
             str(file),
             points,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,8 @@ from pipelines.tradeoffs.outcome import Outcome, front
 SHARES = (0.25, 0.5, 1.0)
 # Combinations of the predicted front that are tried, and those of them that are on all targets.
 COMBINED, FINAL = 8, 5
+# Trials of one knob that are, where the start is beyond the budget.
+ALONE = 2
 # dB that tell no two trials apart.
 EQUAL = 0.02
 # dB below the best that nobody wants, where anything else is within the budget.
@@ -74,6 +76,7 @@ class Search:
         limit: seconds that the sweep may take; trials that would not fit are left out.
         say: is told of each trial.
         kept: what a trial gave in an earlier sweep, or None; such trials take no time.
+        of_bytes: the budget is one of memory, which then is what accuracy is weighed against.
         clock: seconds, for tests.
     """
 
@@ -83,6 +86,7 @@ class Search:
     limit: float
     say: Callable[[str], None] = print
     kept: Callable[[Settings, float], Outcome | None] = lambda settings, share: None
+    of_bytes: bool = False
     clock: Callable[[], float] = time.perf_counter
     tried: list[Tried] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)
@@ -112,10 +116,18 @@ class Search:
             self._try_settings(name, settings, None, SHARES[0])
         for point in neighbours(self.knobs, base):
             self._try(self._change(point), point, SHARES[0])
-        for point in self._promising():
+        for point in self._promising(fits):
             self._try("combination", point, SHARES[1])
         for entry in self._finalists(fits):
             self._try_settings(entry.label, entry.outcome.settings, entry.point, SHARES[-1])
+
+    def seconds(self, outcome: Outcome) -> float:
+        """Of a whole run."""
+        return outcome.seconds(self.targets)
+
+    def cost(self, outcome: Outcome) -> float:
+        """What the budget is of: seconds of a whole run, or bytes."""
+        return outcome.bytes if self.of_bytes else self.seconds(outcome)
 
     def whole(self) -> list[Tried]:
         """Trials on all targets, or on the greatest share that any was made on."""
@@ -154,29 +166,45 @@ class Search:
         row += [float(share == other) for other in SHARES[1:]]
         return np.array(row)
 
-    def _promising(self) -> list[Point]:
-        """Points on the predicted front, half of them of what delivers as much as the start."""
+    def _promising(self, fits: Callable[[Outcome], bool]) -> list[Point]:
+        """Points on the predicted front, half of them of what delivers as much as the start.
+
+        The best that is predicted to be within the budget comes first.
+        """
         points = list(self._combinations())
         whole = [p for p in points if not delivers_less(self.knobs, settings_of(self.knobs, p))]
+        found = self._best_within(whole, fits) or self._best_within(points, fits)
         if len(whole) == len(points):
-            return self._spread(points, COMBINED)
-        found = [*self._spread(whole, COMBINED // 2), *self._spread(points, COMBINED // 2)]
+            found += self._spread(points, COMBINED)
+        else:
+            found += self._spread(whole, COMBINED // 2) + self._spread(points, COMBINED // 2)
         return list(dict.fromkeys(found))
 
-    def _spread(self, points: Sequence[Point], count: int) -> list[Point]:
-        """``count`` points on the predicted front of some, spread over its times."""
+    def _best_within(self, points: Sequence[Point], fits: Callable[[Outcome], bool]) -> list[Point]:
+        """The point of some that is predicted to be the most accurate within the budget, if any."""
         values = self.predicted(points)
-        order = np.lexsort((-values[:, 2], values[:, 0]))
+        like = self.tried[0].outcome
+        for index in np.argsort(-values[:, 2], kind="stable"):
+            seconds, size, _ = map(float, values[index])
+            if fits(replace(like, fixed=seconds, per_target=0.0, bytes=size)):
+                return [points[index]]
+        return []
+
+    def _spread(self, points: Sequence[Point], count: int) -> list[Point]:
+        """``count`` points on the predicted front of some, spread over its costs."""
+        values = self.predicted(points)
+        cost = values[:, int(self.of_bytes)]
+        order = np.lexsort((-values[:, 2], cost))
         best = -np.inf
         found: list[int] = []
         for index in order:
             if values[index, 2] > best + EQUAL:
                 best = values[index, 2]
                 found.append(int(index))
-        # Evenly over the front's log-time, its ends included.
-        times = np.log(values[found, 0])
-        wanted = np.linspace(times[0], times[-1], count)
-        chosen = sorted({int(np.abs(times - time).argmin()) for time in wanted})
+        # Evenly over the front's log-cost, its ends included.
+        costs = np.log(cost[found])
+        wanted = np.linspace(costs[0], costs[-1], count)
+        chosen = sorted({int(np.abs(costs - one).argmin()) for one in wanted})
         return [points[found[i]] for i in chosen]
 
     def _combinations(self) -> Iterable[Point]:
@@ -203,14 +231,20 @@ class Search:
         ranked: list[Outcome] = []
         # Of what delivers as much as the start first.
         for entries in ([e for e in larger if not self._less(e)], larger):
-            best = front([entry.outcome for entry in entries], self.targets)
-            within = [outcome for outcome in best if fits(outcome)] or best[:1]
+            outcomes = [entry.outcome for entry in entries]
+            best = front(outcomes, self.cost)
+            within = front(filter(fits, outcomes), self.cost) or best[:1]
             # The most accurate within the budget first, then the others of the front.
             of_these = list(reversed(within)) + [o for o in reversed(best) if o not in within]
             ranked += [o for o in of_these if o not in ranked][: (FINAL + 1) // 2]
         chosen = [entry for o in ranked[:FINAL] for entry in larger if entry.outcome is o]
-        given = [e for e in self.tried if e.share == SHARES[0] and e.label in self._given]
-        return given + chosen
+        first = [entry for entry in self.tried if entry.share == SHARES[0]]
+        if not fits(self.tried[0].outcome):
+            # One knob alone may bring the start within the budget.
+            alone = [entry for entry in first if entry.point and fits(entry.outcome)]
+            alone.sort(key=lambda entry: (self._less(entry), -entry.outcome.psnr))
+            chosen = alone[:ALONE] + chosen
+        return [entry for entry in first if entry.label in self._given] + chosen
 
     def _less(self, entry: Tried) -> bool:
         return delivers_less(self.knobs, entry.outcome.settings)
@@ -225,7 +259,7 @@ class Search:
         full = [entry for entry in within if not self._less(entry)]
         most = max((entry.outcome.psnr for entry in full or within), default=0.0)
         best = [entry for entry in full or within if entry.outcome.psnr >= most - EQUAL]
-        return min(best, key=lambda entry: entry.outcome.seconds(self.targets), default=None)
+        return min(best, key=lambda entry: self.seconds(entry.outcome), default=None)
 
     def _change(self, point: Point) -> str:
         for knob, level in zip(self.knobs, point, strict=True):
@@ -242,7 +276,7 @@ class Search:
         if any(e.share == share and e.outcome.settings == settings for e in self.tried):
             return
         left = self._end - self.clock()
-        if self.kept(settings, share) is None and self._expected(settings, share) > left:
+        if self.kept(settings, share) is None and self._expected(settings, point, share) > left:
             self.left_out.append(label)
             return
         try:
@@ -260,11 +294,19 @@ class Search:
             f"{outcome.seconds(self.targets):.1f} s a run, {outcome.bytes / 2**20:.0f} MiB"
         )
 
-    def _expected(self, settings: Settings, share: float) -> float:
-        """Seconds of a trial: of the same settings on fewer targets, or else of the start."""
-        same = [e for e in self.tried if e.outcome.settings == settings]
-        known = same or self.tried[:1]
-        return known[-1].outcome.seconds(round(share * self.targets)) if known else 0.0
+    def _expected(self, settings: Settings, point: Point | None, share: float) -> float:
+        """Seconds of a trial: as it took on fewer targets, as predicted, or as the start's."""
+        if not self.tried:
+            return 0.0
+        count = round(share * self.targets)
+        same = [entry.outcome for entry in self.tried if entry.outcome.settings == settings]
+        if same:
+            return same[-1].seconds(count)
+        start = self.tried[0].outcome
+        if point is None or share == SHARES[0]:
+            return start.seconds(count)
+        whole = float(self.predicted([point])[0, 0])
+        return whole * start.seconds(count) / max(self.seconds(start), 1e-9)
 
 
 def marginal_values(search: Search) -> list[dict[str, Any]]:
