@@ -246,14 +246,16 @@ def test_a_run_within_the_budget_is_drawn_whole_and_nothing_is_sent_twice(run):
 @pytest.mark.slow
 def test_who_flies_near_sees_more(run, viewer):
     full = WebViewer(run, port=free_port())
-    # Close enough that all that is in view is within the budget.
+    # Close enough that all that is in view is within the budget: a coarse point beside near ones
+    # is as far as they are, and which of them covers which is decided by who came last.
     shown = run.cameras[1]
     with open_browser() as browser:
 
         def look_from_there(of, **options):
             client = wait(lambda: next(iter(of.server.get_clients().values()), None))
             wxyz, position = of.frame.placement(shown.camera)
-            ahead = 0.8 * run.typical_depth * of.frame.scale * shown.camera.world_from_cam[0, :3, 2]
+            way = of.frame.scale * shown.camera.world_from_cam[0, :3, 2]
+            ahead = 0.88 * run.typical_depth * way
             with client.atomic():
                 client.camera.wxyz, client.camera.position = wxyz, position + ahead
             client.flush()
@@ -288,6 +290,6 @@ def test_who_flies_near_sees_more(run, viewer):
     def share(one, other):
         return (np.abs(one.astype(int) - other).max(axis=2) > 2).mean()
 
-    # As if everything were drawn, but for the rim, where the budget ends; coarse points are not.
+    # As if everything were drawn; coarse points are not.
     assert share(coarse, whole) > 0.3
-    assert share(fine, whole) < 0.1 and share(tinted, whole_tinted) < 0.1
+    assert share(fine, whole) < 0.02 and share(tinted, whole_tinted) < 0.02
