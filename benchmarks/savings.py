@@ -19,6 +19,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gvtools.completers.base import create
+from gvtools.completers.geoverse.completer import GeoVerseCompleter
+from gvtools.completers.geoverse.weights.folder_parts import config_of
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
 from pipelines.config import RunConfig, with_setting, with_settings
@@ -43,6 +46,7 @@ OFF: dict[str, dict[str, Any]] = {
     "small holes left to inpaint": {"savings.minor_holes": 0.0},
     "middle holes in one step": {"savings.one_step": 0.0},
     "middle holes in half the size": {"savings.half_size": 0.0},
+    "middle holes without the video prior": {"savings.no_prior": 0.0},
     "later steps near holes alone": {"savings.near_holes": False},
     "explained views without computed depth": {"savings.explained": None},
 }
@@ -80,7 +84,9 @@ def rows_of(config: RunConfig, *, computed: bool) -> dict[str, Row]:
         idle.add("small holes left to inpaint")
     if config.completer != "geoverse":
         idle |= {"middle holes in one step", "middle holes in half the size"}
-        idle.add("later steps near holes alone")
+        idle |= {"later steps near holes alone", "middle holes without the video prior"}
+    elif not _has_prior(config):
+        idle.add("middle holes without the video prior")
     if not computed:
         idle.add("explained views without computed depth")
 
@@ -95,6 +101,12 @@ def rows_of(config: RunConfig, *, computed: bool) -> dict[str, Row]:
     rows = {"none": without(set(OFF))}
     rows |= {name: without(set(OFF) - {name}) for name in OFF if name in used}
     return rows | {"all": without(set())}
+
+
+def _has_prior(config: RunConfig) -> bool:
+    """Whether the generative core's weights have a video prior."""
+    core = create(config.completer, **config.completer_options)
+    return isinstance(core, GeoVerseCompleter) and config_of(core.folder).video is not None
 
 
 def main() -> None:

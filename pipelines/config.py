@@ -70,6 +70,7 @@ class SavingsOptions:
             of the model's own number where none of their unknown pixels is farther than this share
             of the diagonal from a known one; 0 spares none.
         half_size: likewise, they are completed in pictures of half the model's size.
+        no_prior: likewise, they are completed without the video prior of a model that has one.
         near_holes: steps of the generative core after the first one look at tokens near holes
             alone, where there is no video prior.
         explained: a context view whose depth would have to be computed takes memory's instead where
@@ -81,6 +82,7 @@ class SavingsOptions:
     minor_holes: float = 0.02
     one_step: float = 0.1
     half_size: float = 0.1
+    no_prior: float = 0.1
     near_holes: bool = True
     explained: float | None = 0.9
 
@@ -90,6 +92,7 @@ class SavingsOptions:
         check_range("savings.minor_holes", self.minor_holes, least=0)
         check_range("savings.one_step", self.one_step, least=0)
         check_range("savings.half_size", self.half_size, least=0)
+        check_range("savings.no_prior", self.no_prior, least=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +166,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "savings.minor_holes": 0.05,
         "savings.one_step": 0.3,
         "savings.half_size": 0.3,
+        "savings.no_prior": 0.3,
     },
     "balanced": {},
     "accurate": {
@@ -170,6 +174,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "savings.minor_holes": 0.0,
         "savings.one_step": 0.0,
         "savings.half_size": 0.0,
+        "savings.no_prior": 0.0,
         "savings.near_holes": False,
         "savings.explained": None,
         "memory.same_direction": 0.0,

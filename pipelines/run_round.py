@@ -130,9 +130,10 @@ def _complete(
             completer=sparing(
                 create(config.completer, **config.completer_options),
                 config.savings.minor_holes,
-                config.savings.one_step,
-                config.savings.half_size,
-                config.savings.near_holes,
+                one_step=config.savings.one_step,
+                half_size=config.savings.half_size,
+                no_prior=config.savings.no_prior,
+                near_holes=config.savings.near_holes,
             ),
             context=context, config=config, clock=clock, progress=console.track,
             done=lambda at, result: writing.append(

@@ -117,17 +117,18 @@ def test_only_costly_completers_are_spared_and_only_where_that_is_on():
 def test_a_completer_of_several_steps_is_told_where_one_will_do():
     core = create("geoverse")
     assert isinstance(core, GeoVerseCompleter)
-    assert sparing(core, 0.0, 0.1) == replace(core, one_step_holes=0.1)
-    wrapped = sparing(core, 0.02, 0.1)
+    assert sparing(core, 0.0, one_step=0.1) == replace(core, one_step_holes=0.1)
+    wrapped = sparing(core, 0.02, one_step=0.1)
     assert isinstance(wrapped, SparingCompleter)
     assert wrapped.costly == replace(core, one_step_holes=0.1)
-    assert sparing(core, 0.0, 0.0) is core
-    assert sparing(core, 0.0, 0.1, 0.2) == replace(core, one_step_holes=0.1, half_size_holes=0.2)
+    assert sparing(core, 0.0, one_step=0.0) is core
+    assert sparing(core, 0.0, half_size=0.2) == replace(core, half_size_holes=0.2)
+    assert sparing(core, 0.0, no_prior=0.3) == replace(core, no_prior_holes=0.3)
     assert sparing(core, 0.0, near_holes=True) == replace(core, near_holes=True)
     told = create("geoverse", one_step_holes=0.05)
-    assert sparing(told, 0.0, 0.1) is told
+    assert sparing(told, 0.0, one_step=0.1) is told
     inpaint = create("inpaint")
-    assert sparing(inpaint, 0.02, 0.1) is inpaint
+    assert sparing(inpaint, 0.02, one_step=0.1) is inpaint
 
 
 def test_support_is_absent_where_neither_has_a_scale_to_find():

@@ -352,6 +352,41 @@ def test_passes_whose_holes_are_near_what_is_known_take_one_step(weights, monkey
         assert made.spent["steps"] == steps, options
 
 
+@pytest.mark.parametrize("injection", ["control", "shared"])
+def test_passes_whose_holes_are_near_what_is_known_do_without_the_video_prior(
+    tmp_path, monkeypatch, injection
+):
+    model = micro.model(micro.config(injection=injection))
+    weights = micro.weights_folder(tmp_path, model.config)
+    (weights / "video").mkdir()
+    monkeypatch.setattr(completer_module, "_loaded", lambda *where: model)
+    context, known = micro.context_views(1), micro.guidance(3, size=(24, 32))
+    reach = [hole_reach(valid) for valid in known.valid]
+    asked: list[int] = []
+
+    def features(self: GeoVerse, batch: ViewBatch, seeds: Any) -> Any:
+        asked.append(1)
+        return micro.video_features(*batch.images.shape[:2])
+
+    monkeypatch.setattr(GeoVerse, "_video_features", features)
+
+    def made(no_prior: float) -> np.ndarray:
+        asked.clear()
+        # One target a pass.
+        return complete(weights, context, known, views=2, no_prior_holes=no_prior).rgb
+
+    everywhere = made(0.0)
+    assert len(asked) == 3
+    nowhere = made(1.0)
+    assert not asked
+    middle = (min(reach) + max(reach)) / 2
+    mixed = made(middle)
+    assert len(asked) == sum(far > middle for far in reach) in (1, 2)
+    for row, far in enumerate(reach):
+        assert np.array_equal(mixed[row], (everywhere if far > middle else nowhere)[row])
+        assert not np.array_equal(everywhere[row], nowhere[row])
+
+
 def test_temperature_scales_the_noise_that_level_1_starts_from(weights, monkeypatch):
     states: list[Any] = []
     velocity = GeoVerse.velocity1

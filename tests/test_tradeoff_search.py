@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from gvtools.completers.base import create
+from gvtools.completers.geoverse.completer import GeoVerseCompleter
+from gvtools.completers.sparing import sparing
 from gvtools.errors import GvError, OptionError, ProjectError
 from pipelines.config import RunConfig, with_setting, with_settings
 from pipelines.plan import Plan
@@ -340,6 +342,39 @@ def test_every_completer_can_be_tried_from_any_start(texts):
     start = applied(config, settings_of(knobs, usual(knobs)))
     assert start.completer == config.completer
     assert start.completer_options.items() >= config.completer_options.items()
+
+
+@pytest.mark.parametrize(
+    ("texts", "shares", "usual_share"),
+    [
+        ([], [1e6, 0.1, 0.0], 0.1),
+        (["savings.no_prior=0.3"], [1e6, 0.3, 0.1, 0.0], 0.3),
+        (["profile=accurate"], [1e6, 0.1, 0.0], 0.0),
+        (["completer.no_prior_holes=0.2"], [1e6, 0.2, 0.1, 0.0], 0.2),
+    ],
+)
+def test_a_video_prior_is_swept_where_the_weights_have_one(tmp_path, texts, shares, usual_share):
+    pytest.importorskip("safetensors", reason="weights are read with safetensors")
+    import geoverse_models as micro
+
+    name = "holes without video prior, share of the diagonal"
+    for injection in ("none", "control"):
+        weights = micro.weights_folder(tmp_path / injection, micro.config(injection=injection))
+        # What the prior is read from; nothing is completed here.
+        (weights / "video").mkdir()
+        core = ["completer=geoverse", f"completer.weights={weights}"]
+        config = with_settings(RunConfig(), [*core, *texts])
+        knobs = knobs_in("recorded", config)
+        assert (name in knobs) == (injection == "control")
+    runs = [with_settings(config, [f"{k}={v}" for k, v in level.settings.items()])
+            for level in knobs[name].levels]  # fmt: skip
+    told = []
+    for run in runs:
+        completer = create(run.completer, **run.completer_options)
+        completer = sparing(completer, 0.0, no_prior=run.savings.no_prior)
+        assert isinstance(completer, GeoVerseCompleter)
+        told.append(completer.no_prior_holes)
+    assert told == shares and told[knobs[name].usual] == usual_share
 
 
 def test_what_an_earlier_sweep_gave_takes_no_time():

@@ -59,8 +59,10 @@ class SparingCompleter:
 def sparing(
     completer: Completer,
     minor: float,
+    *,
     one_step: float = 0.0,
     half_size: float = 0.0,
+    no_prior: float = 0.0,
     near_holes: bool = False,
 ) -> Completer:
     """``completer``, spared what small holes do not need, where it is costly.
@@ -72,10 +74,17 @@ def sparing(
             several; 0 leaves them all.
         half_size: passes whose holes reach no farther are made in pictures of half the size, where
             the completer has a size of its own; 0 leaves them all.
+        no_prior: passes whose holes reach no farther are made without the video prior, where the
+            completer has one; 0 leaves it to all.
         near_holes: steps after the first look at what lies near holes alone, where the completer
             can.
     """
-    wanted = {"one_step_holes": one_step, "half_size_holes": half_size, "near_holes": near_holes}
+    wanted = {
+        "one_step_holes": one_step,
+        "half_size_holes": half_size,
+        "no_prior_holes": no_prior,
+        "near_holes": near_holes,
+    }
     for name, value in wanted.items():
         # What the completer was told itself stands: only a 0 is replaced.
         if value and is_dataclass(completer) and not getattr(completer, name, True):

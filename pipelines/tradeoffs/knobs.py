@@ -147,7 +147,7 @@ def knobs_of(plan: Plan) -> list[Knob]:
                         given.get("image_size")),
                 _values("precision", "completer.precision", ("bfloat16", "float32"),
                         given.get("precision", "auto")),
-                *_priors(core, given),
+                *_priors(core, given, config.savings.no_prior),
             )
         ]  # fmt: skip
     if plan.source.name != RecordedDepth.name:
@@ -176,15 +176,23 @@ def _core(given: Mapping[str, Any]) -> GeoVerseConfig:
     return config_of(core.folder)
 
 
-def _priors(core: GeoVerseConfig, given: Mapping[str, Any]) -> list[Knob]:
-    """The video prior left out and used, where the core has one."""
+def _priors(core: GeoVerseConfig, given: Mapping[str, Any], spared: float) -> list[Knob]:
+    """The video prior left out, used for large holes and for all, where the core has one."""
     if core.video is None:
         return []
     every = 1e6
-    return [
-        _numbers("holes without video prior, share of the diagonal", "completer.no_prior_holes",
-                 (every, 0.1, 0.0), float(given.get("no_prior_holes", 0.0)))
-    ]  # fmt: skip
+    own = float(given.get("no_prior_holes", 0.0))
+    knob = _numbers("holes without video prior, share of the diagonal", "savings.no_prior",
+                    (every, 0.1, 0.0), own or spared)  # fmt: skip
+    if own:
+        # The completer's own option stands above the run's.
+        levels = tuple(
+            replace(level, settings={**level.settings, "completer.no_prior_holes": share})
+            for level in knob.levels
+            for share in level.settings.values()
+        )
+        knob = replace(knob, levels=levels)
+    return [knob]
 
 
 def _numbers(name: str, key: str, values: Sequence[float], start: float) -> Knob:
