@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+from tiny_scan import write_scan
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completion, create
@@ -15,7 +16,8 @@ from gvtools.completers.inpaint import InpaintCompleter
 from gvtools.completers.sparing import SparingCompleter, sparing
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
-from pipelines.config import RunConfig, with_setting
+from pipelines.cli import main
+from pipelines.config import RunConfig, with_profile, with_setting
 
 HEIGHT, WIDTH = 60, 80
 
@@ -125,8 +127,16 @@ def test_a_completer_of_several_steps_is_told_where_one_will_do():
     assert sparing(core, 0.0, half_size=0.2) == replace(core, half_size_holes=0.2)
     assert sparing(core, 0.0, no_prior=0.3) == replace(core, no_prior_holes=0.3)
     assert sparing(core, 0.0, near_holes=True) == replace(core, near_holes=True)
-    told = create("geoverse", one_step_holes=0.05)
-    assert sparing(told, 0.0, one_step=0.1) is told
+    for share in (0.05, 0.0):
+        told = create(
+            "geoverse",
+            one_step_holes=share,
+            half_size_holes=share,
+            no_prior_holes=share,
+            near_holes=False,
+        )
+        same = sparing(told, 0.0, one_step=0.1, half_size=0.1, no_prior=0.1, near_holes=True)
+        assert same is told
     inpaint = create("inpaint")
     assert sparing(inpaint, 0.02, one_step=0.1) is inpaint
 
@@ -134,6 +144,32 @@ def test_a_completer_of_several_steps_is_told_where_one_will_do():
 def test_support_is_absent_where_neither_has_a_scale_to_find():
     costly = Recorder(said=None)
     assert SparingCompleter(costly, 0.05).complete((), guidance_with(2, 20)).support is None
+
+
+@pytest.mark.parametrize("profile", ["fast", "balanced", "accurate"])
+def test_a_run_hands_its_savings_on(tmp_path, monkeypatch, profile):
+    told = []
+
+    def kept(completer, minor, **savings):
+        told.append({"minor_holes": minor, **savings})
+        return sparing(completer, minor, **savings)
+
+    monkeypatch.setattr("pipelines.run_round.sparing", kept)
+    scan = write_scan(tmp_path / "scan", views=4)
+    options = ("--context", "first:3", "--targets", "range:3-3", "--profile", profile, "--quiet")
+    assert main(["reconstruct", str(scan), "--out", str(tmp_path / "run"), *options]) == 0
+    savings = with_profile(RunConfig(), profile).savings
+    names = ("minor_holes", "one_step", "half_size", "no_prior", "near_holes")
+    assert told == [{name: getattr(savings, name) for name in names}]
+
+
+@pytest.mark.parametrize("name", ["minor_holes", "one_step", "half_size", "no_prior"])
+def test_a_faster_profile_spares_more(name):
+    shares = [
+        getattr(with_profile(RunConfig(), profile).savings, name)
+        for profile in ("accurate", "balanced", "fast")
+    ]
+    assert shares == sorted(set(shares)) and shares[0] == 0
 
 
 def test_a_negative_share_is_refused():

@@ -351,6 +351,7 @@ def test_every_completer_can_be_tried_from_any_start(texts):
         (["savings.no_prior=0.3"], [1e6, 0.3, 0.1, 0.0], 0.3),
         (["profile=accurate"], [1e6, 0.1, 0.0], 0.0),
         (["completer.no_prior_holes=0.2"], [1e6, 0.2, 0.1, 0.0], 0.2),
+        (["completer.no_prior_holes=0"], [1e6, 0.1, 0.0], 0.0),
     ],
 )
 def test_a_video_prior_is_swept_where_the_weights_have_one(tmp_path, texts, shares, usual_share):
@@ -373,7 +374,7 @@ def test_a_video_prior_is_swept_where_the_weights_have_one(tmp_path, texts, shar
         completer = create(run.completer, **run.completer_options)
         completer = sparing(completer, 0.0, no_prior=run.savings.no_prior)
         assert isinstance(completer, GeoVerseCompleter)
-        told.append(completer.no_prior_holes)
+        told.append(completer.no_prior_holes or 0.0)
     assert told == shares and told[knobs[name].usual] == usual_share
 
 

@@ -52,9 +52,11 @@ class Client:
         self.camera = SimpleNamespace(fov=1.2, image_width=320, image_height=240)
         viewer.server.get_clients = lambda: {number: self}
 
-    def go(self, pose, ahead=0.0):
-        """Stand where a camera of the project stands, or ``ahead`` of it."""
-        self.camera.wxyz, at = self.viewer.frame.placement(pose)
+    def go(self, pose, ahead=0.0, turn=0.0):
+        """Stand where a camera of the project stands, or ``ahead`` of it, turned by radians."""
+        wxyz, at = self.viewer.frame.placement(pose)
+        turned = viser.transforms.SO3.from_y_radians(turn)
+        self.camera.wxyz = (viser.transforms.SO3(np.asarray(wxyz)) @ turned).wxyz
         way = pose.world_from_cam[0, :3, 2]
         self.camera.position = at + ahead * self.viewer.frame.scale * way
         self.viewer._near.moved(self)
@@ -173,14 +175,15 @@ def test_moving_on_sends_what_is_new_alone_and_takes_back_what_is_out_of_view(
     monkeypatch.setattr(web_viewer_near, "REST_SECONDS", 1.5)
     client.go(run.cameras[0].camera)
     first = client.settled()
-    client.go(run.cameras[0].camera, ahead=0.02 * run.typical_depth)
-    for _ in range(8):  # As long as it moves, what was there stays.
+    for _ in range(9):  # As long as it moves, what was there stays.
+        client.go(run.cameras[0].camera, ahead=0.4 * run.typical_depth, turn=-0.3)
         time.sleep(0.25)
         assert client.nodes() == first
-        client.go(run.cameras[0].camera, ahead=0.02 * run.typical_depth)
+    wait(lambda: client.nodes().keys() != first.keys())
     second = client.settled()
     kept = first.keys() & second.keys()
     assert kept and all(first[key] is second[key] for key in kept)
+    assert second.keys() - first.keys() and first.keys() - second.keys()
     client.camera.wxyz = viser.transforms.SO3.from_y_radians(np.pi).wxyz
     viewer._near.moved(client)
     wait(lambda: not client.nodes())

@@ -107,10 +107,11 @@ class Completer(Protocol):
     """Fills what memory does not know of the target views.
 
     One with ``joint`` = True gets all targets of a round at once. One with ``costly`` = True is
-    spared views whose holes are small, and one with a field ``one_step_holes`` or
-    ``half_size_holes`` steps or pixels where they are of middle size (see ``sparing``). One that
-    reads weights names them in an attribute ``files``: they decide the result. What a user should
-    be told before a run may stand in ``notes``.
+    spared views whose holes are small, and one with a field ``one_step_holes``,
+    ``half_size_holes``, ``no_prior_holes`` or ``near_holes`` that is None is spared what those of
+    middle size do not need (see ``sparing``). One that reads weights names them in an attribute
+    ``files``: they decide the result. What a user should be told before a run may stand in
+    ``notes``.
     """
 
     name: str

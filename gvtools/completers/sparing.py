@@ -86,8 +86,8 @@ def sparing(
         "near_holes": near_holes,
     }
     for name, value in wanted.items():
-        # What the completer was told itself stands: only a 0 is replaced.
-        if value and is_dataclass(completer) and not getattr(completer, name, True):
+        # What the completer was told itself stands, a 0 as well.
+        if value and is_dataclass(completer) and getattr(completer, name, 0) is None:
             completer = replace(completer, **{name: value})
     if minor > 0 and getattr(completer, "costly", False):
         return SparingCompleter(completer, minor)

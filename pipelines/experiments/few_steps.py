@@ -1,4 +1,7 @@
-"""Quality against steps: level 1 from 49 to 1 with one cascade step, and the cascade's own."""
+"""Quality against steps: level 1 from 49 to 1 with one cascade step, and the cascade's own.
+
+Of weights with a video prior also against how small the holes are that do without it.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from gvtools.completers.base import Completer
+from gvtools.completers.geoverse.completer import SHIPPED
+from gvtools.completers.geoverse.weights.folder_parts import config_of
 from gvtools.evaluation.tables import Table
 from pipelines.experiments.cases import SIZE, held_out_cases
 from pipelines.experiments.judging import judge, perceptual, records, table
@@ -17,6 +22,8 @@ READS = ("weights", "teacher", "scenes", "size", "seed")
 
 LEVEL1 = (49, 24, 12, 6, 3, 2, 1)
 CASCADE = (1, 2, 4, 8, 24)
+# Holes that do without a video prior, shares of the image diagonal.
+WITHOUT_PRIOR = (0.0, 0.1, 0.3, 1e6)
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
@@ -38,17 +45,24 @@ def _swept(
     distance, found["perceptual_distance"] = perceptual()
     for name, folder in models.items():
         sweeps: dict[str, dict[str, Completer]] = {
-            "level 1": {
+            "level 1 steps": {
                 "3+1, own bounds": geoverse(folder),
                 "3+1, after the first near holes alone": geoverse(folder, near_holes=True),
                 **{f"{n}+1, equal steps": geoverse(folder, steps=n) for n in LEVEL1},
             },
-            "cascade": {f"3+{n}, own bounds": geoverse(folder, cascade_steps=n) for n in CASCADE},
+            "cascade steps": {
+                f"3+{n}, own bounds": geoverse(folder, cascade_steps=n) for n in CASCADE
+            },
         }
+        if config_of(folder or SHIPPED).video is not None:
+            sweeps["video prior's holes"] = {
+                f"3+1, none for holes up to {share:g}": geoverse(folder, no_prior_holes=share)
+                for share in WITHOUT_PRIOR
+            }
         for sweep, methods in sweeps.items():
             cases = held_out_cases(options.scenes, seed=options.seed, size=side)
             judged = judge(methods, cases, distance=distance, seed=options.seed)
             found[f"{name}, {sweep}"] = records(judged)
-            caption = f"{name}, sweep of the {sweep} steps, {options.scenes} held-out scenes"
+            caption = f"{name}, sweep of {sweep}, {options.scenes} held-out scenes"
             tables.append(table(judged, caption=caption))
     return found, tables

@@ -181,10 +181,10 @@ def _priors(core: GeoVerseConfig, given: Mapping[str, Any], spared: float) -> li
     if core.video is None:
         return []
     every = 1e6
-    own = float(given.get("no_prior_holes", 0.0))
+    own = given.get("no_prior_holes")
     knob = _numbers("holes without video prior, share of the diagonal", "savings.no_prior",
-                    (every, 0.1, 0.0), own or spared)  # fmt: skip
-    if own:
+                    (every, 0.1, 0.0), spared if own is None else float(own))  # fmt: skip
+    if own is not None:
         # The completer's own option stands above the run's.
         levels = tuple(
             replace(level, settings={**level.settings, "completer.no_prior_holes": share})

@@ -66,7 +66,7 @@ class GeoVerseCompleter:
         shared_fill: whether targets share what their holes are filled with, see ``surface_fill``.
         one_step_holes: a pass takes one level-1 step where no unknown pixel of its targets lies
             farther from a known one than this share of the image diagonal, and ``steps`` is None;
-            0 never.
+            0 never. None leaves it to what a run spares, see ``sparing``; so do the next three.
         no_prior_holes: likewise, a pass that does without the video prior.
         half_size_holes: likewise, a pass in pictures of half the size.
         near_holes: steps after the first look at what lies near holes alone, see ``near_tokens``.
@@ -92,10 +92,10 @@ class GeoVerseCompleter:
     color_alignment: str | None = None
     composition: str | None = None
     shared_fill: bool = True
-    one_step_holes: float = 0.0
-    no_prior_holes: float = 0.0
-    half_size_holes: float = 0.0
-    near_holes: bool = False
+    one_step_holes: float | None = None
+    no_prior_holes: float | None = None
+    half_size_holes: float | None = None
+    near_holes: bool | None = None
     image_size: int | None = None
     precision: str = "auto"
     device: str = "auto"
@@ -192,7 +192,7 @@ class GeoVerseCompleter:
                 reach = max(hole_reach(valid) for valid in part.valid)
             bounds = self._bounds(model, reach)
             size = self._size(model, part, reach)
-            prior = reach > self.no_prior_holes
+            prior = reach > (self.no_prior_holes or 0)
             made = self._pass(model, device, chosen, part, fill, seed, size, bounds, prior)
             canvas.put(rows, made, part)
             passes += 1
@@ -249,7 +249,7 @@ class GeoVerseCompleter:
                 temperature=self.temperature,
                 prior=prior,
                 targets_alone=told,
-                near_holes=self.near_holes,
+                near_holes=bool(self.near_holes),
             )
 
         def brought(color_alignment: str) -> Completed:
@@ -267,7 +267,7 @@ class GeoVerseCompleter:
     def _size(self, model: GeoVerse, part: Guidance, reach: float) -> tuple[int, int]:
         """(H, W) of the pictures in a pass whose holes reach so far."""
         longest = min(self.image_size or model.config.image_size, model.config.image_size)
-        if reach <= self.half_size_holes:
+        if reach <= (self.half_size_holes or 0):
             longest = longest // 2
         return model_size(*part.depth.shape[1:], longest=longest, patch=model.config.patch)
 
@@ -276,7 +276,8 @@ class GeoVerseCompleter:
         if self.steps == 0:
             return ()
         if self.steps is None:
-            return interval_bounds(1) if reach <= self.one_step_holes else model.config.flow.level1
+            one = reach <= (self.one_step_holes or 0)
+            return interval_bounds(1) if one else model.config.flow.level1
         return interval_bounds(self.steps)
 
     def _cascade_bounds(self, model: GeoVerse) -> tuple[float, ...]:
