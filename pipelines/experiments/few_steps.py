@@ -22,6 +22,11 @@ READS = ("weights", "teacher", "scenes", "size", "seed")
 
 LEVEL1 = (49, 24, 12, 6, 3, 2, 1)
 CASCADE = (1, 2, 4, 8, 24)
+SWEPT = {
+    "level 1": "the level 1 steps",
+    "cascade": "the cascade steps",
+    "video prior": "the holes that do without the video prior",
+}
 # Holes that do without a video prior, shares of the image diagonal.
 WITHOUT_PRIOR = (0.0, 0.1, 0.3, 1e6)
 
@@ -45,17 +50,15 @@ def _swept(
     distance, found["perceptual_distance"] = perceptual()
     for name, folder in models.items():
         sweeps: dict[str, dict[str, Completer]] = {
-            "level 1 steps": {
+            "level 1": {
                 "3+1, own bounds": geoverse(folder),
                 "3+1, after the first near holes alone": geoverse(folder, near_holes=True),
                 **{f"{n}+1, equal steps": geoverse(folder, steps=n) for n in LEVEL1},
             },
-            "cascade steps": {
-                f"3+{n}, own bounds": geoverse(folder, cascade_steps=n) for n in CASCADE
-            },
+            "cascade": {f"3+{n}, own bounds": geoverse(folder, cascade_steps=n) for n in CASCADE},
         }
         if config_of(folder or SHIPPED).video is not None:
-            sweeps["video prior's holes"] = {
+            sweeps["video prior"] = {
                 f"3+1, none for holes up to {share:g}": geoverse(folder, no_prior_holes=share)
                 for share in WITHOUT_PRIOR
             }
@@ -63,6 +66,6 @@ def _swept(
             cases = held_out_cases(options.scenes, seed=options.seed, size=side)
             judged = judge(methods, cases, distance=distance, seed=options.seed)
             found[f"{name}, {sweep}"] = records(judged)
-            caption = f"{name}, sweep of {sweep}, {options.scenes} held-out scenes"
+            caption = f"{name}, sweep of {SWEPT[sweep]}, {options.scenes} held-out scenes"
             tables.append(table(judged, caption=caption))
     return found, tables
