@@ -181,18 +181,13 @@ def _priors(core: GeoVerseConfig, given: Mapping[str, Any], spared: float) -> li
     if core.video is None:
         return []
     every = 1e6
+    # The completer's own option stands above the run's.
     own = given.get("no_prior_holes")
-    knob = _numbers("holes without video prior, share of the diagonal", "savings.no_prior",
-                    (every, 0.1, 0.0), spared if own is None else float(own))  # fmt: skip
-    if own is not None:
-        # The completer's own option stands above the run's.
-        levels = tuple(
-            replace(level, settings={**level.settings, "completer.no_prior_holes": share})
-            for level in knob.levels
-            for share in level.settings.values()
-        )
-        knob = replace(knob, levels=levels)
-    return [knob]
+    key = "savings.no_prior" if own is None else "completer.no_prior_holes"
+    return [
+        _numbers("holes without video prior, share of the diagonal", key,
+                 (every, 0.1, 0.0), spared if own is None else float(own))
+    ]  # fmt: skip
 
 
 def _numbers(name: str, key: str, values: Sequence[float], start: float) -> Knob:
