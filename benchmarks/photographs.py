@@ -26,12 +26,12 @@ from gvtools.depth.stereo.exposure import Exposures, estimate_exposures
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.evaluation.images import psnr
 from gvtools.memory.back_projection import back_project
-from gvtools.memory.points import PointSet
 from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.store.points import PointSet
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
 from gvtools.scenes.selection import select
-from pipelines.plan import automatic_voxel
+from pipelines.reconstruction.plan import automatic_voxel
 
 FOOTPRINTS = (2, 4, 6, 8, 12, 16, 24, 32)  # pixels across
 VARIANTS = {

@@ -22,12 +22,12 @@ from typing import Any
 from gvtools.completers.base import create
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.completers.geoverse.weights.folder_parts import config_of
+from gvtools.runs.folder import RunDirectory
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
+from pipelines.commands.reconstruct import reconstruct
 from pipelines.config import RunConfig, with_setting, with_settings
 from pipelines.console import Console
-from pipelines.reconstruct import reconstruct
-from pipelines.run_directory import RunDirectory
 
 # Each saving's settings when it is off.
 OFF: dict[str, dict[str, Any]] = {

@@ -26,14 +26,15 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.evaluation.images import psnr
 from gvtools.memory.back_projection import back_project
-from gvtools.memory.points import PointSet
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+from gvtools.memory.store.points import PointSet
 from gvtools.scenes.project import open_project
 from gvtools.scenes.selection import select
-from pipelines import bench_fuse, bench_splat, open3d_peers
-from pipelines.bench import report
+from pipelines.bench.side_by_side import alternate
+from pipelines.commands.bench import fuse as bench_fuse
+from pipelines.commands.bench import open3d_peers, report
+from pipelines.commands.bench import splat as bench_splat
 from pipelines.console import Console, write_json
-from pipelines.side_by_side import alternate
 
 VOXEL = 0.005  # metres
 TSDF_VOXEL = 0.01

@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 from browser import Browser, open_browser
 
 from gvtools.memory.spatial_memory import SpatialMemory
-from pipelines.procedural_cloud import box_size, walls
+from pipelines.bench.procedural_cloud import box_size, walls
 
 VOXEL = 0.01
 # Where the scene shows in a window of 1280 x 800, free of the controls and of the page's notes.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import NoReturn
 
@@ -15,21 +15,20 @@ from pipelines.console import Console
 
 # Each module has SUMMARY, EXAMPLES, add_arguments(parser) and run(args, console).
 COMMANDS = {
-    "demo": "pipelines.demo",
-    "check": "pipelines.check",
-    "reconstruct": "pipelines.reconstruct",
-    "render": "pipelines.render",
-    "tradeoff": "pipelines.tradeoff",
-    "evaluate": "pipelines.evaluate",
-    "trajectory": "pipelines.trajectory",
-    "report": "pipelines.report",
-    "plot": "pipelines.plot",
-    "weights": "pipelines.weights",
-    "train": "pipelines.train",
-    "experiment": "pipelines.experiment",
-    "export": "pipelines.export",
-    "view": "pipelines.view",
-    "bench": "pipelines.bench",
+    "demo": "pipelines.commands.demo",
+    "check": "pipelines.commands.check",
+    "reconstruct": "pipelines.commands.reconstruct",
+    "render": "pipelines.commands.render",
+    "tradeoff": "pipelines.commands.tradeoff",
+    "evaluate": "pipelines.commands.evaluate",
+    "trajectory": "pipelines.commands.trajectory",
+    "report": "pipelines.commands.report",
+    "plot": "pipelines.commands.plot",
+    "weights": "pipelines.commands.weights",
+    "train": "pipelines.commands.train",
+    "export": "pipelines.commands.export",
+    "view": "pipelines.commands.view",
+    "bench": "pipelines.commands.bench",
 }
 
 
@@ -40,8 +39,8 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"gvtools: {message}; see '{self.prog} --help'\n")
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The parser of all commands."""
+def build_parser(modules: Mapping[str, str] = COMMANDS) -> argparse.ArgumentParser:
+    """The parser of all commands, given as name and module."""
     parser = _Parser(
         prog="gvtools",
         description="Grow a coloured point-cloud memory from posed photographs or RGB-D, project "
@@ -50,7 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"gvtools {gvtools.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
-    for name, path in COMMANDS.items():
+    for name, path in modules.items():
         module = import_module(path)
         examples = "\n".join(f"  {line}" for line in module.EXAMPLES)
         command = commands.add_parser(
@@ -67,11 +66,16 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status: 0 done, 2 wrong input or options, 1 otherwise."""
+def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMMANDS) -> int:
+    """Run one command; returns the exit status: 0 done, 2 wrong input or options, 1 otherwise.
+
+    Args:
+        argv: the command line; None takes this process's.
+        modules: the commands to choose from, as name and module.
+    """
     # Waiting threads that spin would take the cores that other programs need, and with them ours.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    parser = build_parser()
+    parser = build_parser(modules)
     args = parser.parse_args(argv)
     if args.command is None:
         parser.print_help()

@@ -15,7 +15,7 @@ from gvtools.depth.stereo.options import StereoOptions
 from gvtools.errors import OptionError
 from gvtools.memory.back_projection import BackProjectionOptions
 from gvtools.memory.spatial_memory import MemoryOptions
-from gvtools.memory.splat import DEVICES, SplatOptions
+from gvtools.memory.splat.api import DEVICES, SplatOptions
 from gvtools.options import check_range
 from gvtools.scenes.reduced import SMALLEST
 

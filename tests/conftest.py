@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from shared_data import shared_folder
 
 # As the command line has it: threads that spin while they wait are slow where others work, too.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
-REPOSITORY = Path(__file__).resolve().parent.parent
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -35,12 +34,6 @@ def _cuda() -> bool:
     import torch
 
     return torch.cuda.is_available()
-
-
-def shared_folder() -> Path:
-    """Where the real scenes and oracles lie: $GVTOOLS_SHARED, or shared/ beside the repository."""
-    named = os.environ.get("GVTOOLS_SHARED")
-    return Path(named) if named else REPOSITORY.parent / "shared"
 
 
 @pytest.fixture(scope="session")

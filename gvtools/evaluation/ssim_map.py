@@ -12,7 +12,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from gvtools.memory.compiled import compiled
+from gvtools.kernels import compiled
 
 SIGMA = 1.5
 RADIUS = 5  # scikit-image truncates at 3.5 sigma

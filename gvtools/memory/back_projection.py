@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
-from gvtools.memory.compiled import compiled
-from gvtools.memory.local_frame import LocalFrame
-from gvtools.memory.pixel_blocks import join_blocks
-from gvtools.memory.points import PointSet
-from gvtools.memory.voxel_levels import VoxelLevels
+from gvtools.kernels import compiled
+from gvtools.memory.pixel_binning import join_blocks
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.memory.store.points import PointSet
+from gvtools.memory.store.voxel_levels import VoxelLevels
 from gvtools.options import check_range
 
 # Side of a cell of the free-space grid, pixels.

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from gvtools.memory.compiled import FAST, compiled
+from gvtools.kernels import FAST, compiled
 from gvtools.memory.occlusion import seen_through
 
 TILE = 16

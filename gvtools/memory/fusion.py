@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvtools.memory.compiled import compiled
-from gvtools.memory.voxel_index import (
+from gvtools.kernels import compiled
+from gvtools.memory.store.voxel_index import (
     EMPTY_KEY,
     NO_RECORD,
     find_block,

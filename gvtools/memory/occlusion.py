@@ -8,8 +8,8 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from gvtools.kernels import compiled
 from gvtools.memory.back_projection import FREE_CELL
-from gvtools.memory.compiled import compiled
 
 # K (3, 3), cam_from_world (4, 4) and free-space grid (h, w) of one view (see PointSet).
 FreeGrid = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]

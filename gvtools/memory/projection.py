@@ -22,7 +22,7 @@ from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, together
 from gvtools.memory import culling
 from gvtools.memory.occlusion import stacked
-from gvtools.memory.splat import ONE_PIXEL, SplatOptions, Splatter, Target
+from gvtools.memory.splat.api import ONE_PIXEL, SplatOptions, Splatter, Target
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -69,7 +69,7 @@ def project(
     check_usable(cameras)
     options = options or SplatOptions()
     if options.backend in ONE_PIXEL:
-        from gvtools.memory.one_pixel import project_one_pixel
+        from gvtools.memory.splat.one_pixel import project_one_pixel
 
         return project_one_pixel(memory, cameras, open3d=options.backend == "open3d")
     splatter = _splatter(memory, options)
@@ -136,10 +136,10 @@ def observed_of(memory: SpatialMemory, camera: Cameras, *, options: SplatOptions
 
 def _splatter(memory: SpatialMemory, options: SplatOptions) -> Splatter:
     if options.backend == "torch":
-        from gvtools.memory.splat_torch import TorchSplatter
+        from gvtools.memory.splat.torch_splatter import TorchSplatter
 
         return TorchSplatter(memory, options)
-    from gvtools.memory.splat_cpu import CpuSplatter
+    from gvtools.memory.splat.cpu import CpuSplatter
 
     return CpuSplatter(memory, options)
 

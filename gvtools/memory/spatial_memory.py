@@ -14,20 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ShapeError
 from gvtools.memory import fusion
-from gvtools.memory.local_frame import LocalFrame
 from gvtools.memory.occlusion import FreeGrid, in_free_space
-from gvtools.memory.points import PointSet
-from gvtools.memory.records import Records, Runs
-from gvtools.memory.views import SourceView, ViewTable
-from gvtools.memory.voxel_index import EMPTY_KEY, MAX_VOXEL, VoxelIndex, check_grid
-from gvtools.memory.voxel_levels import VoxelLevels
+from gvtools.memory.store.columns import Records, Runs
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.memory.store.points import PointSet
+from gvtools.memory.store.views import SourceView, ViewTable
+from gvtools.memory.store.voxel_index import EMPTY_KEY, MAX_VOXEL, VoxelIndex, check_grid
+from gvtools.memory.store.voxel_levels import VoxelLevels
 from gvtools.options import check_range
 
 if TYPE_CHECKING:
     import open3d as o3d
 
     from gvtools.guidance import Guidance
-    from gvtools.memory.splat import SplatOptions
+    from gvtools.memory.splat.api import SplatOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -432,14 +432,14 @@ class SpatialMemory:
         return cloud
 
     def save(self, path: Path | str) -> None:
-        """Write the memory; see gvtools.memory.memory_file."""
-        from gvtools.memory.memory_file import save_memory
+        """Write the memory; see gvtools.memory.io.npz."""
+        from gvtools.memory.io.npz import save_memory
 
         save_memory(self, Path(path))
 
     @staticmethod
     def load(path: Path | str) -> SpatialMemory:
-        """Read a memory; see gvtools.memory.memory_file."""
-        from gvtools.memory.memory_file import load_memory
+        """Read a memory; see gvtools.memory.io.npz."""
+        from gvtools.memory.io.npz import load_memory
 
         return load_memory(Path(path))

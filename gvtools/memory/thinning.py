@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory.voxel_levels import levels_above
+from gvtools.memory.store.voxel_levels import levels_above
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse.correction import composed
-from gvtools.completers.geoverse.depth_anything.rays import camera_centres
 from gvtools.completers.geoverse.flow import (
     clean_from_velocity,
     interpolate,
@@ -16,6 +15,7 @@ from gvtools.completers.geoverse.flow import (
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective.objective import Prediction, Reference, objective
 from gvtools.completers.geoverse.passes import Prepared
+from gvtools.networks.depth_anything.rays import camera_centres
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 from gvtools.training.options import DenoiserStageOptions

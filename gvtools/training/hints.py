@@ -18,7 +18,7 @@ from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance
 from gvtools.memory.back_projection import BackProjectionOptions, back_project
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-from gvtools.memory.splat import SplatOptions
+from gvtools.memory.splat.api import SplatOptions
 from gvtools.training.corruption import (
     CorruptionOptions,
     corrupted_camera,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvtools.memory.compiled import FAST, compiled
+from gvtools.kernels import FAST, compiled
 from gvtools.training.ray_intervals import SAME, enter_solid, leave_rooms, turned
 
 # A surface point is lifted by this share of its way to the lamp, or it would shade itself.

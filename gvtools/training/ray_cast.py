@@ -12,7 +12,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.memory.compiled import FAST, compiled
+from gvtools.kernels import FAST, compiled
 from gvtools.training.ray_intervals import enter_solid, leave_rooms, turned
 from gvtools.training.solid_geometry import Geometry
 

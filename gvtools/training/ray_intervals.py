@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvtools.memory.compiled import FAST, compiled
+from gvtools.kernels import FAST, compiled
 
 # Ends of intervals nearer to each other than this share of the way are the same place.
 SAME = 1e-9

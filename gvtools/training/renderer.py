@@ -11,7 +11,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.memory.compiled import FAST, compiled
+from gvtools.kernels import FAST, compiled
 from gvtools.scenes.room_textures import encode_srgb
 from gvtools.training.lighting import light_on
 from gvtools.training.ray_cast import CODES, FLOATS, rectangles, trace_row, world_rays

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory.compiled import FAST, compiled
+from gvtools.kernels import FAST, compiled
 from gvtools.training.textures import LEVELS, OFFSETS, SIDE
 
 Float32 = NDArray[np.float32]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory.compiled import compiled
+from gvtools.kernels import compiled
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory.compiled import compiled
+from gvtools.kernels import compiled
 from gvtools.scenes.room_textures import decode_srgb
 from gvtools.training.patterns import color, pattern
 from gvtools.training.photographs import photograph

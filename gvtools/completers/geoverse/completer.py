@@ -22,9 +22,9 @@ from gvtools.completers.geoverse.correction import seamless
 from gvtools.completers.geoverse.depth_scale import ALIGNMENTS
 from gvtools.completers.geoverse.fill import Filled
 from gvtools.completers.geoverse.flow import interval_bounds
-from gvtools.completers.geoverse.full_size import Completed, averaged, brought_back, corrected
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.model_views import context_depth, view_batch
+from gvtools.completers.geoverse.postprocess import Completed, averaged, brought_back, corrected
 from gvtools.completers.geoverse.resampling import model_size
 from gvtools.completers.geoverse.weights.folder import from_pretrained
 from gvtools.completers.geoverse.weights.folder_check import check_headers

@@ -16,11 +16,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gvtools.completers.geoverse.depth_anything.network import DepthAnything3, relative_cameras
 from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
 from gvtools.completers.geoverse.plucker import normalised_poses
 from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.errors import OptionError, ShapeError
+from gvtools.networks.depth_anything.network import DepthAnything3, relative_cameras
 
 LOG_DEPTH_LIMIT = 6.0
 FILLS = ("none", "push-pull", "surfaces")

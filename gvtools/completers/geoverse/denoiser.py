@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from gvtools.completers.geoverse.active_tokens import NearTokens
 from gvtools.completers.geoverse.attention import attend
-from gvtools.completers.geoverse.near_tokens import NearTokens
 from gvtools.completers.geoverse.plucker import CameraCondition
 from gvtools.completers.geoverse.projective import HEAD_MULTIPLE, Projective
 from gvtools.completers.geoverse.shared_attention import VideoKeys

@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
-from gvtools.completers.geoverse.depth_anything.rays import camera_centres
 from gvtools.completers.geoverse.fill import push_pull
 from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.errors import DegenerateError, OptionError
+from gvtools.networks.depth_anything.geometry_head import Geometry
+from gvtools.networks.depth_anything.rays import camera_centres
 from gvtools.similarity import ScaleFit, align_depth_scale
 
 ALIGNMENTS = ("centres", "hint", "field")

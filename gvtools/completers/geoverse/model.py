@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse import stages
+from gvtools.completers.geoverse.active_tokens import NearTokens, near_tokens
 from gvtools.completers.geoverse.conditioning import (
     ViewBatch,
     depth_condition,
@@ -29,7 +30,6 @@ from gvtools.completers.geoverse.conditioning import (
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.control import ControlBranch
 from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
-from gvtools.completers.geoverse.depth_anything.network import DepthAnything3
 from gvtools.completers.geoverse.flow import (
     check_bounds,
     over_state,
@@ -37,7 +37,6 @@ from gvtools.completers.geoverse.flow import (
     velocity_from_clean,
 )
 from gvtools.completers.geoverse.injection import check_features, video_keys
-from gvtools.completers.geoverse.near_tokens import NearTokens, near_tokens
 from gvtools.completers.geoverse.noise import seeded_noise, view_seed
 from gvtools.completers.geoverse.passes import Decoded, Generated, Prepared
 from gvtools.completers.geoverse.plucker import camera_condition
@@ -47,6 +46,7 @@ from gvtools.completers.geoverse.stages import Clock, no_clock
 from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.completers.geoverse.video_prior.prior import VideoFeatures, VideoPrior
 from gvtools.errors import CheckpointError
+from gvtools.networks.depth_anything.network import DepthAnything3
 
 __all__ = ["Decoded", "Generated", "GeoVerse", "Prepared"]
 

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from gvtools.completers.geoverse.conditioning import Hints, ViewBatch
 from gvtools.completers.geoverse.denoiser import Conditions, Positions
-from gvtools.completers.geoverse.depth_anything.geometry_head import Geometry
 from gvtools.completers.geoverse.shared_attention import VideoKeys
 from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
 from gvtools.errors import ShapeError
+from gvtools.networks.depth_anything.geometry_head import Geometry
 
 
 @dataclass(frozen=True)

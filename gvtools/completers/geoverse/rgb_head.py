@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from gvtools.completers.geoverse.attention import attend
-from gvtools.completers.geoverse.depth_anything.encoder import IMAGENET_MEAN, IMAGENET_STD
 from gvtools.errors import ShapeError
+from gvtools.networks.depth_anything.encoder import IMAGENET_MEAN, IMAGENET_STD
 
 SINE_BASE = 10000.0
 

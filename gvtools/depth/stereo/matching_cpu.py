@@ -6,7 +6,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from gvtools.memory.compiled import FAST, compiled
+from gvtools.kernels import FAST, compiled
 
 Float32 = NDArray[np.float32]
 

@@ -1,0 +1,1 @@
+"""The experiments on held-out scenes: ``python -m benchmarks.experiments NAME``."""

@@ -1,0 +1,230 @@
+"""The memory on disk: a zip of .npy members, versioned, checksummed, without pickle.
+
+Every member carries the zip's CRC-32, and ``header.json`` lists each array's type and shape, so a
+file that was cut short, altered or written by another version is refused by name. Saving the same
+memory twice gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.errors import GvError, MemoryFileError
+from gvtools.files import ZIP_EPOCH, replaced_when_written
+from gvtools.memory.store.views import SourceView, ViewTable
+from gvtools.memory.store.voxel_index import MOST_LEVEL
+
+if TYPE_CHECKING:
+    from gvtools.memory.spatial_memory import SpatialMemory
+
+FORMAT = "gvtools memory"
+VERSION = 3
+# The version whose voxels have one edge.
+ONE_EDGE = 2
+READABLE = (ONE_EDGE, VERSION)
+CONVENTION = "OpenCV axes (x right, y down, z forward); first pixel's centre at (0.5, 0.5)"
+_RECORD_ARRAYS = ("x", "y", "z", "color", "confidence", "spacing", "view", "level", "agreement")
+_RUN_ARRAYS = ("start", "length", "view", "box")
+
+
+def save_memory(memory: SpatialMemory, path: Path) -> None:
+    """Write ``memory`` to ``path``; an older file stays until the new one is whole.
+
+    Raises:
+        ProjectError: the disk is full or the folder cannot be written.
+    """
+    arrays = _arrays(memory)
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "convention": CONVENTION,
+        "voxel": memory.voxel.hex(),
+        "origin": [float(x).hex() for x in memory.origin],
+        "axes": [float(x).hex() for x in memory.frame.axes.ravel()],
+        "options": asdict(memory.options),
+        "names": [memory.views[i].camera.names[0] for i in range(len(memory.views))],
+        "arrays": {name: [array.dtype.str, list(array.shape)] for name, array in arrays.items()},
+    }
+    with (
+        replaced_when_written(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive,
+    ):
+        _write(archive, "header.json", json.dumps(header, indent=1).encode())
+        for name, array in arrays.items():
+            buffer = io.BytesIO()
+            np.save(buffer, array, allow_pickle=False)
+            _write(archive, f"{name}.npy", buffer.getvalue())
+
+
+def load_memory(path: Path) -> SpatialMemory:
+    """Read a memory; every byte is checked.
+
+    Raises:
+        MemoryFileError: absent, truncated, altered, of another kind or version.
+    """
+    header, arrays = _read(path)
+    try:
+        return _assembled(header, arrays)
+    except (GvError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise MemoryFileError(f"{path}: the memory's parts do not fit together ({error})") from None
+
+
+def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> SpatialMemory:
+    from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+
+    memory = SpatialMemory(
+        float.fromhex(header["voxel"]),
+        origin=[float.fromhex(x) for x in header["origin"]],
+        axes=np.reshape([float.fromhex(x) for x in header["axes"]], (3, 3)),
+        options=MemoryOptions(**header["options"]),
+    )
+    _check_consistency(arrays, len(header["names"]))
+    count = len(arrays["record_view"])
+    records, runs = memory.records, memory.runs
+    records.count = count
+    for name in _RECORD_ARRAYS:
+        setattr(records, name, arrays[f"record_{name}"])
+    records.next = np.empty(count, np.int32)
+    runs.append(*(arrays[f"run_{name}"] for name in _RUN_ARRAYS))
+    memory.views = ViewTable(memory.frame, _views(header["names"], arrays))
+    start = arrays["agreement_start"]
+    for i, round_ in enumerate(arrays["agreement_round"].tolist()):
+        rows = slice(int(start[i]), int(start[i + 1]))
+        entry = (arrays["agreement_record"][rows].copy(), arrays["agreement_weight"][rows].copy())
+        memory.agreements.setdefault(round_, []).append(entry)
+    memory.rebuild_index()
+    return memory
+
+
+def _arrays(memory: SpatialMemory) -> dict[str, NDArray[Any]]:
+    records, runs, views = memory.records, memory.runs, memory.views
+    arrays: dict[str, NDArray[Any]] = {}
+    for name in _RECORD_ARRAYS:
+        arrays[f"record_{name}"] = getattr(records, name)[: records.count]
+    for name in _RUN_ARRAYS:
+        arrays[f"run_{name}"] = getattr(runs, name)[: runs.count]
+    rows = [views[i] for i in range(len(views))]
+    cameras = views.cameras
+    arrays["view_K"] = cameras.K if cameras else np.zeros((0, 3, 3))
+    arrays["view_cam_from_world"] = cameras.cam_from_world if cameras else np.zeros((0, 4, 4))
+    size = np.stack([cameras.width, cameras.height], 1) if cameras else np.zeros((0, 2), np.int64)
+    arrays["view_size"] = size
+    arrays["view_round"] = views.round
+    arrays["view_generated"] = views.generated
+    grids = [row.free_depth for row in rows]
+    arrays["grid_shape"] = np.array([g.shape for g in grids], np.int64).reshape(-1, 2)
+    arrays["grid_depth"] = np.concatenate([np.zeros(0, np.float32), *(g.ravel() for g in grids)])
+    logs = [(r, entry) for r in sorted(memory.agreements) for entry in memory.agreements[r]]
+    arrays["agreement_round"] = np.array([r for r, _ in logs], np.int32)
+    lengths = [len(entry[0]) for _, entry in logs]
+    arrays["agreement_start"] = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+    empty = np.zeros(0)
+    arrays["agreement_record"] = np.concatenate(
+        [empty.astype(np.int32), *(entry[0] for _, entry in logs)]
+    )
+    arrays["agreement_weight"] = np.concatenate(
+        [empty.astype(np.float32), *(entry[1] for _, entry in logs)]
+    )
+    return arrays
+
+
+def _views(names: list[str], arrays: dict[str, NDArray[Any]]) -> list[SourceView]:
+    views = []
+    at = 0
+    for i, name in enumerate(names):
+        rows = slice(i, i + 1)
+        camera = Cameras(
+            arrays["view_K"][rows],
+            arrays["view_cam_from_world"][rows],
+            arrays["view_size"][rows, 0],
+            arrays["view_size"][rows, 1],
+            (name,),
+        )
+        height, width = arrays["grid_shape"][i].tolist()
+        grid = arrays["grid_depth"][at : at + height * width].reshape(height, width).copy()
+        at += height * width
+        generated = bool(arrays["view_generated"][i])
+        views.append(SourceView(camera, int(arrays["view_round"][i]), generated, grid))
+    return views
+
+
+def _write(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+    archive.writestr(zipfile.ZipInfo(name, ZIP_EPOCH), data)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """The header and its arrays, each checked against the zip's CRC and the header's list."""
+    if not path.is_file():
+        raise MemoryFileError(f"{path}: no such memory file")
+    size = path.stat().st_size
+    try:
+        with zipfile.ZipFile(path) as archive:
+            # A damaged directory may claim absurd sizes; nothing here is compressed.
+            if sum(item.file_size for item in archive.infolist()) > size:
+                raise MemoryFileError(f"{path}: its directory claims more bytes than the file has")
+            header = json.loads(archive.read("header.json"))
+            if not isinstance(header, dict) or header.get("format") != FORMAT:
+                raise MemoryFileError(f"{path}: not a gvtools memory")
+            version = header.get("version")
+            if version not in READABLE:
+                raise MemoryFileError(
+                    f"{path}: memory format version {version}; this gvtools reads versions "
+                    f"{READABLE[0]} to {VERSION}; write it again with a matching release"
+                )
+            arrays = {}
+            for name, (dtype, shape) in header["arrays"].items():
+                data = archive.read(f"{name}.npy")
+                array = np.load(io.BytesIO(data), allow_pickle=False)
+                if array.dtype.str != dtype or list(array.shape) != shape:
+                    raise MemoryFileError(f"{path}: array {name} is not what the header lists")
+                arrays[name] = array
+            if version == ONE_EDGE:
+                header["options"]["footprints"] = 0.0
+                arrays["record_level"] = np.zeros(len(arrays["record_view"]), np.uint8)
+    except MemoryFileError:
+        raise
+    except Exception as error:  # any parser's complaint means the same to the user
+        reason = f"{type(error).__name__}: {error}"
+        raise MemoryFileError(
+            f"{path}: damaged or truncated memory file ({reason}); restore it or run again"
+        ) from None
+    return header, arrays
+
+
+def _check_consistency(arrays: dict[str, NDArray[Any]], views: int) -> None:
+    count = len(arrays["record_view"])
+    columns = {
+        "record_x": (count,), "record_y": (count,), "record_z": (count,),
+        "record_color": (count, 3), "record_confidence": (count,),
+        "record_spacing": (count,), "record_agreement": (count,), "record_level": (count,),
+        "view_K": (views, 3, 3), "view_cam_from_world": (views, 4, 4), "view_size": (views, 2),
+        "view_round": (views,), "view_generated": (views,), "grid_shape": (views, 2),
+    }  # fmt: skip
+    for name, shape in columns.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")
+    rows = arrays["record_view"]
+    if count and not (rows.min() >= 0 and rows.max() < views):
+        raise ValueError("an observation names a view that is not there")
+    level = arrays["record_level"]
+    if level.dtype != np.uint8 or (count and level.max() > MOST_LEVEL):
+        raise ValueError("an observation is of a level that is not there")
+    start, length = arrays["run_start"], arrays["run_length"].astype(np.int64)
+    if len(start) and not (start[0] == 0 and (start[1:] == (start + length)[:-1]).all()):
+        raise ValueError("runs are not contiguous")
+    if int(length.sum()) != count:
+        raise ValueError("runs do not cover the observations")
+    run_view = arrays["run_view"]
+    if len(run_view) and not (run_view.min() >= 0 and run_view.max() < views):
+        raise ValueError("a run names a view that is not there")
+    if int(arrays["grid_shape"].prod(axis=1).sum()) != len(arrays["grid_depth"]):
+        raise ValueError("the free-space grids do not fill their array")

@@ -1,0 +1,201 @@
+"""The splatting kernels: depth pass, blending pass, resolving.
+
+The image is cut into bands of rows; each band walks the same runs in the same order, so the result
+does not depend on how many threads share the work.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import prange
+
+from gvtools.kernels import FAST, compiled
+from gvtools.memory.culling import REACHABLE
+
+# Channels of the accumulator: weighted rgb, weight, weighted z in Target.unit, kernel.
+CHANNELS = 6
+# Confidence x proximity counts as no less: below, sums of float32 would vanish.
+FAINTEST = np.float32(1e-36)
+# The smallest float32 of full precision, and the least weight that a pixel is divided by.
+SMALLEST = np.finfo(np.float32).tiny
+
+
+@compiled(inline="always")
+def closed_off(u, v, reach, width, height, reachable):
+    """Whether a footprint certainly holds no pixel to be written."""
+    if not reachable.size or reach > REACHABLE - 1:
+        return False
+    if not (u >= 0 and u < width and v >= 0 and v < height):
+        return False
+    return not reachable[np.uint64(np.int64(v) * width + np.int64(u))]
+
+
+@compiled(fastmath=FAST)
+def _project_run(
+    x, y, z, spacing, M, fx, fy, skew, cx, cy, focal, near, factor, size_cap, width, top, bottom,
+    u, v, depth, reach, c0, c1, r0, r1,
+):  # fmt: skip
+    """Centre-of-pixel coordinates, depth, reach (pixels) and window of one run's points.
+
+    The window is the pixels within reach, cut to the image and to the rows ``top`` to ``bottom``;
+    it is empty behind the camera.
+    """
+    m00, m01, m02, m03 = M[0, 0], M[0, 1], M[0, 2], M[0, 3]
+    m10, m11, m12, m13 = M[1, 0], M[1, 1], M[1, 2], M[1, 3]
+    m20, m21, m22, m23 = M[2, 0], M[2, 1], M[2, 2], M[2, 3]
+    one = np.float32(1)
+    left = np.float32(-1)
+    right = np.float32(width)
+    above = np.float32(top - 1)
+    below = np.float32(bottom + 1)
+    for k in range(len(x)):
+        px = m00 * x[k] + m01 * y[k] + m02 * z[k] + m03
+        py = m10 * x[k] + m11 * y[k] + m12 * z[k] + m13
+        pz = m20 * x[k] + m21 * y[k] + m22 * z[k] + m23
+        depth[k] = pz
+        inverse = one / max(pz, near)
+        col = (fx * px + skew * py) * inverse + cx
+        row = fy * py * inverse + cy
+        h = factor * min(max(spacing[k] * focal * inverse, one), size_cap)
+        u[k] = col
+        v[k] = row
+        reach[k] = h
+        # Clamped before the conversion: far out of view a column exceeds every integer.
+        first_col = np.int32(np.ceil(min(max(col - h, left), right)))
+        last_col = np.int32(np.floor(min(max(col + h, left), right)))
+        first_row = np.int32(np.ceil(min(max(row - h, above), below)))
+        last_row = np.int32(np.floor(min(max(row + h, above), below)))
+        c0[k] = max(first_col, np.int32(0))
+        c1[k] = min(last_col, np.int32(width - 1))
+        r0[k] = max(first_row, np.int32(top))
+        r1[k] = min(last_row, np.int32(bottom)) if pz > near else np.int32(-1)
+
+
+@compiled(parallel=True, fastmath=FAST)
+def splat_runs(
+    runs, run_start, run_length, run_view, rect, x, y, z, color, confidence, agreement, spacing,
+    view_weight, M, K, near, unit, limit, reachable, band, depth_reach, blend_reach, size_cap,
+    weight_cap, threads, blend, width, height, depth, total,
+):  # fmt: skip
+    """Depth pass, then blending inside the depth band.
+
+    ``runs`` (n,) are added in their order. Only what is nearer than ``limit`` (H x W,) makes a
+    depth; 0 shuts a pixel. ``reachable`` (H x W,) bool holds the pixels within REACHABLE pixels of
+    one to be written; it is empty when most of the image is open. ``band`` is the relative depth
+    band that blends; ``depth_reach`` and ``blend_reach`` are the footprints' half width and the
+    kernel's radius in spacings; footprints wider than ``size_cap`` pixels are cut to it. Without
+    ``blend`` it stops after the depth pass. Depths are summed in the power of two ``unit``.
+
+    Writes ``depth`` (H x W,) float32, the nearest depth, or ``limit`` where nothing is nearer, and
+    ``total`` (H x W, CHANNELS) float32.
+    """
+    fx = np.float32(K[0, 0])
+    fy = np.float32(K[1, 1])
+    skew = np.float32(K[0, 1])
+    cx = np.float32(K[0, 2] - 0.5)
+    cy = np.float32(K[1, 2] - 0.5)
+    focal = np.float32(np.sqrt(K[0, 0] * K[1, 1]))
+    longest = 0
+    for r in runs:
+        longest = max(longest, run_length[r])
+    one = np.float32(1)
+    zero = np.float32(0)
+    per_unit = one / unit
+    bands = max(1, min(4, height // (16 * threads)))
+    for task in prange(bands * threads):
+        # Neighbouring bands go to different threads: what is open tends to lie together.
+        b = (task % bands) * threads + task // bands
+        top = b * height // (bands * threads)
+        bottom = (b + 1) * height // (bands * threads) - 1
+        u = np.empty(longest, np.float32)
+        v = np.empty(longest, np.float32)
+        depths = np.empty(longest, np.float32)
+        reach = np.empty(longest, np.float32)
+        c0 = np.empty(longest, np.int32)
+        c1 = np.empty(longest, np.int32)
+        r0 = np.empty(longest, np.int32)
+        r1 = np.empty(longest, np.int32)
+        for i in range(top * width, (bottom + 1) * width):
+            depth[i] = limit[i]
+            if blend and limit[i] > 0:
+                total[i] = 0
+        for r in runs:
+            if rect[r, 3] < top or rect[r, 2] > bottom:
+                continue
+            first = run_start[r]
+            last = first + run_length[r]
+            _project_run(
+                x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx, fy, skew,
+                cx, cy, focal, near, depth_reach, size_cap, width, top, bottom,
+                u, v, depths, reach, c0, c1, r0, r1,
+            )  # fmt: skip
+            for k in range(last - first):
+                if closed_off(u[k], v[k], reach[k], width, height, reachable):
+                    continue
+                zk = depths[k]
+                for row in range(r0[k], r1[k] + 1):
+                    for col in range(c0[k], c1[k] + 1):
+                        # Unsigned: the compiler need not ask for negative indices.
+                        cell = np.uint64(row * width + col)
+                        if zk < depth[cell]:
+                            depth[cell] = zk
+        if not blend:
+            continue
+        for r in runs:
+            if rect[r, 3] < top or rect[r, 2] > bottom:
+                continue
+            first = run_start[r]
+            last = first + run_length[r]
+            proximity = view_weight[run_view[r]]
+            _project_run(
+                x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx, fy, skew,
+                cx, cy, focal, near, blend_reach, size_cap, width, top, bottom,
+                u, v, depths, reach, c0, c1, r0, r1,
+            )  # fmt: skip
+            for k in range(last - first):
+                if r0[k] > r1[k] or closed_off(u[k], v[k], reach[k], width, height, reachable):
+                    continue
+                zk = depths[k]
+                q = one / (reach[k] * reach[k])
+                near_side = zk / (one + band)
+                scale = min(confidence[first + k] + agreement[first + k], weight_cap) * proximity
+                scale = max(scale, FAINTEST)
+                red = scale * np.float32(color[first + k, 0])
+                green = scale * np.float32(color[first + k, 1])
+                blue = scale * np.float32(color[first + k, 2])
+                far = scale * (zk * per_unit)
+                for row in range(r0[k], r1[k] + 1):
+                    dy = np.float32(row) - v[k]
+                    for col in range(c0[k], c1[k] + 1):
+                        cell = np.uint64(row * width + col)
+                        if near_side > depth[cell]:
+                            continue
+                        dx = np.float32(col) - u[k]
+                        kernel = max(one - q * (dx * dx + dy * dy), zero)
+                        kernel *= kernel
+                        total[cell, 0] += kernel * red
+                        total[cell, 1] += kernel * green
+                        total[cell, 2] += kernel * blue
+                        total[cell, 3] += kernel * scale
+                        total[cell, 4] += kernel * far
+                        total[cell, 5] += kernel
+
+
+@compiled(parallel=True, fastmath=FAST)
+def resolve(total, open_, support, unit, made, rgb, depth, valid, confidence, generated):
+    """Turn accumulators into pixels where ``open_`` and the support suffices."""
+    for row in prange(total.shape[0]):
+        for col in range(total.shape[1]):
+            if not open_[row, col]:
+                continue
+            kernel = total[row, col, 5]
+            weight = total[row, col, 3]
+            if kernel < support or not weight >= SMALLEST:
+                continue
+            scale = np.float32(1) / weight
+            for c in range(3):
+                rgb[row, col, c] = total[row, col, c] * scale * np.float32(1 / 255)
+            depth[row, col] = total[row, col, 4] * scale * unit
+            confidence[row, col] = weight / kernel
+            generated[row, col] = made
+            valid[row, col] = True

@@ -1,0 +1,221 @@
+"""The torch back end of projection, for CUDA: every (observation, pixel) pair as one row.
+
+Depth is a scatter with ``amin``, blending an indexed sum, so the result is the compiled back end's
+but for rounding. Sums are added in the order of the rows on the CPU and, through the sorting form
+of ``index_put_``, on CUDA too: the same memory and cameras give the same bytes on the same device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gvtools.errors import OptionError
+from gvtools.memory.splat.cpu_kernels import CHANNELS, FAINTEST, SMALLEST
+
+if TYPE_CHECKING:
+    from gvtools.cameras import Cameras
+    from gvtools.guidance import Guidance
+    from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.memory.splat.api import SplatOptions, Target
+
+# Pairs held at a time: about 120 bytes each.
+PAIRS = {"cpu": 1 << 20, "cuda": 1 << 24}
+
+
+def project_torch(
+    memory: SpatialMemory,
+    cameras: Cameras,
+    *,
+    options: SplatOptions | None = None,
+    device: str = "auto",
+) -> Guidance:
+    """Project the memory with torch; see gvtools.memory.projection.project.
+
+    Args:
+        memory: what is projected.
+        cameras: of one image size.
+        options: see SplatOptions; its back end and device are overridden.
+        device: "cpu", "cuda" or "auto".
+
+    Raises:
+        OptionError: CUDA is asked for and torch sees none.
+        ShapeError: the cameras have images of several sizes, or there is none.
+    """
+    from gvtools.memory.projection import project
+    from gvtools.memory.splat.api import SplatOptions
+
+    options = replace(options or SplatOptions(), backend="torch", device=device)
+    return project(memory, cameras, options=options)
+
+
+def torch_device(name: str) -> torch.device:
+    """The device that "auto", "cpu" or "cuda" means here.
+
+    Raises:
+        OptionError: CUDA is asked for and torch sees none.
+    """
+    there = torch.cuda.is_available()
+    if name == "cuda" and not there:
+        raise OptionError("splat device 'cuda': torch sees no CUDA device; choose 'auto' or 'cpu'")
+    return torch.device("cuda" if name == "cuda" or (name == "auto" and there) else "cpu")
+
+
+class TorchSplatter:
+    """Splats runs of a memory on one device; see gvtools.memory.splat.api.Splatter."""
+
+    def __init__(self, memory: SpatialMemory, options: SplatOptions) -> None:
+        self.options = options
+        self.device = torch_device(options.device)
+        records, runs, n = memory.records, memory.runs, len(memory)
+        self.start = self._tensor(runs.start[: runs.count])
+        self.length = self._tensor(runs.length[: runs.count].astype(np.int64))
+        self.run_view = self._tensor(runs.view[: runs.count].astype(np.int64))
+        self.xyz = self._tensor(records.position)
+        self.color = self._tensor(records.color[:n])
+        self.trust = self._tensor(memory.confidence)
+        self.spacing = self._tensor(records.spacing[:n])
+        self.total = torch.empty(0)
+
+    def _tensor(self, array: NDArray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+
+    def splat(
+        self,
+        target: Target,
+        chosen: NDArray[np.int64],
+        limit: NDArray[np.float32],
+        *,
+        weight: NDArray[np.float32],
+        table: NDArray[np.int32] | None,
+        blend: bool,
+    ) -> NDArray[np.float32]:
+        """See gvtools.memory.splat.api.Splatter."""
+        height, width = target.shape
+        limits = self._tensor(limit.reshape(-1))
+        sums = None if table is None else self._tensor(table)
+        zbuffer = limits.clone()
+        rows, view = self._observations(chosen)
+        u, v, z, size = self._project(target, rows)
+        ahead = z > target.near
+        rows, view, u, v, z, size = (column[ahead] for column in (rows, view, u, v, z, size))
+        for i, row, col in self._pairs(u, v, self.options.depth_reach * size, target.shape, sums):
+            cell = row * width + col
+            use = z[i] < limits[cell]
+            zbuffer.scatter_reduce_(0, cell[use], z[i[use]], "amin")
+        if blend:
+            farthest = zbuffer * (1 + self.options.band)
+            scale = self.trust[rows] * self._tensor(weight)[view]
+            scale = scale.clamp(min=float(FAINTEST))
+            self.total = torch.zeros((height * width, CHANNELS), device=self.device)
+            reach = self.options.blend_reach * size
+            for i, row, col in self._pairs(u, v, reach, target.shape, sums):
+                cell = row * width + col
+                use = z[i] <= farthest[cell]
+                i, row, col, cell = i[use], row[use], col[use], cell[use]
+                squared = (col - u[i]) ** 2 + (row - v[i]) ** 2
+                kernel = (1 - squared / reach[i] ** 2).clamp(min=0) ** 2
+                self._add(cell, kernel, scale[i], rows[i], z=z[i] / float(target.unit))
+        return zbuffer.reshape(height, width).cpu().numpy()
+
+    def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
+        """See gvtools.memory.splat.api.Splatter."""
+        kernel, weight = self.total[:, 5], self.total[:, 3]
+        done = self._tensor(open_.reshape(-1)) & (kernel >= self.options.support)
+        done &= weight >= float(SMALLEST)
+        cells = torch.nonzero(done)[:, 0]
+        total = self.total[cells]
+        kernel, weight = total[:, 5], total[:, 3]
+        at = cells.cpu().numpy()
+        target.rgb.reshape(-1, 3)[at] = (total[:, :3] / weight[:, None] / 255).cpu().numpy()
+        target.depth.reshape(-1)[at] = (total[:, 4] / weight * float(target.unit)).cpu().numpy()
+        target.confidence.reshape(-1)[at] = (weight / kernel).cpu().numpy()
+        target.generated.reshape(-1)[at] = generated
+        target.valid.reshape(-1)[at] = True
+
+    def _observations(self, chosen: NDArray[np.int64]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Rows of the chosen runs' observations, and the view of each."""
+        runs = self._tensor(chosen)
+        length = self.length[runs]
+        which = torch.repeat_interleave(length)
+        within = torch.arange(len(which), device=self.device) - (length.cumsum(0) - length)[which]
+        return self.start[runs][which] + within, self.run_view[runs][which]
+
+    def _project(self, target: Target, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Centre-of-pixel coordinates, depth and footprint width (pixels) of observations."""
+        M = self._tensor(target.cam_from_local[:3].astype(np.float32))
+        K = target.camera.K[0]
+        # Component by component: a matrix product may be computed in TF32.
+        x, y, w = self.xyz[rows].unbind(1)
+        px, py, z = (M[k, 0] * x + M[k, 1] * y + M[k, 2] * w + M[k, 3] for k in range(3))
+        inverse = 1 / z.clamp(min=float(target.near))
+        u = (float(K[0, 0]) * px + float(K[0, 1]) * py) * inverse + float(K[0, 2] - 0.5)
+        v = float(K[1, 1]) * py * inverse + float(K[1, 2] - 0.5)
+        size = self.spacing[rows] * float(np.sqrt(K[0, 0] * K[1, 1])) * inverse
+        return u, v, z, size.clamp(1, self.options.size_cap)
+
+    def _pairs(
+        self,
+        u: torch.Tensor,
+        v: torch.Tensor,
+        half: torch.Tensor,
+        shape: tuple[int, int],
+        table: torch.Tensor | None,
+    ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+        """Yield (observation, row, column) of the pixel centres within ``half``, in parts."""
+        height, width = shape
+        # Clamped as floats: far outside the image, the integers would overflow.
+        left = torch.ceil(u - half).clamp(0, width).long()
+        right = torch.floor(u + half).clamp(-1, width - 1).long()
+        top = torch.ceil(v - half).clamp(0, height).long()
+        bottom = torch.floor(v + half).clamp(-1, height - 1).long()
+        across = (right - left + 1).clamp(min=0)
+        count = across * (bottom - top + 1).clamp(min=0)
+        if table is not None:
+            # Footprints without a pixel to be written are most of those of a late tier.
+            r0, r1, c0, c1 = top, bottom + 1, left, right + 1
+            opened = table[r1, c1] - table[r0, c1] - table[r1, c0] + table[r0, c0]
+            count = count * (opened > 0)
+        inside = torch.nonzero(count)[:, 0]
+        left, top, across, count = (c[inside] for c in (left, top, across, count))
+        end = count.cumsum(0)
+        budget = PAIRS[self.device.type]
+        first = 0
+        while first < len(inside):
+            done = int(end[first - 1]) if first else 0
+            last = int(torch.searchsorted(end, done + budget, right=True))
+            part = slice(first, max(last, first + 1))
+            which = torch.repeat_interleave(count[part])
+            offset = end[part] - count[part] - done
+            within = torch.arange(len(which), device=self.device) - offset[which]
+            wide = across[part][which]
+            row, col = top[part][which] + within // wide, left[part][which] + within % wide
+            yield inside[part][which], row, col
+            first = part.stop
+
+    def _add(
+        self,
+        cell: torch.Tensor,
+        kernel: torch.Tensor,
+        scale: torch.Tensor,
+        rows: torch.Tensor,
+        *,
+        z: torch.Tensor,
+    ) -> None:
+        """Add the pairs' contributions to the sums of their pixels."""
+        w = scale * kernel
+        channels = torch.empty((len(cell), CHANNELS), device=self.device)
+        channels[:, :3] = w[:, None] * self.color[rows]
+        channels[:, 3] = w
+        channels[:, 4] = w * z
+        channels[:, 5] = kernel
+        if self.device.type == "cuda":
+            # index_add_ adds in no fixed order on CUDA; index_put_ sorts first.
+            self.total.index_put_((cell,), channels, accumulate=True)
+        else:
+            self.total.index_add_(0, cell, channels)

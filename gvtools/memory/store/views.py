@@ -1,0 +1,87 @@
+"""From where the memory's observations were seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras, concatenate
+from gvtools.memory.store.local_frame import LocalFrame
+
+
+@dataclass(frozen=True, eq=False)
+class SourceView:
+    """One fused view.
+
+    Attributes:
+        camera: a batch of one, in the world frame.
+        round: the round it was fused in.
+        generated: True when a completer made it.
+        free_depth: (h, w) float32, see PointSet; (0, 0) when unknown.
+    """
+
+    camera: Cameras
+    round: int
+    generated: bool
+    free_depth: NDArray[np.float32]
+
+
+class ViewTable:
+    """The fused views in order, and their columns as arrays for the kernels."""
+
+    def __init__(self, frame: LocalFrame, views: Iterable[SourceView] = ()) -> None:
+        self.frame = frame
+        self._views: list[SourceView] = []
+        self.round: NDArray[np.int32] = np.zeros(0, np.int32)
+        self.generated: NDArray[np.bool_] = np.zeros(0, np.bool_)
+        self.centers: NDArray[np.float64] = np.zeros((0, 3))
+        self.cam_from_local: NDArray[np.float64] = np.zeros((0, 4, 4))
+        for view in views:
+            self.append(view)
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> SourceView:
+        return self._views[index]
+
+    @property
+    def cameras(self) -> Cameras | None:
+        """All cameras, in the world frame; None when there are no views."""
+        return concatenate([view.camera for view in self._views]) if self._views else None
+
+    def take(self, view: SourceView) -> int:
+        """The row of a view: the last one's where it goes on with it, else a new one."""
+        if not self._views or not _goes_on(self._views[-1], view):
+            return self.append(view)
+        last = self._views[-1]
+        if last.free_depth.shape == view.free_depth.shape:
+            # Each knows a part; what both know is free as far as both saw.
+            one, two = last.free_depth, view.free_depth
+            free = np.where((one > 0) & (two > 0), np.minimum(one, two), np.maximum(one, two))
+            self._views[-1] = replace(last, free_depth=free)
+        return len(self._views) - 1
+
+    def append(self, view: SourceView) -> int:
+        """Add a view; returns its row."""
+        self._views.append(view)
+        self.round = np.append(self.round, np.int32(view.round))
+        self.generated = np.append(self.generated, view.generated)
+        self.centers = np.concatenate([self.centers, self.frame.from_world(view.camera.centers)])
+        local = self.frame.cam_from_local(view.camera.cam_from_world)
+        self.cam_from_local = np.concatenate([self.cam_from_local, local])
+        return len(self._views) - 1
+
+
+def _goes_on(last: SourceView, view: SourceView) -> bool:
+    """Whether both are one camera's, of one round and one kind: a fusion in parts."""
+    one, two = last.camera, view.camera
+    return (
+        (last.round, last.generated, one.names) == (view.round, view.generated, two.names)
+        and np.array_equal(one.cam_from_world, two.cam_from_world)
+        and np.array_equal(one.K, two.K)
+        and (int(one.width[0]), int(one.height[0])) == (int(two.width[0]), int(two.height[0]))
+    )

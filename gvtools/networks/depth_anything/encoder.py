@@ -1,0 +1,285 @@
+"""The geometric encoder: Depth Anything 3's backbone, split at the synthesis boundary.
+
+``encode`` runs the blocks up to a given one and keeps the taps; ``propagate`` runs the rest from
+features that a denoiser made. Blocks alternate from ``alternate_from`` on: even ones attend within
+a view, odd ones across all views. A tap is the concatenation of the last local state and the
+current state (2 x width channels), *raw*: the final LayerNorm is not applied, because it cannot be
+undone and the re-run needs the state before it. ``normed`` applies it to the half that has it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gvtools.errors import ShapeError
+from gvtools.networks.depth_anything.vit import Block, RotaryTable
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+# Numbers of a ray: direction, origin, moment.
+RAY = 9
+LENGTH_GAIN = 6.0
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Dimensions of the backbone; the defaults are Depth Anything 3 Base.
+
+    Attributes:
+        width: channels of a token.
+        depth: number of blocks.
+        heads: attention heads.
+        mlp_ratio: hidden width of the MLPs over ``width``.
+        patch: patch edge, px.
+        base_grid: edge of the learned position table, patches.
+        alternate_from: from this block on, odd blocks are global; the camera token enters here.
+        qk_norm_from: from this block on, queries and keys are normed.
+        rotary_from: from this block on, attention has rotary positions.
+        taps: the blocks whose features are levels 0 to 3; all but none of them odd.
+        boundary: the level at which features are generated (the paper's b1).
+        norm_eps: of the LayerNorms within the blocks.
+        rays: the rays of known cameras are added to the patch tokens (not in Depth Anything 3,
+            which has a camera token alone).
+    """
+
+    width: int = 768
+    depth: int = 12
+    heads: int = 12
+    mlp_ratio: float = 4.0
+    patch: int = 14
+    base_grid: int = 37
+    alternate_from: int = 4
+    qk_norm_from: int = 4
+    rotary_from: int = 4
+    taps: tuple[int, ...] = (5, 7, 9, 11)
+    boundary: int = 1
+    norm_eps: float = 1e-6
+    rays: bool = False
+
+    @property
+    def channels(self) -> int:
+        """Channels of a tapped level: local and current state."""
+        return 2 * self.width
+
+
+class PatchEmbed(nn.Module):
+    """Non-overlapping patches to tokens."""
+
+    def __init__(self, width: int, patch: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(3, width, kernel_size=patch, stride=patch)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(B, 3, H, W) to (B, H/patch * W/patch, width), row-major."""
+        return self.proj(images).flatten(2).transpose(1, 2)
+
+
+class Backbone(nn.Module):
+    """The vision transformer. Images are (B, V, 3, H, W), normalised as ImageNet's.
+
+    The first view is the reference view: its frame is the frame of the predicted rays.
+    """
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.width
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
+        self.camera_token = nn.Parameter(torch.randn(1, 2, width) * 0.02)
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.base_grid**2, width))
+        self.patch_embed = PatchEmbed(width, config.patch)
+        self.blocks = nn.ModuleList(
+            Block(
+                width,
+                config.heads,
+                mlp_ratio=config.mlp_ratio,
+                qk_norm=index >= config.qk_norm_from,
+                eps=config.norm_eps,
+            )
+            for index in range(config.depth)
+        )
+        self.norm = nn.LayerNorm(width)
+        self.ray_embed = _ray_embedder(width) if config.rays else None
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        """Patches (rows, columns) of an image of this size.
+
+        Raises:
+            ShapeError: a side is no multiple of the patch.
+        """
+        patch = self.config.patch
+        if height % patch or width % patch or height <= 0 or width <= 0:
+            raise ShapeError(
+                f"images of {width}x{height} pixels; expected sides that are multiples of {patch}: "
+                f"resize to {max(1, round(width / patch)) * patch}x"
+                f"{max(1, round(height / patch)) * patch}"
+            )
+        return height // patch, width // patch
+
+    def encode(
+        self,
+        images: Tensor,
+        *,
+        levels: int | None = None,
+        camera_token: Tensor | None = None,
+        rays: Tensor | None = None,
+    ) -> list[Tensor]:
+        """Features of the first levels, raw, token 0 included.
+
+        Args:
+            images: (B, V, 3, H, W), ImageNet-normalised.
+            levels: how many levels; None for all. Blocks after the last tap are not run.
+            camera_token: (B, V, width) from the camera encoder; the learned ones without.
+            rays: (B, V, N, 9) of ``patch_rays``, where the configuration has them.
+
+        Returns:
+            A (B, V, 1 + N, 2 width) tensor a level.
+        """
+        batch, views = images.shape[:2]
+        grid = self.grid(images.shape[-2], images.shape[-1])
+        x = self.patch_embed(images.flatten(0, 1))
+        if self.ray_embed is not None and rays is not None:
+            x = x + self.ray_embed(rays.flatten(0, 1).to(x.dtype))
+        x = torch.cat((self.cls_token.expand(len(x), -1, -1), x), dim=1) + self._positions(grid)
+        x = x.unflatten(0, (batch, views))
+        taps = self.config.taps[:levels]
+        return self._run(x, grid, 0, taps, camera_token)
+
+    def propagate(
+        self, level: Tensor, grid: tuple[int, int], *, boundary: int | None = None
+    ) -> list[Tensor]:
+        """The levels after ``boundary``, from the raw features of that level.
+
+        Args:
+            level: (B, V, 1 + N, 2 width) raw, token 0 first. Only its second half (the current
+                state) is used: a local block follows and replaces the first.
+            grid: patches (rows, columns).
+            boundary: the level that ``level`` is; the configured one by default.
+
+        Returns:
+            A (B, V, 1 + N, 2 width) tensor for each level after the boundary.
+        """
+        boundary = self.config.boundary if boundary is None else boundary
+        state = level[..., self.config.width :]
+        start = self.config.taps[boundary] + 1
+        return self._run(state, grid, start, self.config.taps[boundary + 1 :], None)
+
+    def normed(self, level: Tensor) -> Tensor:
+        """What the heads receive of a raw (..., 2 width) level: [local, LayerNorm(current)]."""
+        local, current = level.chunk(2, dim=-1)
+        return torch.cat((local, self.norm(current)), dim=-1)
+
+    def _run(
+        self,
+        x: Tensor,
+        grid: tuple[int, int],
+        start: int,
+        taps: tuple[int, ...],
+        camera_token: Tensor | None,
+    ) -> list[Tensor]:
+        """Blocks ``start`` to the last tap on (B, V, 1 + N, width); the tapped features."""
+        config = self.config
+        batch, views = x.shape[:2]
+        within, across = self._rotary(grid, views, x.device)
+        found: list[Tensor] = []
+        local = x
+        for index in range(start, taps[-1] + 1 if taps else start):
+            block = self.blocks[index]
+            if index == config.alternate_from:
+                x = torch.cat((self._camera_tokens(x, camera_token), x[:, :, 1:]), dim=2)
+            rotary = index >= config.rotary_from
+            if index >= config.alternate_from and index % 2 == 1:
+                x = block(x.flatten(1, 2), across if rotary else None).unflatten(1, (views, -1))
+            else:
+                x = block(x.flatten(0, 1), within if rotary else None).unflatten(0, (batch, views))
+                local = x
+            if index in taps:
+                found.append(torch.cat((local, x), dim=-1))
+        return found
+
+    def _camera_tokens(self, x: Tensor, given: Tensor | None) -> Tensor:
+        """(B, V, 1, width): the given tokens, or the learned ones: reference, others."""
+        batch, views = x.shape[:2]
+        if given is not None:
+            return given.to(x.dtype)[:, :, None]
+        reference, other = self.camera_token.to(x.dtype).split(1, dim=1)
+        tokens = torch.cat((reference, other.expand(-1, views - 1, -1)), dim=1)
+        return tokens.expand(batch, -1, -1)[:, :, None]
+
+    def _rotary(
+        self, grid: tuple[int, int], views: int, device: torch.device
+    ) -> tuple[RotaryTable, RotaryTable]:
+        """Positions within a view, (row, column) + 1; across views all patches stand at (1, 1)."""
+        rows, columns = torch.meshgrid(
+            torch.arange(1, grid[0] + 1, device=device),
+            torch.arange(1, grid[1] + 1, device=device),
+            indexing="ij",
+        )
+        patches = torch.stack((rows.flatten(), columns.flatten()), dim=1)
+        special = patches.new_zeros((1, 2))
+        head_dim = self.config.width // self.config.heads
+        within = torch.cat((special, patches))
+        across = torch.cat((special, torch.ones_like(patches))).repeat(views, 1)
+        return RotaryTable.of(within, head_dim), RotaryTable.of(across, head_dim)
+
+    def _positions(self, grid: tuple[int, int]) -> Tensor:
+        """(1, 1 + N, width): the learned position table on this grid.
+
+        The published weights were trained with DINOv2's scale factor (grid + 0.1) / base, not with
+        the exact size; the difference is visible in the outputs.
+        """
+        base = self.config.base_grid
+        if grid == (base, base):
+            return self.pos_embed
+        token, patches = self.pos_embed.float().split((1, base * base), dim=1)
+        table = patches.transpose(1, 2).unflatten(2, (base, base))
+        factor = [(side + 0.1) / base for side in grid]
+        table = F.interpolate(table, scale_factor=factor, mode="bicubic", antialias=False)
+        return torch.cat((token, table.flatten(2).transpose(1, 2)), dim=1).to(self.pos_embed.dtype)
+
+
+def _ray_embedder(width: int) -> nn.Linear:
+    """Rays as large as what pictures add to a token: the smaller, the later they are learned.
+
+    Origins and moments are fractions of a mean depth.
+    """
+    embedder = nn.Linear(RAY, width)
+    with torch.no_grad():
+        nn.init.normal_(embedder.weight)
+        embedder.weight[:, 3:] *= LENGTH_GAIN
+        nn.init.zeros_(embedder.bias)
+    return embedder
+
+
+def patch_rays(
+    cam_from_world: Tensor, K: Tensor, grid: tuple[int, int], size: tuple[int, int]
+) -> Tensor:
+    """(B, V, N, 9): direction (z = 1 in the camera), origin and moment of the patches' middle rays.
+
+    Args:
+        cam_from_world: (B, V, 4, 4).
+        K: (B, V, 3, 3), pixels of the images.
+        grid: patches (rows, columns).
+        size: (H, W) of the images.
+    """
+    y = (torch.arange(grid[0], device=K.device, dtype=K.dtype) + 0.5) * (size[0] / grid[0])
+    x = (torch.arange(grid[1], device=K.device, dtype=K.dtype) + 0.5) * (size[1] / grid[1])
+    rows, columns = torch.meshgrid(y, x, indexing="ij")
+    pixel = torch.stack((columns, rows, torch.ones_like(rows)), dim=-1).flatten(0, 1)
+    turn = cam_from_world[..., :3, :3].mT
+    direction = pixel @ (turn @ torch.linalg.inv(K)).mT
+    origin = -(turn @ cam_from_world[..., :3, 3:])[..., 0][:, :, None].expand_as(direction)
+    return torch.cat((direction, origin, torch.linalg.cross(origin, direction)), dim=-1)
+
+
+def imagenet_normalised(images: Tensor) -> Tensor:
+    """(..., 3, H, W) in [0, 1] to ImageNet's mean 0 and deviation 1."""
+    mean = images.new_tensor(IMAGENET_MEAN)[:, None, None]
+    std = images.new_tensor(IMAGENET_STD)[:, None, None]
+    return (images - mean) / std

@@ -1,0 +1,175 @@
+"""``gvtools bench``: our times beside those of what a user would otherwise call, as ratios.
+
+``bench complete`` times the generative core by stage; its only peer is its own step with attention
+spelt out.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError
+
+if TYPE_CHECKING:
+    from pipelines.bench.side_by_side import Comparison
+    from pipelines.console import Console
+
+SUMMARY = (
+    "time fusing or projecting against Open3D in one process, as ratios; or the generative core, "
+    "stage by stage"
+)
+EXAMPLES = (
+    "gvtools bench splat --repeat 15 --json splat.json",
+    "gvtools bench complete --config base --flops-only",
+)
+
+FEWEST_POINTS = 1000
+POINTS = {"fuse": 3_200_000, "splat": 4_000_000}
+COMPLETE = (
+    "config",
+    "weights",
+    "size",
+    "context",
+    "targets",
+    "steps",
+    "cascade_steps",
+    "device",
+    "precision",
+    "video",
+    "compile",
+    "flops_only",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument(
+        "what",
+        choices=("fuse", "splat", "complete"),
+        help="fuse: one 640x480 frame into a memory; splat: the memory into a camera; complete: a "
+        "pass of the geoverse completer's network",
+    )
+    parser.add_argument(
+        "--points",
+        type=int,
+        metavar="N",
+        help="voxels of the memory to fuse into (3.2 million), or points of the largest "
+        "one-pixel projection (4 million; a quarter of them is timed as well)",
+    )
+    parser.add_argument(
+        "--repeat", type=int, default=9, metavar="N", help="timed turns of each (%(default)s)"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    _add_complete(parser.add_argument_group("of complete alone"))
+
+
+def _add_complete(group: argparse._ArgumentGroup) -> None:
+    """Options that None leaves to ``CompleteOptions``."""
+    group.add_argument("--config", choices=("tiny", "base"), help="random weights (tiny)")
+    group.add_argument("--weights", type=Path, metavar="DIR", help="a model's folder instead")
+    group.add_argument("--size", metavar="HxW|N", help="of the pictures, px (the model's own)")
+    group.add_argument("--context", type=int, metavar="N", help="photographs in a pass (2)")
+    group.add_argument("--targets", type=int, metavar="N", help="views to complete (6)")
+    group.add_argument("--steps", type=int, metavar="N", help="of level 1 (3)")
+    group.add_argument("--cascade-steps", type=int, metavar="N", help="of level 0 (1)")
+    group.add_argument("--device", choices=("auto", "cpu", "cuda"), help="(auto)")
+    group.add_argument(
+        "--precision",
+        choices=("float32", "bfloat16"),
+        help="of products (bfloat16 on a GPU, float32 on a CPU)",
+    )
+    group.add_argument(
+        "--video",
+        action=argparse.BooleanOptionalAction,
+        help="run the video prior, 15 GB of weights (on a GPU, where the model has one)",
+    )
+    group.add_argument(
+        "--compile",
+        action="store_true",
+        default=None,
+        help="torch.compile first: needs a C++ compiler and most of a minute, pays in long runs",
+    )
+    group.add_argument(
+        "--flops-only",
+        action="store_true",
+        default=None,
+        help="count FLOPs and parameters; run nothing, which needs no memory",
+    )
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Run the benchmark and show or write its rows.
+
+    Raises:
+        OptionError: too few points or repeats, or options of another benchmark.
+    """
+    given = {name for name in COMPLETE if getattr(args, name) is not None}
+    if args.what == "complete":
+        if args.points is not None:
+            raise OptionError("bench complete: --points is of fuse and splat")
+        _run_complete(args, given, console)
+        return
+    if given:
+        names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in given))
+        raise OptionError(f"bench {args.what}: {names} given, which only complete knows")
+    points = POINTS[args.what] if args.points is None else args.points
+    if points < FEWEST_POINTS or args.repeat < 1:
+        raise OptionError(
+            f"bench: {points} points, {args.repeat} repeats; expected at least {FEWEST_POINTS} "
+            "points and 1 repeat"
+        )
+    import os
+
+    if args.what == "fuse":
+        from pipelines.bench.fuse import fuse_rows
+
+        rows = fuse_rows(points, repeat=args.repeat)
+    else:
+        from pipelines.bench.splat import splat_rows
+
+        rows = splat_rows(points, repeat=args.repeat)
+    report(rows, console, args.json, bench=args.what, points=points, load=os.getloadavg()[0])
+
+
+def _run_complete(args: argparse.Namespace, given: set[str], console: Console) -> None:
+    from pipelines.bench.complete import complete_figures, show
+    from pipelines.bench.options import CompleteOptions, parsed_size
+
+    options = {name: getattr(args, name) for name in given}
+    if "size" in options:
+        options["size"] = parsed_size(options["size"])
+    figures = complete_figures(CompleteOptions(repeat=args.repeat, **options))
+    if args.json is None:
+        show(figures, console)
+        return
+    from pipelines.console import write_json
+
+    write_json(args.json, figures)
+    console.line(f"{len(figures['results'])} rows written to {args.json}")
+
+
+def report(
+    rows: list[Comparison], console: Console, path: Path | None, **conditions: object
+) -> None:
+    """A table, or the JSON object with the rows under ``results``."""
+    if path is not None:
+        import os
+
+        from pipelines.console import write_json
+
+        data = {**conditions, "cpus": os.cpu_count(), "results": [row.to_dict() for row in rows]}
+        write_json(path, data)
+        console.line(f"{len(rows)} comparisons written to {path}")
+        return
+    console.table(
+        ("what", "peer", "ours_s", "peer_s", "ratio", "ratio_of_minima"),
+        [
+            (row.name, row.peer, row.ours_s, row.peer_s, row.ratio, row.ratio_of_minima)
+            for row in rows
+        ],
+    )
+    for row in rows:
+        if row.note:
+            console.line(f"{row.name}, {row.peer}: {row.note}")

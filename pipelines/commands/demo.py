@@ -1,0 +1,90 @@
+"""gvtools demo: the main job on a sample that needs no download."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from gvtools.runs.folder import RunDirectory
+from pipelines.commands.reconstruct import add_run_arguments, config_from, copy_figures, reconstruct
+from pipelines.console import Console
+
+SUMMARY = "run the main job on a sample that needs no download"
+EXAMPLES = (
+    "gvtools demo",
+    "gvtools demo --sample motorcycle --out runs/motorcycle",
+)
+SAMPLES = ("room", "motorcycle")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``demo``: the sample, and every option of ``reconstruct``.
+
+    The sample is written beside the run also with ``--dry-run``, which opens it.
+    """
+    parser.add_argument("--sample", choices=SAMPLES, default="room", help="default room")
+    add_run_arguments(parser, out_required=False)
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Run ``gvtools demo``: write the sample, reconstruct it, say where the results are."""
+    config = config_from(args)
+    default = Path("runs") / f"demo-{args.sample}"
+    # Absolute, since the sample's folder is named after it, and "." has no name.
+    out = args.out.absolute() if args.out else free_folder(default, resume=args.resume)
+    RunDirectory(out).refuse_foreign()
+    sample = out.with_name(f"{out.name}-sample")
+    console.line(f"sample {args.sample}, seed {config.seed}: writing {sample}")
+    context, targets = _write(args.sample, sample, config.seed)
+    from gvtools.scenes.project import open_project
+
+    if args.context is None:
+        config = replace(config, context=",".join(context))
+    if args.targets is None:
+        config = replace(config, targets=",".join(targets))
+    if args.views_per_round is None and args.rounds is None:
+        config = replace(config, views_per_round=4)
+    reconstruct(
+        open_project(sample),
+        config,
+        out,
+        console=console,
+        resume=args.resume,
+        dry_run=args.dry_run,
+    )
+    copy_figures(args, out)
+    if not args.dry_run and (out / "round_001").is_dir():
+        console.line(
+            f"look at {out / 'growth.png'} and at the pictures in {out}/round_001: guidance_* is "
+            "what the completer was given, generated_* what it made of it, after_* what the memory "
+            "knows now"
+        )
+
+
+def free_folder(path: Path, *, resume: bool) -> Path:
+    """``path``, or the first of path-2, path-3, ... that is not there yet (the last when resuming).
+
+    A demo is run again and again; its default folder must not refuse.
+    """
+    candidate = path
+    last = path
+    number = 2
+    while candidate.exists():
+        last = candidate
+        candidate = path.with_name(f"{path.name}-{number}")
+        number += 1
+    return last if resume and last.exists() else candidate
+
+
+def _write(name: str, folder: Path, seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Write the sample; returns the names of context and targets."""
+    if name == "room":
+        from gvtools.scenes.synthetic import write_room
+
+        room = write_room(folder, seed=seed)
+        return room.context, room.targets
+    from gvtools.scenes.stereo_sample import write_motorcycle
+
+    pair = write_motorcycle(folder)
+    return pair.context, pair.targets

@@ -1,0 +1,129 @@
+"""``gvtools plot``: one figure of a run, a sweep or a training, as PNG, SVG or PDF."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError, ProjectError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from pipelines.console import Console
+
+SUMMARY = "draw one figure of a run, a sweep or a training"
+EXAMPLES = (
+    "gvtools plot trajectories runs/kitchen --out kitchen.svg",
+    "gvtools plot losses training/tiny --out losses.png",
+)
+KINDS = {
+    "growth": "of a run: what is stored, what became of the points, coverage, time",
+    "coverage": "of a run: coverage against round",
+    "timing": "of a run: time by stage and by round",
+    "trajectories": "of a run: given, requested and estimated cameras",
+    "pareto": "of a sweep, or of a run in one: accuracy against time and memory",
+    "losses": "of a training, or of one stage's folder: loss curves",
+}
+FORMATS = ("png", "svg", "pdf")
+ENDINGS = ".png, .svg or .pdf"
+DPI = 150
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument(
+        "what", choices=tuple(KINDS), help="; ".join(f"{k}: {said}" for k, said in KINDS.items())
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="of the run, sweep or training")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help=f"ends with {ENDINGS}"
+    )
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Draw and write.
+
+    Raises:
+        GvError: nothing there to draw, or a place that cannot be written.
+    """
+    from gvtools.files import replaced_when_written
+
+    ending = args.out.suffix.lower().lstrip(".")
+    if ending not in FORMATS:
+        raise OptionError(f"--out {args.out}: expected a name that ends with {ENDINGS}")
+    figure = _figure(args.what, args.folder)
+    with replaced_when_written(args.out) as temporary:
+        figure.savefig(temporary, format=ending, dpi=DPI)
+    console.line(f"{args.what} of {args.folder} in {args.out}")
+
+
+def _figure(what: str, folder: Path) -> Figure:
+    title = folder.resolve().name
+    if what == "losses":
+        from viz.plots.losses import draw_losses
+
+        return draw_losses(read_training(folder), title=title)
+    if what == "pareto":
+        from pipelines.report.data import read_sweep
+        from viz.plots.pareto import draw_pareto
+
+        sweep = read_sweep(folder)
+        if sweep is None:
+            raise ProjectError(
+                f"{folder}: holds no tradeoff.json, nor do the folders above; expected the folder "
+                "of a sweep; gvtools tradeoff makes one"
+            )
+        return draw_pareto(
+            sweep.trials, front=sweep.front, recommended=sweep.recommended, budget=sweep.budget,
+            title=title,
+        )  # fmt: skip
+    from gvtools.runs.finished import read_record, read_reports
+
+    record = read_record(folder)
+    rounds = read_reports(folder)
+    if what == "trajectories":
+        from pipelines.report.data import open_sources
+        from pipelines.report.measures import read_measures, report_poses
+        from viz.plots.trajectories import draw_trajectories
+
+        sources = open_sources(record)
+        found = read_measures(folder, record, rounds).poses
+        poses = report_poses(rounds, sources.scene, record["context"], found).drawn
+        if poses is None:
+            raise ProjectError(f"{folder}: no cameras to draw ({sources.problem or 'no rounds'})")
+        return draw_trajectories(poses, title=title)
+    if what == "growth":
+        from viz.plots.growth import draw_growth
+
+        return draw_growth(rounds, title=title)
+    if what == "coverage":
+        from viz.plots.coverage import draw_coverage
+
+        return draw_coverage(rounds, title=title)
+    from viz.plots.timing import draw_timing
+
+    return draw_timing(rounds, title=title)
+
+
+def read_training(folder: Path) -> dict[str, list[dict[str, object]]]:
+    """The logs of a training's stages by name, or of the one stage whose folder it is.
+
+    Raises:
+        ProjectError: no log there.
+    """
+    from gvtools.training.names import STAGES
+    from gvtools.training.records import read_log
+
+    logs = {stage: read_log(folder / stage) for stage in STAGES}
+    logs = {stage: records for stage, records in logs.items() if records}
+    if not logs:
+        own = read_log(folder)
+        logs = {folder.resolve().name: own} if own else {}
+    if not logs:
+        raise ProjectError(
+            f"{folder}: holds no log.jsonl with a record, nor do {', '.join(STAGES)} in it; "
+            "expected the folder of a training or of one of its stages"
+        )
+    return logs

@@ -1,0 +1,145 @@
+"""``gvtools render``: a saved memory seen from cameras, as pictures and as figures."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError
+from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
+from pipelines.commands.scene_arguments import add_scene_arguments, open_scene
+
+if TYPE_CHECKING:
+    from gvtools.cameras import Cameras
+    from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.memory.splat.api import SplatOptions
+    from gvtools.scenes.scene import Scene
+    from pipelines.console import Console
+
+SUMMARY = "project a saved memory into cameras, and measure it against their pictures"
+EXAMPLES = (
+    "gvtools render runs/kitchen --cameras scans/kitchen --views every:20 --out renders",
+    "gvtools render runs/kitchen --cameras scans/kitchen --views every:20+10 --against-images "
+    "--out renders --json figures.json",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("memory", type=Path, metavar="MEMORY_OR_RUN", help="a memory.npz or a run")
+    parser.add_argument(
+        "--cameras",
+        type=Path,
+        required=True,
+        metavar="PROJECT",
+        help="a project whose cameras to take, or a TUM or KITTI trajectory (camera as the "
+        "memory's first view)",
+    )
+    parser.add_argument("--views", default="all", metavar="SPEC", help="which (all)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="for the pictures; with --against-images it may be left out, for the figures alone",
+    )
+    parser.add_argument(
+        "--against-images", action="store_true", help="compare with the project's own pictures"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="splat.KEY=VALUE",
+        help="a setting of the projection, such as splat.band=0.03",
+    )
+    parser.add_argument(
+        "--backend", metavar="NAME", help="short for --set splat.backend=NAME (cpu, torch, ...)"
+    )
+    parser.add_argument(
+        "--device", metavar="NAME", help="short for --set splat.device=NAME (auto, cpu, cuda)"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    add_lpips_arguments(parser)
+    add_scene_arguments(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Project, write pictures, measure.
+
+    Raises:
+        GvError: the memory, the cameras, the selection or the output folder is wrong.
+    """
+    from gvtools.runs.pictures import file_stems, write_view
+    from gvtools.scenes.selection import select
+    from pipelines.console import write_json
+    from pipelines.rendering.figures import measure, render_view, summary
+    from pipelines.rendering.memory_source import open_memory
+
+    if args.out is None and not args.against_images:
+        raise OptionError("--out: nothing would be left; give a folder, or --against-images")
+    short = {"backend": args.backend, "device": args.device}
+    given = [f"splat.{key}={value}" for key, value in short.items() if value is not None]
+    options = splat_options([*given, *args.set])
+    memory = open_memory(args.memory)
+    if not len(memory.views):
+        raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
+    cameras, scene = _cameras(args, memory)
+    if args.against_images and scene is None:
+        raise OptionError(
+            f"--against-images: {args.cameras} is a trajectory without pictures; give a project"
+        )
+    names = select(cameras.names, args.views)
+    row_of = {name: row for row, name in enumerate(cameras.names)}
+    stems = file_stems(names)
+    lpips, no_lpips = open_lpips(args) if args.against_images else (None, None)
+    # The first projection compiles or loads the kernels and is not timed.
+    memory.project(cameras[row_of[names[0]]], options=options)
+    views = []
+    for name in console.track(names, "rendering"):
+        guidance, seconds = render_view(memory, cameras[row_of[name]], options)
+        frame = scene[name].load() if scene is not None and args.against_images else None
+        if args.out is not None:
+            write_view(args.out, stems[name], guidance)
+        views.append(measure(name, guidance, frame, seconds=seconds, lpips=lpips))
+    figures = summary(views, compared=args.against_images, no_lpips=no_lpips)
+    if args.json is not None:
+        write_json(args.json, figures)
+    else:
+        columns = ("view", "psnr", "ssim", "psnr_valid", "ssim_valid", "depth_rel_valid",
+                   "coverage", "seconds")  # fmt: skip
+        mean = {**figures, "view": "all", "seconds": figures["seconds_per_view"]}
+        console.table(columns, [[row[column] for column in columns] for row in [*views, mean]])
+        for reason in dict.fromkeys(figures["notes"].values()):
+            keys = [key for key, note in figures["notes"].items() if note == reason]
+            console.line(f"{', '.join(keys)}: {reason}")
+    if args.out is not None:
+        console.line(f"{len(views)} views in {args.out}")
+
+
+def splat_options(texts: list[str]) -> SplatOptions:
+    """The projection's options, changed by ``splat.KEY=VALUE`` texts.
+
+    Raises:
+        OptionError: another key or a wrong value.
+    """
+    from pipelines.config import RunConfig, with_settings
+
+    for text in texts:
+        if not text.strip().startswith("splat."):
+            raise OptionError(f"--set {text!r}: render takes splat.KEY=VALUE alone")
+    return with_settings(RunConfig(), texts).splat
+
+
+def _cameras(args: argparse.Namespace, memory: SpatialMemory) -> tuple[Cameras, Scene | None]:
+    if args.cameras.is_file() and args.cameras.suffix.lower() != ".json":
+        from gvtools.trajectory_files import read_trajectory
+
+        if args.memory.suffix.lower() == ".ply":
+            raise OptionError(
+                f"--cameras {args.cameras}: a trajectory takes its camera from the memory's views, "
+                f"and {args.memory} is a PLY without any; give the run or its memory.npz"
+            )
+        return read_trajectory(args.cameras, memory.views[0].camera), None
+    scene = open_scene(args.cameras, args)
+    return scene.cameras, scene

@@ -1,0 +1,85 @@
+"""``gvtools report``: a run as one HTML page that needs neither network nor other files."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError
+from gvtools.options import check_range
+
+if TYPE_CHECKING:
+    from pipelines.console import Console
+    from pipelines.reconstruction.plan import Plan
+
+SUMMARY = "write a run's report: one HTML page with plots, pictures, figures and settings"
+EXAMPLES = (
+    "gvtools report runs/kitchen",
+    "gvtools report runs/kitchen --pictures 30 --out kitchen.html",
+)
+FILE = "report.html"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder, finished or not")
+    parser.add_argument("--out", type=Path, metavar="FILE", help=f"default RUN/{FILE}")
+    parser.add_argument(
+        "--pictures",
+        type=int,
+        default=12,
+        metavar="N",
+        help="targets whose pictures are shown, at most (%(default)s)",
+    )
+    parser.add_argument(
+        "--project", type=Path, metavar="DIR", help="where the run's project lies, if it was moved"
+    )
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Write the page.
+
+    Raises:
+        GvError: no run, one without a whole round, or a place that cannot be written.
+    """
+    from gvtools.files import write_text
+    from pipelines.report.data import collect
+    from viz.report.page import report_html
+
+    check_range("--pictures", args.pictures, least=1)
+    out = args.out or args.run / FILE
+    _refuse_foreign(out)
+    report = collect(args.run, project=args.project, most=args.pictures)
+    page = report_html(report)
+    write_text(out, page)
+    for warning in report.warnings:
+        console.warn(warning)
+    console.line(f"{out}: {len(page) / 2**20:.1f} MiB, {len(report.sheet)} targets with pictures")
+
+
+def write_report(plan: Plan, path: Path) -> None:
+    """The report of a run whose project is open, as ``reconstruct`` leaves it in the run's folder.
+
+    Args:
+        plan: of the run.
+        path: its folder, with ``metrics.json`` in it.
+
+    Raises:
+        GvError: the folder cannot be read or written.
+    """
+    from gvtools.files import write_text
+    from pipelines.report.data import Sources, collect
+    from viz.report.page import report_html
+
+    targets = plan.targets
+    truths = dict(zip(targets.cameras.names, targets.truth, strict=True))
+    write_text(path / FILE, report_html(collect(path, sources=Sources(plan.scene, truths))))
+
+
+def _refuse_foreign(out: Path) -> None:
+    """Keep what no report is."""
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise OptionError(f"--out {out}: expected a name that ends with .html")
+    if out.is_dir():
+        raise OptionError(f"--out {out}: is a folder; expected a file's name")

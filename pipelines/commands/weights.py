@@ -1,0 +1,278 @@
+"""``gvtools weights``: which checkpoints a configuration needs, whether a folder fits, making one.
+
+The actions: list, check, create, pack, truncate-wan, empty-prompt.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gvtools.errors import CheckpointError, GvError, OptionError, ProjectError
+from pipelines.weights.report import print_needed, print_parts, size_text
+
+if TYPE_CHECKING:
+    from gvtools.completers.geoverse.config import GeoVerseConfig
+    from pipelines.console import Console
+
+SUMMARY = "tell which weights the generative core needs, and whether a folder of them fits"
+EXAMPLES = ("gvtools weights list base", "gvtools weights check weights/base --json check.json")
+
+# Seconds between two lines of progress where there is no terminal.
+_INTERVAL = 10.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's actions and their options."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+
+    def action(
+        name: str, run: Callable[..., None], summary: str, *examples: str
+    ) -> argparse.ArgumentParser:
+        lines = "\n".join(f"  gvtools weights {name} {example}".rstrip() for example in examples)
+        added = actions.add_parser(
+            name,
+            help=summary,
+            description=f"examples:\n{lines}\n\n{summary}.",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        added.set_defaults(act=run)
+        # As of every command; given before the action they hold as well.
+        for option, text in (("quiet", "print nothing but warnings"), ("debug", "tracebacks")):
+            added.add_argument(
+                f"--{option}", action="store_true", default=argparse.SUPPRESS, help=text
+            )
+        return added
+
+    lists = action("list", _list, "files, publishers, licences, sizes", "", "base --json list.json")
+    lists.add_argument(
+        "config", nargs="?", metavar="CONFIG", help="base, tiny or a config.json; all by default"
+    )
+    check = action(
+        "check", _check, "say precisely what does not fit", "weights/base", "DIR --config tiny"
+    )
+    check.add_argument("folder", type=Path, metavar="DIR", help="a weights folder")
+    check.add_argument(
+        "--config", metavar="NAME|FILE", help="instead of the folder's own config.json"
+    )
+    for parser_ in (lists, check):
+        parser_.add_argument("--json", type=Path, metavar="FILE", help="write the report there")
+    create = action(
+        "create",
+        _create,
+        "write an untrained model, for tests and as a start of training",
+        "tiny weights/untrained",
+        "tiny weights/other --seed 1",
+    )
+    create.add_argument("config", metavar="NAME", help="base, tiny or a config.json")
+    create.add_argument("folder", type=Path, metavar="DIR", help="the folder to make")
+    create.add_argument("--seed", type=int, default=0, metavar="N", help="of the numbers (0)")
+    pack = action(
+        "pack",
+        _pack,
+        "write a trained model in half precision, with its training's record",
+        "training/tiny weights/tiny",
+    )
+    pack.add_argument("source", type=Path, metavar="TRAINING", help="of gvtools train --out")
+    pack.add_argument("folder", type=Path, metavar="DIR", help="the folder to make or to renew")
+    truncate = action(
+        "truncate-wan",
+        _truncate,
+        "make the video prior's folder from published Wan2.2-VACE weights",
+        "Wan2.2-VACE-Fun-A14B weights/base/video --vae Wan2.1-VACE-diffusers/vae",
+        "Wan2.2-VACE-Fun-14B-diffusers weights/base/video",
+    )
+    truncate.add_argument(
+        "source", type=Path, metavar="SOURCE", help="the published folder, or its one safetensors"
+    )
+    truncate.add_argument("folder", type=Path, metavar="DIR", help="the folder to make")
+    truncate.add_argument(
+        "--vae", type=Path, metavar="DIR", help="of diffusers; found beside the transformer else"
+    )
+    truncate.add_argument(
+        "--blocks", type=int, default=16, metavar="N", help="backbone blocks to keep (16)"
+    )
+    prompt = action(
+        "empty-prompt",
+        _empty_prompt,
+        "add the empty prompt's embedding to the video prior's folder",
+        "Wan2.2-VACE-Fun-14B-diffusers/text_encoder weights/base/video",
+        "text_encoder weights/base/video",
+    )
+    prompt.add_argument(
+        "source", type=Path, metavar="SOURCE", help="folder of Wan's text encoder (transformers)"
+    )
+    prompt.add_argument("folder", type=Path, metavar="DIR", help="the video prior's folder")
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Do what the action says.
+
+    Raises:
+        GvError: a folder does not fit, a name is unknown, or a file cannot be written.
+    """
+    args.act(args, console)
+
+
+def _list(args: argparse.Namespace, console: Console) -> None:
+    from gvtools.completers.geoverse.config import NAMES
+    from gvtools.completers.geoverse.weights.needed_files import needed_files
+    from pipelines.console import write_json
+
+    names = NAMES if args.config is None else (args.config,)
+    listed = [needed_files(_config(name)) for name in names]
+    if args.json is not None:
+        sizes = "bytes are approximate: of the numbers, without headers; published files: float32"
+        data = {"configs": [entry.to_dict() for entry in listed], "notes": [sizes]}
+        write_json(args.json, data)
+        console.line(f"{len(listed)} configurations written to {args.json}")
+        return
+    for number, entry in enumerate(listed):
+        if number:
+            console.line("")
+        print_needed(entry, console)
+
+
+def _pack(args: argparse.Namespace, console: Console) -> None:
+    from pipelines.weights.pack import pack, packed_bytes
+
+    source = pack(args.source, args.folder)
+    console.line(f"{args.folder}: {size_text(packed_bytes(args.folder))}, from {source}")
+
+
+def _check(args: argparse.Namespace, console: Console) -> None:
+    from gvtools.completers.geoverse.weights.folder_check import check_folder
+    from gvtools.completers.geoverse.weights.folder_parts import check_is_folder, config_of
+    from pipelines.console import write_json
+
+    folder = args.folder
+    report: dict[str, Any] = {"folder": str(folder), "config": None, "ok": False, "parts": []}
+    try:
+        check_is_folder(folder)
+        config = config_of(folder) if args.config is None else _config(args.config)
+        report["config"] = config.name
+        parts = check_folder(folder, config)
+    except GvError as error:
+        if args.json is not None:
+            write_json(args.json, {**report, "problem": str(error)})
+        raise
+    bad = [part for part in parts if not part.ok]
+    problem = None
+    if bad:
+        first = bad[0].name if bad[0].path is None else str(bad[0].path)
+        problem = (
+            f"{folder}: {len(bad)} of {len(parts)} parts cannot be loaded, first {first}: "
+            f"{bad[0].said}"
+        )
+    if args.json is not None:
+        found = [part.to_dict() for part in parts]
+        write_json(args.json, {**report, "ok": not bad, "parts": found, "problem": problem})
+        console.line(f"report written to {args.json}")
+    else:
+        print_parts(folder, config, parts, console)
+    if problem:
+        raise CheckpointError(problem)
+
+
+def _create(args: argparse.Namespace, console: Console) -> None:
+    import torch
+
+    from gvtools.completers.geoverse.model import GeoVerse
+    from gvtools.completers.geoverse.weights.folder import save_pretrained
+    from gvtools.completers.geoverse.weights.folder_parts import empty_model
+    from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
+
+    config, folder = _config(args.config), args.folder
+    if folder.is_file() or (
+        folder.is_dir() and any(path.name != VIDEO_FOLDER for path in folder.iterdir())
+    ):
+        raise ProjectError(
+            f"{folder} is there already, and not empty; nothing is overwritten; choose another "
+            "folder"
+        )
+    empty_model(config, where=args.config)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(args.seed)
+        model = GeoVerse(replace(config, trained=False))
+    path = save_pretrained(model, folder, about=f"untrained, seed {args.seed}")
+    numbers = sum(tensor.numel() for tensor in model.state_dict().values())
+    console.line(f"{path}: {numbers:,} numbers, {size_text(path.stat().st_size)}")
+    console.line(
+        f"this {config.name} model is UNTRAINED (seed {args.seed}): a start for training, and for "
+        "tests; what it generates is noise"
+    )
+    if config.video is not None and not (folder / VIDEO_FOLDER).is_dir():
+        console.line(
+            f"it needs the video prior as well: gvtools weights truncate-wan SOURCE "
+            f"{folder / VIDEO_FOLDER}"
+        )
+
+
+def _truncate(args: argparse.Namespace, console: Console) -> None:
+    from gvtools.completers.geoverse.video_prior.wan_checkpoint import truncate
+    from gvtools.completers.geoverse.video_prior.wan_folder import EMPTY_PROMPT
+
+    truncate(
+        args.source,
+        args.folder,
+        blocks=args.blocks,
+        vace_blocks=None,
+        vae=args.vae,
+        progress=_progress(console),
+    )
+    console.line(
+        f"{args.folder} is written; it still needs {EMPTY_PROMPT}: gvtools weights empty-prompt "
+        f"TEXT_ENCODER {args.folder}"
+    )
+
+
+def _empty_prompt(args: argparse.Namespace, console: Console) -> None:
+    from gvtools.completers.geoverse.video_prior.wan_checkpoint import write_empty_prompt
+    from gvtools.completers.geoverse.video_prior.wan_folder import EMPTY_PROMPT
+
+    path = args.folder / EMPTY_PROMPT
+    if not args.folder.is_dir():
+        raise ProjectError(f"no folder {args.folder}; make it with gvtools weights truncate-wan")
+    if path.exists():
+        raise ProjectError(f"{path} is there already; nothing is overwritten")
+    write_empty_prompt(args.source, args.folder)
+    console.line(f"{path} is written")
+
+
+def _progress(console: Console) -> Callable[[int, int], None]:
+    """Bytes done of all: a line that is rewritten on a terminal, one now and then elsewhere."""
+    last = [time.monotonic()]
+
+    def report(done: int, total: int) -> None:
+        text = f"{size_text(done)} of {size_text(total)} written"
+        if console.interactive:
+            print(f"\r{text}", end="\n" if done >= total else "", flush=True)
+        elif done >= total or time.monotonic() - last[0] > _INTERVAL:
+            last[0] = time.monotonic()
+            console.line(text)
+
+    return report
+
+
+def _config(name: str) -> GeoVerseConfig:
+    """A configuration by its name, or from its file.
+
+    Raises:
+        OptionError: neither.
+        CheckpointError: a damaged file.
+    """
+    from gvtools.completers.geoverse.config import NAMES, named, read
+
+    if name in NAMES:
+        return named(name)
+    path = Path(name)
+    if path.is_dir():
+        path = path / "config.json"
+    if path.is_file():
+        return read(path)
+    raise OptionError(f"no configuration {name!r}; expected {' or '.join(NAMES)}, or a config.json")

@@ -1,0 +1,1 @@
+"""Evaluation of finished runs, and the tables written from it."""

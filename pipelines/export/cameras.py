@@ -1,0 +1,299 @@
+"""The cameras of a memory, with points or without, for COLMAP's and nerfstudio's readers.
+
+Pictures stay where they are. Which of the views a completer made stands in ``generated.txt``
+beside the export: one name a line and, where a run has it, the path of the picture. Its first line
+tells which exports of the folder it is for, so that nothing else is ever written over.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.errors import ProjectError
+from gvtools.files import write_text
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.thinning import thinned
+from gvtools.scenes.colmap_writer import write_colmap
+from gvtools.scenes.transforms_json import FILE as TRANSFORMS
+from gvtools.scenes.transforms_json import write_transforms
+from viz.run_view.view import inside
+
+GENERATED = "generated.txt"
+HEADER = "# views that a completer made: name, and its picture where the run kept it; exports:"
+MODEL = "sparse/0"
+
+
+@dataclass(frozen=True)
+class Written:
+    """What an export holds.
+
+    Attributes:
+        views: cameras.
+        generated: how many of them a completer made.
+        renamed: how many of those have a new name, since another camera has theirs.
+        points: 3D points.
+        elements: track elements: which view saw which point, and where.
+        edge: voxel edge that the points were thinned to, scene units; 0 without points.
+    """
+
+    views: int
+    generated: int
+    renamed: int = 0
+    points: int = 0
+    elements: int = 0
+    edge: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class DistinctCameras:
+    """Each camera of a memory once, under a name of its own.
+
+    Attributes:
+        cameras: V cameras.
+        row_of_view: (views of the memory,) int64, which of the cameras each view has.
+        generated: names of those that a completer alone saw through, in order, with the pictures
+            that the run kept.
+        renamed: how many do not have the name that the memory knows them by.
+    """
+
+    cameras: Cameras
+    row_of_view: NDArray[np.int64]
+    generated: dict[str, Path | None]
+    renamed: int
+
+
+def write_colmap_export(
+    memory: SpatialMemory, folder: Path, *, max_points: int | None, run: Path
+) -> Written:
+    """A workspace with a binary model in ``sparse/0``; pictures belong into its ``images``.
+
+    Each point is the most confident observation of its voxel. Its track are the other observations
+    there, one a view, at the pixels where their views have them, so that reprojection errors are
+    real.
+
+    Args:
+        memory: with at least one observation.
+        folder: the workspace.
+        max_points: thin to at most so many.
+        run: where the memory came from, for the paths of generated pictures.
+
+    Raises:
+        ProjectError: two observed cameras have one name, a picture lies outside the run, or the
+            folder cannot be written.
+    """
+    distinct = distinct_cameras(memory, run)
+    kept = thinned(memory, max_points)
+    point, view, xy = _tracks(memory, distinct.cameras, kept.group, distinct.row_of_view)
+    write_colmap(
+        folder / MODEL,
+        distinct.cameras,
+        points=memory.positions[kept.rows],
+        colors=memory.records.color[kept.rows],
+        point_index=point,
+        view_index=view,
+        xy=xy,
+    )
+    _write_generated(folder / GENERATED, MODEL, distinct.generated)
+    return Written(
+        views=len(distinct.cameras),
+        generated=len(distinct.generated),
+        renamed=distinct.renamed,
+        points=len(kept.rows),
+        elements=len(point),
+        edge=kept.edge,
+    )
+
+
+def write_transforms_export(
+    memory: SpatialMemory, path: Path, *, images: str, run: Path
+) -> Written:
+    """The cameras as ``transforms.json``.
+
+    Args:
+        memory: with at least one view.
+        path: the file, or the folder for it.
+        images: folder of the observed views' pictures, absolute or relative to the file.
+        run: where the memory came from; pictures of generated views are those of its rounds.
+
+    Raises:
+        ProjectError: two observed cameras have one name, a picture lies outside the run, or the
+            file cannot be written.
+    """
+    file = transforms_file(path)
+    distinct = distinct_cameras(memory, run)
+    paths: list[str | Path] = []
+    for name in distinct.cameras.names:
+        made = distinct.generated.get(name)
+        paths.append(Path(images) / name if made is None else made)
+    write_transforms(file, distinct.cameras, image_paths=paths)
+    _write_generated(file.with_name(GENERATED), file.name, distinct.generated)
+    return Written(len(distinct.cameras), len(distinct.generated), distinct.renamed)
+
+
+def transforms_file(path: Path) -> Path:
+    """The file that an export to ``path``, a folder or a ``.json`` file, writes."""
+    return path if path.suffix.lower() == ".json" else path / TRANSFORMS
+
+
+def foreign_model(folder: Path) -> Path | None:
+    """What a model written to ``folder`` would replace or hide and no export wrote, if anything."""
+    places = [folder / name for name in ("sparse", "cameras.bin", "cameras.txt")]
+    held = [path for path in places if path.is_file() or any(map(Path.is_file, path.rglob("*")))]
+    return _foreign(folder / GENERATED, MODEL, held)
+
+
+def foreign_transforms(path: Path) -> Path | None:
+    """What a ``transforms.json`` written to ``path`` would replace and no export wrote, if any."""
+    file = transforms_file(path)
+    return _foreign(file.with_name(GENERATED), file.name, [file] if file.is_file() else [])
+
+
+def _foreign(listing: Path, export: str, held: list[Path]) -> Path | None:
+    exports = _exports(listing)
+    if exports is None:
+        return held[0] if held else listing
+    return held[0] if held and export not in exports else None
+
+
+def distinct_cameras(memory: SpatialMemory, run: Path) -> DistinctCameras:
+    """Each camera once, as formats of other tools need it, each with a unique name.
+
+    A view may be fused twice. Observed cameras keep their names. A generated one whose name another
+    camera has, also in other case, becomes ``generated/NAME``, ``generated_2/NAME`` and so on.
+
+    Args:
+        memory: with at least one view.
+        run: where the memory came from, for the paths of generated pictures.
+
+    Raises:
+        ProjectError: no views, or two different observed cameras of one name.
+    """
+    cameras, made = memory.views.cameras, memory.views.generated
+    if cameras is None:
+        raise ProjectError("the memory has no views; nothing to export")
+    reserved = {name.lower() for name in cameras.names}  # no new name takes one of these
+    first: list[int] = []  # for each camera kept the first view that has it
+    names: list[str] = []
+    rows_of_name: dict[str, list[int]] = {}
+    row_of_view = np.empty(len(cameras), np.int64)
+    used: set[str] = set()
+    # Observed views come first and keep their names.
+    for i in np.argsort(made, kind="stable").tolist():
+        name = cameras.names[i]
+        alike = rows_of_name.setdefault(name, [])
+        row = next((row for row in alike if _same_camera(memory, first[row], i)), len(first))
+        row_of_view[i] = row
+        if row < len(first):
+            continue
+        if alike and not made[i]:
+            raise ProjectError(
+                f"two different observed cameras of the memory are named {name!r}; formats of "
+                "other tools need unique names; rename one in the project and run again"
+            )
+        if made[i] and name.lower() in used:
+            name = next(new for new in _new_names(name) if new.lower() not in reserved)
+            reserved.add(name.lower())
+        alike.append(row)
+        first.append(i)
+        names.append(name)
+        used.add(name.lower())
+    kept = cameras[first]
+    renamed = sum(new != old for new, old in zip(names, kept.names, strict=True))
+    kept = Cameras(kept.K, kept.cam_from_world, kept.width, kept.height, tuple(names))
+    pictures: dict[str, Path | None] = {}
+    for i, row in enumerate(row_of_view.tolist()):
+        if made[first[row]]:
+            # Of several rounds' pictures the last.
+            pictures[names[row]] = _picture(memory, i, run) or pictures.get(names[row])
+    return DistinctCameras(kept, row_of_view, pictures, renamed)
+
+
+def _new_names(name: str) -> Iterator[str]:
+    yield f"generated/{name}"
+    yield from (f"generated_{number}/{name}" for number in count(2))
+
+
+def _same_camera(memory: SpatialMemory, i: int, j: int) -> bool:
+    """Whether two views of the memory have one camera, up to rounding."""
+    first, second = memory.views[i].camera, memory.views[j].camera
+    # Relative to the memory's origin: in a far world frame a tolerance would swallow a step aside.
+    pose = memory.views.cam_from_local
+    return bool(
+        (first.width == second.width).all()
+        and (first.height == second.height).all()
+        and np.allclose(pose[i], pose[j])
+        and np.allclose(first.K, second.K)
+    )
+
+
+def _tracks(
+    memory: SpatialMemory,
+    cameras: Cameras,
+    group: NDArray[np.int64],
+    row_of_view: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Point, view and pixel of each track element: one observation for each point and view."""
+    view = row_of_view[memory.records.view[: len(memory)]]
+    order = np.argsort(-memory.confidence, kind="stable")
+    pair = group[order] * np.int64(len(cameras)) + view[order]
+    _, first = np.unique(pair, return_index=True)
+    chosen = np.sort(order[first])
+    positions = memory.positions
+    xy = np.empty((len(chosen), 2))
+    inside = np.zeros(len(chosen), np.bool_)
+    for i in range(len(cameras)):
+        rows = np.flatnonzero(view[chosen] == i)
+        if len(rows):
+            xy[rows], z = (values[0] for values in cameras[i].project(positions[chosen[rows]]))
+            size = (cameras.width[i], cameras.height[i])
+            inside[rows] = (z > 0) & ((xy[rows] >= 0) & (xy[rows] <= size)).all(axis=1)
+    chosen, xy = chosen[inside], xy[inside]
+    return group[chosen], view[chosen], xy
+
+
+def _picture(memory: SpatialMemory, view: int, run: Path) -> Path | None:
+    """The picture that a run kept of a generated view, absolute."""
+    source = memory.views[view]
+    folder = run / f"round_{source.round:03d}"
+    picture = folder / f"generated_{_stem(folder, source.camera.names[0])}.png"
+    return inside(run, picture).resolve() if picture.is_file() else None
+
+
+def _stem(folder: Path, name: str) -> str:
+    """By what a round's files call a target."""
+    from gvtools.runs.round_files import target_stems
+
+    try:
+        views = json.loads((folder / "report.json").read_text(encoding="utf-8"))["views"]
+        return str(next(view["stem"] for view in views if view["name"] == name))
+    except (OSError, ValueError, KeyError, TypeError, StopIteration):
+        return target_stems((name,))[0]
+
+
+def _exports(listing: Path) -> list[str] | None:
+    """The exports that a list of generated views is for; None for a file that is no such list."""
+    try:
+        first = listing.read_text(encoding="utf-8").partition("\n")[0]
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except (OSError, ValueError):
+        return None
+    head, *exports = first.split("\t")
+    return exports if head == HEADER else None
+
+
+def _write_generated(path: Path, export: str, generated: dict[str, Path | None]) -> None:
+    others = [name for name in _exports(path) or [] if (path.parent / name).exists()]
+    header = "\t".join([HEADER, *sorted({*others, export})])
+    lines = [
+        name if picture is None else f"{name}\t{picture}" for name, picture in generated.items()
+    ]
+    write_text(path, "\n".join([header, *lines]) + "\n")

@@ -1,0 +1,1 @@
+"""What commands accept as input: trajectories, runs and memories."""

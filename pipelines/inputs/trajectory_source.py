@@ -1,0 +1,105 @@
+"""The trajectory that a command is given: a file, a COLMAP model, a project, or a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gvtools.errors import OptionError, ProjectError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from gvtools.trajectory_files import Trajectory
+
+LAYOUTS = ("auto", "tum", "kitti", "euroc")
+ASSOCIATIONS = ("auto", "time", "name", "index")
+
+
+def open_trajectory(path: Path, *, layout: str = "auto") -> Trajectory:
+    """Camera-to-world poses.
+
+    Args:
+        path: a TUM, KITTI or EuRoC file; a COLMAP model or workspace (its pictures need not be
+            there); a transforms.json or posed RGB-D folder; or a run, whose poses are those of the
+            views in its memory.
+        layout: of a file, see gvtools.trajectory_files.read_poses.
+
+    Raises:
+        GvError: nothing there, or nothing that holds poses.
+    """
+    from gvtools.scenes.colmap_files import find_model
+    from gvtools.trajectory_files import Trajectory, read_poses
+
+    if not path.exists():
+        raise ProjectError(f"{path}: no such file or folder; expected a trajectory")
+    if path.is_file() and path.suffix.lower() not in (".json", ".npz"):
+        return read_poses(path, layout=layout)
+    if path.suffix.lower() == ".npz" or (path / "run.json").is_file():
+        from pipelines.rendering.memory_source import open_memory
+
+        cameras = open_memory(path).views.cameras
+        if cameras is None:
+            raise ProjectError(f"{path}: a memory without views; expected at least one")
+        # A view that was fused twice is one pose.
+        first = {name: row for row, name in reversed(list(enumerate(cameras.names)))}
+        cameras = cameras[sorted(first.values())]
+        return Trajectory(cameras.world_from_cam, cameras.names)
+    model = find_model(path) if path.is_dir() else None
+    if model is not None:
+        from gvtools.cameras import invert_rigid
+        from gvtools.scenes.colmap_model import load_model
+
+        images = load_model(model).images
+        poses = invert_rigid(np.array([image.cam_from_world for image in images]))
+        return Trajectory(poses, tuple(image.name for image in images))
+    from gvtools.scenes.project import open_project
+
+    cameras = open_project(path).cameras
+    return Trajectory(cameras.world_from_cam, cameras.names)
+
+
+def associate(
+    reference: Trajectory,
+    estimate: Trajectory,
+    *,
+    how: str = "auto",
+    max_difference: float,
+    offset: float = 0.0,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], str]:
+    """Rows of both trajectories that belong together, and how they were found.
+
+    Args:
+        reference: N poses.
+        estimate: M poses.
+        how: "time", "name", "index", or "auto": names where both have them, times where both have
+            them, else the order.
+        max_difference: seconds, of an association by time.
+        offset: seconds, added to the estimate's times.
+
+    Raises:
+        OptionError: one of the two has no times or names, or an unknown way.
+        DegenerateError: nothing belongs together.
+    """
+    from gvtools.evaluation.association import by_index, by_name, by_time
+
+    if how not in ASSOCIATIONS:
+        raise OptionError(f"association {how!r}; expected one of {', '.join(ASSOCIATIONS)}")
+    timed = reference.stamps is not None and estimate.stamps is not None
+    if how == "auto":
+        named = bool(reference.names and estimate.names)
+        how = "name" if named else "time" if timed else "index"
+    if how == "index":
+        return (*by_index(len(reference), len(estimate)), how)
+    if how == "name":
+        if not (reference.names and estimate.names):
+            raise OptionError(
+                "association by name: a TUM, KITTI or EuRoC file has no names; use time or index"
+            )
+        return (*by_name(reference.names, estimate.names), how)
+    if reference.stamps is None or estimate.stamps is None:
+        raise OptionError("association by time: a trajectory has no times; use name or index")
+    found = by_time(reference.stamps, estimate.stamps, max_difference=max_difference, offset=offset)
+    return (*found, how)

@@ -1,0 +1,1 @@
+"""The rounds of a reconstruction: plan, depth, fuse, project, complete, fuse back."""

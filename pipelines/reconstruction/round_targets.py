@@ -1,0 +1,66 @@
+"""The cameras of a run's rounds, each projected before its round begins."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+
+from gvtools.kernels import run_beside_each_other
+from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.memory.spatial_memory import SpatialMemory
+from pipelines.reconstruction.plan import Plan
+
+
+class RoundTargets:
+    """The targets of each round as they follow the memory.
+
+    While the targets of a round are completed, what observed views show of the next round's is
+    projected in another thread, where projections are reused at all: completions do not change it.
+
+    Args:
+        plan: of the run.
+        memory: that the rounds add to.
+    """
+
+    def __init__(self, plan: Plan, memory: SpatialMemory) -> None:
+        self.plan, self.memory = plan, memory
+        self._pool = ThreadPoolExecutor(1)
+        self._next: tuple[int, list[FollowedCamera], list[Future[None]]] | None = None
+
+    def __enter__(self) -> RoundTargets:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def of(self, number: int) -> list[FollowedCamera]:
+        """The targets of round ``number``, from 1, in order."""
+        if self._next is None or self._next[0] != number:
+            return self._followed(number)
+        _, targets, looks = self._next
+        self._next = None
+        for look in looks:
+            look.result()
+        return targets
+
+    def look_ahead(self, number: int) -> None:
+        """Begin to project what observed views show of round ``number``, if there is one."""
+        if number > len(self.plan.schedule) or not run_beside_each_other():
+            return
+        targets = self._followed(number)
+        snapshot = self.memory.snapshot()
+        # One by one, so that a run that is stopped need not wait for all.
+        looks = [self._pool.submit(target.look, snapshot) for target in targets]
+        self._next = (number, targets, looks)
+
+    def _followed(self, number: int) -> list[FollowedCamera]:
+        config = self.plan.config
+        return [
+            FollowedCamera(self.memory, camera, options=config.splat, reuse=config.savings.reuse)
+            for camera in self.plan.targets.cameras[list(self.plan.schedule[number - 1])]
+        ]

@@ -1,0 +1,301 @@
+"""One round: lift the context, or project, complete, align and fuse the round's targets."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.completers.base import Completer, Completion, ContextView
+from gvtools.errors import ProjectError
+from gvtools.guidance import Guidance, together
+from gvtools.memory.back_projection import back_project
+from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
+from gvtools.scenes.scene import Frame, Scene, View
+from gvtools.similarity import ScaleFit, align_depth_scale
+from pipelines.config import RunConfig
+from pipelines.reconstruction.depth_cache import KeptDepth, depth_report
+from pipelines.reconstruction.prefetch import ahead
+
+STAGES = ("depth", "fuse", "project", "complete", "align")
+
+
+@dataclass
+class Clock:
+    """Seconds spent in each stage."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the block's time to stage ``name``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] += time.perf_counter() - start
+
+
+@dataclass(frozen=True, eq=False)
+class TargetResult:
+    """One completed target.
+
+    Attributes:
+        guidance: what the completer was given, a batch of one; a completer that takes one target
+            at a time is given what earlier targets of the round added, too.
+        completion: what the completer made of it, a batch of one.
+        fused: which pixels went to fusion.
+        report: figures of the view for the round's report.
+    """
+
+    guidance: Guidance
+    completion: Completion
+    fused: NDArray[np.bool_]
+    report: dict[str, Any]
+
+
+def observe_context(
+    scene: Scene,
+    names: Sequence[str],
+    *,
+    source: KeptDepth,
+    memory: SpatialMemory,
+    config: RunConfig,
+    clock: Clock,
+    progress: Any,
+) -> tuple[FuseReport, dict[str, int], list[dict[str, Any]]]:
+    """Round 0: lift the context views and fuse them.
+
+    Returns:
+        The sum of what was fused, the pixels dropped by reason, and a report of each view's depth.
+    """
+    total = FuseReport()
+    dropped: dict[str, int] = {}
+    reports = []
+    frames = ahead(_load, [view for view in map(scene.__getitem__, names) if source.covers(view)])
+    for name in progress(names, "context views"):
+        view = scene[name]
+        if not source.covers(view):
+            dropped["views without depth"] = dropped.get("views without depth", 0) + 1
+            continue
+        with clock.stage("depth"):
+            frame = next(frames)
+            depth_map = source.depth(view, frame)
+            reports.append(depth_report(scene, name, depth_map))
+        with clock.stage("fuse"):
+            points = back_project(
+                frame.rgb,
+                depth_map.depth,
+                view.camera,
+                frame=memory.frame,
+                confidence=depth_map.confidence,
+                mask=frame.mask,
+                options=config.back_projection,
+                levels=memory.levels,
+                joined=config.savings.joined,
+            )
+            total += memory.fuse(points, round=0)
+        for reason, count in points.dropped.items():
+            dropped[reason] = dropped.get(reason, 0) + count
+    for entry in reports:
+        entry["failed"] = source.failed.get(entry["view"])
+    if not len(memory) and source.failed:
+        raise ProjectError(next(iter(source.failed.values())))
+    if not len(memory) and total.out_of_reach:
+        raise ProjectError(
+            f"{scene.root}: all {total.out_of_reach} points of the context lie beyond the "
+            f"{memory.reach:.3g} scene units that voxels of {memory.voxel:g} reach from the "
+            "cameras; expected a greater voxel edge; leave --voxel out, or look at the depth's unit"
+        )
+    if not len(memory):
+        raise ProjectError(
+            f"{scene.root}: the context's depth gave no point; look at 'gvtools check' and at the "
+            "depth's unit"
+        )
+    return total, dropped, reports
+
+
+def _load(view: View) -> Frame:
+    return view.load()
+
+
+def load_context(scene: Scene, names: Sequence[str], source: KeptDepth) -> list[ContextView]:
+    """The context as completers see it."""
+    out = []
+    views = [scene[name] for name in names]
+    for name, view, frame in zip(names, views, ahead(_load, views), strict=True):
+        depth = source.depth(view, frame) if source.covers(view) else None
+        out.append(
+            ContextView(
+                name,
+                view.camera,
+                (frame.rgb / np.float32(255)).astype(np.float32),
+                depth.depth if depth else None,
+                depth.confidence if depth else None,
+            )
+        )
+    return out
+
+
+def complete_targets(
+    targets: Sequence[FollowedCamera],
+    number: int,
+    *,
+    memory: SpatialMemory,
+    completer: Completer,
+    context: Sequence[ContextView],
+    config: RunConfig,
+    clock: Clock,
+    progress: Any,
+    done: Callable[[int, TargetResult], object] = lambda row, result: None,
+) -> tuple[list[TargetResult], FuseReport]:
+    """Rounds 1, 2, ...: complete, align and fuse the round's targets.
+
+    A completer that looks at several targets at once (``joint``) gets all of one size together; for
+    any other, each view is completed on what the views before it added, so that they agree with
+    each other.
+
+    Args:
+        targets: the round's cameras, following ``memory``.
+        number: of the round.
+        memory: is added to.
+        completer: see ``Completer``.
+        context: the given views.
+        config: of the run.
+        clock: receives the stages' times.
+        progress: (items, label) to the items.
+        done: is told of each target as soon as it is completed: its place and what became of it.
+
+    Returns:
+        What became of each target, in the order given, and the sum of what was fused.
+    """
+    seed = config.seed + number
+    results: list[TargetResult] = []
+    total = FuseReport()
+
+    def take(guidance: Guidance, completion: Completion) -> None:
+        nonlocal total
+        result, report = _align_and_fuse(guidance, completion, number, memory, config, clock)
+        done(len(results), result)
+        results.append(result)
+        total += report
+
+    if getattr(completer, "joint", False):
+        with clock.stage("project"):
+            known = [target.guidance() for target in targets]
+        with clock.stage("complete"):
+            made = _completed_together(completer, context, known, seed)
+        for pair in progress(list(zip(known, made, strict=True)), f"round {number}"):
+            take(*pair)
+        return results, total
+    for target in progress(list(targets), f"round {number}"):
+        with clock.stage("project"):
+            guidance = target.guidance()
+        with clock.stage("complete"):
+            completion = completer.complete(context, guidance, seed=seed)
+        take(guidance, completion)
+    return results, total
+
+
+def _completed_together(
+    completer: Completer, context: Sequence[ContextView], known: Sequence[Guidance], seed: int
+) -> list[Completion]:
+    """A batch of one for each target, of batches of all targets of one size."""
+    made: list[Completion | None] = [None] * len(known)
+    sizes: dict[tuple[int, ...], list[int]] = {}
+    for index, guidance in enumerate(known):
+        sizes.setdefault(guidance.valid.shape[1:], []).append(index)
+    for rows in sizes.values():
+        completion = completer.complete(context, together([known[i] for i in rows]), seed=seed)
+        for place, index in enumerate(rows):
+            made[index] = _row(completion, place)
+    return [completion for completion in made if completion is not None]
+
+
+def _row(completion: Completion, index: int) -> Completion:
+    rows = slice(index, index + 1)
+    rays = None if completion.rays is None else completion.rays[rows]
+    return Completion(
+        completion.rgb[rows],
+        completion.depth[rows],
+        completion.confidence[rows],
+        rays,
+        completion.spent,
+        None if completion.support is None else completion.support[rows],
+    )
+
+
+def _align_and_fuse(
+    guidance: Guidance,
+    completion: Completion,
+    number: int,
+    memory: SpatialMemory,
+    config: RunConfig,
+    clock: Clock,
+) -> tuple[TargetResult, FuseReport]:
+    valid, depth = guidance.valid[0], completion.depth[0]
+    confidence = completion.confidence[0]
+    with clock.stage("align"):
+        fit = align_depth_scale(
+            depth,
+            guidance.depth[0],
+            valid=valid & (depth > 0),
+            confidence=guidance.confidence[0],
+            max_residual=config.fusion.max_scale_residual,
+        )
+    said = None if completion.support is None else completion.support[0]
+    if said is not None:
+        fit = _vouched(fit, said)
+    made = ~valid & (depth > 0)
+    fused = made & (confidence >= config.fusion.min_confidence) & (confidence > 0)
+    report = FuseReport()
+    if not fit.ok:
+        fused = np.zeros_like(fused)
+    elif fused.any():
+        with clock.stage("fuse"):
+            points = back_project(
+                np.rint(np.clip(completion.rgb[0], 0, 1) * 255).astype(np.uint8),
+                (depth * np.float32(fit.scale)).astype(np.float32),
+                guidance.cameras,
+                frame=memory.frame,
+                # Unused outside the mask, where it must still be positive.
+                confidence=np.where(fused, confidence, np.float32(1)),
+                mask=fused,
+                options=config.back_projection,
+                levels=memory.levels,
+                joined=config.savings.joined,
+            )
+            report = memory.fuse(points, round=number, generated=True)
+    figures = {
+        "name": guidance.cameras.names[0],
+        "observed": float((valid & ~guidance.generated[0]).mean()),
+        "completed": float((valid | made).mean()),
+        "fused_pixels": int(fused.sum()),
+        "scale": {
+            "status": fit.status,
+            "scale": fit.scale,
+            "inlier_share": fit.inlier_share,
+            "residual": fit.residual,
+            "support": fit.support,
+            "by": said,
+        },
+        "fuse": asdict(report),
+    }
+    return TargetResult(guidance, completion, fused, figures), report
+
+
+def _vouched(fit: ScaleFit, said: str) -> ScaleFit:
+    """The fit of a completion whose scale the completer found itself.
+
+    Its known pixels are the memory's own, so the comparison with them tells nothing: a refusal
+    stands, and a view that the memory does not know is accepted.
+    """
+    if said.startswith("refused"):
+        return replace(fit, status=said, scale=float("nan"))
+    return replace(fit, status="aligned", scale=1.0)

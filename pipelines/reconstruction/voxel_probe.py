@@ -1,0 +1,246 @@
+"""How coarse a memory may be: context views, predicted from their neighbours at several edges.
+
+A footprint says what a pixel could show, not what the pictures do: blur, noise and the mixing of
+views often leave less, and coarser voxels then store a fraction of it and look the same. Where
+pictures and depth are sharp, several views together show more than one pixel could.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.memory.back_projection import back_project
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.store.local_frame import LocalFrame
+from pipelines.reconstruction.grid_frame import grid_frame
+from pipelines.reconstruction.sampling import sampled
+
+if TYPE_CHECKING:
+    from gvtools.scenes.scene import Frame, Scene
+    from pipelines.config import RunConfig
+
+# Edges that are tried, in shares of the one given.
+SCALES = (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0)
+# The first of them.
+START = 2.0
+# Views that are predicted, and neighbours that each is predicted from.
+PROBES, NEIGHBOURS = 3, 4
+# A quarter of their pixels is looked at, in squares of this side, and what falls a little beside.
+TILE, MARGIN, BLOCK = 48, 6, 2
+# Memories that are fused at once.
+THREADS = 2
+# Fewer valid pixels of a view tell nothing.
+LEAST = 250
+# Mean squared errors below it, of one part in a hundred, are one: nobody sees them.
+UNSEEN = 1e-4
+
+
+def sufficient_scale(
+    scene: Scene,
+    names: Sequence[str],
+    *,
+    config: RunConfig,
+    loss: float,
+    say: Callable[[str], None] | None = None,
+) -> float:
+    """The coarsest share of the configured voxel edge that shows as much as the best one.
+
+    Of ``SCALES``, it predicts views within ``loss`` of the best.
+
+    Args:
+        scene: the project.
+        names: context views with recorded depth.
+        config: of the run: the edge to start from, and how points are lifted, kept and projected.
+        loss: dB that the mean PSNR of the predicted views may fall behind.
+        say: is told what was found.
+
+    Returns:
+        A share of ``config.voxel``; 1 where there are too few views to tell.
+    """
+    voxel = config.voxel
+    if voxel is None or len(names) <= NEIGHBOURS:
+        return 1.0
+    frames: dict[str, Frame] = {}
+    probes = [
+        _probe(scene, name, _nearest(scene, names, name), frames) for name in sampled(names, PROBES)
+    ]
+    shown: dict[float, list[tuple[NDArray[np.float32], NDArray[np.bool_]]]] = {}
+
+    def look(scale: float) -> dict[float, float]:
+        """PSNR of each scale looked at so far; none where there is too little to compare."""
+        scaled = at_scale(config, scale)
+        with ThreadPoolExecutor(THREADS) as pool:
+            memories = pool.map(lambda probe: _fused(probe, scaled), probes)
+            shown[scale] = [
+                _predicted(probe, memory, scaled)
+                for probe, memory in zip(probes, memories, strict=True)
+            ]
+        # What the finest of these memories knows; coarser ones know more.
+        masks = [mask for _, mask in shown[min(shown)]]
+        return {at: _psnr(pairs, masks) for at, pairs in shown.items()} if _enough(masks) else {}
+
+    # Of finer edges the PSNR rises, then falls: no more are looked at than it takes to see that.
+    found = look(START)
+    for scale in [scale for scale in reversed(SCALES) if scale < START]:
+        found = look(scale)
+        if not found:
+            return 1.0
+        # A gain of less than what may be lost decides nothing.
+        if found[scale] < max(psnr for at, psnr in found.items() if at > scale) + loss:
+            break
+    for scale in [scale for scale in SCALES if scale > START]:
+        if not found or found[max(found)] < max(found.values()) - loss:
+            break
+        found = look(scale)
+    if not found:
+        return 1.0
+    best = max(found.values())
+    chosen = max(scale for scale, psnr in found.items() if psnr >= best - loss)
+    if say is not None:
+        said = ", ".join(
+            f"{scale * voxel:.3g}: {psnr:.2f} dB" for scale, psnr in sorted(found.items())
+        )
+        say(f"voxel edge by {len(probes)} context views predicted from their neighbours ({said})")
+    return chosen
+
+
+def at_scale(config: RunConfig, scale: float) -> RunConfig:
+    """``config`` with all voxels so many times as wide.
+
+    An edge of twice the typical footprint means voxels of twice the footprint everywhere.
+    """
+    assert config.voxel is not None
+    memory = replace(config.memory, footprints=scale * config.memory.footprints)
+    return replace(config, voxel=scale * config.voxel, memory=memory)
+
+
+def _enough(masks: Sequence[NDArray[np.bool_]]) -> bool:
+    return any(mask.sum() >= LEAST for mask in masks)
+
+
+def _psnr(
+    pairs: Sequence[tuple[NDArray[np.float32], NDArray[np.bool_]]],
+    masks: Sequence[NDArray[np.bool_]],
+) -> float:
+    """Mean over the views whose mask holds enough pixels."""
+    errors = [
+        float(error[mask].mean())
+        for (error, _), mask in zip(pairs, masks, strict=True)
+        if mask.sum() >= LEAST
+    ]
+    return float(np.mean([-10 * np.log10(max(error, UNSEEN)) for error in errors]))
+
+
+def _nearest(scene: Scene, names: Sequence[str], name: str) -> list[str]:
+    """The views that stand and look most like one."""
+    camera = scene[name].camera
+    others = [other for other in names if other != name]
+    cameras = scene.subset(others).cameras
+    apart = np.linalg.norm(cameras.centers - camera.centers, axis=1)
+    forward = cameras.world_from_cam[:, :3, 2] @ camera.world_from_cam[0, :3, 2]
+    spread = max(float(np.median(apart)), 1e-12)
+    order = np.argsort(apart / spread + (1 - forward), kind="stable")
+    return [others[i] for i in order[:NEIGHBOURS]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Probe:
+    """Tiles of a view, and what its neighbours see of the place.
+
+    Attributes:
+        camera: of the view.
+        rgb: (H, W, 3) uint8, its photograph.
+        tiles: (H, W) bool, which of its pixels count.
+        frame: for the memory of the neighbours.
+        seen: each neighbour's camera and picture, and which of its pixels fall into the tiles or
+            beside them.
+    """
+
+    camera: Cameras
+    rgb: NDArray[np.uint8]
+    tiles: NDArray[np.bool_]
+    frame: LocalFrame
+    seen: list[tuple[Cameras, Frame, NDArray[np.bool_]]]
+
+
+def _probe(scene: Scene, name: str, others: Sequence[str], frames: dict[str, Frame]) -> _Probe:
+    """``frames`` keeps the pictures."""
+    for other in (name, *others):
+        if other not in frames:
+            frames[other] = scene[other].load()
+    camera, truth = scene[name].camera, frames[name]
+    row, col = (np.arange(length) // TILE % 2 == 0 for length in truth.rgb.shape[:2])
+    tiles = row[:, None] & col[None]
+    wanted = cv2.dilate(tiles.astype(np.uint8), np.ones((2 * MARGIN + 1,) * 2, np.uint8)) > 0
+    seen = [
+        (
+            scene[other].camera,
+            frames[other],
+            _falls_on(scene[other].camera, frames[other], camera, wanted),
+        )
+        for other in others
+    ]
+    if truth.mask is not None:
+        tiles &= truth.mask
+    return _Probe(camera, truth.rgb, tiles, grid_frame(scene, others), seen)
+
+
+def _falls_on(
+    camera: Cameras, frame: Frame, onto: Cameras, wanted: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """(H, W), the pixels with depth that fall on the ``wanted`` pixels of another camera.
+
+    One pixel of each BLOCK x BLOCK speaks for all.
+    """
+    assert frame.depth is not None
+    depth = frame.depth[::BLOCK, ::BLOCK]
+    use = np.isfinite(depth) & (depth > 0)
+    rays, pose = camera.rays()[::BLOCK, ::BLOCK][use], camera.world_from_cam[0]
+    xy, z = onto.project((rays * depth[use, None]) @ pose[:3, :3].T + pose[:3, 3])
+    height, width = wanted.shape
+    inside = (z[0] > 0) & (xy[0] >= 0).all(axis=1) & (xy[0] < (width, height)).all(axis=1)
+    col, row = xy[0][inside].astype(np.int64).T
+    inside[inside] = wanted[row, col]
+    use[use] = inside
+    whole = np.repeat(np.repeat(use, BLOCK, axis=0), BLOCK, axis=1)
+    whole = whole[: frame.depth.shape[0], : frame.depth.shape[1]]
+    return whole if frame.mask is None else whole & frame.mask
+
+
+def _fused(probe: _Probe, config: RunConfig) -> SpatialMemory:
+    """The neighbours' memory."""
+    assert config.voxel is not None
+    memory = SpatialMemory(
+        config.voxel, origin=probe.frame.origin, axes=probe.frame.axes, options=config.memory
+    )
+    for camera, frame, mask in probe.seen:
+        assert frame.depth is not None
+        points = back_project(
+            frame.rgb,
+            frame.depth,
+            camera,
+            frame=probe.frame,
+            mask=mask,
+            options=config.back_projection,
+            levels=memory.levels,
+            joined=config.savings.joined,
+        )
+        memory.fuse(points, round=0)
+    return memory
+
+
+def _predicted(
+    probe: _Probe, memory: SpatialMemory, config: RunConfig
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """(H, W) squared colour error of a view, and where in its tiles the memory knows it."""
+    guidance = memory.project(probe.camera, options=config.splat)
+    error = guidance.rgb[0] - probe.rgb.astype(np.float32) / np.float32(255)
+    return np.square(error).mean(-1), guidance.valid[0] & probe.tiles

@@ -1,0 +1,1 @@
+"""Pictures of a saved memory in given cameras, and their figures."""

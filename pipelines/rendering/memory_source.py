@@ -1,0 +1,65 @@
+"""The memory that a command is given: a file, or a run's folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError, ProjectError
+
+if TYPE_CHECKING:
+    from gvtools.memory.spatial_memory import SpatialMemory
+
+FILE = "memory.npz"
+
+
+def open_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
+    """The memory in a file or of a run.
+
+    Args:
+        path: a memory file, a coloured PLY, or a run's folder; an unfinished run gives that of its
+            last whole round.
+        up_to: forget the rounds after this one; None keeps all.
+
+    Raises:
+        ProjectError: neither a memory nor a run with one.
+        MemoryFileError: a damaged file.
+        OptionError: the memory has no such round.
+    """
+    from gvtools.memory.spatial_memory import SpatialMemory
+
+    if path.suffix.lower() == ".ply":
+        from gvtools.memory.io.ply_memory import memory_from_ply
+
+        memory = memory_from_ply(path)
+    else:
+        memory = SpatialMemory.load(memory_file(path))
+    if up_to is not None:
+        if up_to not in memory.rounds:
+            raise OptionError(
+                f"--round {up_to}: the memory has rounds {', '.join(map(str, memory.rounds))}; "
+                "expected one of them"
+            )
+        for number in reversed(memory.rounds):
+            if number > up_to:
+                memory.forget(round=number)
+    return memory
+
+
+def memory_file(path: Path) -> Path:
+    """Where the memory lies that ``path`` means.
+
+    Raises:
+        ProjectError: nowhere.
+    """
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise ProjectError(f"{path}: no such file or folder; expected a memory or a run's folder")
+    rounds = sorted(path.glob(f"round_*/{FILE}"))
+    for candidate in (path / FILE, *reversed(rounds)):
+        if candidate.is_file():
+            return candidate
+    raise ProjectError(
+        f"{path}: holds no {FILE} and no round with one; expected a run's folder or a memory file"
+    )

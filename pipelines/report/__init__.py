@@ -1,0 +1,1 @@
+"""What the HTML report of a run shows, collected from its folder."""

@@ -1,0 +1,218 @@
+"""Everything that a run's report tells, collected from the run's folder and its project."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gvtools.errors import GvError, ProjectError
+from gvtools.runs.finished import open_scenes, read_record, read_reports
+from pipelines.config import RunConfig, flat_settings
+from pipelines.reconstruction.depth_cache import off_scale
+from pipelines.report.measures import read_measures, report_poses
+from pipelines.report.sheets import contact_sheets
+from viz.report.content import RunReport
+
+if TYPE_CHECKING:
+    from gvtools.scenes.scene import Scene, View
+    from viz.plots.pareto import TradeOff
+
+PICTURES = 12
+# A sweep keeps its trials two folders below itself.
+ABOVE = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Sources:
+    """Where a report's photographs come from.
+
+    Attributes:
+        scene: the project, in the size that the run works in; None where it cannot be read.
+        truths: by the target's name the view that shows the truth, if any.
+        problem: why the project cannot be read.
+    """
+
+    scene: Scene | None
+    truths: Mapping[str, View | None]
+    problem: str | None = None
+
+
+def open_sources(record: Mapping[str, Any], *, project: Path | None = None) -> Sources:
+    """The project of a run read again; what cannot be read is said, not raised.
+
+    Args:
+        record: of its run.json.
+        project: where the project lies now; None: where it lay.
+    """
+    try:
+        scene, truths = open_scenes(record, project=project)
+    except GvError as error:
+        return Sources(None, {}, str(error))
+    found = {} if truths is None else {view.name: view for view in truths}
+    return Sources(scene, {name: found.get(name) for name in record["targets"]})
+
+
+def collect(
+    path: Path, *, sources: Sources | None = None, project: Path | None = None, most: int = PICTURES
+) -> RunReport:
+    """What the report of a run tells, of its whole rounds.
+
+    Args:
+        path: the run's folder.
+        sources: the project, where it is open already.
+        project: where it lies now, where it is not; None: where it lay.
+        most: targets whose pictures are shown.
+
+    Raises:
+        ProjectError: no run, a damaged one, or one without a whole round.
+    """
+    record = read_record(path)
+    reports = read_reports(path)
+    if not reports:
+        raise ProjectError(f"{path}: no round is done yet; expected one; wait, or add --resume")
+    sources = sources or open_sources(record, project=project)
+    measures = read_measures(path, record, reports)
+    psnr = {view["name"]: view.get("psnr") for view in measures.views}
+    sheets = contact_sheets(
+        path,
+        reports,
+        psnr=psnr,
+        most=most,
+        scene=sources.scene,
+        context=record["context"],
+        truths=sources.truths,
+    )
+    poses = report_poses(reports, sources.scene, record["context"], measures.poses)
+    trade_off, unread = _trade_off(path, record)
+    settings = dict(flat_settings(record["config"]))
+    return RunReport(
+        title=f"{path.resolve().name}: a run of gvtools",
+        facts=_facts(record, reports),
+        rounds=reports,
+        changed=_changed(settings),
+        settings={key: _said(value) for key, value in settings.items()},
+        warnings=[
+            *_warnings(record, reports),
+            *([] if sources.problem is None else [f"no photographs: {sources.problem}"]),
+            *measures.warnings,
+            *sheets.warnings,
+            *unread,
+        ],
+        figures=measures.figures,
+        intervals=measures.intervals,
+        figures_from=measures.source,
+        views=measures.views,
+        notes=measures.notes,
+        sheet=sheets.rows,
+        sheet_note=sheets.note,
+        poses=poses.drawn,
+        poses_note=poses.note,
+        pose_errors=poses.errors,
+        trade_off=trade_off,
+    )
+
+
+def read_sweep(path: Path, *, of: Mapping[str, Any] | None = None) -> TradeOff | None:
+    """The trade-off in a folder or one above it, such as that of a trial's run; None without one.
+
+    For a run it may stand beside the run's folder as well, of several there the last written, and
+    has to be of the run's project.
+
+    Args:
+        path: the folder.
+        of: the run's record; None takes any project's.
+
+    Raises:
+        ProjectError: one in the folder or above cannot be read.
+    """
+    from pipelines.tradeoff.points import FILE, read_trade_off
+
+    folder = path.resolve()
+    for candidate in (folder, *folder.parents)[:ABOVE]:
+        if (candidate / FILE).is_file():
+            found = read_trade_off(candidate / FILE, of=of)
+            if found is not None:
+                return found
+    if of is None:
+        return None
+    beside = sorted(folder.parent.glob(f"*/{FILE}"), key=lambda file: file.stat().st_mtime_ns)
+    for file in reversed(beside):
+        # What cannot be read there is no more this run's than anybody's.
+        with suppress(ProjectError):
+            found = read_trade_off(file, of=of)
+            if found is not None:
+                return found
+    return None
+
+
+def _trade_off(path: Path, record: Mapping[str, Any]) -> tuple[TradeOff | None, list[str]]:
+    try:
+        return read_sweep(path, of=record), []
+    except ProjectError as error:
+        return None, [str(error)]
+
+
+def _facts(
+    record: Mapping[str, Any], reports: Sequence[Mapping[str, Any]]
+) -> list[tuple[str, str]]:
+    config, done = record["config"], len(reports) - 1
+    planned = len(record["schedule"])
+    return [
+        ("project", str(record["project"])),
+        ("context", f"{len(record['context'])} views"),
+        ("targets", f"{len(record['targets'])} ({record['targets_kind']})"),
+        ("rounds", str(done) if done == planned else f"{done} of {planned}"),
+        ("completer", str(config["completer"])),
+        ("voxel", f"{config['voxel']:g} scene units"),
+        ("seed", str(config["seed"])),
+        ("gvtools", str(record["versions"].get("gvtools", "?"))),
+    ]
+
+
+def _warnings(record: Mapping[str, Any], reports: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    planned = len(record["schedule"])
+    if len(reports) - 1 < planned:
+        yield (
+            f"the run is not finished: {len(reports) - 1} of {planned} rounds are done; "
+            "gvtools reconstruct ... --resume goes on, gvtools report renews this page"
+        )
+    scheduled = sum(len(rows) for rows in record["schedule"])
+    if scheduled < len(record["targets"]):
+        yield f"{len(record['targets']) - scheduled} targets are in no round"
+    depth = reports[0].get("depth", ())
+    flagged = off_scale([entry for entry in depth if "scale" in entry])
+    if flagged:
+        yield flagged
+    failed = [str(entry["view"]) for entry in depth if entry.get("failed")]
+    if failed:
+        yield f"no depth was found for {len(failed)} of {len(depth)} context views: {_few(failed)}"
+    for report in reports[1:]:
+        refused = [view for view in report["views"] if view["scale"]["status"] != "aligned"]
+        if refused:
+            yield (
+                f"round {report['round']}: {len(refused)} of {len(report['views'])} completions "
+                f"gave no points: {_few([str(view['name']) for view in refused])} "
+                f"({refused[0]['scale']['status']})"
+            )
+
+
+def _few(names: Sequence[str], most: int = 4) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{more}"
+
+
+def _changed(settings: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Settings that differ from the defaults, with both."""
+    usual = dict(flat_settings(RunConfig().to_dict()))
+    return [
+        (key, _said(value), _said(usual[key]) if key in usual else "none")
+        for key, value in settings.items()
+        if key not in usual or value != usual[key]
+    ]
+
+
+def _said(value: object) -> str:
+    return "not set" if value is None else str(value)

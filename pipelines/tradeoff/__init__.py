@@ -1,0 +1,1 @@
+"""The search for settings that suit a scene and a budget."""

@@ -1,0 +1,1 @@
+"""Published network weights: what a model needs, and whether a folder fits."""

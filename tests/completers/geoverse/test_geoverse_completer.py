@@ -1,0 +1,444 @@
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import geoverse_models as micro
+import numpy as np
+import pytest
+import torch
+
+from gvtools.cameras import Cameras
+from gvtools.completers import Completion, ContextView, create
+from gvtools.completers.geoverse import completer as completer_module
+from gvtools.completers.geoverse.completer import GeoVerseCompleter
+from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.context_views import nearest_views
+from gvtools.completers.geoverse.depth_scale import PassScale
+from gvtools.completers.geoverse.model import Generated, GeoVerse
+from gvtools.completers.geoverse.postprocess import GENERATED
+from gvtools.errors import CheckpointError, OptionError
+from gvtools.guidance import Guidance
+
+pytest.importorskip("safetensors", reason="weights are read with safetensors")
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Encodes with known cameras and fills holes, as ``tiny`` does."""
+    hints = {"cameras": True, "fill": "push-pull", "mask": 0.0}
+    return micro.weights_folder(tmp_path_factory.mktemp("micro"), micro.config(hints=hints))
+
+
+def complete(
+    weights: Path,
+    context: list[ContextView],
+    known: Guidance,
+    *,
+    seed: int = 0,
+    **options: Any,
+) -> Completion:
+    options = {"alignment": "hint", "device": "cpu", **options}
+    return create("geoverse", weights=str(weights), **options).complete(context, known, seed=seed)
+
+
+def watched(monkeypatch: pytest.MonkeyPatch) -> list[tuple[ViewBatch, Any, Generated]]:
+    """Batches, names and results of the passes to come."""
+    seen: list[tuple[ViewBatch, Any, Generated]] = []
+    generate = GeoVerse.generate
+
+    def wrapper(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
+        made = generate(self, batch, **options)
+        seen.append((batch, options["names"][0], made))
+        return made
+
+    monkeypatch.setattr(GeoVerse, "generate", wrapper)
+    return seen
+
+
+FIELDS = ("rgb", "depth", "valid", "confidence", "generated")
+SIZES = [(30, 40), (24, 32), (17, 23), (9, 7), (64, 31), (1, 40), (100, 133)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_observed_pixels_are_kept_bit_for_bit_and_holes_are_filled(weights, size):
+    context, known = micro.context_views(2), micro.guidance(2, size=size)
+    result = complete(weights, context, known, alignment="centres" if min(size) < 20 else "hint")
+    assert known.valid.any() and not known.valid.all()
+    for name in ("rgb", "depth", "confidence"):
+        found, given = getattr(result, name), getattr(known, name)
+        assert found.dtype == np.float32
+        assert found[known.valid].tobytes() == given[known.valid].tobytes(), name
+    hole = ~known.valid
+    assert result.spent["holes"] == hole.sum()
+    assert result.rgb[hole].std() > 0.01 and result.rgb.min() >= 0 and result.rgb.max() <= 1
+    assert np.isfinite(result.rgb).all() and np.isfinite(result.depth).all()
+    assert result.spent["unfilled"] == (result.depth[hole] <= 0).sum()
+    confident = result.confidence[hole]
+    assert (confident >= 0).all() and (confident <= GENERATED).all()
+    assert ((result.depth[hole] > 0) == (confident > 0)).all()
+    if min(size) >= 20:
+        assert result.spent["unfilled"] == 0
+        assert 1 < np.median(result.depth[hole]) < 9
+    assert result.rays is not None
+    direction, moment = result.rays[..., :3], result.rays[..., 3:]
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, rtol=1e-4)
+    np.testing.assert_allclose((direction * moment).sum(-1), 0, atol=1e-3)
+
+
+def test_the_same_seed_gives_the_same_bytes(weights):
+    context, known = micro.context_views(2), micro.guidance(3)
+    first, again = (complete(weights, context, known, seed=5) for _ in range(2))
+    other = complete(weights, context, known, seed=6)
+    for name in ("rgb", "depth", "confidence", "rays"):
+        assert getattr(first, name).tobytes() == getattr(again, name).tobytes()
+    assert np.abs(first.rgb - other.rgb).max() > 1e-3
+
+
+def test_more_targets_than_a_pass_takes_go_through_several(weights, monkeypatch):
+    seen = watched(monkeypatch)
+    context, known = micro.context_views(3), micro.guidance(5)
+    result = complete(weights, context, known, context_views=2, views=4)
+    assert [batch.images.shape[1] for batch, _, _ in seen] == [4, 4, 3]
+    assert [batch.context for batch, _, _ in seen] == [2, 2, 2]
+    assert result.spent["passes"] == 3
+    names = [name for _, names, _ in seen for name in names[2:]]
+    assert names == [f"target {name}" for name in known.cameras.names]
+    for index in range(5):
+        hole = ~known.valid[index]
+        assert (result.depth[index][hole] > 0).all()
+    # The context leaves room for one target at least.
+    seen.clear()
+    complete(weights, context, known, context_views=3, views=2)
+    assert [(batch.images.shape[1], batch.context) for batch, _, _ in seen] == [(2, 1)] * 5
+
+
+def test_views_without_holes_come_back_and_are_not_computed(weights, monkeypatch):
+    seen = watched(monkeypatch)
+    context, known = micro.context_views(1), micro.guidance(3)
+    full = micro.guidance(3, share=1.1)
+    parts = (known, full, known)
+    rows = (np.stack([getattr(part, name)[i] for i, part in enumerate(parts)]) for name in FIELDS)
+    mixed = Guidance(known.cameras, *rows)
+    result = complete(weights, context, mixed)
+    (_, names, _), = seen  # fmt: skip
+    assert names == ["context photo_0_0", "target target_1_0", "target target_1_2"]
+    for name in ("rgb", "depth", "confidence"):
+        assert getattr(result, name)[1].tobytes() == getattr(mixed, name)[1].tobytes()
+    expected = np.float32(mixed.cameras.plucker(1))
+    assert result.rays is not None and result.rays[1].tobytes() == expected.tobytes()
+    seen.clear()
+    whole = complete(weights, context, full)
+    assert not seen and whole.spent["passes"] == whole.spent["holes"] == 0
+    nothing = Guidance(full.cameras[:0], *(getattr(full, name)[:0] for name in FIELDS))
+    assert complete(weights, context, nothing).rgb.shape == (0, 30, 40, 3)
+
+
+@pytest.mark.parametrize("size", [(30, 40), (61, 33), (20, 90), (5, 6), (200, 150)])
+def test_context_pictures_may_have_any_size_and_aspect(weights, size, monkeypatch):
+    seen = watched(monkeypatch)
+    context = [*micro.context_views(1, size=size), *micro.context_views(1, seed=4, depth=False)]
+    result = complete(weights, context, micro.guidance(1))
+    assert (result.depth[0] > 0).all()
+    assert seen[0][0].images.shape == (1, 3, 3, *micro.SIZE)
+
+
+def test_one_photograph_is_enough_and_none_is_said(weights):
+    known = micro.guidance(2)
+    assert (complete(weights, micro.context_views(1), known).depth > 0).all()
+    with pytest.raises(OptionError, match="needs at least one context view, and got none"):
+        complete(weights, [], known)
+
+
+def test_a_photograph_and_a_target_of_one_name_start_from_different_noise(weights, monkeypatch):
+    seen = watched(monkeypatch)
+    context, known = micro.context_views(1), micro.guidance(1)
+    named = replace(known.cameras, names=("photo_0_0",))
+    complete(weights, context, replace(known, cameras=named))
+    assert seen[0][1] == ["context photo_0_0", "target photo_0_0"]
+
+
+TURN = micro.rotation((0.3, 1.0, -0.4), 2.0)
+WORLDS: dict[str, dict[str, Any]] = {
+    "kilometres": {"scale": 1e-3},
+    "millimetres": {"scale": 1e3},
+    "tiny": {"scale": 1e-7},
+    "turned": {"turn": TURN},
+    "far": {"shift": (3e5, -5e5, 1e5)},
+    "far, turned, in millimetres": {"turn": TURN, "shift": (40.0, 1e3, -2e3), "scale": 1e3},
+}
+
+
+@pytest.mark.parametrize("alignment", ["hint", "field"])
+@pytest.mark.parametrize("world", list(WORLDS))
+def test_neither_the_worlds_unit_nor_its_frame_matter(weights, alignment, world):
+    context, known = micro.context_views(2), micro.guidance(2)
+    expected = complete(weights, context, known, alignment=alignment)
+    found = complete(weights, *micro.moved(context, known, **WORLDS[world]), alignment=alignment)
+    scale = WORLDS[world].get("scale", 1.0)
+    assert expected.spent["views_without_scale"] == 0
+    np.testing.assert_allclose(found.rgb, expected.rgb, atol=2e-4)
+    np.testing.assert_allclose(found.depth, expected.depth * scale, rtol=5e-4)
+    np.testing.assert_allclose(found.confidence, expected.confidence, atol=2e-4)
+
+
+def test_cameras_that_only_turn_have_no_unit_but_that_of_depth(weights):
+    context, known = micro.context_views(2), micro.guidance(2)
+
+    def in_place(cameras: Cameras, centre: np.ndarray) -> Cameras:
+        pose = cameras.cam_from_world.copy()
+        pose[:, :3, 3] = -pose[:, :3, :3] @ centre
+        return replace(cameras, cam_from_world=pose)
+
+    results = []
+    for scale, centre in ((1.0, np.zeros(3)), (1e3, np.zeros(3)), (1.0, np.array([3e6, -7e6, 0]))):
+        views, hint = micro.moved(context, known, scale=scale)
+        views = [replace(view, camera=in_place(view.camera, centre)) for view in views]
+        hint = replace(hint, cameras=in_place(hint.cameras, centre))
+        results.append(complete(weights, views, hint))
+    for found, scale in zip(results[1:], (1e3, 1.0), strict=True):
+        np.testing.assert_allclose(found.rgb, results[0].rgb, atol=2e-4)
+        np.testing.assert_allclose(found.depth, results[0].depth * scale, rtol=5e-4)
+
+
+def test_what_stands_in_holes_does_not_matter(weights):
+    context, known = micro.context_views(1), micro.guidance(1)
+    hole = ~known.valid
+    damaged = replace(known, rgb=known.rgb.copy(), depth=known.depth.copy(),
+                      confidence=known.confidence.copy())  # fmt: skip
+    for name in ("rgb", "depth", "confidence"):
+        getattr(damaged, name)[hole] = np.nan
+    expected, found = (complete(weights, context, g) for g in (known, damaged))
+    for name in ("rgb", "depth", "confidence"):
+        assert getattr(found, name).tobytes() == getattr(expected, name).tobytes()
+
+
+def test_a_pass_that_went_wrong_leaves_holes_and_says_so(weights, monkeypatch):
+    generate = GeoVerse.generate
+
+    def damaged(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
+        made = generate(self, batch, **options)
+        made.decoded.rgb[:, 0, :, :8, :8] = torch.nan
+        made.decoded.geometry.depth[:, -1] = torch.nan
+        return made
+
+    monkeypatch.setattr(GeoVerse, "generate", damaged)
+    known = micro.guidance(2)
+    result = complete(weights, micro.context_views(2), known, alignment="field")
+    for name in ("rgb", "depth", "confidence"):
+        assert np.isfinite(getattr(result, name)).all()
+    hole = ~known.valid
+    assert not result.depth[0, :6, :6][hole[0, :6, :6]].any()
+    assert not result.confidence[1][hole[1]].any() and not result.depth[1][hole[1]].any()
+    assert result.spent["unfilled"] == (result.depth[hole] <= 0).sum() > hole[1].sum()
+
+
+@pytest.mark.filterwarnings("error")
+def test_without_any_support_for_a_scale_there_is_no_depth(weights, monkeypatch):
+    """The requested cameras' rays stand where the predicted ones have no unit."""
+    monkeypatch.setattr(
+        "gvtools.completers.geoverse.postprocess.pass_scale",
+        lambda *a: PassScale(float("nan"), "refused: nothing to go by"),
+    )
+    known = micro.guidance(2, share=-1.0)
+    result = complete(weights, micro.context_views(2), known)
+    assert not result.depth.any() and not result.confidence.any() and result.rgb.any()
+    assert result.spent["views_without_scale"] == 2
+    assert result.support is not None
+    assert all((said or "").startswith("refused: nothing to go by") for said in result.support)
+    assert result.spent["unfilled"] == result.spent["holes"] == known.valid.size
+    assert result.rays is not None
+    np.testing.assert_array_equal(result.rays[1], np.float32(known.cameras.plucker(1)))
+
+
+def true_rays(cameras: Cameras, unit: float, grid: tuple[int, int]) -> torch.Tensor:
+    """(1, V, h, w, 6) what a perfect geometry head would say, in the first view's frame."""
+    world_from_cam = cameras.cam_from_world[0] @ cameras.world_from_cam
+    small = cameras.resized(grid[1], grid[0])
+    maps = []
+    for view, pose in enumerate(world_from_cam):
+        origin = np.broadcast_to(pose[:3, 3] / unit, (*grid, 3))
+        maps.append(np.concatenate((small.rays(view) @ pose[:3, :3].T, origin), axis=-1))
+    return torch.from_numpy(np.stack(maps)).float()[None]
+
+
+@pytest.mark.parametrize("world", [{}, {"turn": TURN, "shift": (4.0, -2.0, 9.0), "scale": 20.0}])
+def test_predicted_rays_come_back_to_the_world(weights, monkeypatch, world):
+    generate = GeoVerse.generate
+    context, known = micro.moved(micro.context_views(2), micro.guidance(2, share=-1.0), **world)
+    # Without any known depth, the centres alone give the scale.
+    context = [replace(view, depth=None) for view in context]
+    order = nearest_views(context, known.cameras, 2)
+
+    def perfect(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
+        made = generate(self, batch, **options)
+        ray = made.decoded.geometry.ray
+        ray.copy_(true_rays(micro.joined(order, known), 2.5, (ray.shape[2], ray.shape[3])))
+        return made
+
+    monkeypatch.setattr(GeoVerse, "generate", perfect)
+    result = complete(weights, context, known, alignment="centres")
+    assert result.support == ("centres", "centres")
+    assert result.rays is not None
+    for view in range(2):
+        expected = known.cameras.plucker(view)[4:-4, 4:-4]
+        # Predicted in the first view's frame and another unit; the rim is extrapolated.
+        np.testing.assert_allclose(result.rays[view][4:-4, 4:-4], expected, rtol=1e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("size", [(30, 40), (61, 83), (20, 30)])
+def test_generated_depth_is_never_averaged_between_two_surfaces(weights, monkeypatch, size):
+    generate = GeoVerse.generate
+
+    def stepped(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
+        made = generate(self, batch, **options)
+        depth = made.decoded.geometry.depth
+        near = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) < 0.5
+        depth.copy_(torch.where(near, 1.0, 1.5))
+        return made
+
+    monkeypatch.setattr(GeoVerse, "generate", stepped)
+    monkeypatch.setattr(
+        "gvtools.completers.geoverse.postprocess.pass_scale", lambda *a: PassScale(2.0, "centres")
+    )
+    known = micro.guidance(1, size=size, share=-1.0)
+    result = complete(weights, micro.context_views(1), known, alignment="centres")
+    np.testing.assert_allclose(np.unique(result.depth[~known.valid].round(4)), [2, 3])
+
+
+def test_steps_and_guidance_are_the_options(weights, monkeypatch):
+    calls: list[float] = []
+    velocity = GeoVerse.velocity1
+
+    def counted(self: GeoVerse, prepared: Any, state: Any, t: Any, **options: Any) -> Any:
+        calls.append(float(t[0]))
+        return velocity(self, prepared, state, t, **options)
+
+    monkeypatch.setattr(GeoVerse, "velocity1", counted)
+    context, known = micro.context_views(1), micro.guidance(1)
+    for options, times in (
+        ({}, [1, 2 / 3, 1 / 3]),
+        ({"steps": 2}, [1, 0.5]),
+        ({"steps": 2, "guidance": 1.5}, [1, 1, 0.5, 0.5]),
+    ):
+        calls.clear()
+        result = complete(weights, context, known, **options)
+        assert sorted(calls, reverse=True) == pytest.approx(times)
+        assert result.spent["steps"] == len(set(times))
+
+
+def test_temperature_scales_the_noise_that_level_1_starts_from(weights, monkeypatch):
+    states: list[Any] = []
+    velocity = GeoVerse.velocity1
+
+    def kept(self: GeoVerse, prepared: Any, state: Any, t: Any, **options: Any) -> Any:
+        states.append(state.clone())
+        return velocity(self, prepared, state, t, **options)
+
+    monkeypatch.setattr(GeoVerse, "velocity1", kept)
+    context, known = micro.context_views(1), micro.guidance(1)
+    pictures = {}
+    for temperature in (None, 1.0, 0.25, 0.0):
+        options: dict[str, Any] = {} if temperature is None else {"temperature": temperature}
+        pictures[temperature] = complete(weights, context, known, steps=1, **options).rgb
+    own, whole, quarter, none = states
+    assert torch.equal(own, whole) and whole.std() > 0.9
+    assert torch.equal(quarter, 0.25 * whole) and not none.any()
+    assert np.array_equal(pictures[None], pictures[1.0])
+    assert not np.array_equal(pictures[None], pictures[0.25])
+    with pytest.raises(OptionError, match=r"completer\.temperature"):
+        create("geoverse", weights=str(weights), temperature=-1)
+
+
+def test_half_precision_gives_nearly_the_same(weights):
+    context, known = micro.context_views(2), micro.guidance(2)
+    full = complete(weights, context, known, precision="float32")
+    half = complete(weights, context, known, precision="bfloat16")
+    error = np.abs(half.rgb - full.rgb)
+    assert 0 < error.max() < 0.05
+    np.testing.assert_allclose(half.depth, full.depth, rtol=0.05)
+
+
+def test_photographs_beyond_the_models_are_left_out(weights, monkeypatch):
+    seen = watched(monkeypatch)
+    complete(weights, micro.context_views(5), micro.guidance(1))
+    assert seen[0][0].context == micro.CONFIG.context == 2
+
+
+def folders(root: Path) -> dict[str, tuple[str | None, str]]:
+    (root / "empty").mkdir()
+    (root / "damaged").mkdir()
+    (root / "damaged" / "config.json").write_text("{")
+    (root / "unknown").mkdir()
+    (root / "unknown" / "config.json").write_text('{"image_sizes": 96}')
+    (root / "patchless").mkdir()
+    (root / "patchless" / "config.json").write_text('{"geometry": {"encoder": {"patch": 0}}}')
+    return {
+        "none": (None, "completer.weights=DIR"),
+        "absent": (str(root / "absent"), "gvtools weights list"),
+        "empty": (str(root / "empty"), "gvtools weights list"),
+        "damaged": (str(root / "damaged"), "config.json"),
+        "unknown": (str(root / "unknown"), "did you mean 'image_size'"),
+        "patchless": (str(root / "patchless"), "config.json"),
+    }
+
+
+@pytest.mark.parametrize("what", ["none", "absent", "empty", "damaged", "unknown", "patchless"])
+def test_a_folder_that_is_no_model_is_refused_in_one_line_at_creation(what, tmp_path, monkeypatch):
+    folder, said = folders(tmp_path)[what]
+    # As in an installation that was stripped of its weights.
+    monkeypatch.setattr(completer_module, "SHIPPED", tmp_path / "nothing")
+    with pytest.raises((OptionError, CheckpointError)) as refused:
+        create("geoverse", weights=folder)
+    assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"steps": -1}, "completer.steps -1; expected at least 0"),
+        ({"views": 1}, "completer.views 1; expected at least 2"),
+        ({"context_views": 0}, "expected at least 1"),
+        ({"guidance": -1.0}, "expected at least 0"),
+        ({"precision": "float64"}, "expected one of auto, float32, bfloat16"),
+        ({"device": "tpu"}, "expected one of auto, cpu, cuda"),
+        ({"alignment": "best"}, "expected one of centres, hint, field"),
+        ({"step": 3}, "did you mean 'steps'"),
+    ],
+)
+def test_options_out_of_range_are_refused(weights, options, said):
+    with pytest.raises(OptionError, match=said):
+        create("geoverse", weights=str(weights), **options)
+
+
+def test_weights_that_cannot_be_loaded_are_refused_before_anything_is_computed(weights, tmp_path):
+    torn = tmp_path / "torn"
+    shutil.copytree(weights, torn)
+    file = torn / "geoverse.safetensors"
+    file.write_bytes(file.read_bytes()[:-10])
+    with pytest.raises(CheckpointError, match=r"geoverse\.safetensors"):
+        create("geoverse", weights=str(torn))
+    file.unlink()
+    with pytest.raises(CheckpointError, match="absent"):
+        create("geoverse", weights=str(torn))
+    other = tmp_path / "other"
+    shutil.copytree(weights, other)
+    config = json.loads((other / "config.json").read_text())
+    config["level1"]["depth"] += 1
+    (other / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match="absent"):
+        create("geoverse", weights=str(other))
+
+
+def test_untrained_weights_are_said(tmp_path, weights):
+    assert not GeoVerseCompleter(weights=str(weights)).notes
+    plain = tmp_path / "plain"
+    shutil.copytree(weights, plain)
+    config = json.loads((plain / "config.json").read_text())
+    (plain / "config.json").write_text(json.dumps({**config, "trained": False}))
+    (note,) = GeoVerseCompleter(weights=str(plain)).notes
+    assert "untrained" in note

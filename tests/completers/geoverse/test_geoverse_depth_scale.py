@@ -1,0 +1,293 @@
+from __future__ import annotations
+
+import math
+
+import geoverse_models as micro
+import numpy as np
+import pytest
+import torch
+
+from gvtools.completers.geoverse.depth_scale import (
+    ALIGNMENTS,
+    MAX_FIELD,
+    PassScale,
+    centre_scale,
+    pass_scale,
+    scaled_depth,
+)
+from gvtools.completers.geoverse.resampling import EDGE, resampled, resampled_depth
+from gvtools.errors import OptionError
+from gvtools.networks.depth_anything.geometry_head import Geometry
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SIZE = (30, 40)
+
+
+def geometry(origins: np.ndarray, *, seed: int = 0, noise: float = 0.0) -> Geometry:
+    """Rays that start at (V, 3) origins, noisy where they are not confident."""
+    generator = torch.Generator().manual_seed(seed)
+    views = len(origins)
+    ray = torch.randn(1, views, 4, 5, 6, generator=generator)
+    ray[..., 3:] *= noise
+    ray[..., 3:] += torch.from_numpy(origins).float()[None, :, None, None]
+    certain = 1 + torch.rand(1, views, 4, 5, generator=generator)
+    depth = torch.ones(1, views, 8, 10)
+    return Geometry(depth, depth + 1, ray, certain)
+
+
+def poses(count: int) -> np.ndarray:
+    return micro.cameras(count, seed=7).world_from_cam
+
+
+def model_centres(world_from_cam: np.ndarray, scale: float) -> np.ndarray:
+    """The centres in another unit and the first view's frame."""
+    relative = np.linalg.inv(world_from_cam[0]) @ world_from_cam
+    return relative[:, :3, 3] / scale
+
+
+@pytest.mark.parametrize("views", [4, 6])
+@pytest.mark.parametrize("scale", [1e-3, 0.4, 2500.0])
+def test_the_scale_between_centres_is_found(views, scale):
+    known = poses(views)
+    found, said = centre_scale(geometry(model_centres(known, scale)), known)
+    assert said == "aligned" and found == pytest.approx(scale, rel=1e-5)
+    known[:, :3, 3] += [1e6, -2e6, 5e5]
+    far, _ = centre_scale(geometry(model_centres(poses(views), scale)), known)
+    assert far == pytest.approx(scale, rel=1e-5)
+
+
+def test_a_centre_is_the_mean_of_its_rays_by_their_confidence():
+    known = poses(4)
+    made = geometry(model_centres(known, 2.0), noise=0.01)
+    found, _ = centre_scale(made, known)
+    assert found == pytest.approx(2.0, rel=0.02)
+    worse = made.ray.clone()
+    worse[:, 1, 0, 0, 3:] = 100.0
+    made.ray_confidence[:, 1, 0, 0] = 0.0
+    again, _ = centre_scale(Geometry(made.depth, made.depth, worse, made.ray_confidence), known)
+    assert again == pytest.approx(found, rel=0.02)
+
+
+def refused() -> dict[str, tuple[Geometry, np.ndarray]]:
+    rng = np.random.default_rng(0)
+    known = poses(4)
+    centres = model_centres(known, 2.0)
+    nan = geometry(centres)
+    nan.ray[:, 1:, 0, 0, 4] = math.nan
+    blind = geometry(centres)
+    blind.ray_confidence[:, 2] = math.nan
+    empty = geometry(centres)
+    empty.ray_confidence[:, 2] = 0
+    rounding = np.full((4, 3), 0.3) + 1e-8 * rng.normal(size=(4, 3))
+    one_place = known.copy()
+    one_place[:, :3, 3] = [3.0, 1.0, 4.0]
+    return {
+        "unrelated": (geometry(rng.normal(size=(8, 3))), poses(8)),
+        "nan rays": (nan, known),
+        "nan confidence": (blind, known),
+        "no confidence": (empty, known),
+        "same predicted": (geometry(np.full((4, 3), 0.3)), known),
+        "two that differ by rounding": (geometry(rounding[:2]), known[:2]),
+        "rounding": (geometry(rounding), known),
+        "same requested": (geometry(centres), one_place),
+        "one view": (geometry(centres[:1]), known[:1]),
+        "three views": (geometry(centres[:3]), known[:3]),
+    }
+
+
+@pytest.mark.parametrize("what", list(refused()))
+def test_centres_that_support_no_scale_are_refused_with_a_reason(what):
+    found, said = centre_scale(*refused()[what])
+    assert math.isnan(found) and said != "aligned" and "\n" not in said
+
+
+def scene(
+    views: int = 2, *, scale: float = 3.0, seed: int = 0
+) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
+    """The model's depth, the memory's as ``scale`` times it, and where it is known."""
+    rng = np.random.default_rng(seed)
+    made = rng.uniform(0.8, 1.2, (views, *SIZE)).astype(np.float32)
+    valid = rng.random((views, *SIZE)) < 0.4
+    return torch.from_numpy(made), (made * np.float32(scale)), valid
+
+
+@pytest.mark.parametrize("alignment", ALIGNMENTS)
+@pytest.mark.parametrize("scale", [0.002, 3.0, 4000.0])
+def test_all_alignments_agree_where_everything_fits(alignment, scale):
+    made, truth, valid = scene(scale=scale)
+    hint = np.where(valid, truth, 0)
+    found = scaled_depth(made, hint, valid, centres=scale, alignment=alignment)
+    np.testing.assert_allclose(found.depth, truth, rtol=1e-4)
+    np.testing.assert_allclose(found.scale, scale, rtol=1e-4)
+    assert found.method == (alignment,) * 2
+    assert found.depth.dtype == np.float32
+
+
+def test_each_alignment_uses_its_own_evidence():
+    made, truth, valid = scene(scale=3.0)
+    truth[1] *= 1.2
+    hint = np.where(valid, truth, 0)
+    found = {
+        name: scaled_depth(made, hint, valid, centres=3.3, alignment=name) for name in ALIGNMENTS
+    }
+    np.testing.assert_allclose(found["centres"].scale, [3.3, 3.3])
+    np.testing.assert_allclose(found["hint"].scale, [3, 3.6], rtol=1e-4)
+    np.testing.assert_allclose(found["field"].scale, [3, 3.6], rtol=1e-4)
+    np.testing.assert_allclose(found["centres"].depth, 3.3 * made.numpy(), rtol=1e-6)
+
+
+def test_a_field_follows_the_memory_and_stays_within_its_limit():
+    made, truth, valid = scene(views=1)
+    x = np.linspace(0, 1, SIZE[1])
+    bent = truth * np.exp(0.3 * (x - 0.5)).astype(np.float32)
+    bent[0, 3, 3] *= 10  # another surface, no error of scale
+    valid[0, 3, 3] = True
+    hint = np.where(valid, bent, 0)
+    found = scaled_depth(made, hint, valid, centres=math.nan, alignment="field")
+    rest = valid.copy()
+    rest[0, 3, 3] = False
+    np.testing.assert_allclose(found.depth[rest], hint[rest], rtol=1e-4)
+    ratio = found.depth[0] / (found.scale[0] * made[0].numpy())
+    assert ratio[3, 3] == pytest.approx(MAX_FIELD, rel=1e-4)
+    # Holes have what stands around them.
+    calm = np.ones(SIZE, bool)
+    calm[:12, :12] = False
+    assert np.abs(found.depth / bent - 1)[0][calm].max() < 0.1
+    plain = scaled_depth(made, hint, valid, centres=math.nan, alignment="hint")
+    assert np.abs(plain.depth / bent - 1)[0][calm].max() > 0.12
+
+
+def test_without_support_the_next_one_is_asked_and_at_last_none():
+    made, truth, valid = scene(views=3)
+    valid[1] = False  # nothing known
+    valid[2].flat[50:] = False  # hardly anything
+    hint = np.where(valid, truth, 0)
+    nan = math.nan
+    for alignment, centres, methods in (
+        ("hint", 3.6, ("hint", "centres", "centres")),
+        ("field", 3.6, ("field", "centres", "centres")),
+        ("centres", nan, ("hint", "none", "none")),
+        ("hint", nan, ("hint", "none", "none")),
+        ("field", nan, ("field", "none", "none")),
+    ):
+        found = scaled_depth(made, hint, valid, centres=centres, alignment=alignment)
+        assert found.method == methods
+        for view, method in enumerate(methods):
+            expected = {"none": nan, "centres": centres}.get(method, 3.0)
+            assert found.scale[view] == pytest.approx(expected, rel=1e-4, nan_ok=True)
+            assert bool(found.depth[view].any()) is (method != "none")
+
+
+def test_depth_that_does_not_follow_the_memory_is_no_support():
+    made, truth, valid = scene(views=1)
+    truth = np.random.default_rng(3).uniform(0.1, 10, truth.shape).astype(np.float32)
+    found = scaled_depth(made, truth, valid, centres=math.nan, alignment="hint")
+    assert found.method == ("none",) and not found.depth.any()
+
+
+def test_a_scale_that_contradicts_the_memory_is_not_taken():
+    made, truth, valid = scene(views=2, scale=3.0)
+    hint = np.where(valid, truth, 0)
+    # The centres are off by thirty: the memory is asked instead, and a view that knows nothing is
+    # not given a scale that its sibling refutes.
+    blind = valid.copy()
+    blind[1] = False
+    found = scaled_depth(made, hint, blind, centres=90.0, alignment="centres")
+    assert found.method == ("hint", "none")
+    found = scaled_depth(made, hint, valid, centres=90.0, alignment="centres")
+    assert found.method == ("hint", "hint")
+    np.testing.assert_allclose(found.scale, [3, 3], rtol=1e-4)
+    # Depth without any relation to the memory is left out, whatever the centres say.
+    noise = np.random.default_rng(3).uniform(0.01, 10, truth.shape).astype(np.float32)
+    for centres in (3.0, 90.0):
+        found = scaled_depth(made, noise, valid, centres=centres, alignment="field")
+        assert found.method == ("none", "none") and not found.depth.any()
+    # Where the memory knows too little to tell, the centres stand.
+    valid[:] = False
+    found = scaled_depth(made, hint, valid, centres=90.0, alignment="centres")
+    assert found.method == ("centres", "centres")
+
+
+@pytest.mark.parametrize("alignment", ALIGNMENTS)
+def test_damaged_depth_does_no_harm_around_it(alignment):
+    made, truth, valid = scene(views=1)
+    hint = np.where(valid, truth, math.nan)
+    valid[0, 9, 9] = True
+    hint[0, 9, 9] = math.inf
+    damaged = made.clone()
+    damaged[0, :4, :4] = math.nan
+    damaged[0, 5, 5] = math.inf
+    found = scaled_depth(damaged, hint, valid, centres=3.0, alignment=alignment)
+    assert not found.depth[0, :4, :4].any() and found.depth[0, 5, 5] == 0
+    intact = np.isfinite(damaged[0].numpy())
+    intact[8:11, 8:11] = False
+    np.testing.assert_allclose(found.depth[0][intact], truth[0][intact], rtol=0.01)
+    assert np.isfinite(found.depth).all()
+
+
+def test_another_alignment_is_refused():
+    made, truth, valid = scene(views=1)
+    with pytest.raises(OptionError, match="expected one of centres, hint, field"):
+        scaled_depth(made, truth, valid, centres=1.0, alignment="best")
+
+
+@pytest.mark.parametrize("size", [(60, 80), (31, 47), (24, 33), (24, 90)])
+def test_depth_at_another_size_never_lies_between_two_surfaces(size):
+    near, far = 1.0, 1.0 + 2 * (EDGE - 1)
+    depth = torch.where(torch.rand(2, 24, 32, generator=torch.Generator().manual_seed(0)) < 0.5,
+                        near, far)  # fmt: skip
+    found = resampled_depth(depth, size)
+    assert found.shape == (2, *size)
+    gap = torch.minimum((found - near).abs(), (found - far).abs())
+    assert gap.max() < 1e-6
+    mixed = resampled(depth[:, None], size)
+    assert ((mixed - near).abs() > 0.05).logical_and((mixed - far).abs() > 0.05).any()
+
+
+@pytest.mark.parametrize("size", [(96, 128), (50, 61), (24, 32)])
+def test_a_plane_stays_a_plane(size):
+    """1 / z is linear over the picture; half a pixel of the small one is left out at the rim."""
+
+    def plane(rows: int, columns: int) -> torch.Tensor:
+        y = (torch.arange(rows).double() + 0.5) / rows
+        x = (torch.arange(columns).double() + 0.5) / columns
+        return 1 / (0.3 + 0.1 * x[None] + 0.2 * y[:, None])
+
+    found = resampled_depth(plane(24, 32)[None], size)[0]
+    rim = max(1, -(-size[0] // 24))
+    inner = np.s_[rim:-rim, rim:-rim]
+    torch.testing.assert_close(found[inner], plane(*size)[inner], rtol=1e-9, atol=1e-9)
+
+
+def test_depth_at_a_smaller_size_is_that_of_a_pixel():
+    depth = torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0)) + 1
+    for size in ((7, 9), (30, 39), (60, 20)):
+        found = resampled_depth(depth, size)
+        assert torch.isin(found, depth).all()
+
+
+def test_one_scale_a_pass_stands_on_centres_and_on_the_context():
+    known = poses(6)
+    made = geometry(model_centres(known, 2.0))
+    truth = np.random.default_rng(1).uniform(1, 3, (2, 40, 50)).astype(np.float32)
+    fitting = torch.from_numpy(np.concatenate((truth, np.ones((4, 40, 50), np.float32))))[None]
+
+    def of(depth: torch.Tensor, context: np.ndarray, cameras: np.ndarray = known) -> PassScale:
+        ray, sure = made.ray[:, : len(cameras)], made.ray_confidence[:, : len(cameras)]
+        return pass_scale(Geometry(depth, depth + 1, ray, sure), cameras, context)
+
+    agreed = of(fitting / 2.0, truth)
+    assert agreed.by == "centres" and agreed.scale == pytest.approx(2.0, rel=1e-4)
+    # The context's own depth is better evidence than the centres, and stands in for them.
+    for cameras in (known, known[:2]):
+        other = of(fitting / 50.0, truth, cameras)
+        assert other.by == "context" and other.scale == pytest.approx(50.0, rel=1e-4)
+    # A model that misses the depth of its own context is not believed.
+    noise = torch.from_numpy(np.random.default_rng(2).uniform(0.01, 9, fitting.shape)).float()
+    missed = of(noise, truth)
+    assert missed.by.startswith("refused: the context") and math.isnan(missed.scale)
+    # Without known depth the centres decide, if there are enough of them.
+    nothing = np.zeros_like(truth)
+    assert of(fitting, nothing).by == "centres"
+    assert "at least 4" in of(fitting, nothing, known[:3]).by

@@ -1,0 +1,237 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from gvtools.errors import DegenerateError, OptionError, ShapeError
+from gvtools.networks.depth_anything import homography
+from gvtools.networks.depth_anything.rays import (
+    camera_centres,
+    nearest_rotation,
+    poses_least_squares,
+    poses_ransac,
+)
+
+SIZE = (84, 112)
+GRID = (24, 32)
+
+
+def poses(views: int, *, seed: int = 0, tilt: float = 0.5) -> np.ndarray:
+    """World-from-camera, the first the identity, turned by up to ``tilt`` radians."""
+    rng = np.random.default_rng(seed)
+    pose = np.tile(np.eye(4), (views, 1, 1))
+    axis = rng.normal(size=(views - 1, 3))
+    axis *= rng.uniform(0, tilt, (views - 1, 1)) / np.linalg.norm(axis, axis=1, keepdims=True)
+    pose[1:, :3, :3] = Rotation.from_rotvec(axis).as_matrix()
+    pose[1:, :3, 3] = rng.uniform(-2, 2, (views - 1, 3))
+    return pose
+
+
+def intrinsics(*, centred: bool) -> np.ndarray:
+    middle = (56, 42) if centred else (61, 37)
+    return np.array([[100, 0, middle[0]], [0, 95, middle[1]], [0, 0, 1]], float)
+
+
+def ray_map(pose: np.ndarray, K: np.ndarray, *, grid=GRID, seed=1) -> torch.Tensor:
+    """Exact rays through the cells' centres; each view's directions have their own length."""
+    y = (np.arange(grid[0]) + 0.5) * SIZE[0] / grid[0]
+    x = (np.arange(grid[1]) + 0.5) * SIZE[1] / grid[1]
+    pixel = np.stack(np.broadcast_arrays(x[None], y[:, None], 1.0), -1)
+    length = np.random.default_rng(seed).uniform(0.5, 2, (len(pose), 1, 1, 1))
+    direction = np.einsum("vij,jk,yxk->vyxi", pose[:, :3, :3], np.linalg.inv(K), pixel) * length
+    origin = np.broadcast_to(pose[:, None, None, :3, 3], direction.shape)
+    return torch.from_numpy(np.concatenate([direction, origin], -1))
+
+
+def noisy(ray: torch.Tensor, level: float, *, seed: int = 2) -> torch.Tensor:
+    rng = np.random.default_rng(seed)
+    return ray + torch.from_numpy(rng.normal(0, level, tuple(ray.shape)))
+
+
+@pytest.mark.parametrize("subsample", [1, 3, 4])
+@pytest.mark.parametrize("centred", [True, False])
+def test_least_squares_is_exact_on_exact_rays(centred, subsample):
+    pose, K = poses(4), intrinsics(centred=centred)
+    found = poses_least_squares(ray_map(pose, K), size=SIZE, subsample=subsample, cell_offset=0.5)
+    np.testing.assert_allclose(found.world_from_cam, pose, atol=1e-9)
+    np.testing.assert_allclose(found.K, np.tile(K, (4, 1, 1)), atol=1e-6)
+
+
+def test_the_published_cells_move_the_principal_point_by_half_a_cell():
+    ray = ray_map(poses(3), intrinsics(centred=False))
+    published, ours = (poses_least_squares(ray, size=SIZE, cell_offset=c) for c in (0.0, 0.5))
+    torch.testing.assert_close(published.world_from_cam, ours.world_from_cam)
+    shift = (ours.K - published.K)[..., :2, 2]
+    np.testing.assert_allclose(shift, np.tile([1.75, 1.75], (3, 1)), atol=1e-6)
+
+
+def test_weights_multiply_the_equations():
+    ray = noisy(ray_map(poses(3), intrinsics(centred=False)), 0.05).numpy()
+    weight = np.random.default_rng(3).uniform(0.1, 5, ray.shape[:-1])
+    found = poses_least_squares(torch.from_numpy(ray), torch.from_numpy(weight), size=SIZE)
+    fits = []
+    for view in range(3):
+        left, right = [], []
+        for y in range(0, GRID[0], 4):
+            for x in range(0, GRID[1], 4):
+                left.append(weight[view, y, x] * np.array([x, y, 1.0]))
+                right.append(weight[view, y, x] * ray[view, y, x, :3])
+        fits.append(np.linalg.lstsq(np.array(left), np.array(right), rcond=None)[0].T)
+    K = np.linalg.inv(fits[0])
+    scale = np.diag([SIZE[1] / GRID[1], SIZE[0] / GRID[0], 1])
+    np.testing.assert_allclose(found.K[1], scale @ K / K[2, 2], rtol=1e-9)
+    for view in range(3):
+        u, _, vt = np.linalg.svd(fits[view] @ K)
+        np.testing.assert_allclose(found.world_from_cam[view, :3, :3], u @ vt, atol=1e-9)
+        mean = np.average(ray[view, ..., 3:].reshape(-1, 3), axis=0, weights=weight[view].ravel())
+        np.testing.assert_allclose(found.world_from_cam[view, :3, 3], mean, rtol=1e-9)
+
+
+def test_ransac_with_the_right_factors_is_exact_off_centre_too():
+    pose, K = poses(4), intrinsics(centred=False)
+    found = poses_ransac(ray_map(pose, K), size=SIZE, factorisation="qr")
+    np.testing.assert_allclose(found.world_from_cam, pose, atol=1e-6)
+    np.testing.assert_allclose(found.K, np.tile(K, (4, 1, 1)), atol=1e-4)
+
+
+def test_the_published_factors_hold_for_a_centred_principal_point_alone():
+    pose = poses(4)
+    centred = poses_ransac(ray_map(pose, intrinsics(centred=True)), size=SIZE)
+    np.testing.assert_allclose(centred.world_from_cam, pose, atol=1e-6)
+    np.testing.assert_allclose(centred.K, np.tile(intrinsics(centred=True), (4, 1, 1)), atol=1e-4)
+    off = poses_ransac(ray_map(pose, intrinsics(centred=False)), size=SIZE)
+    assert 0.01 < np.abs(off.world_from_cam.numpy() - pose).max() < 0.1
+
+
+def test_wrong_rays_are_left_out():
+    pose, K = poses(3), intrinsics(centred=True)
+    ray = noisy(ray_map(pose, K), 1e-3)
+    rng = np.random.default_rng(4)
+    wrong = torch.from_numpy(rng.random(ray.shape[:-1]) < 0.3)
+    spoilt = ray.clone()
+    spoilt[..., :3][wrong] = torch.from_numpy(rng.normal(size=(int(wrong.sum()), 3)))
+    robust = poses_ransac(spoilt, size=SIZE, threshold=0.05)
+    np.testing.assert_allclose(robust.world_from_cam[:, :3, :3], pose[:, :3, :3], atol=5e-3)
+    plain = poses_least_squares(spoilt, size=SIZE)
+    assert np.abs(plain.world_from_cam.numpy() - pose)[:, :3, :3].max() > 0.02
+    confident = poses_least_squares(spoilt, (~wrong).double(), size=SIZE)
+    np.testing.assert_allclose(confident.world_from_cam[:, :3, :3], pose[:, :3, :3], atol=5e-3)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_a_batch_its_parts():
+    ray = noisy(ray_map(poses(4), intrinsics(centred=True)), 0.02)
+    one, two = (poses_ransac(ray, size=SIZE, seed=3) for _ in range(2))
+    torch.testing.assert_close(one.world_from_cam, two.world_from_cam, rtol=0, atol=0)
+    batch = ray.unflatten(0, (2, 2))
+    for solve in (poses_ransac, poses_least_squares):
+        whole = solve(batch, size=SIZE)
+        assert whole.world_from_cam.shape == (2, 2, 4, 4) and whole.K.shape == (2, 2, 3, 3)
+        second = solve(batch[1], size=SIZE)
+        torch.testing.assert_close(whole.world_from_cam[1], second.world_from_cam)
+        torch.testing.assert_close(whole.K[1], second.K)
+
+
+def test_homographies_are_opencvs():
+    rng = np.random.default_rng(5)
+    source = rng.uniform(-1, 1, (60, 2))
+    H = np.eye(3) + rng.normal(0, 0.2, (3, 3))
+    target = np.concatenate([source, np.ones((60, 1))], 1) @ H.T
+    target = target[:, :2] / target[:, 2:]
+    found, share = homography.fit(*map(torch.from_numpy, (source, target, np.ones(60))))
+    expected, _ = cv2.findHomography(source, target)
+    np.testing.assert_allclose(found / found[2, 2], expected, atol=1e-6)
+    assert share > 1e-6
+
+
+def test_homographies_of_noisy_points_are_the_singular_vector():
+    rng = np.random.default_rng(6)
+    (x, y), (u, v) = rng.uniform(-1, 1, (2, 2, 40))
+    weight = rng.uniform(0.1, 3, 40)
+    zero, one, root = np.zeros(40), np.ones(40), np.sqrt(weight)
+    rows = np.concatenate(
+        [
+            (np.stack([-x, -y, -one, zero, zero, zero, x * u, y * u, u]) * root).T,
+            (np.stack([zero, zero, zero, -x, -y, -one, x * v, y * v, v]) * root).T,
+        ]
+    )
+    expected = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    arrays = (np.stack([x, y], 1), np.stack([u, v], 1), weight)
+    found, _ = homography.fit(*map(torch.from_numpy, arrays))
+    np.testing.assert_allclose(
+        found / found.norm() * np.sign(float(found[2, 2]) * expected[2, 2]), expected, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("upper", [True, False])
+def test_factors_multiply_to_the_matrix(upper):
+    generator = torch.Generator().manual_seed(7)
+    H = torch.randn((3, 3), generator=generator, dtype=torch.float64)
+    H = H * torch.linalg.det(H).sign()
+    R, K = homography.factor(H, upper=upper)
+    torch.testing.assert_close(R @ R.mT, torch.eye(3).double())
+    assert torch.linalg.det(R) > 0 and K[2, 2] == 1
+    if upper:
+        product = R @ torch.linalg.inv(K)
+    else:
+        lower = R.mT @ H
+        torch.testing.assert_close(lower, lower.tril())
+        product = R @ lower
+        torch.testing.assert_close(K[:2, 2], lower[2, :2] / lower[2, 2])
+    torch.testing.assert_close(product / product.norm(), H / H.norm())
+
+
+def test_centres_are_weighted_means_and_pass_gradients():
+    ray = noisy(ray_map(poses(3), intrinsics(centred=True)), 0.1)
+    weight = torch.from_numpy(np.random.default_rng(8).uniform(1, 4, ray.shape[:-1]))
+    found = camera_centres(ray, weight)
+    expected = [
+        np.average(r[..., 3:].reshape(-1, 3), axis=0, weights=w.ravel())
+        for r, w in zip(ray.numpy(), weight.numpy(), strict=True)
+    ]
+    np.testing.assert_allclose(found, expected)
+    torch.testing.assert_close(camera_centres(ray), camera_centres(ray, torch.full_like(weight, 7)))
+    torch.testing.assert_close(camera_centres(ray[None], weight[None])[0], found)
+    small = (ray[:, :2, :3].clone().requires_grad_(), weight[:, :2, :3].clone().requires_grad_())
+    assert torch.autograd.gradcheck(camera_centres, small)
+
+
+def test_the_nearest_rotation_is_scipys():
+    rng = np.random.default_rng(9)
+    matrices = Rotation.random(5, random_state=1).as_matrix() + rng.normal(0, 0.1, (5, 3, 3))
+    matrices[0] = np.diag([1.0, 1.0, -0.2])
+    found = nearest_rotation(torch.from_numpy(matrices)).numpy()
+    np.testing.assert_allclose(np.linalg.det(found), 1)
+    for matrix, rotation in zip(matrices, found, strict=True):
+        distance = np.linalg.norm(matrix - rotation)
+        for near in Rotation.from_rotvec(rng.normal(0, 0.05, (20, 3))).as_matrix():
+            assert distance <= np.linalg.norm(matrix - near @ rotation) + 1e-12
+
+
+def test_rays_that_hold_no_camera():
+    ray = ray_map(poses(2), intrinsics(centred=True))
+    equal = ray.clone()
+    equal[1, ..., :3] = torch.tensor([0.1, 0.2, 1.0]).double()
+    for solve in (poses_least_squares, poses_ransac):
+        with pytest.raises(DegenerateError):
+            solve(equal, size=SIZE)
+        with pytest.raises(DegenerateError, match="NaN"):
+            solve(ray * np.nan, size=SIZE)
+        with pytest.raises(DegenerateError, match="confidences"):
+            solve(ray, torch.zeros(ray.shape[:-1]), size=SIZE)
+        with pytest.raises(ShapeError, match="6"):
+            solve(ray[..., :3], size=SIZE)
+        with pytest.raises(ShapeError, match="confidence"):
+            solve(ray, torch.ones(2, 3, 4), size=SIZE)
+    with pytest.raises(DegenerateError, match="at least 8"):
+        poses_ransac(ray[:, :2, :3], size=SIZE)
+    with pytest.raises(ShapeError, match="below 230"):
+        poses_ransac(ray, size=SIZE, samples=torch.full((5, 8), 230))
+    with pytest.raises(OptionError, match="'ql' or 'qr'"):
+        poses_ransac(ray, size=SIZE, factorisation="lu")
+    with pytest.raises(OptionError, match="subsample"):
+        poses_least_squares(ray, size=SIZE, subsample=0)
+    with pytest.raises(DegenerateError, match="negative"):
+        camera_centres(ray, -torch.ones(ray.shape[:-1]))

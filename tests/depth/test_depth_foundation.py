@@ -1,0 +1,320 @@
+"""Depth Anything 3 as a depth source, with a stand-in network that knows the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from tiny_scan import SQUARE, WALL, render, write_colmap_scan, write_scan
+
+from gvtools.completers.geoverse.resampling import resampled
+from gvtools.depth.choice import choose_source
+from gvtools.depth.foundation import source as module
+from gvtools.depth.foundation.options import FoundationOptions
+from gvtools.depth.foundation.source import FoundationDepth
+from gvtools.depth.source import MixedDepth
+from gvtools.errors import CheckpointError, DegenerateError, OptionError, ProjectError
+from gvtools.networks.depth_anything.encoder import EncoderConfig
+from gvtools.networks.depth_anything.geometry_head import Geometry, GeometryHeadConfig
+from gvtools.networks.depth_anything.network import DepthAnything3, DepthAnythingConfig
+from gvtools.networks.depth_anything.weights import RELEASED, load_depth_anything
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.scene import Scene
+from gvtools.scenes.sevenscenes import read_sevenscenes
+from pipelines.cli import main
+
+# What the stand-in's unit is, in scene units of the cameras that it sees.
+UNIT = 1.7
+
+
+class Oracle:
+    """A network that recognises the pictures and answers with the true depth, in its own unit."""
+
+    def __init__(self, scene: Scene, *, wrong: str = "") -> None:
+        self.config = DepthAnythingConfig(EncoderConfig(patch=14), GeometryHeadConfig())
+        self.scene, self.wrong = scene, wrong
+        self.calls: list[int] = []
+
+    def __call__(self, images, cam_from_world=None, K=None):
+        size = images.shape[-2:]
+        rows = [self._recognised(image, size) for image in images[0].cpu()]
+        self.calls.append(len(rows))
+        views = [self.scene.views[row] for row in rows]
+        first = views[0].camera.cam_from_world[0]
+        depths, centres = [], []
+        for view in views:
+            truth = torch.from_numpy(true_depth(view))[None, None]
+            depths.append(resampled(truth, tuple(size))[0, 0])
+            centres.append(first[:3, :3] @ view.camera.centers[0] + first[:3, 3])
+        seen = self._unit(cam_from_world, np.array(centres))
+        depth = torch.stack(depths)[None].float() / seen / UNIT
+        ray = torch.zeros(1, len(rows), 4, 4, 6)
+        ray[..., 2] = 1
+        ray[..., 3:] = torch.from_numpy(np.array(centres) / seen / UNIT)[None, :, None, None]
+        if self.wrong == "centres":
+            ray[..., 3:] = torch.randn(ray[..., 3:].shape, generator=torch.Generator())
+        if self.wrong == "depth":
+            depth = torch.rand(depth.shape, generator=torch.Generator()) + 0.1
+        sure = torch.full_like(depth, 5.0)
+        sure[..., :7] = 1.0
+        return Geometry(depth, sure, ray, torch.ones(ray.shape[:-1]))
+
+    def _recognised(self, image, size) -> int:
+        gaps = []
+        for view in self.scene.views:
+            rgb = torch.from_numpy(view.load().rgb).permute(2, 0, 1)[None].float() / 255
+            gaps.append(float((resampled(rgb, tuple(size))[0] - image).abs().mean()))
+        return int(np.argmin(gaps))
+
+    def _unit(self, cam_from_world, centres) -> float:
+        """The unit of the cameras that were handed in; 1 without them."""
+        if cam_from_world is None:
+            return 1.0
+        given = torch.linalg.inv(cam_from_world[0].double())[:, :3, 3].numpy()
+        longest = np.linalg.norm(centres, axis=1).argmax()
+        return float(np.linalg.norm(centres[longest]) / np.linalg.norm(given[longest]))
+
+
+def true_depth(view) -> np.ndarray:
+    """Exact depth of a view of the tiny scan."""
+    return render(view.camera.world_from_cam[0])[1]
+
+
+@pytest.fixture
+def weights(tmp_path):
+    """A file that is only looked for, not read."""
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "model.safetensors").write_bytes(b"stand-in")
+    return str(tmp_path / "weights")
+
+
+def stand_in(monkeypatch, scene: Scene, **options) -> Oracle:
+    oracle = Oracle(scene, **options)
+    monkeypatch.setattr(module, "load_depth_anything", lambda path, device: oracle)
+    return oracle
+
+
+def relative_errors(scene: Scene, source: FoundationDepth) -> list[float]:
+    found = []
+    for view in scene.views:
+        frame = view.load()
+        made = source.depth(scene, view, replace(frame, depth=None)).depth
+        known = made > 0
+        assert known.mean() > 0.5
+        found.append(float(np.median(np.abs(made[known] / true_depth(view)[known] - 1))))
+    return found
+
+
+@pytest.mark.parametrize("cameras", [True, False])
+def test_depth_gets_the_scale_of_the_sparse_points(tmp_path, monkeypatch, weights, cameras):
+    scene = read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
+    stand_in(monkeypatch, scene)
+    options = FoundationOptions(weights=weights, longest=56, cameras=cameras)
+    source = FoundationDepth(scene, views=scene.names, options=options)
+    assert max(relative_errors(scene, source)) < 0.02
+    fitted = source.scale(scene.names[0])
+    assert fitted.ok and fitted.support == "points" and fitted.count >= 50
+    assert fitted.scale == pytest.approx(UNIT, rel=0.03)
+
+
+@pytest.mark.parametrize("cameras", [True, False])
+def test_without_points_the_camera_centres_give_the_scale(tmp_path, monkeypatch, weights, cameras):
+    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    stand_in(monkeypatch, scene)
+    options = FoundationOptions(weights=weights, longest=56, cameras=cameras)
+    source = FoundationDepth(scene, views=scene.names, options=options)
+    assert max(relative_errors(scene, source)) < 0.02
+    fitted = source.scale(scene.names[0])
+    assert fitted.support == "cameras" and fitted.scale == pytest.approx(UNIT, rel=1e-3)
+
+
+def test_passes_share_one_scale_and_are_as_equal_as_can_be(tmp_path, monkeypatch, weights):
+    scene = read_sevenscenes(write_scan(tmp_path / "scan", views=7))
+    oracle = stand_in(monkeypatch, scene)
+    options = FoundationOptions(weights=weights, longest=56, views=3)
+    source = FoundationDepth(scene, views=scene.names, options=options)
+    assert max(relative_errors(scene, source)) < 0.02
+    assert sorted(oracle.calls) == [2, 2, 3]
+    assert len({source.scale(name).scale for name in scene.names}) == 1
+
+
+@pytest.mark.parametrize("wrong", ["centres", "depth"])
+def test_a_scale_without_support_is_refused(tmp_path, monkeypatch, weights, wrong):
+    if wrong == "centres":
+        scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    else:
+        scene = read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
+    oracle = stand_in(monkeypatch, scene, wrong=wrong)
+    if wrong == "depth":
+        oracle.wrong = "depth"
+        original = oracle.__class__.__call__
+
+        def both(self, *args, **known):
+            made = original(self, *args, **known)
+            noise = torch.randn(made.ray.shape, generator=torch.Generator())
+            return replace(made, ray=noise)
+
+        monkeypatch.setattr(Oracle, "__call__", both)
+    options = FoundationOptions(weights=weights, longest=56)
+    source = FoundationDepth(scene, views=scene.names, options=options)
+    view = scene.views[0]
+    with pytest.raises(DegenerateError, match="unsupported"):
+        source.depth(scene, view, view.load())
+
+
+class Recorder:
+    """A network that keeps what it is given and answers with what the cameras alone decide."""
+
+    def __init__(self) -> None:
+        self.config = DepthAnythingConfig(EncoderConfig(patch=14), GeometryHeadConfig())
+        self.given: list[dict[str, torch.Tensor]] = []
+
+    def __call__(self, images, cam_from_world, K):
+        self.given.append({"images": images, "cam_from_world": cam_from_world, "K": K})
+        centres = torch.linalg.inv(cam_from_world)[..., :3, 3]
+        ray = torch.ones(*images.shape[:2], 4, 4, 6)
+        ray[..., 3:] = centres[:, :, None, None]
+        depth = 1 + images.mean(2) + centres.norm(dim=-1)[..., None, None]
+        return Geometry(depth, torch.full_like(depth, 5.0), ray, torch.ones(ray.shape[:-1]))
+
+
+def in_another_unit(scene: Scene, factor: float) -> Scene:
+    """The scene with all lengths of its cameras times ``factor``."""
+
+    def changed(view):
+        pose = view.camera.cam_from_world.copy()
+        pose[:, :3, 3] *= factor
+        return replace(view, camera=replace(view.camera, cam_from_world=pose))
+
+    return replace(scene, views=tuple(changed(view) for view in scene.views))
+
+
+@pytest.mark.parametrize("factor", [0.01, 100.0])
+def test_the_scenes_unit_changes_the_depths_unit_alone(tmp_path, monkeypatch, weights, factor):
+    network = Recorder()
+    monkeypatch.setattr(module, "load_depth_anything", lambda path, device: network)
+    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    options = FoundationOptions(weights=weights, longest=56)
+    depths = []
+    for other in (scene, in_another_unit(scene, factor)):
+        source = FoundationDepth(other, views=other.names, options=options)
+        view = other.views[-1]
+        depths.append(source.depth(other, view, replace(view.load(), depth=None)).depth)
+    before, after = network.given
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value, rtol=1e-5, atol=1e-6)
+    assert (depths[0] > 0).all()
+    np.testing.assert_allclose(depths[1], factor * depths[0], rtol=1e-5)
+
+
+def test_no_depth_lies_between_two_surfaces(tmp_path, monkeypatch, weights):
+    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    oracle = stand_in(monkeypatch, scene)
+    original = Oracle.__call__
+
+    def sharp(self, *args, **known):
+        """Every pixel of the network on one of the two surfaces."""
+        made = original(self, *args, **known)
+        unit = made.depth.amax() / WALL
+        nearer = made.depth < unit * (SQUARE + WALL) / 2
+        return replace(made, depth=torch.where(nearer, unit * SQUARE, unit * WALL))
+
+    monkeypatch.setattr(Oracle, "__call__", sharp)
+    options = FoundationOptions(weights=weights, longest=56)
+    source = FoundationDepth(scene, views=scene.names, options=options)
+    view = scene.views[0]
+    made = source.depth(scene, view, view.load()).depth
+    assert oracle.calls and made.shape == view.load().rgb.shape[:2]
+    found = made[made > 0]
+    gaps = np.minimum(np.abs(found / SQUARE - 1), np.abs(found / WALL - 1))
+    assert gaps.max() < 0.02
+    assert 100 < (np.abs(found / SQUARE - 1) < 0.02).sum() < found.size / 2
+
+
+def test_unsure_pixels_and_masked_ones_stay_empty(tmp_path, monkeypatch, weights):
+    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    stand_in(monkeypatch, scene)
+    source = FoundationDepth(
+        scene, views=scene.names, options=FoundationOptions(weights=weights, longest=56)
+    )
+    view = scene.views[0]
+    frame = view.load()
+    mask = np.ones(frame.rgb.shape[:2], bool)
+    mask[: len(mask) // 2] = False
+    found = source.depth(scene, view, replace(frame, mask=mask))
+    assert not found.depth[~mask].any()
+    assert not found.depth[:, 0].any() and found.depth[-1, -1] > 0
+    assert (found.confidence[found.depth > 0] > 0.2).all()
+
+
+def test_choice_takes_it_when_weights_are_given(tmp_path, weights):
+    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+
+    def bare(view):
+        return replace(view, load=lambda: replace(view.load(), depth=None), has_depth=False)
+
+    given = FoundationOptions(weights=weights)
+    without = replace(scene, views=tuple(bare(view) for view in scene.views))
+    chosen = choose_source(without, scene.names, "auto", foundation=given)
+    assert isinstance(chosen.source, FoundationDepth) and "weights are given" in chosen.reason
+    mixed = replace(scene, views=(scene.views[0], *without.views[1:]))
+    chosen = choose_source(mixed, scene.names, "auto", foundation=given)
+    assert isinstance(chosen.source, MixedDepth) and chosen.source.files
+    # A foundation model needs no second view.
+    single = choose_source(without, scene.names[:1], "auto", foundation=given)
+    assert isinstance(single.source, FoundationDepth)
+    chosen = choose_source(scene, scene.names, "da3", foundation=given)
+    assert isinstance(chosen.source, FoundationDepth)
+    with pytest.raises(CheckpointError, match=r"needs weights.*da3\.weights"):
+        choose_source(scene, scene.names, "da3")
+    with pytest.raises(ProjectError):
+        choose_source(without, scene.names[:1], "auto")
+
+
+def test_wrong_options_and_folders_are_one_clear_line(tmp_path, weights, capsys):
+    with pytest.raises(OptionError, match=r"da3\.device"):
+        FoundationOptions(device="tpu")
+    with pytest.raises(CheckpointError, match=r"no model\.safetensors"):
+        load_depth_anything(tmp_path)
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        load_depth_anything(weights)
+    scan = write_scan(tmp_path / "scan")
+    run = ["reconstruct", str(scan), "--out", str(tmp_path / "run"), "--depth", "da3"]
+    assert main([*run, "--set", f"da3.weights={tmp_path}"]) == 2
+    assert "model.safetensors" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_released_small_model_is_known_by_its_width(tmp_path):
+    with torch.device("meta"):
+        whole = DepthAnything3(RELEASED[384])
+    state = whole.state_dict()
+    tensors = {
+        f"model.{name}": torch.zeros(t.shape, dtype=torch.float16) for name, t in state.items()
+    }
+    save_file(tensors, tmp_path / "model.safetensors")
+    network = load_depth_anything(tmp_path)
+    assert network.config == RELEASED[384]
+    assert not any(parameter.requires_grad for parameter in network.parameters())
+    assert next(network.parameters()).dtype == torch.float32
+
+
+def test_points_that_fit_no_scale_refuse_whatever_the_centres_say(tmp_path, monkeypatch, weights):
+    scene = read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
+    stand_in(monkeypatch, scene, wrong="depth")
+    options = FoundationOptions(weights=weights, longest=56)
+    source = FoundationDepth(scene, views=scene.names, options=options)
+    fitted = source.scale(scene.names[0])
+    assert not fitted.ok and fitted.support == "points"
+
+
+def test_two_centres_alone_are_no_support(tmp_path, monkeypatch, weights):
+    scene = read_sevenscenes(write_scan(tmp_path / "scan", views=2))
+    stand_in(monkeypatch, scene)
+    options = FoundationOptions(weights=weights, longest=56)
+    source = FoundationDepth(scene, views=scene.names, options=options)
+    with pytest.raises(DegenerateError, match="at least 4"):
+        source.depth(scene, scene.views[0], scene.views[0].load())

@@ -1,0 +1,292 @@
+"""Confidence from nothing to the largest float32, a million fusions, and views from far away."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from extreme_scenes import SIZE, finite
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from memory_scenes import camera, plane_view, points, saved_bytes
+from numba import njit
+from reference_splat import reference_project
+
+from gvtools.errors import MemoryFileError, OptionError
+from gvtools.memory import fusion
+from gvtools.memory.back_projection import back_project
+from gvtools.memory.io.ply import export_memory_ply, read_ply, write_ply
+from gvtools.memory.io.ply_memory import memory_from_ply
+from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+from gvtools.memory.splat.api import SplatOptions
+from gvtools.memory.splat.cpu_kernels import FAINTEST
+
+BACKENDS = ("cpu", "torch", "nearest")
+LARGEST = float(np.finfo(np.float32).max)
+MILLION = 1_000_000
+COLOR = (0, 99, 200)
+
+
+def _wall(confidence, **more) -> SpatialMemory:
+    source = camera(**SIZE, focal=60)
+    memory = SpatialMemory(0.02, **more)
+    lifted = plane_view(source, 4.0, color=COLOR)
+    trust = np.full(len(lifted), confidence, np.float32)
+    memory.fuse(dataclasses.replace(lifted, confidence=trust), round=0)
+    return memory
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("confidence", [1e-45, 1e-40, 1e-38, 1e-30, 1.0, 1e30, LARGEST])
+def test_any_positive_confidence_gives_the_colour_and_the_depth(confidence, backend):
+    seen = _wall(confidence).project(
+        camera(**SIZE, focal=60), options=SplatOptions(backend=backend)
+    )
+    assert seen.valid.all()
+    np.testing.assert_allclose(seen.depth, 4, rtol=1e-5)
+    np.testing.assert_allclose(seen.rgb * 255, np.broadcast_to(COLOR, seen.rgb.shape), atol=1e-3)
+    faintest = 0 if backend == "nearest" else FAINTEST
+    known = np.float32(confidence)
+    np.testing.assert_allclose(seen.confidence, np.clip(known, faintest, 100), rtol=1e-5)
+
+
+@pytest.mark.parametrize("confidence", [0.0, -0.0, -1.0, np.nan, np.inf])
+def test_no_confidence_is_no_point_and_is_counted(confidence):
+    memory = SpatialMemory(0.1)
+    report = memory.fuse(points([(0, 0, 2)] * 3, confidence=confidence), round=0)
+    assert (report.added, report.out_of_reach, len(memory)) == (0, 3, 0)
+    assert memory.project(camera()).coverage == 0
+
+
+@pytest.mark.parametrize("column", ["confidence", "spacing"])
+def test_a_point_cloud_without_a_usable_point_is_refused(column, tmp_path):
+    """It gave a memory of nothing, and empty pictures."""
+    memory = SpatialMemory(0.1)
+    memory.fuse(points([(0, 0, 2), (1, 0, 2), (0, 1, 2)]), round=0)
+    path = tmp_path / "cloud.ply"
+    export_memory_ply(memory, path)
+    vertices = read_ply(path)
+    vertices[column] = 0
+    write_ply(path, vertices)
+    with pytest.raises(MemoryFileError, match="none of its 3 points has a positive"):
+        memory_from_ply(path)
+
+
+@pytest.mark.parametrize("trust", [0.0, 1e-45, 1e-38, 1e30, LARGEST])
+def test_the_confidence_of_a_source_is_kept_or_counted(trust):
+    source = camera(**SIZE, focal=60)
+    depth = np.full((SIZE["height"], SIZE["width"]), 4, np.float32)
+    rgb = np.zeros((*depth.shape, 3), np.uint8)
+    lifted = back_project(rgb, depth, source, confidence=np.full_like(depth, trust))
+    assert len(lifted) + lifted.dropped["no depth"] == depth.size
+    assert (lifted.confidence > 0).all()
+    assert np.isfinite(lifted.confidence).all()
+    if trust > 1e-44:
+        assert len(lifted) == depth.size
+
+
+@settings(max_examples=30, deadline=None)
+@given(powers=st.lists(st.floats(-44.8, 38.5), min_size=2, max_size=30), seed=st.integers(0, 999))
+def test_mixed_confidences_average_as_in_float64(powers, seed):
+    """Weights over eighty decades in one voxel."""
+    rng = np.random.default_rng(seed)
+    weight = (10 ** np.array(powers)).astype(np.float32).clip(None, LARGEST)
+    count = len(weight)
+    where = rng.uniform((0.1, 0.1, 2.1), (0.9, 0.9, 2.9), (count, 3)).astype(np.float32)
+    color = rng.integers(0, 256, (count, 3))
+    memory = SpatialMemory(1.0)
+    memory.fuse(points(where, colors=color, confidence=weight), round=0)
+    # Powers of two keep the sums of the oracle within float64, too.
+    w = weight.astype(np.float64) / float(weight.max())
+    np.testing.assert_allclose(memory.positions[0], w @ where / w.sum(), rtol=1e-6)
+    assert np.abs(memory.records.color[0] - w @ color / w.sum()).max() <= 0.5 + 1e-6
+    assert memory.confidence[0] == min(weight.max(), np.float32(100))
+
+
+def test_huge_confidences_saturate_within_and_across_rounds(tmp_path):
+    memory = SpatialMemory(1.0)
+    place = [(0.5, 0.5, 2.5)]
+    for round_ in (0, 0, 1, 1, 2):
+        memory.fuse(points(place, confidence=LARGEST, colors=COLOR), round=round_)
+    assert memory.confidence.tolist() == [100]
+    np.testing.assert_array_equal(memory.records.color[0], COLOR)
+    seen = memory.project(camera())
+    assert finite(seen)
+    np.testing.assert_allclose(seen.confidence[seen.valid], 100, rtol=1e-5)
+    memory.save(tmp_path / "m.npz")
+    loaded = SpatialMemory.load(tmp_path / "m.npz")
+    assert saved_bytes(loaded, tmp_path) == saved_bytes(memory, tmp_path)
+    for round_ in (2, 1):
+        memory.forget(round=round_)
+    assert np.isfinite(memory.records.agreement[:1]).all()
+
+
+@pytest.mark.parametrize("cap", [0.0, 1e-21, 1e21, np.inf, np.nan])
+def test_caps_that_a_picture_cannot_hold_are_refused(cap):
+    with pytest.raises(OptionError, match=r"memory\.weight_cap .*; expected at least 1e-20"):
+        MemoryOptions(weight_cap=cap)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("cap", [1e-20, 1e20])
+def test_pictures_are_finite_at_either_end_of_the_cap(cap, backend):
+    memory = _wall(LARGEST, options=MemoryOptions(weight_cap=cap))
+    seen = memory.project(camera(**SIZE, focal=60), options=SplatOptions(backend=backend))
+    assert finite(seen)
+    np.testing.assert_allclose(seen.confidence, cap, rtol=1e-5)
+    np.testing.assert_allclose(seen.depth, 4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "torch"])
+@pytest.mark.parametrize("depths", [1.0, 3.3, 3.5, 4.0, 20.0])
+def test_what_only_a_far_view_saw_is_neither_lost_nor_nan(depths, backend):
+    """exp(-proximity x distance) leaves float32 some four typical depths away."""
+    half = np.full((SIZE["height"], SIZE["width"]), 4, np.float32)
+    half[:, SIZE["width"] // 2 :] = 0
+    near = camera(**SIZE, focal=60, center=(0.05, 0, 0))
+    far = camera(**SIZE, focal=60, center=(0, 0, -4 * depths))
+    memory = SpatialMemory(0.02)
+    memory.fuse(plane_view(near, half), round=0)
+    memory.fuse(plane_view(far, 4 + 4 * depths, color=COLOR), round=0)
+    target = camera(**SIZE, focal=60)
+    seen = memory.project(target, options=SplatOptions(backend=backend))
+    reference = reference_project(memory, target)
+    assert finite(seen)
+    np.testing.assert_array_equal(seen.valid, reference.valid)
+    np.testing.assert_allclose(seen.rgb, reference.rgb, atol=1e-5)
+    np.testing.assert_allclose(seen.depth, reference.depth, rtol=1e-5)
+    trust = np.where(seen.valid, np.maximum(reference.confidence, FAINTEST), 0)
+    np.testing.assert_allclose(seen.confidence, trust, rtol=1e-4)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "torch"])
+def test_an_occluder_that_only_a_far_view_saw_is_let_through(backend):
+    """Its weight beside the nearest view's is below every float32."""
+    near = camera(**SIZE, focal=60, center=(0.02, 0, 0))
+    witness = camera(**SIZE, focal=60, center=(0, 0, -40.0), name="witness")
+    wall = dataclasses.replace(plane_view(near, 4.0, color=(0, 0, 255)), free_depth=None)
+    grid = np.linspace(-0.3, 0.3, 40)
+    x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    where = np.stack([x, y, np.full(x.size, 2.0)], 1)
+    memory = SpatialMemory(0.02)
+    memory.fuse(wall, round=0)
+    memory.fuse(points(where, source=witness, colors=(255, 0, 0), spacing=0.03), round=0)
+    target = camera(**SIZE, focal=60)
+    options = SplatOptions(nearest_views=1, backend=backend)
+    seen = memory.project(target, options=options)
+    thing = (abs(2 * target.rays()[..., :2]) < 0.27).all(-1)
+    assert (seen.rgb[0, ..., 0] > 0.9)[thing].all()
+    np.testing.assert_allclose(seen.depth[0][thing], 2, rtol=1e-5)
+
+
+def test_a_million_points_of_one_view_in_one_voxel():
+    """Summed in float64: the mean is that of numpy, and equal points stay what they are."""
+    rng = np.random.default_rng(0)
+    where = rng.uniform((0.1, 0.1, 2.1), (0.9, 0.9, 2.9), (MILLION, 3)).astype(np.float32)
+    color = rng.integers(0, 256, (MILLION, 3)).astype(np.uint8)
+    memory = SpatialMemory(1.0)
+    report = memory.fuse(points(where, colors=color, confidence=0.3), round=0)
+    assert (report.added, report.merged) == (1, MILLION - 1)
+    np.testing.assert_allclose(memory.positions[0], where.mean(0, dtype=np.float64), rtol=6e-8)
+    np.testing.assert_array_equal(memory.records.color[0], np.rint(color.mean(0)))
+    assert memory.confidence[0] == np.float32(0.3)
+    same = SpatialMemory(1.0)
+    place = np.array((0.1, 0.7, 2.3), np.float32)
+    same.fuse(points(np.tile(place, (MILLION, 1)), colors=COLOR, confidence=0.3), round=0)
+    np.testing.assert_array_equal(same.records.position[0], place)
+    np.testing.assert_array_equal(same.records.color[0], COLOR)
+
+
+@njit
+def _merge_again(times, where, color, own, cap, x, y, z, c, confidence, spacing, view):
+    p, sums = np.empty(3), np.empty(6)
+    for i in range(times):
+        k = i % len(where)
+        for axis in range(3):
+            p[axis] = where[k, axis]
+            sums[3 + axis] = own * color[k, axis]
+        fusion._merge(
+            0, p, sums, own, own, 1.0, i + 1, 1.0, x, y, z, c, confidence, spacing, view, cap
+        )
+
+
+def merged_again(times: int, where, color, *, own=1.0, start=None, cap=100.0) -> SimpleNamespace:
+    """One observation in a voxel of edge 1, and ``times`` merges of later views into it.
+
+    It is what as many calls of ``fuse`` do (tested below), without a million views to store.
+    """
+    where = np.atleast_2d(np.asarray(where, np.float32)).astype(np.float64)
+    color = np.atleast_2d(np.asarray(color, np.float64))
+    first, tint = (where[0], color[0]) if start is None else start
+    single = np.float32
+    x, y, z = (np.array([value], single) for value in first)
+    c = np.array([tint]).astype(np.uint8)
+    confidence = np.array([own], single)
+    _merge_again(
+        times, where, color, float(single(own)), cap, x, y, z, c, confidence, np.ones(1, single),
+        np.zeros(1, np.int32),
+    )  # fmt: skip
+    return SimpleNamespace(
+        position=np.array([x[0], y[0], z[0]]), color=c[0], confidence=confidence[0]
+    )
+
+
+def test_merging_again_and_again_is_what_fusing_does():
+    rng = np.random.default_rng(3)
+    where = rng.uniform((0.1, 0.1, 2.1), (0.9, 0.9, 2.9), (300, 3)).astype(np.float32)
+    color = rng.integers(0, 256, (300, 3))
+    memory = SpatialMemory(1.0)
+    for place, tint in zip(where, color, strict=True):
+        memory.fuse(points(place, colors=tint, confidence=0.3), round=0)
+    assert len(memory) == 1
+    found = merged_again(299, np.roll(where, -1, 0), np.roll(color, -1, 0), own=0.3,
+                         start=(where[0], color[0]))  # fmt: skip
+    np.testing.assert_array_equal(memory.records.position[0], found.position)
+    np.testing.assert_array_equal(memory.records.color[0], found.color)
+    assert memory.records.confidence[0] == found.confidence
+
+
+@pytest.mark.parametrize("own", [1e-30, 1e-6, 0.3, 1.0, 100.0, LARGEST])
+def test_a_million_equal_fusions_drift_nowhere(own):
+    place = (0.1, 0.7, 2.3)
+    found = merged_again(MILLION, place, COLOR, own=own)
+    np.testing.assert_array_equal(found.position, np.array(place, np.float32))
+    np.testing.assert_array_equal(found.color, COLOR)
+    # The sum of confidences is float32's: within a hundredth of the true one, up to the cap.
+    expected = min(float(np.float32(own)) * (MILLION + 1), 100.0)
+    assert found.confidence == pytest.approx(expected, rel=0.01)
+    assert found.confidence <= 100
+
+
+@pytest.mark.parametrize("own", [0.01, 0.3, 1.0])
+def test_a_million_noisy_fusions_stay_with_the_mean(own):
+    """The last hundred confidences' worth counts: a running mean of 100 / own views."""
+    rng = np.random.default_rng(1)
+    where = rng.uniform((0.1, 0.1, 2.1), (0.9, 0.9, 2.9), (100_000, 3))
+    color = rng.integers(100, 200, (100_000, 3))
+    found = merged_again(MILLION, where, color, own=own)
+    window = 100 / own
+    bound = 5 * 0.8 / np.sqrt(12) / np.sqrt(2 * window) + 1e-4
+    assert np.abs(found.position - (0.5, 0.5, 2.5)).max() < bound
+    assert np.abs(found.color.astype(float) - 149.5).max() < 5 * 29 / np.sqrt(2 * window) + 11
+
+
+@pytest.mark.parametrize("own", [0.01, 1.0])
+def test_a_wrong_first_observation_is_outvoted_up_to_the_rounding_of_storage(own):
+    """uint8 colours stop within 11 of 255 levels, float32 positions within 3e-4 of a voxel."""
+    found = merged_again(MILLION, (0.6, 0.7, 2.9), (255, 130, 20), own=own,
+                         start=((0.2, 0.2, 2.2), (0, 0, 255)))  # fmt: skip
+    assert np.abs(found.position - (0.6, 0.7, 2.9)).max() < 3e-4
+    assert np.abs(found.color.astype(float) - (255, 130, 20)).max() <= 11
+
+
+def test_a_million_agreements_of_later_rounds_add_up():
+    memory = SpatialMemory(1.0)
+    memory.fuse(points([(0.5, 0.5, 2.5)], confidence=1e-4), round=0)
+    rows = np.zeros(MILLION, np.int32)
+    memory.records.agree(rows, np.full(MILLION, 1e-4, np.float32))
+    assert memory.confidence[0] == pytest.approx(100, rel=0.01)
+    memory.records.agree(rows, np.full(MILLION, LARGEST, np.float32))
+    assert memory.confidence[0] == 100

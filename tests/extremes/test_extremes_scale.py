@@ -1,0 +1,185 @@
+"""Scenes of every size and place: a change of unit or of the world's zero is no change of picture.
+
+A power of two is exact in floating point, so every image has to be the same to the bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from extreme_scenes import (
+    IMAGES,
+    share_that_differs,
+    square_before_wall,
+    target,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from memory_scenes import camera, plane_view, points
+from reference_splat import reference_project
+from scipy.spatial import cKDTree
+
+from gvtools.errors import GvError, MemoryFileError, OptionError
+from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.io.ply_memory import memory_from_ply
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.splat.api import SplatOptions
+from gvtools.memory.store.voxel_index import VOXEL_RANGE, rounded_origin
+
+BACKENDS = ("cpu", "torch", "nearest", "open3d")
+
+
+@pytest.fixture(scope="module")
+def home():
+    memory, reports = square_before_wall(1.0)
+    return memory, reports, {b: _seen(memory, 1.0, backend=b) for b in BACKENDS}
+
+
+def _seen(memory, scale, *, offset=(0, 0, 0), backend="cpu"):
+    return memory.project(target(scale, offset), options=SplatOptions(backend=backend))
+
+
+@settings(max_examples=25, deadline=None)
+@given(power=st.integers(-70, 80))
+def test_a_power_of_two_changes_no_bit(power, home):
+    scale = 2.0**power
+    memory, reports = square_before_wall(scale)
+    assert reports == home[1]
+    np.testing.assert_array_equal(memory.positions, home[0].positions * scale)
+    np.testing.assert_array_equal(memory.confidence, home[0].confidence)
+    for backend in ("cpu", "nearest"):
+        seen, expected = _seen(memory, scale, backend=backend), home[2][backend]
+        for name in IMAGES:
+            factor = np.float32(scale if name == "depth" else 1)
+            np.testing.assert_array_equal(getattr(seen, name), getattr(expected, name) * factor)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("power", [-60, -20, 20, 32, 70])
+def test_every_back_end_is_free_of_units(power, backend, home):
+    scale = 2.0**power
+    seen = _seen(square_before_wall(scale)[0], scale, backend=backend)
+    assert share_that_differs(seen, home[2][backend], scale=scale) == 0
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-5, 1e-3, 0.1, 10, 1e3, 1e6])
+def test_a_power_of_ten_changes_no_picture_and_no_point(scale, home):
+    memory, _ = square_before_wall(scale)
+    assert len(memory) == pytest.approx(len(home[0]), rel=1e-3)
+    apart, _ = cKDTree(memory.positions / scale).query(home[0].positions)
+    assert (apart > 1e-6).mean() < 1e-3
+    seen = _seen(memory, scale)
+    assert seen.coverage == 1
+    assert share_that_differs(seen, home[2]["cpu"], scale=scale) < 1e-3
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_the_reference_in_float64_agrees_at_either_end(scale):
+    memory, _ = square_before_wall(scale)
+    reference = reference_project(memory, target(scale))
+    reference = dataclasses.replace(reference, depth=reference.depth / np.float32(scale))
+    assert share_that_differs(_seen(memory, scale), reference, scale=scale) < 1e-3
+
+
+@pytest.mark.parametrize("far", [1e3, 1e5, 1e6, 1e7])
+@pytest.mark.parametrize("scale", [0.03, 1.0, 1e3])
+def test_utm_coordinates_change_no_picture(scale, far, home):
+    offset = np.array((far, -far, far / 3)) + 0.4
+    memory, reports = square_before_wall(scale, offset=offset)
+    assert [r.points for r in reports] == [r.points for r in home[1]]
+    apart, _ = cKDTree((memory.positions - offset) / scale).query(home[0].positions)
+    assert (apart > 1e-6).mean() < 1e-3
+    seen = _seen(memory, scale, offset=offset)
+    assert share_that_differs(seen, home[2]["cpu"], scale=scale) < 1e-3
+
+
+@pytest.mark.parametrize("far", [1e3, 2.0**20, 2.0**22, 2.0**23 - 200])
+def test_a_point_is_held_to_half_a_step_of_float32_as_far_as_voxels_go(far):
+    """Positions in voxels: the step is a sixteenth of one at 2²⁰ and a half at the end."""
+    rng = np.random.default_rng(1)
+    where = rng.uniform(-100, 100, (300, 3)) + np.array((far, -far, 0))
+    memory = SpatialMemory(1.0)
+    report = memory.fuse(points(where, spacing=1.0), round=0)
+    assert report.out_of_reach == 0
+    assert len(memory) > 295
+    apart, _ = cKDTree(where).query(memory.positions)
+    single = np.abs(memory.positions).max(axis=1).astype(np.float32)
+    lone = report.added - report.merged
+    assert (np.sort(apart / np.spacing(single))[:lone] <= np.sqrt(0.75)).all()
+
+
+@pytest.mark.parametrize("far", [1e6, 1e7])
+def test_points_out_of_reach_are_counted_not_misplaced(far):
+    offset = np.array((far, 0, 0))
+    memory, reports = square_before_wall(1.0, offset=offset, origin=(0, 0, 0))
+    assert all(r.out_of_reach == r.points > 0 for r in reports)
+    assert len(memory) == 0
+    assert _seen(memory, 1.0, offset=offset).coverage == 0
+
+
+@pytest.mark.parametrize("voxel", [1e-310, 9e-26, 2e25, 1e39, 1e300])
+def test_voxels_that_float32_cannot_hold_are_refused_in_a_line(voxel):
+    with pytest.raises(OptionError, match=r"positive length in scene units, 1e-25 to 1e\+25") as e:
+        SpatialMemory(voxel)
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize("end", [0, 1])
+@pytest.mark.parametrize("backend", ["cpu", "torch", "nearest"])
+def test_the_ends_of_the_range_of_voxels_hold(end, backend):
+    """A wall of pixels as wide as a voxel."""
+    voxel = VOXEL_RANGE[end]
+    source = camera(width=32, height=24, focal=4000)
+    memory = SpatialMemory(voxel)
+    depth = 4000 * voxel
+    assert memory.fuse(plane_view(source, depth), round=0).out_of_reach == 0
+    seen = memory.project(source, options=SplatOptions(backend=backend))
+    assert seen.coverage > 0.2
+    np.testing.assert_allclose(seen.depth[seen.valid] / depth, 1, rtol=1e-5)
+    color = np.broadcast_to((200, 100, 50), seen.rgb.shape)
+    np.testing.assert_allclose(seen.rgb[seen.valid] * 255, color[seen.valid], rtol=1e-5)
+
+
+def test_an_origin_where_float64_is_coarser_than_voxels_is_refused():
+    SpatialMemory(0.005, origin=(1e7, 0, 0))
+    SpatialMemory(1e-7, origin=(1e7, 0, 0))
+    with pytest.raises(OptionError, match="move the scene nearer to 0 or take an edge of") as e:
+        SpatialMemory(2e-8, origin=(0, -1e7, 0))
+    assert "\n" not in str(e.value)
+    with pytest.raises(GvError):
+        SpatialMemory(0.005, origin=(0, 0, 1e15))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1, 1e4])
+def test_a_ply_of_any_unit_keeps_its_points(scale, tmp_path):
+    """Whole scene units are no origin for a scene of a millionth of one."""
+    rng = np.random.default_rng(0)
+    offset = np.array((0.4, -12.3, 7.45))
+    where = offset + scale * rng.uniform(-1, 1, (400, 3))
+    memory = SpatialMemory(0.05 * scale, origin=offset)
+    memory.fuse(points(where, origin=offset, spacing=0.05 * scale), round=0)
+    path = tmp_path / "cloud.ply"
+    export_memory_ply(memory, path)
+    again = memory_from_ply(path)
+    apart, _ = cKDTree(again.positions).query(memory.positions)
+    # A fiftieth of the voxels that were written: points that shared a voxel are averaged.
+    assert np.median(apart) < 1e-3 * scale
+
+
+def test_an_origin_in_whole_units_stays_where_it_suffices():
+    middle = np.array((512345.6, -12.3, 0.45))
+    for voxel in (1e-5, 0.005, 3.0):
+        np.testing.assert_array_equal(rounded_origin(middle, voxel), np.rint(middle))
+    for voxel in (1e-6, 1e-8):
+        left = np.abs(rounded_origin(middle, voxel) - middle)
+        assert (np.spacing(left.astype(np.float32)) <= voxel / 64).all()
+
+
+def test_a_ply_without_two_places_that_float64_tells_apart_is_refused(tmp_path):
+    memory = SpatialMemory(0.1)
+    memory.fuse(points([(0.05, 0.05, 1.05)] * 3), round=0)
+    export_memory_ply(memory, tmp_path / "one.ply")
+    with pytest.raises(MemoryFileError, match="expected at least two"):
+        memory_from_ply(tmp_path / "one.ply")

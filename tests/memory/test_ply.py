@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from memory_scenes import camera, points, random_memory
+
+from gvtools.errors import MemoryFileError
+from gvtools.memory.io.ply import export_memory_ply, read_ply, write_ply
+from gvtools.memory.spatial_memory import SpatialMemory
+
+COLUMNS = (
+    "x", "y", "z", "red", "green", "blue", "confidence", "spacing", "round", "view", "generated"
+)  # fmt: skip
+
+
+@pytest.fixture
+def exported(tmp_path):
+    memory, path = random_memory(3), tmp_path / "memory.ply"
+    assert export_memory_ply(memory, path) == (len(memory), 0.0)
+    return memory, path
+
+
+def test_plyfile_reads_what_the_memory_holds(exported):
+    plyfile = pytest.importorskip("plyfile")
+    memory, path = exported
+    vertex = plyfile.PlyData.read(str(path))["vertex"].data
+    ours = read_ply(path)
+    assert ours.dtype.names == vertex.dtype.names == COLUMNS
+    for name in COLUMNS:
+        np.testing.assert_array_equal(vertex[name], ours[name], err_msg=name)
+    n, view = len(memory), memory.records.view[: len(memory)]
+    where = np.stack([vertex[axis] for axis in "xyz"], 1)
+    np.testing.assert_allclose(where, memory.positions, atol=1e-6)
+    color = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
+    np.testing.assert_array_equal(color, memory.records.color[:n])
+    np.testing.assert_array_equal(vertex["confidence"], memory.confidence)
+    np.testing.assert_array_equal(vertex["spacing"], memory.records.spacing[:n])
+    np.testing.assert_array_equal(vertex["round"], memory.views.round[view])
+    np.testing.assert_array_equal(vertex["view"], view)
+    np.testing.assert_array_equal(vertex["generated"], memory.generated)
+
+
+def test_open3d_opens_it_with_the_attributes(exported):
+    import open3d as o3d
+
+    memory, path = exported
+    cloud = o3d.t.io.read_point_cloud(str(path))
+    np.testing.assert_allclose(cloud.point.positions.numpy(), memory.positions, atol=1e-6)
+    np.testing.assert_array_equal(cloud.point.colors.numpy(), memory.records.color[: len(memory)])
+    for name, expected in (
+        ("confidence", memory.confidence),
+        ("spacing", memory.records.spacing[: len(memory)]),
+        ("generated", memory.generated),
+        ("view", memory.records.view[: len(memory)]),
+    ):
+        np.testing.assert_array_equal(cloud.point[name].numpy()[:, 0], expected, err_msg=name)
+
+
+@pytest.mark.parametrize(("far", "kind"), [(0.0, "f4"), (5e6, "f8")])
+def test_far_origins_get_double_coordinates(far, kind, tmp_path):
+    rng = np.random.default_rng(0)
+    origin = np.full(3, far)
+    where = origin + rng.uniform(-3, 3, (100, 3))
+    memory = SpatialMemory(0.001, origin=origin)
+    memory.fuse(points(where, source=camera(center=origin), origin=origin), round=0)
+    export_memory_ply(memory, tmp_path / "far.ply")
+    read = read_ply(tmp_path / "far.ply")
+    assert read.dtype["x"].str[1:] == kind
+    found = np.stack([read[axis] for axis in "xyz"], 1).astype(float)
+    order, expected = np.lexsort(found.T), np.lexsort(where.T)
+    assert abs(found[order] - where[expected]).max() < 1e-5
+
+
+@pytest.mark.parametrize("most", [200, 50, 7, 1])
+def test_thinning_keeps_the_most_confident_of_each_larger_voxel(most, tmp_path):
+    memory = random_memory(3)
+    assert len(memory) > 200
+    written, edge = export_memory_ply(memory, tmp_path / "thin.ply", max_points=most)
+    kept = read_ply(tmp_path / "thin.ply")
+    assert len(kept) == written <= most
+    assert edge >= memory.voxel
+    positions = memory.records.position.astype(float)
+    cells = np.floor((positions - positions.min(axis=0)) / edge)
+    best: dict[tuple, float] = {}
+    for cell, trust in zip(map(tuple, cells), memory.confidence, strict=True):
+        best[cell] = max(best.get(cell, 0.0), float(trust))
+    assert len(best) == written
+    np.testing.assert_allclose(np.sort(kept["confidence"]), np.sort(list(best.values())))
+
+
+def test_an_empty_memory_is_a_file_of_no_vertices(tmp_path):
+    assert export_memory_ply(SpatialMemory(1), tmp_path / "empty.ply") == (0, 0.0)
+    assert len(read_ply(tmp_path / "empty.ply")) == 0
+
+
+def test_no_length_but_the_right_one_is_accepted(exported, tmp_path):
+    _, path = exported
+    data = path.read_bytes()
+    bad = tmp_path / "bad.ply"
+    for size in (*range(0, 400, 7), len(data) // 2, len(data) - 1):
+        bad.write_bytes(data[:size])
+        with pytest.raises(MemoryFileError, match=r"bad\.ply"):
+            read_ply(bad)
+    for tail in (b"\0", b"\n", data):
+        bad.write_bytes(data + tail)
+        with pytest.raises(MemoryFileError, match="truncated or damaged"):
+            read_ply(bad)
+
+
+def test_a_garbled_header_is_refused_or_reads_the_same_numbers(exported, tmp_path):
+    """Any byte of the header replaced: renamed columns aside, nothing else may come out."""
+    _, path = exported
+    data, right = path.read_bytes(), read_ply(path)
+    bad = tmp_path / "bad.ply"
+    rng = np.random.default_rng(0)
+    refused = 0
+    end = data.index(b"end_header\n") + 11
+    for at in range(end):
+        altered = bytearray(data)
+        altered[at] = rng.choice([c for c in range(32, 127) if c != data[at]])
+        bad.write_bytes(bytes(altered))
+        try:
+            read = read_ply(bad)
+        except MemoryFileError:
+            refused += 1
+            continue
+        assert len(read) == len(right)
+        for one, two in zip(read.dtype.names or (), COLUMNS, strict=True):
+            if read.dtype[one] == right.dtype[two]:
+                np.testing.assert_array_equal(read[one], right[two])
+            else:
+                assert read.dtype[one].itemsize == right.dtype[two].itemsize
+    assert refused > end / 2
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
+        b"property float z\nend_header\n",
+        b"ply\nformat binary_big_endian 1.0\nelement vertex 0\nproperty float x\n"
+        b"property float y\nproperty float z\nend_header\n",
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\n"
+        b"property float y\nend_header\n",
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\n"
+        b"property float y\nproperty float z\nelement face 3\n"
+        b"property list uchar int vertex_indices\nend_header\n",
+        b"ply\nelement vertex -1\nend_header\n",
+        b"",
+    ],
+)
+def test_other_kinds_of_ply_are_refused(header, tmp_path):
+    (tmp_path / "other.ply").write_bytes(header)
+    with pytest.raises(MemoryFileError, match=r"other\.ply"):
+        read_ply(tmp_path / "other.ply")
+    with pytest.raises(MemoryFileError, match="cannot be read"):
+        read_ply(tmp_path / "absent.ply")
+
+
+def test_any_table_survives(tmp_path):
+    rng = np.random.default_rng(0)
+    table = np.zeros(50, [("x", "<f8"), ("y", "<f4"), ("z", "<f4"), ("n", "<i4"), ("b", "u1")])
+    for name in "xyznb":
+        table[name] = rng.integers(0, 255, 50)
+    write_ply(tmp_path / "table.ply", table, comments=("a note",))
+    np.testing.assert_array_equal(read_ply(tmp_path / "table.ply"), table)

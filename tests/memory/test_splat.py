@@ -1,0 +1,351 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+from memory_scenes import camera, plane_view, points, random_camera, random_memory
+from reference_splat import reference_project
+
+from gvtools.cameras import concatenate
+from gvtools.errors import OptionError, ShapeError
+from gvtools.guidance import Guidance
+from gvtools.memory.projection import project
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.splat.api import SplatOptions
+
+IMAGES = ("rgb", "depth", "valid", "confidence", "generated")
+OTHERS = (
+    SplatOptions(),
+    SplatOptions(nearest_views=1, band=0.2, blend_reach=0.8, support=0.2),
+    SplatOptions(proximity=0.5, depth_reach=1.0, size_cap=4.0, occluders=False),
+)
+
+
+def assert_same(ours: Guidance, reference: Guidance) -> None:
+    """Equal to 1e-4, but for a pixel in a thousand where rounding tips a threshold."""
+    off = np.zeros(ours.valid.shape, bool)
+    for name in IMAGES:
+        one, two = getattr(ours, name), getattr(reference, name)
+        near = np.isclose(one.astype(float), two.astype(float), rtol=1e-4, atol=1e-4)
+        off |= ~near.reshape(*off.shape, -1).all(-1)
+    assert off.sum() <= off.size * 1e-3, f"{off.sum()} of {off.size} pixels differ"
+
+
+@pytest.mark.parametrize("options", OTHERS)
+@pytest.mark.parametrize("seed", range(8))
+def test_random_memories_look_as_the_reference_says(seed, options):
+    memory = random_memory(seed)
+    target = random_camera(np.random.default_rng(100 + seed), spread=0.5)
+    assert_same(
+        project(memory, target, options=options), reference_project(memory, target, options)
+    )
+
+
+def test_the_random_memories_cover_every_case():
+    """Holes, generated pixels and occluders occur, so that the comparison means something."""
+    covered, made, let_through = [], 0, 0
+    for seed in range(8):
+        memory = random_memory(seed)
+        target = random_camera(np.random.default_rng(100 + seed), spread=0.5)
+        seen = project(memory, target)
+        plain = project(memory, target, options=SplatOptions(occluders=False))
+        covered.append(seen.coverage)
+        assert (seen.valid == plain.valid).all()
+        made += int(seen.generated.sum())
+        let_through += int((seen.depth < plain.depth - 1e-3).sum())
+    assert min(covered) < 0.7 < max(covered)
+    assert made > 50
+    assert let_through > 50
+
+
+@pytest.mark.parametrize("seed", [1, 6])
+def test_the_number_of_threads_changes_nothing(seed):
+    memory = random_memory(seed, most=2000)
+    target = random_camera(np.random.default_rng(seed)).resized(64, 200)
+    threads = numba.get_num_threads()
+    results = []
+    try:
+        for count in sorted({1, min(2, threads), threads}):
+            numba.set_num_threads(count)
+            results.append(project(memory, target))
+    finally:
+        numba.set_num_threads(threads)
+    for name in IMAGES:
+        for other in results[1:]:
+            np.testing.assert_array_equal(getattr(results[0], name), getattr(other, name))
+
+
+def test_boxes_hold_their_observations_also_after_merging():
+    """Culling trusts the boxes; a merge moves an observation of an earlier view."""
+    rng = np.random.default_rng(0)
+    memory = SpatialMemory(0.2)
+    source = camera()
+    for _ in range(4):
+        where = rng.uniform((-1, -1, 2), (1, 1, 4), (500, 3))
+        memory.fuse(points(where, source=source, spacing=rng.uniform(0.1, 2, 500)), round=0)
+    records, runs = memory.records, memory.runs
+    run = np.repeat(np.arange(runs.count), runs.length[: runs.count])
+    assert (records.position >= runs.box[run, :3]).all()
+    assert (records.position <= runs.box[run, 3:6]).all()
+    assert (records.spacing[: len(memory)] <= runs.box[run, 6]).all()
+
+
+def test_generated_content_never_outranks_observed_content():
+    """Whatever generated views add, the pixels that observed views fill stay as they are."""
+    target = camera(width=64, height=48, focal=60)
+    observed = plane_view(camera(width=64, height=48, focal=60, center=(0.3, 0, 0)), 3.0)
+    # Nothing is known to be free: fusion lets the points in.
+    observed = replace(observed, free_depth=None)
+    for depth in (1.5, 2.98, 4.0):
+        memory = SpatialMemory(0.05)
+        memory.fuse(observed, round=0)
+        before = project(memory, target)
+        made = plane_view(target, depth, color=(0, 255, 0))
+        assert memory.fuse(made, round=1, generated=True).added > 0
+        after = project(memory, target)
+        kept = before.valid
+        assert 0.5 < kept.mean() < 1
+        for name in ("rgb", "depth", "confidence"):
+            np.testing.assert_array_equal(getattr(after, name)[kept], getattr(before, name)[kept])
+        assert not after.generated[kept].any()
+        assert after.valid.all()
+        assert after.generated[~kept].all()
+        np.testing.assert_allclose(after.depth[~kept], depth, rtol=0.02)
+
+
+def _square_before_wall(source):
+    """Depth and colour of a red square at z = 2 before a blue wall at z = 4."""
+    rays = source.rays()
+    square = (abs(2 * rays[..., 0]) <= 0.4) & (abs(2 * rays[..., 1]) <= 0.4)
+    depth = np.where(square, 2.0, 4.0).astype(np.float32)
+    rgb = np.where(square[..., None], (255, 0, 0), (0, 0, 255)).astype(np.uint8)
+    return depth, rgb
+
+
+MOVES = {"sideways": (0.31, 0, 0), "forward 0.8": (0, 0, 0.8), "forward 1.4": (0, 0, 1.4)}
+
+
+def silhouette_shares(
+    move, voxels: float, *, scale=1, options: SplatOptions | None = None
+) -> dict[str, float]:
+    """What is wrong after a move, against the analytic scene.
+
+    hole: share of the pixels that the source saw and that are left open; bleed: share of the
+    square that shows the wall; false: share of the never seen pixels that are valid; fattening and
+    growth: by how many voxels the square grew over the wall, and the wall into the unseen. The
+    outermost two source pixels of either side are dropped as depth edges and are no hole.
+
+    Args:
+        move: of the target camera.
+        voxels: voxel edge, in pixels of the wall.
+        scale: image size, 1 for 320 x 240.
+        options: of the projection.
+    """
+    focal = 250 * scale
+    voxel = voxels * 4 / focal
+    size = {"width": 320 * scale, "height": 240 * scale, "focal": focal}
+    depth, rgb = _square_before_wall(camera(**size))
+    memory = SpatialMemory(voxel)
+    memory.fuse(plane_view(camera(**size), depth, color=rgb), round=0)
+    target = camera(**size, center=move)
+    seen = project(memory, target, options=options)
+    valid, red = seen.valid[0], seen.rgb[0, ..., 0] > 0.5
+    center = np.asarray(move, float)
+    rays = target.rays()
+    square = (abs(center + rays * (2 - center[2])) <= 0.4)[..., :2].all(-1)
+    world = center + rays * (np.where(square, 2.0, 4.0) - center[2])[..., None]
+    source_ray = world[..., :2] / world[..., 2:]
+    inside = (abs(source_ray) < (0.63, 0.47)).all(-1)
+    # What the source's ray to a wall point passes at z = 2: within the square, it is hidden.
+    at_square = abs(2 * source_ray).max(-1)
+    edge = 4 / focal
+    hidden = ~square & (at_square <= 0.4)
+    core = square & (at_square < 0.4 - edge)
+    known = inside & (core | ~square & (at_square > 0.4 + edge))
+    false = hidden & valid & ~red
+    fat = ~square & valid & red
+    # A strip one voxel wide around the square, and beside the strip of wall that it hid.
+    strip = 4 * 0.8 * voxel * (focal / (2 - center[2])) ** 2
+    beside = 2 * 0.8 * (4 - center[2]) / 2 * voxel * (focal / (4 - center[2])) ** 2
+    return {
+        "hole": float((known & ~valid).sum() / known.sum()),
+        "bleed": float((core & valid & ~red).sum() / core.sum()),
+        "false": float(false.sum() / max(1, hidden.sum())),
+        "fattening": float(fat.sum() / strip),
+        "growth": float(false.sum() / beside),
+    }
+
+
+@pytest.mark.parametrize("voxels", [0.5, 1, 2, 4])
+@pytest.mark.parametrize("move", MOVES)
+def test_silhouettes_do_not_grow_and_let_nothing_through(move, voxels):
+    # The widest footprint here is that of 4-pixel voxels from 0.6 before the square: 27 pixels.
+    shares = silhouette_shares(MOVES[move], voxels, options=SplatOptions(size_cap=32))
+    assert shares["hole"] < 1e-3
+    assert shares["bleed"] < 1e-3
+    assert shares["fattening"] < 0.5
+    assert shares["growth"] < 1.0
+
+
+def _scene_with_a_far_witness(saw_through: bool):
+    """A near view that misses an object which a far view saw; the near view may rule it out."""
+    target = camera(width=64, height=48, focal=60)
+    near = camera(width=64, height=48, focal=60, center=(0.02, 0, 0), name="near")
+    witness = camera(width=64, height=48, focal=60, center=(0.9, 0, 0.3), name="witness")
+    wall = plane_view(near, 4.0, color=(0, 0, 255))
+    if not saw_through:
+        wall = replace(wall, free_depth=None)
+    grid = np.linspace(-0.3, 0.3, 40)
+    x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    thing = points(
+        np.stack([x, y, np.full(x.size, 2.0)], 1), source=witness, colors=(255, 0, 0), spacing=0.03
+    )
+    memory = SpatialMemory(0.02)
+    memory.fuse(wall, round=0)
+    memory.fuse(thing, round=0)
+    return memory, target
+
+
+def test_an_object_that_only_a_far_view_saw_is_let_through():
+    memory, target = _scene_with_a_far_witness(saw_through=False)
+    seen = project(memory, target, options=SplatOptions(nearest_views=1))
+    rays = target.rays()
+    thing = (abs(2 * rays[..., :2]) < 0.27).all(-1)
+    around = (abs(2 * rays[..., :2]) > 0.35).any(-1)
+    assert thing.sum() > 150
+    assert (seen.rgb[0, ..., 0] > 0.9)[thing].all()
+    np.testing.assert_allclose(seen.depth[0][thing], 2, rtol=1e-5)
+    assert (seen.rgb[0, ..., 0] == 0)[around].all()
+    unseen = project(memory, target, options=SplatOptions(nearest_views=1, occluders=False))
+    assert (unseen.rgb[0, ..., 0] == 0).all()
+
+
+def test_an_object_whose_place_a_near_view_saw_to_be_free_is_not():
+    memory, target = _scene_with_a_far_witness(saw_through=True)
+    seen = project(memory, target, options=SplatOptions(nearest_views=1))
+    assert seen.coverage > 0.95
+    assert (seen.rgb[0, ..., 0] == 0).all()
+
+
+@pytest.mark.parametrize("case", OTHERS)
+@pytest.mark.parametrize("saw_through", [False, True])
+def test_the_reference_agrees_about_occluders(saw_through, case):
+    memory, target = _scene_with_a_far_witness(saw_through)
+    assert_same(project(memory, target, options=case), reference_project(memory, target, case))
+
+
+def _blank(guidance: Guidance) -> bool:
+    return not any(getattr(guidance, name).any() for name in IMAGES)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "torch", "nearest", "open3d"])
+def test_what_holds_nothing_in_view_gives_empty_images(backend):
+    options = SplatOptions(backend=backend)
+    target = camera()
+    assert _blank(SpatialMemory(0.1).project(target, options=options))
+    behind = SpatialMemory(0.1)
+    behind.fuse(points([(0, 0, -2), (0.1, 0.2, -3)]), round=0)
+    assert _blank(behind.project(target, options=options))
+
+
+@pytest.mark.parametrize("backend", ["cpu", "torch"])
+def test_points_at_the_camera_plane_do_no_harm(backend):
+    memory = SpatialMemory(0.5)
+    memory.fuse(
+        points([(0, 0, 0), (1e-9, 0, 1e-9), (0.3, 0, -1e-7), (0, 0, 2)], spacing=0.3), round=0
+    )
+    options = SplatOptions(backend=backend)
+    seen = memory.project(camera(), options=options)
+    assert np.isfinite(seen.rgb).all()
+    assert np.isfinite(seen.depth).all()
+    np.testing.assert_allclose(seen.depth[seen.valid], 2, rtol=1e-6)
+    assert seen.valid.any()
+
+
+@pytest.mark.parametrize("backend", ["cpu", "torch", "nearest", "open3d"])
+def test_an_image_of_one_pixel(backend):
+    memory = SpatialMemory(0.1)
+    memory.fuse(points([(0, 0, 2)], colors=(255, 51, 0), confidence=0.7), round=0)
+    seen = memory.project(camera(width=1, height=1), options=SplatOptions(backend=backend))
+    assert seen.valid.shape == (1, 1, 1)
+    np.testing.assert_allclose(seen.rgb[0, 0, 0], (1, 0.2, 0), atol=1e-6)
+    assert seen.depth[0, 0, 0] == pytest.approx(2)
+    assert seen.confidence[0, 0, 0] == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "torch"])
+@pytest.mark.parametrize("shift", [0, 0.25, 0.5, 0.75])
+def test_a_shift_by_a_part_of_a_pixel_leaves_no_hole(backend, shift):
+    source = camera(width=64, height=48, focal=60)
+    memory = SpatialMemory(0.01)
+    memory.fuse(plane_view(source, 3.0), round=0)
+    moved = camera(width=64, height=48, focal=60, center=(shift * 3 / 60, shift * 3 / 60, 0))
+    seen = memory.project(moved, options=SplatOptions(backend=backend))
+    assert seen.valid[0, :-1, :-1].all()
+    np.testing.assert_allclose(seen.depth[seen.valid], 3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "torch", "nearest", "open3d"])
+def test_a_far_origin_keeps_millimetres(backend):
+    """A georeferenced scene gives the image of the same scene at home."""
+    offset = np.array([4.1e6, 1e6, -2.2e6])
+    depth = np.linspace(2, 2.2, 64)[None, :] * np.ones((48, 1))
+    seen = []
+    for shift in (np.zeros(3), offset):
+        source = camera(width=64, height=48, focal=60, center=shift)
+        memory = SpatialMemory(0.01, origin=shift)
+        memory.fuse(plane_view(source, depth, origin=shift), round=0)
+        seen.append(memory.project(source, options=SplatOptions(backend=backend)))
+    assert (seen[0].valid == seen[1].valid).mean() > 0.999
+    both = seen[0].valid & seen[1].valid
+    assert both.mean() > 0.9
+    assert abs(seen[0].depth - seen[1].depth)[both].max() < 1e-3
+
+
+def test_views_of_a_batch_are_those_of_single_cameras():
+    memory = random_memory(3)
+    rng = np.random.default_rng(5)
+    cameras = concatenate([random_camera(rng, name=f"t{i}") for i in range(3)])
+    batch = project(memory, cameras)
+    assert len(batch) == 3
+    for i, one in enumerate(cameras):
+        single = project(memory, one)
+        for name in IMAGES:
+            np.testing.assert_array_equal(getattr(batch, name)[i], getattr(single, name)[0])
+
+
+def test_cameras_of_several_sizes_are_refused():
+    cameras = concatenate([camera(name="a"), camera(width=31, name="b")])
+    with pytest.raises(ShapeError, match="2 image sizes"):
+        project(random_memory(0), cameras)
+    with pytest.raises(ShapeError, match="0 image sizes"):
+        project(random_memory(0), cameras[:0])
+
+
+def test_unknown_back_ends_are_refused_by_name():
+    with pytest.raises(OptionError, match=r"'gpu'.*cpu, torch, nearest, open3d"):
+        SplatOptions(backend="gpu")
+    with pytest.raises(OptionError, match=r"'mps'.*auto, cpu, cuda"):
+        SplatOptions(device="mps")
+
+
+@pytest.mark.parametrize("backend", ["nearest", "open3d"])
+def test_one_pixel_back_ends_show_the_nearest_observation(backend):
+    memory = random_memory(9, views=5)
+    target = camera(rotation=(0.1, -0.1, 0.2))
+    seen = memory.project(target, options=SplatOptions(backend=backend))
+    xy, z = target.project(memory.positions)
+    column, row = np.floor(xy[0]).T
+    best: dict[tuple[int, int], int] = {}
+    for i in np.argsort(-z[0]):
+        if z[0, i] > 0 and 0 <= column[i] < 32 and 0 <= row[i] < 24:
+            best[int(row[i]), int(column[i])] = i
+    assert seen.valid.sum() == len(best)
+    assert len(best) > 100
+    for (r, c), i in best.items():
+        assert seen.depth[0, r, c] == pytest.approx(z[0, i], rel=1e-5)
+        np.testing.assert_allclose(seen.rgb[0, r, c] * 255, memory.records.color[i], atol=1e-3)
+        assert seen.confidence[0, r, c] == memory.confidence[i]
+        assert seen.generated[0, r, c] == memory.generated[i]

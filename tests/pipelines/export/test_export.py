@@ -1,0 +1,268 @@
+from __future__ import annotations
+
+import argparse
+import builtins
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+from box_project import VOXEL, fused, write_box
+from memory_scenes import points
+from PIL import Image
+from plyfile import PlyData
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.memory.thinning import thinned
+from gvtools.scenes.project import open_project
+from pipelines.commands import export
+from pipelines.console import Console
+
+ORIGIN = (431_000.0, 5_650_000.0, 120.0)
+
+
+def run(*words: object) -> None:
+    parser = argparse.ArgumentParser()
+    export.add_arguments(parser)
+    export.run(parser.parse_args([str(word) for word in words]), Console(quiet=True))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_box(tmp_path_factory.mktemp("box"))
+
+
+@pytest.fixture(scope="module")
+def memory(scene):
+    return fused(scene, [0, 2, 4], generated=(4,))
+
+
+@pytest.fixture
+def saved(memory, tmp_path):
+    """A run's folder with the memory, and a picture of the generated view."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    memory.save(folder / "memory.npz")
+    (folder / "round_002").mkdir()
+    Image.new("RGB", (96, 72)).save(folder / "round_002" / "generated_view_4.png")
+    return folder
+
+
+def test_thinning_keeps_the_most_confident_of_each_voxel(memory):
+    kept = thinned(memory, None)
+    cells = [
+        tuple(cell)
+        for cell in np.floor(memory.records.position.astype(np.float64) * (1 / VOXEL)).astype(int)
+    ]
+    best: dict[tuple[int, ...], int] = {}
+    for row, cell in enumerate(cells):
+        if cell not in best or memory.confidence[row] > memory.confidence[best[cell]]:
+            best[cell] = row
+    assert kept.rows.tolist() == sorted(best.values())
+    assert len(kept.rows) == memory.voxels
+    np.testing.assert_array_equal(kept.rows[kept.group], [best[cell] for cell in cells])
+
+
+@pytest.mark.parametrize("limit", [1, 50, 700])
+def test_thinning_to_a_number(memory, limit):
+    kept = thinned(memory, limit)
+    assert limit / 6 < len(kept.rows) <= limit
+    assert kept.edge > VOXEL
+
+
+@pytest.mark.parametrize("limit", [1, 5, 7])
+def test_points_all_around_the_origin_are_thinned_to_few(limit):
+    memory = SpatialMemory(0.1)
+    memory.fuse(points(np.random.default_rng(0).uniform(-3, 3, (500, 3))), round=0)
+    kept = thinned(memory, limit)
+    assert 1 <= len(kept.rows) <= limit
+    assert kept.edge < 12 and kept.group.max() == len(kept.rows) - 1
+
+
+def test_ply_is_what_plyfile_reads(memory, saved, tmp_path):
+    run(saved, "--format", "ply", "--out", tmp_path / "cloud.ply")
+    vertex = PlyData.read(tmp_path / "cloud.ply")["vertex"]
+    xyz = np.stack([vertex[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(xyz, memory.positions, atol=1e-6)
+    assert vertex["generated"].sum() == memory.generated.sum()
+    run(saved, "--format", "ply", "--out", tmp_path / "cloud.ply", "--max-points", 200)
+    assert 0 < PlyData.read(tmp_path / "cloud.ply")["vertex"].count <= 200
+
+
+def test_an_earlier_round(memory, saved, tmp_path):
+    run(saved, "--format", "ply", "--out", tmp_path / "cloud.ply", "--round", 1)
+    vertex = PlyData.read(tmp_path / "cloud.ply")["vertex"]
+    rounds = memory.views.round[memory.records.view[: len(memory)]]
+    assert vertex.count == int((rounds <= 1).sum())
+    assert not vertex["generated"].any()
+    with pytest.raises(OptionError, match="rounds 0, 1, 2"):
+        run(saved, "--format", "ply", "--out", tmp_path / "cloud.ply", "--round", 7)
+
+
+def test_colmap_reads_the_model_back(scene, memory, saved, tmp_path):
+    run(saved, "--format", "colmap", "--out", tmp_path / "out", "--max-points", 1500)
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    assert model.num_reg_images() == 3
+    for image in model.images.values():
+        camera = scene[image.name].camera
+        np.testing.assert_allclose(
+            image.cam_from_world().matrix(), camera.cam_from_world[0, :3], atol=1e-12
+        )
+        np.testing.assert_allclose(image.camera.calibration_matrix(), camera.K[0])
+    in_order = [model.points3D[i] for i in sorted(model.points3D)]
+    points = np.array([point.xyz for point in in_order])
+    colors = np.array([point.color for point in in_order])
+    kept = thinned(memory, 1500)
+    np.testing.assert_allclose(points, memory.positions[kept.rows])
+    np.testing.assert_array_equal(colors, memory.records.color[kept.rows])
+    # Detections are those of the observations themselves: within a thinned voxel of the point.
+    focal = scene.views[0].camera.K[0, 0, 0]
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() < focal * np.sqrt(3) * kept.edge / 0.8
+    assert model.compute_mean_track_length() > 1
+    names = (tmp_path / "out" / "generated.txt").read_text().splitlines()[1:]
+    assert [line.split("\t")[0] for line in names] == ["view_4.png"]
+    assert not (tmp_path / "out" / "images").exists()
+
+
+def test_each_track_element_is_an_observation_of_its_view(scene, memory, saved, tmp_path):
+    run(saved, "--format", "colmap", "--out", tmp_path / "out", "--max-points", 100_000)
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    assert model.num_points3D() == memory.voxels
+    # The kept observation projects onto its own detection exactly.
+    own = 0
+    for point in list(model.points3D.values())[:200]:
+        errors = [
+            np.linalg.norm(
+                model.images[element.image_id].project_point(point.xyz)
+                - model.images[element.image_id].points2D[element.point2D_idx].xy
+            )
+            for element in point.track.elements
+        ]
+        assert len(errors) == len({element.image_id for element in point.track.elements})
+        own += bool(min(errors) < 1e-9)
+    assert own == 200
+
+
+def test_transforms_open_as_a_project(scene, memory, saved, tmp_path):
+    folder = scene.root
+    run(saved, "--format", "transforms", "--out", tmp_path / "out", "--images", folder / "images")
+    project = open_project(tmp_path / "out" / "transforms.json")
+    by_name = {view.name.split("/")[-1]: view for view in project}
+    assert set(by_name) == {"view_0.png", "view_2.png", "generated_view_4.png"}
+    for name in ("view_0.png", "view_2.png"):
+        np.testing.assert_allclose(
+            by_name[name].camera.cam_from_world, scene[name].camera.cam_from_world, atol=1e-12
+        )
+        np.testing.assert_array_equal(by_name[name].load().rgb, scene[name].load().rgb)
+    np.testing.assert_allclose(
+        by_name["generated_view_4.png"].camera.cam_from_world,
+        scene["view_4.png"].camera.cam_from_world,
+        atol=1e-12,
+    )
+    assert "view_4.png\t" in (tmp_path / "out" / "generated.txt").read_text()
+
+
+def test_glb_is_what_trimesh_reads(memory, saved, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    run(saved, "--format", "glb", "--out", tmp_path / "cloud.glb")
+    scene = trimesh.load_scene(tmp_path / "cloud.glb")
+    (cloud,) = scene.dump()
+    kept = thinned(memory, None)
+    np.testing.assert_allclose(cloud.vertices, memory.positions[kept.rows], atol=1e-6)
+    np.testing.assert_array_equal(cloud.colors[:, :3], memory.records.color[kept.rows])
+
+
+def test_glb_keeps_millimetres_far_from_the_origin(scene, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    near = fused(scene, [0])
+    far = fused(scene, [0])
+    far.frame = LocalFrame.at(ORIGIN)
+    far.views.frame = far.frame
+    far.save(tmp_path / "memory.npz")
+    run(tmp_path / "memory.npz", "--format", "glb", "--out", tmp_path / "cloud.glb")
+    loaded = trimesh.load_scene(tmp_path / "cloud.glb")
+    matrix, name = loaded.graph[loaded.graph.nodes_geometry[0]]
+    local = np.asarray(loaded.geometry[name].vertices)
+    assert np.abs(local).max() < 5
+    world = local @ matrix[:3, :3].T + matrix[:3, 3]
+    expected = near.positions[thinned(near, None).rows] + ORIGIN
+    np.testing.assert_allclose(world, expected, atol=1e-5)
+    data = (tmp_path / "cloud.glb").read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    (node,) = (node for node in json.loads(data[20 : 20 + length])["nodes"] if "mesh" in node)
+    assert node["extras"]["origin"] == node["matrix"][12:15] == matrix[:3, 3].tolist()
+
+
+def test_glb_without_trimesh_says_what_to_install(saved, tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def refuse(name, *args, **options):
+        if name == "trimesh":
+            raise ImportError(name)
+        return real(name, *args, **options)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(OptionError, match=r"gvtools\[glb\]"):
+        run(saved, "--format", "glb", "--out", tmp_path / "cloud.glb")
+    assert not (tmp_path / "cloud.glb").exists()
+
+
+def test_a_view_fused_twice_is_one_camera(scene, tmp_path):
+    fused(scene, [0, 0, 2]).save(tmp_path / "memory.npz")
+    run(tmp_path / "memory.npz", "--format", "colmap", "--out", tmp_path / "out")
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    assert sorted(i.name for i in model.images.values()) == ["view_0.png", "view_2.png"]
+
+
+def test_options_that_make_no_sense(saved, tmp_path):
+    with pytest.raises(OptionError, match="1 or more"):
+        run(saved, "--format", "ply", "--out", tmp_path / "a.ply", "--max-points", 0)
+    with pytest.raises(OptionError, match="holds no points"):
+        run(saved, "--format", "transforms", "--out", tmp_path / "a", "--max-points", 5)
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_a_ply_has_no_cameras_to_export(memory, tmp_path, kind):
+    export_memory_ply(memory, tmp_path / "cloud.ply")
+    with pytest.raises(OptionError, match="a PLY, which holds no cameras"):
+        run(tmp_path / "cloud.ply", "--format", kind, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", export.FORMATS)
+def test_a_target_that_cannot_be_written(saved, tmp_path, kind):
+    out = tmp_path / (f"out.{kind}" if kind in ("ply", "glb") else "out")
+    if kind == "colmap":
+        out.write_text("in the way")
+    else:
+        name = out / "transforms.json" if kind == "transforms" else out
+        (name / "in the way").mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ProjectError, match=r"written"):
+        run(saved, "--format", kind, "--out", out)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_files_that_are_no_export_and_the_input_itself_are_kept(saved, tmp_path):
+    memory = saved / "memory.npz"
+    before = memory.read_bytes()
+    for form, out, text in (
+        ("ply", memory, "ends with .ply"),
+        ("glb", tmp_path / "photo.jpg", "ends with .glb"),
+        ("ply", tmp_path, "ends with .ply"),
+    ):
+        with pytest.raises(OptionError, match=text):
+            run(saved, "--format", form, "--out", out)
+    (tmp_path / "mine.ply").write_text("notes")
+    with pytest.raises(OptionError, match="no PLY file"):
+        run(saved, "--format", "ply", "--out", tmp_path / "mine.ply")
+    assert (tmp_path / "mine.ply").read_text() == "notes"
+    assert memory.read_bytes() == before
+    run(saved, "--format", "ply", "--out", tmp_path / "one.ply")
+    run(saved, "--format", "ply", "--out", tmp_path / "one.ply", "--max-points", 50)
+    with pytest.raises(OptionError, match="the input"):
+        run(tmp_path / "one.ply", "--format", "ply", "--out", tmp_path / "one.ply")

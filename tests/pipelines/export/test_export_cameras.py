@@ -1,0 +1,324 @@
+"""Names of exported cameras, and what an export never writes over."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+from box_project import VOXEL, fused, write_box
+from PIL import Image
+
+from gvtools.cameras import Cameras
+from gvtools.errors import OptionError, ProjectError
+from gvtools.memory.back_projection import back_project
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.store.views import SourceView
+from pipelines.commands import export
+from pipelines.console import Console
+
+ORIGIN = (431_000.0, 5_650_000.0, 120.0)
+
+
+def parsed(*words: object) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    export.add_arguments(parser)
+    return parser.parse_args([str(word) for word in words])
+
+
+def run(*words: object) -> None:
+    export.run(parsed(*words), Console(quiet=True))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_box(tmp_path_factory.mktemp("box"))
+
+
+@pytest.fixture
+def saved(scene, tmp_path):
+    """A run's folder with a memory of two observed views and a generated one."""
+    folder = tmp_path / "run"
+    (folder / "round_002").mkdir(parents=True)
+    fused(scene, [0, 2, 4], generated=(4,)).save(folder / "memory.npz")
+    return folder
+
+
+def add_view(memory, camera, name, *, number, generated):
+    """A fused view that left no observation."""
+    named = Cameras(camera.K, camera.cam_from_world, camera.width, camera.height, (name,))
+    memory.views.append(SourceView(named, number, generated, np.zeros((0, 0), np.float32)))
+
+
+def exported(folder):
+    """The model's poses by name, and the lines of generated.txt by name."""
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    poses = {i.name: np.vstack([i.cam_from_world().matrix(), [0, 0, 0, 1]]) for i in
+             model.images.values()}  # fmt: skip
+    lines = (folder / "generated.txt").read_text().splitlines()[1:]
+    return poses, dict([*line.split("\t"), ""][:2] for line in lines)
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_two_observed_cameras_of_one_name_are_refused(scene, tmp_path, kind):
+    memory = fused(scene, [0, 2])
+    add_view(memory, memory.views[1].camera, "view_0.png", number=1, generated=False)
+    memory.save(tmp_path / "memory.npz")
+    with pytest.raises(ProjectError, match="two different observed cameras"):
+        run(tmp_path / "memory.npz", "--format", kind, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_generated_views_give_way_to_names_that_are_taken(scene, tmp_path):
+    camera = [view.camera for view in scene]
+    memory = fused(scene, [0, 2])
+    for number, row, name in (
+        (2, 1, "view_0.png"),  # another camera than the observed one
+        (2, 3, "VIEW_2.png"),  # the same file where case is ignored
+        (2, 4, "generated/view_0.png"),  # the name that the first one would get
+        (2, 5, "own.png"),
+        (3, 1, "view_0.png"),  # the first one's camera again
+        (3, 4, "view_0.png"),
+    ):
+        add_view(memory, camera[row], name, number=number, generated=True)
+    run_folder = tmp_path / "run"
+    for number, stem in ((2, "view_0"), (2, "own"), (3, "view_0")):
+        picture = run_folder / f"round_{number:03d}" / f"generated_{stem}.png"
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (96, 72)).save(picture)
+    memory.save(run_folder / "memory.npz")
+    expected = {
+        "view_0.png": 0,
+        "view_2.png": 2,
+        "generated_2/view_0.png": 1,
+        "generated/VIEW_2.png": 3,
+        "generated/view_0.png": 4,
+        "own.png": 5,
+        "generated_3/view_0.png": 4,
+    }
+    run(run_folder, "--format", "colmap", "--out", tmp_path / "out")
+    poses, generated = exported(tmp_path / "out")
+    assert set(poses) == set(expected)
+    for name, row in expected.items():
+        np.testing.assert_allclose(poses[name], camera[row].cam_from_world[0], atol=1e-12)
+    assert set(generated) == set(expected) - {"view_0.png", "view_2.png"}
+    pictures = {name: path.removeprefix(f"{run_folder}/") for name, path in generated.items()}
+    assert pictures == {
+        "generated_2/view_0.png": "round_003/generated_view_0.png",
+        "generated/VIEW_2.png": "",
+        "generated/view_0.png": "",
+        "own.png": "round_002/generated_own.png",
+        "generated_3/view_0.png": "round_003/generated_view_0.png",
+    }
+
+
+def test_new_names_stand_in_transforms_too(scene, tmp_path):
+    memory = fused(scene, [0, 2])
+    add_view(memory, scene.views[3].camera, "view_0.png", number=2, generated=True)
+    memory.save(tmp_path / "memory.npz")
+    out = tmp_path / "out"
+    run(tmp_path / "memory.npz", "--format", "transforms", "--out", out)
+    frames = json.loads((out / "transforms.json").read_text())["frames"]
+    paths = [frame["file_path"] for frame in frames]
+    assert paths == ["images/view_0.png", "images/view_2.png", "images/generated/view_0.png"]
+    assert (out / "generated.txt").read_text().splitlines()[1:] == ["generated/view_0.png"]
+
+
+def test_renamed_views_are_counted(scene, tmp_path, capsys):
+    memory = fused(scene, [0, 2])
+    add_view(memory, scene.views[3].camera, "view_0.png", number=2, generated=True)
+    add_view(memory, scene.views[4].camera, "own.png", number=2, generated=True)
+    memory.save(tmp_path / "memory.npz")
+    for kind in ("colmap", "transforms"):
+        words = (tmp_path / "memory.npz", "--format", kind, "--out", tmp_path / kind)
+        export.run(parsed(*words), Console())
+        assert "4 views (2 generated, 1 of them renamed" in capsys.readouterr().out
+
+
+def test_track_elements_follow_the_renamed_views(scene, tmp_path):
+    memory = fused(scene, [0, 2])
+    other = scene.views[5]
+    frame = other.load()
+    namesake = Cameras(
+        other.camera.K, other.camera.cam_from_world, other.camera.width, other.camera.height,
+        ("view_0.png",),
+    )  # fmt: skip
+    memory.fuse(back_project(frame.rgb, frame.depth, namesake), round=2, generated=True)
+    count = int(memory.generated.sum())
+    assert count
+    memory.save(tmp_path / "memory.npz")
+    run(tmp_path / "memory.npz", "--format", "colmap", "--out", tmp_path / "out")
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    (image,) = (i for i in model.images.values() if i.name == "generated/view_0.png")
+    errors = [
+        np.linalg.norm(image.project_point(model.points3D[p.point3D_id].xyz) - p.xy)
+        for p in image.points2D
+        if p.has_point3D()
+    ]
+    # Points that this view alone saw lie exactly where it saw them.
+    assert 0 < len(errors) <= count
+    assert np.median(errors) < 1e-6
+
+
+def test_cameras_far_from_the_origin_are_told_apart(scene, tmp_path):
+    """Five million units out, the camera next door is within a relative tolerance of the pose."""
+    memory = SpatialMemory(VOXEL, origin=ORIGIN)
+    shift = np.eye(4)
+    shift[:3, 3] = -np.array(ORIGIN)
+    far = [
+        Cameras(view.camera.K, view.camera.cam_from_world @ shift, view.camera.width,
+                view.camera.height, ("a.png",))
+        for view in scene
+    ]  # fmt: skip
+    beside = far[0].cam_from_world.copy()
+    beside[0, 0, 3] += 0.5
+    near = Cameras(far[0].K, beside, far[0].width, far[0].height, ("a.png",))
+    frame = scene.views[0].load()
+    memory.fuse(back_project(frame.rgb, frame.depth, far[0], frame=memory.frame), round=0)
+    add_view(memory, near, "a.png", number=1, generated=True)
+    memory.save(tmp_path / "memory.npz")
+    run(tmp_path / "memory.npz", "--format", "colmap", "--out", tmp_path / "out")
+    poses, _ = exported(tmp_path / "out")
+    assert set(poses) == {"a.png", "generated/a.png"}
+
+
+def test_a_view_observed_and_generated_shows_its_photograph(scene, saved, tmp_path):
+    memory = fused(scene, [0, 2])
+    add_view(memory, scene.views[0].camera, "view_0.png", number=2, generated=True)
+    memory.save(saved / "memory.npz")
+    Image.new("RGB", (96, 72)).save(saved / "round_002" / "generated_view_0.png")
+    run(saved, "--format", "transforms", "--out", tmp_path / "out")
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == ["images/view_0.png", "images/view_2.png"]
+    assert len((tmp_path / "out" / "generated.txt").read_text().splitlines()) == 1
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_pictures_are_named_from_anywhere(saved, tmp_path, monkeypatch, kind):
+    (saved / "round_002").mkdir(exist_ok=True)
+    picture = saved / "round_002" / "generated_view_4.png"
+    Image.new("RGB", (96, 72)).save(picture)
+    monkeypatch.chdir(tmp_path)
+    run(saved.relative_to(tmp_path), "--format", kind, "--out", "out")
+    line = (tmp_path / "out" / "generated.txt").read_text().splitlines()[1]
+    assert line.split("\t") == ["view_4.png", str(picture.resolve())]
+
+
+@pytest.mark.parametrize("stem", ["x/../../../secret", "link"])
+def test_no_picture_outside_the_run_is_named(saved, tmp_path, stem):
+    folder = saved / "round_002"
+    (folder / "generated_x").mkdir(parents=True)
+    Image.new("RGB", (96, 72)).save(tmp_path / "secret.png")
+    (folder / "generated_link.png").symlink_to(tmp_path / "secret.png")
+    report = {"views": [{"name": "view_4.png", "stem": stem}]}
+    (folder / "report.json").write_text(json.dumps(report))
+    with pytest.raises(ProjectError, match="lies outside"):
+        run(saved, "--format", "transforms", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def put(path, text="mine"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+FOREIGN = [
+    ("colmap", "", ["sparse/0/cameras.bin"]),
+    ("colmap", "", ["sparse/0/cameras.txt"]),
+    ("colmap", "", ["sparse/cameras.bin"]),
+    ("colmap", "", ["cameras.bin", "images.bin"]),
+    ("colmap", "", ["cameras.txt"]),
+    ("transforms", "", ["transforms.json"]),
+    ("transforms", "transforms.json", ["transforms.json"]),
+    ("transforms", "mine.json", ["mine.json"]),
+    ("transforms", "mine.JSON", ["mine.JSON"]),
+]
+
+
+@pytest.mark.parametrize(("kind", "out", "files"), FOREIGN)
+@pytest.mark.parametrize("more", [[], ["runs/old/generated.txt"], ["generated.txt"]])
+def test_models_of_others_are_kept(saved, tmp_path, kind, out, files, more):
+    folder = tmp_path / "project"
+    for name in [*files, *more]:
+        put(folder / name)
+    before = contents(folder)
+    with pytest.raises(OptionError, match=r"was not written by gvtools export") as error:
+        run(saved, "--format", kind, "--out", folder / out)
+    assert str(folder / files[0].split("/")[0]) in str(error.value)
+    assert "\n" not in str(error.value)
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize(("kind", "out"), [("colmap", ""), ("transforms", "a.json")])
+def test_a_users_own_list_is_kept(saved, tmp_path, kind, out):
+    put(tmp_path / "out" / "generated.txt")
+    with pytest.raises(OptionError, match=r"generated\.txt: .*not written by gvtools export"):
+        run(saved, "--format", kind, "--out", tmp_path / "out" / out)
+    assert list(contents(tmp_path / "out").values()) == [b"mine"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "out"),
+    [("colmap", ""), ("transforms", ""), ("transforms", "a.json"), ("transforms", "a.JSON")],
+)
+def test_an_export_replaces_an_earlier_one(scene, saved, tmp_path, kind, out):
+    folder = tmp_path / "out"
+    run(saved, "--format", kind, "--out", folder / out)
+    before = contents(folder)
+    run(saved, "--format", kind, "--out", folder / out)
+    assert contents(folder) == before
+    fused(scene, [0]).save(saved / "memory.npz")
+    run(saved, "--format", kind, "--out", folder / out)
+    assert set(contents(folder)) == set(before)
+    assert "view_4.png" not in (folder / "generated.txt").read_text()
+
+
+def test_several_exports_share_a_folder(saved, tmp_path):
+    for _ in range(2):
+        run(saved, "--format", "colmap", "--out", tmp_path / "out")
+        run(saved, "--format", "transforms", "--out", tmp_path / "out")
+        run(saved, "--format", "transforms", "--out", tmp_path / "out" / "other.json")
+
+
+@pytest.mark.parametrize(
+    ("first", "kind", "out"),
+    [
+        ("sparse/0/cameras.bin", "transforms", ""),
+        ("transforms.json", "transforms", "other.json"),
+        ("transforms.json", "colmap", ""),
+    ],
+)
+def test_an_export_beside_a_users_model_does_not_make_it_ours(saved, tmp_path, first, kind, out):
+    folder = tmp_path / "project"
+    put(folder / first)
+    run(saved, "--format", kind, "--out", folder / out)
+    before = contents(folder)
+    other = "colmap" if first.startswith("sparse") else "transforms"
+    with pytest.raises(OptionError, match=r"not written by gvtools export"):
+        run(saved, "--format", other, "--out", folder)
+    assert contents(folder) == before
+    (folder / first).unlink()
+    run(saved, "--format", kind, "--out", folder / out)
+
+
+def test_what_was_removed_is_no_longer_ours(saved, tmp_path):
+    folder = tmp_path / "out"
+    run(saved, "--format", "colmap", "--out", folder)
+    run(saved, "--format", "transforms", "--out", folder)
+    (folder / "transforms.json").unlink()
+    run(saved, "--format", "colmap", "--out", folder)
+    put(folder / "transforms.json")
+    with pytest.raises(OptionError, match=r"not written by gvtools export"):
+        run(saved, "--format", "transforms", "--out", folder)
+
+
+def test_empty_folders_hold_no_model(saved, tmp_path):
+    (tmp_path / "out" / "sparse" / "0").mkdir(parents=True)
+    run(saved, "--format", "colmap", "--out", tmp_path / "out")
+    assert pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0").num_reg_images() == 3

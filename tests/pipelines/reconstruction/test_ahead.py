@@ -1,0 +1,39 @@
+"""Reading ahead keeps the order, stays one ahead, and raises an error in its place."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from pipelines.reconstruction.prefetch import ahead
+
+
+def test_items_come_in_order_with_the_next_one_begun():
+    begun: list[int] = []
+    second = threading.Event()
+
+    def load(item: int) -> int:
+        begun.append(item)
+        if item == 1:
+            second.set()
+        return 10 * item
+
+    items = ahead(load, range(4))
+    assert next(items) == 0
+    # Nobody has asked for it yet.
+    assert second.wait(5) and 3 not in begun
+    assert list(items) == [10, 20, 30]
+    assert list(ahead(load, [])) == []
+
+
+def test_an_error_comes_where_its_item_would_have():
+    def load(item: int) -> int:
+        if item == 1:
+            raise ValueError("broken")
+        return item
+
+    items = ahead(load, range(3))
+    assert next(items) == 0
+    with pytest.raises(ValueError, match="broken"):
+        next(items)

@@ -1,0 +1,218 @@
+"""Whole runs that must agree: again, the world moved, views listed otherwise, a fusion in parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from tiny_scan import write_scan
+
+from gvtools.cameras import Cameras
+from gvtools.memory.back_projection import back_project
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.scenes.project import open_project
+from gvtools.scenes.scene import Frame, Scene, View
+from pipelines.commands.reconstruct import reconstruct
+from pipelines.config import RunConfig, with_settings
+from pipelines.console import Console
+
+CONTEXT = [f"frame-{i:06d}.color.png" for i in (0, 2, 4, 6)]
+TARGETS = [f"frame-{i:06d}.color.png" for i in (1, 3, 5, 7)]
+SAME = 60.0
+
+
+@dataclass(frozen=True)
+class World:
+    """new = scale rotation old + shift."""
+
+    scale: float = 1.0
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def points(self, old: np.ndarray) -> np.ndarray:
+        turn = Rotation.from_rotvec(self.rotation).as_matrix()
+        return np.asarray(self.scale * old @ turn.T + np.array(self.shift))
+
+    def view(self, view: View) -> View:
+        pose = view.camera.world_from_cam.copy()
+        pose[0, :3, :3] = Rotation.from_rotvec(self.rotation).as_matrix() @ pose[0, :3, :3]
+        pose[0, :3, 3] = self.points(view.camera.world_from_cam[0, :3, 3])
+        known = view.camera
+        camera = Cameras(
+            known.K,
+            np.linalg.inv(pose).astype(np.float64),
+            known.width,
+            known.height,
+            names=known.names,
+        )
+
+        def load() -> Frame:
+            frame = view.load()
+            assert frame.depth is not None
+            return replace(frame, depth=(frame.depth * self.scale).astype(np.float32))
+
+        return replace(view, camera=camera, load=load)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a run left."""
+
+    memory: SpatialMemory
+    pictures: dict[str, np.ndarray]
+    bytes: bytes
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Scene:
+    return open_project(write_scan(tmp_path_factory.mktemp("scan"), views=8))
+
+
+@pytest.fixture(scope="module")
+def plain(scene, tmp_path_factory) -> Run:
+    return run(scene, tmp_path_factory.mktemp("plain") / "run")
+
+
+def run(scene: Scene, out: Path, *more: str, targets: Sequence[str] = TARGETS) -> Run:
+    texts = [f"context={','.join(CONTEXT)}", f"targets={','.join(targets)}", "views_per_round=2"]
+    config = with_settings(RunConfig(), [*texts, *more])
+    reconstruct(scene, config, out, console=Console(quiet=True))
+    pictures = {
+        path.name: np.asarray(Image.open(path))
+        for path in out.glob("round_*/*.png")
+        if path.name.startswith(("guidance_", "generated_", "after_"))
+    }
+    stored = out / "memory.npz"
+    return Run(SpatialMemory.load(stored), pictures, stored.read_bytes())
+
+
+def worst(one: Run, two: Run) -> float:
+    """PSNR of the pictures that differ most, dB; infinite where none does."""
+    assert one.pictures.keys() == two.pictures.keys() and len(one.pictures) == 3 * len(TARGETS)
+    error = max(
+        float(np.mean((picture.astype(float) - two.pictures[name]) ** 2))
+        for name, picture in one.pictures.items()
+    )
+    return 10 * np.log10(255**2 / error) if error else np.inf
+
+
+def test_the_same_run_again_is_the_same_to_the_last_bit(scene, plain, tmp_path):
+    again = run(scene, tmp_path / "run")
+    assert again.bytes == plain.bytes and worst(plain, again) == np.inf
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        World(scale=2.0),
+        World(scale=0.37),
+        World(scale=1e-4),
+        World(shift=(0.1234, 5.4321, -2.222)),
+        World(shift=(1e4, -3e4, 5e3)),
+        World(rotation=(0.0, 0.0, np.pi / 2)),
+        World(rotation=(0.3, -1.1, 0.6)),
+        World(rotation=(0.0, 3.1, 0.2)),
+        World(scale=41.0, rotation=(-0.7, 0.2, 2.0), shift=(800.0, 0.3, -7000.0)),
+    ],
+    ids=str,
+)
+def test_a_moved_world_gives_the_same_memory_moved_and_the_same_pictures(
+    scene, plain, tmp_path, world
+):
+    moved = replace(scene, views=tuple(world.view(view) for view in scene.views))
+    found = run(moved, tmp_path / "run")
+    assert worst(plain, found) >= SAME
+    assert len(found.memory) == pytest.approx(len(plain.memory), rel=1e-3)
+    assert found.memory.voxels == pytest.approx(plain.memory.voxels, rel=1e-3)
+    low, middle, high = (
+        np.percentile(world.points(plain.memory.positions), share, axis=0) for share in (1, 50, 99)
+    )
+    edge = found.memory.voxel
+    for share, wanted in ((1, low), (50, middle), (99, high)):
+        there = np.percentile(found.memory.positions, share, axis=0)
+        np.testing.assert_allclose(there, wanted, atol=0.05 * edge)
+
+
+@pytest.fixture(scope="module")
+def busy(tmp_path_factory) -> Scene:
+    """The scan with colours of a pixel's size, and more views, so that its edge is measured.
+
+    Its wall must not lie on the borders of voxels, where rounding decides.
+    """
+    scene = open_project(write_scan(tmp_path_factory.mktemp("busy"), views=12))
+
+    def painted(row: int, view: View) -> View:
+        noise = np.random.default_rng(row).integers(-40, 40, view.load().rgb.shape)
+
+        def load() -> Frame:
+            frame = view.load()
+            return replace(frame, rgb=np.clip(frame.rgb + noise, 0, 255).astype(np.uint8))
+
+        return replace(view, load=load)
+
+    return replace(scene, views=tuple(painted(i, view) for i, view in enumerate(scene.views)))
+
+
+@pytest.mark.parametrize(
+    "world",
+    [World(scale=2.0), World(scale=0.37), World(scale=41.0, rotation=(-0.7, 0.2, 2.0))],
+    ids=str,
+)
+@pytest.mark.parametrize("more", ["fusion.voxel_scale=1.07", "fusion.voxel_scale=2.37"])
+def test_so_does_one_whose_edge_is_measured_and_whose_pixels_are_joined(
+    busy, tmp_path, world, more
+):
+    names = busy.names
+    context = f"context={','.join([*names[::2], names[1]])}"
+    targets = [names[3], names[5], names[7], names[9]]
+    still = run(busy, tmp_path / "still", context, more, targets=targets)
+    moved = replace(busy, views=tuple(world.view(view) for view in busy.views))
+    found = run(moved, tmp_path / "moved", context, more, targets=targets)
+    assert found.memory.voxel == pytest.approx(world.scale * still.memory.voxel, rel=1e-6)
+    assert worst(still, found) >= SAME
+    assert len(found.memory) == pytest.approx(len(still.memory), rel=1e-3)
+
+
+def test_views_listed_in_another_order_give_the_same_run(scene, plain, tmp_path):
+    order = np.random.default_rng(0).permutation(len(scene.views))
+    listed = replace(scene, views=tuple(scene.views[i] for i in order))
+    found = run(listed, tmp_path / "run")
+    assert found.bytes == plain.bytes and worst(plain, found) == np.inf
+
+
+def test_targets_in_another_order_see_the_same_context(scene, plain, tmp_path):
+    """Without completions, which one target hands to the next, order is all that changes."""
+    one = run(scene, tmp_path / "one", "completer=none")
+    two = run(scene, tmp_path / "two", "completer=none", targets=TARGETS[::-1])
+    assert worst(one, two) == np.inf and one.bytes == two.bytes
+
+
+def test_a_fusion_cut_in_two_is_the_whole_one(scene, plain, tmp_path):
+    """Halves of a picture in turn, saved and loaded between."""
+    frame = plain.memory.frame
+    whole, halves = (
+        SpatialMemory(plain.memory.voxel, origin=frame.origin, axes=frame.axes) for _ in range(2)
+    )
+    for name in CONTEXT:
+        view = scene[name]
+        shown = view.load()
+        assert shown.depth is not None
+        whole.fuse(back_project(shown.rgb, shown.depth, view.camera, frame=frame), round=0)
+        for half in (np.s_[:, :48], np.s_[:, 48:]):
+            mask = np.zeros(shown.depth.shape, np.bool_)
+            mask[half] = True
+            points = back_project(shown.rgb, shown.depth, view.camera, frame=frame, mask=mask)
+            halves.fuse(points, round=0)
+            halves.save(tmp_path / "memory.npz")
+            halves = SpatialMemory.load(tmp_path / "memory.npz")
+    assert halves.voxels == whole.voxels and len(halves) == len(whole)
+    for name in TARGETS:
+        one, two = whole.project(scene[name].camera), halves.project(scene[name].camera)
+        np.testing.assert_array_equal(one.valid, two.valid)
+        error = float(np.mean((one.rgb - two.rgb)[one.valid] ** 2))
+        assert error == 0 or -10 * np.log10(error) > 100

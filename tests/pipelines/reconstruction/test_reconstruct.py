@@ -1,0 +1,239 @@
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scan import write_scan
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.scenes.project import open_project
+from pipelines.commands.reconstruct import reconstruct
+from pipelines.config import RunConfig, with_settings
+from pipelines.console import Console
+
+SETTINGS = ("context=first:2", "targets=range:2-5", "views_per_round=2", "completer=inpaint")
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    return write_scan(tmp_path_factory.mktemp("scan"))
+
+
+@pytest.fixture(scope="module")
+def whole(scan, tmp_path_factory):
+    """An uninterrupted run."""
+    return run(scan, tmp_path_factory.mktemp("runs") / "whole")
+
+
+def run(scan: Path, out: Path, *settings: str, resume: bool = False, dry_run: bool = False) -> Path:
+    config = with_settings(RunConfig(), (*SETTINGS, *settings))
+    return reconstruct(
+        open_project(scan), config, out, console=Console(quiet=True), resume=resume, dry_run=dry_run
+    )
+
+
+def results(out: Path) -> dict[str, bytes]:
+    """Every file of a run whose bytes an interruption may not change."""
+    timed = ("report.json", "rounds.jsonl", "growth.png", "report.html")
+    return {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.is_file() and path.name not in timed
+    }
+
+
+def untimed(out: Path) -> list[dict]:
+    rounds = [json.loads(line) for line in (out / "rounds.jsonl").read_text().splitlines()]
+    for entry in rounds:
+        entry.pop("seconds")
+    return rounds
+
+
+def test_the_memory_grows_round_by_round(whole):
+    rounds = [json.loads(line) for line in (whole / "rounds.jsonl").read_text().splitlines()]
+    assert [entry["round"] for entry in rounds] == [0, 1, 2]
+    assert rounds[0]["generated"] == 0
+    assert rounds[0]["observed"] == rounds[1]["observed"] == rounds[2]["observed"]
+    assert rounds[2]["generated"] > rounds[1]["generated"] > 0
+    for entry in rounds[1:]:
+        assert entry["coverage_after"] > entry["coverage_before"]
+        assert set(entry["seconds"]) >= {"depth", "fuse", "project", "complete", "align"}
+    memory = SpatialMemory.load(whole / "memory.npz")
+    assert len(memory) == rounds[-1]["points"]
+    assert memory.voxels == rounds[-1]["voxels"]
+    assert memory.nbytes == rounds[-1]["bytes"]
+
+
+def test_the_figures_agree_with_the_scene(whole):
+    metrics = json.loads((whole / "metrics.json").read_text())
+    # The scene is smooth and its depth is rounded to millimetres.
+    assert metrics["depth_rel_valid"] < 1e-3
+    assert metrics["psnr_valid"] > 24
+    assert metrics["lpips"] is None
+    assert metrics["coverage_after"] > metrics["coverage"]
+
+
+def test_forgetting_the_last_round_gives_the_memory_before_it(whole, scan, tmp_path):
+    shorter = run(scan, tmp_path / "shorter", "rounds=1")
+    memory = SpatialMemory.load(whole / "memory.npz")
+    memory.forget(round=2)
+    memory.save(tmp_path / "forgotten.npz")
+    assert (tmp_path / "forgotten.npz").read_bytes() == (shorter / "memory.npz").read_bytes()
+
+
+def test_two_runs_give_the_same_bytes(whole, scan, tmp_path):
+    again = run(scan, tmp_path / "again")
+    assert results(again).keys() == results(whole).keys()
+    for name, data in results(whole).items():
+        assert results(again)[name] == data, name
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing catches it."""
+
+
+@pytest.mark.parametrize("moment", range(0, 40, 3))
+def test_resuming_after_a_stop_gives_the_bytes_of_an_uninterrupted_run(
+    whole, scan, tmp_path, monkeypatch, moment
+):
+    """Stop at every third of the moments at which a file or folder takes its final name."""
+    out = tmp_path / "run"
+    calls = 0
+    real_replace, real_rename = os.replace, Path.replace
+
+    def count() -> None:
+        nonlocal calls
+        if calls == moment:
+            raise Killed
+        calls += 1
+
+    def replace(*args, **kwargs):
+        count()
+        return real_replace(*args, **kwargs)
+
+    def rename(self, target):
+        count()
+        return real_rename(self, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr(Path, "replace", rename)
+    with contextlib.suppress(Killed):
+        run(scan, out)
+    monkeypatch.undo()
+    run(scan, out, resume=True)
+    assert results(out) == results(whole)
+    assert untimed(out) == untimed(whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [2.0, 3.0, 3.5, 4.0, 4.5, 5.0, 6.0])
+def test_resuming_after_a_kill_signal(whole, scan, tmp_path, delay):
+    out = tmp_path / "run"
+    options = [f"--set={text}" for text in SETTINGS]
+    command = [sys.executable, "-m", "pipelines.cli", "reconstruct", str(scan), "--out", str(out)]
+    process = subprocess.Popen([*command, *options, "--quiet"])
+    time.sleep(delay)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    again = [*command, *options, "--quiet", "--resume"]
+    assert subprocess.run(again, check=False).returncode == 0
+    assert results(out) == results(whole)
+
+
+def test_resuming_a_finished_run_changes_nothing(whole):
+    before = results(whole)
+    scan = Path(json.loads((whole / "run.json").read_text())["project"])
+    run(scan, whole, resume=True)
+    assert results(whole) == before
+
+
+def test_a_folder_of_another_run_is_refused_untouched(whole, scan):
+    before = results(whole)
+    with pytest.raises(ProjectError, match="another run"):
+        run(scan, whole, "seed=5", resume=True)
+    with pytest.raises(ProjectError, match="--resume"):
+        run(scan, whole)
+    assert results(whole) == before
+
+
+def test_a_folder_that_is_no_run_is_refused_untouched(scan, tmp_path):
+    (tmp_path / "letters.txt").write_text("mine")
+    with pytest.raises(ProjectError, match=r"no run\.json"):
+        run(scan, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["letters.txt"]
+
+
+def test_a_dry_run_writes_nothing(scan, tmp_path):
+    run(scan, tmp_path / "dry", dry_run=True)
+    assert not (tmp_path / "dry").exists()
+
+
+def test_a_disk_that_fills_up_leaves_the_rounds_before(whole, scan, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    save = SpatialMemory.save
+
+    def full(self, path):
+        if "round_002" in str(path):
+            Path(path).write_bytes(b"half")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        save(self, path)
+
+    monkeypatch.setattr(SpatialMemory, "save", full)
+    with pytest.raises(ProjectError, match=r"No space left.*--resume"):
+        run(scan, out)
+    monkeypatch.undo()
+    assert len((out / "rounds.jsonl").read_text().splitlines()) == 2
+    assert not list(out.glob(".round_*"))
+    assert len(SpatialMemory.load(out / "round_001" / "memory.npz")) > 0
+    run(scan, out, resume=True)
+    assert results(out) == results(whole)
+
+
+@pytest.mark.parametrize(
+    ("setting", "error", "text"),
+    [
+        ("completer=inpant", OptionError, "inpaint"),
+        ("depth=colmap", OptionError, "rgbd"),
+        ("depth=guess", OptionError, "sensor"),
+        ("targets=first:1", OptionError, "allow-overlap"),
+        ("views_per_round=0", OptionError, "at least 1"),
+        ("device=tpu", OptionError, "cuda"),
+        ("completer.sweps=1", OptionError, "sweeps"),
+        ("voxel=-1", OptionError, "more than 0"),
+        ("seed=-1", OptionError, "at least 0"),
+        ("memory.observations_per_voxel=0", OptionError, "at least 1"),
+        ("memory.weight_cap=0", OptionError, "at least 1e-20"),
+        ("memory.same_direction=-2", OptionError, "at least 0 and at most 180"),
+        ("back_projection.edge=-5", OptionError, "more than 0"),
+        ("back_projection.grazing=2", OptionError, "less than 1"),
+        ("fusion.voxel_percentile=300", OptionError, "at most 100"),
+        ("fusion.voxel_scale=0", OptionError, "more than 0"),
+        ("completer.sweeps=-3", OptionError, "at least 0"),
+        ("completer.confidence_reach=0", OptionError, "more than 0"),
+        ("targets=every", OptionError, "every:2"),
+    ],
+)
+def test_wrong_options_leave_no_folder(scan, tmp_path, setting, error, text):
+    with pytest.raises(error, match=text):
+        run(scan, tmp_path / "run", setting)
+    assert not (tmp_path / "run").exists()
+
+
+def test_no_context_depth_is_said(scan, tmp_path):
+    bare = write_scan(tmp_path / "bare")
+    for path in bare.glob("*.depth.png"):
+        from PIL import Image
+
+        Image.fromarray(np.zeros((72, 96), np.uint16)).save(path)
+    with pytest.raises(ProjectError, match="depth"):
+        run(bare, tmp_path / "run")

@@ -1,0 +1,77 @@
+"""The next round's targets are projected beside this one's: nothing changes but the time."""
+
+from __future__ import annotations
+
+import time
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from memory_scenes import camera, random_memory
+
+from gvtools.cameras import concatenate
+from gvtools.kernels import run_beside_each_other
+from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.memory.spatial_memory import SpatialMemory
+from pipelines.config import RunConfig
+from pipelines.reconstruction.plan import Plan
+from pipelines.reconstruction.round_targets import RoundTargets
+
+
+@pytest.fixture
+def memory() -> SpatialMemory:
+    memory = random_memory(5)
+    # With it, numba chooses how kernels run.
+    memory.project(camera())
+    if not run_beside_each_other():
+        pytest.skip("no OpenMP and no TBB: rounds are not looked at ahead")
+    return memory
+
+
+def plan(*rounds: int) -> Plan:
+    """Of so many targets a round."""
+    cuts = np.cumsum([0, *rounds])
+    at = [camera(center=(0.1 * i, 0, 0), name=f"t{i}") for i in range(int(cuts[-1]))]
+    return cast(
+        Plan,
+        SimpleNamespace(
+            config=RunConfig(),
+            schedule=tuple(tuple(range(a, b)) for a, b in pairwise(cuts)),
+            targets=SimpleNamespace(cameras=concatenate(at)),
+        ),
+    )
+
+
+def test_rounds_are_the_plans_whether_looked_at_ahead_or_not(memory):
+    with RoundTargets(plan(1, 2), memory) as targets:
+        assert [t.camera.names for t in targets.of(1)] == [("t0",)]
+        targets.look_ahead(2)
+        ahead = targets.of(2)
+        again = targets.of(2)
+        targets.look_ahead(3)
+    assert [t.camera.names for t in ahead] == [t.camera.names for t in again] == [("t1",), ("t2",)]
+    for one, two in zip(ahead, again, strict=True):
+        np.testing.assert_array_equal(one.guidance().rgb, two.guidance().rgb)
+        np.testing.assert_array_equal(one.guidance().depth, two.guidance().depth)
+
+
+def test_an_error_comes_where_the_round_begins(memory, monkeypatch):
+    def broken(self: FollowedCamera, snapshot: Any) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(FollowedCamera, "look", broken)
+    with RoundTargets(plan(1, 1), memory) as targets:
+        targets.look_ahead(2)
+        with pytest.raises(ZeroDivisionError):
+            targets.of(2)
+
+
+def test_a_run_that_is_stopped_waits_for_one_target_at_most(memory, monkeypatch):
+    monkeypatch.setattr(FollowedCamera, "look", lambda self, snapshot: time.sleep(0.5))
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), RoundTargets(plan(1, 20), memory) as targets:
+        targets.look_ahead(2)
+        raise KeyboardInterrupt
+    assert time.monotonic() - start < 5

@@ -1,0 +1,117 @@
+"""A round's targets: completed together where wanted, projected no oftener than needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from gvtools.cameras import Cameras
+from gvtools.completers.base import Completion
+from gvtools.errors import ShapeError
+from gvtools.guidance import Guidance, together
+from gvtools.memory.back_projection import back_project
+from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.memory.spatial_memory import SpatialMemory
+from pipelines.config import RunConfig
+from pipelines.reconstruction.rounds import Clock, complete_targets
+
+
+def camera(name: str, size: tuple[int, int], x: float = 0.0) -> Cameras:
+    height, width = size
+    pose = np.eye(4)
+    pose[0, 3] = -x
+    K = np.array([[40.0, 0, width / 2], [0, 40.0, height / 2], [0, 0, 1]])
+    return Cameras(K[None], pose[None], np.array([width]), np.array([height]), names=(name,))
+
+
+@dataclass
+class Recorder:
+    """Fills holes with one grey and depth 2, or leaves them."""
+
+    joint: bool
+    fill: bool = True
+    name: str = "recorder"
+    batches: list[tuple[str, ...]] = field(default_factory=list)
+
+    def complete(self, context, guidance: Guidance, *, seed: int = 0) -> Completion:
+        self.batches.append(guidance.cameras.names)
+        hole = ~guidance.valid & self.fill
+        rgb = np.where(hole[..., None], np.float32(0.5), guidance.rgb)
+        depth = np.where(hole, np.float32(2), guidance.depth)
+        confidence = np.where(hole, np.float32(0.5), np.minimum(guidance.confidence, 1))
+        return Completion(rgb, depth, confidence.astype(np.float32), support=("own",) * len(rgb))
+
+
+@pytest.fixture
+def memory() -> SpatialMemory:
+    out = SpatialMemory(0.02)
+    seen = camera("seen", (24, 32))
+    rgb = np.full((24, 32, 3), 200, np.uint8)
+    out.fuse(back_project(rgb, np.full((24, 32), 2, np.float32), seen, frame=out.frame), round=0)
+    return out
+
+
+def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras]):
+    calls: list[str] = []
+    project = memory.project
+
+    def counted(cameras, **options):
+        calls.append(cameras.names[0])
+        return project(cameras, **options)
+
+    followed = [FollowedCamera(memory, target, reuse=False) for target in targets]
+    for target in followed:
+        target.guidance()
+    memory.project = counted  # type: ignore[method-assign]
+    results, total = complete_targets(
+        followed,
+        1,
+        memory=memory,
+        completer=completer,
+        context=(),
+        config=RunConfig(),
+        clock=Clock(),
+        progress=lambda items, _: items,
+    )
+    return results, total, calls
+
+
+def test_targets_of_different_sizes_are_completed_together_by_size(memory):
+    sizes = [(24, 32), (32, 24), (24, 32), (32, 24)]
+    targets = [camera(f"t{i}", size, x=0.3 * i) for i, size in enumerate(sizes)]
+    completer = Recorder(joint=True)
+    results, total, calls = complete(memory, completer, targets)
+    assert completer.batches == [("t0", "t2"), ("t1", "t3")] and not calls
+    assert [r.guidance.cameras.names[0] for r in results] == ["t0", "t1", "t2", "t3"]
+    for result, size in zip(results, sizes, strict=True):
+        assert result.completion.depth.shape == (1, *size)
+        assert (result.completion.depth > 0).all()
+    assert total.added > 0
+
+
+def test_a_later_target_sees_what_an_earlier_one_added(memory):
+    targets = [camera("t0", (24, 32), x=0.4), camera("t1", (24, 32), x=0.4)]
+    results, _, calls = complete(memory, Recorder(joint=False), targets)
+    assert calls == ["t1"]
+    assert results[1].guidance.generated.any() and not results[0].guidance.generated.any()
+
+
+def test_nothing_is_projected_again_while_nothing_is_fused(memory):
+    targets = [camera(f"t{i}", (24, 32), x=0.4) for i in range(3)]
+    _, total, calls = complete(memory, Recorder(joint=False, fill=False), targets)
+    assert not total.points and not calls
+
+
+def test_guidance_of_one_size_makes_a_batch_and_of_two_sizes_is_refused(memory):
+    views = [memory.project(camera(f"t{i}", (24, 32), x=0.1 * i)) for i in range(2)]
+    both = together(views)
+    assert both.cameras.names == ("t0", "t1")
+    for index, view in enumerate(views):
+        assert np.array_equal(both[index].rgb, view.rgb)
+        assert np.array_equal(both[index].valid, view.valid)
+    with pytest.raises(ShapeError, match="2 picture sizes"):
+        together([*views, memory.project(camera("t2", (32, 24)))])
+    with pytest.raises(ShapeError, match="0 picture sizes"):
+        together([])

@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+import argparse
+import json
+
+import numpy as np
+import pytest
+from scenes_workspace import HEIGHT, WIDTH, sevenscenes, workspace
+
+from gvtools.errors import ProjectError
+from pipelines.commands import check
+from pipelines.console import Console
+
+
+def run(*words: object) -> None:
+    parser = argparse.ArgumentParser()
+    check.add_arguments(parser)
+    check.run(parser.parse_args([str(word) for word in words]), Console())
+
+
+def test_a_good_project_is_ok_and_told_in_lines(tmp_path, capsys):
+    sevenscenes(tmp_path)
+    run(tmp_path)
+    out = capsys.readouterr().out
+    assert "ok: true" in out
+    assert f"{WIDTH}x{HEIGHT} (3 views)" in out
+    assert "info: depth unit: 0.001 m" in out
+
+
+def test_json_holds_the_report(tmp_path):
+    reconstruction = workspace(tmp_path / "project", "PINHOLE")
+    run(tmp_path / "project", "--json", tmp_path / "report.json")
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert data["ok"] is True
+    assert data["views"] == data["views_opened"] == reconstruction.num_reg_images()
+    assert data["sparse_points"] == reconstruction.num_points3D()
+    assert data["depth"] is None
+
+
+def test_a_project_without_depth_is_ok_and_told(tmp_path, capsys):
+    workspace(tmp_path)
+    run(tmp_path)
+    out = capsys.readouterr().out
+    assert "info: none of the 4 views has recorded depth" in out
+    assert "ok: true" in out
+
+
+def test_an_unreadable_picture_is_an_error_after_the_report(tmp_path, capsys):
+    sevenscenes(tmp_path / "project")
+    (tmp_path / "project" / "frame-000001.color.png").write_bytes(b"no picture")
+    with pytest.raises(ProjectError, match=r"not ok: 1 errors, first: .*frame-000001"):
+        run(tmp_path / "project")
+    out = capsys.readouterr().out
+    assert "ok: false" in out
+    assert out.index("error: ") < out.index("info: ")
+    with pytest.raises(ProjectError):
+        run(tmp_path / "project", "--json", tmp_path / "report.json")
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert data["ok"] is False
+    assert data["views_opened"] == 2
+
+
+def test_what_cannot_be_opened_is_in_the_json_too(tmp_path):
+    with pytest.raises(ProjectError, match="no such folder"):
+        run(tmp_path / "absent", "--json", tmp_path / "report.json")
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert data["ok"] is False
+    assert "no such folder" in data["findings"][0]["message"]
+
+
+@pytest.mark.data
+def test_the_kitchen(shared, capsys):
+    run(shared / "data" / "redwood_rgbd5")
+    out = capsys.readouterr().out
+    assert "ok: true" in out
+    assert np.char.count(out, "info: ") >= 1

@@ -1,0 +1,219 @@
+"""Bad input from the command line: one clear line, status 2, nothing lost."""
+
+from __future__ import annotations
+
+import json
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_scan import write_scan
+
+from pipelines.cli import COMMANDS, build_parser, main
+
+RUN = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2", "--quiet")
+
+
+@pytest.fixture
+def scan(tmp_path):
+    return write_scan(tmp_path / "scan")
+
+
+def refused(capsys, *arguments: object) -> str:
+    """The one line with which the command ends, status 2."""
+    try:
+        status = main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        status = int(stop.code or 0)
+    error = capsys.readouterr().err.strip()
+    assert status == 2, error
+    last = error.splitlines()[-1]
+    assert "Traceback" not in error
+    assert last.startswith("gvtools: ")
+    return last
+
+
+def reconstruct(*arguments: object) -> tuple[object, ...]:
+    return ("reconstruct", *arguments, *RUN)
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out.startswith("gvtools ")
+
+
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_every_help_starts_with_two_examples(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert text.count(f"  gvtools {command}") >= 2
+    # The examples are accepted by the parser itself.
+    for line in text.splitlines():
+        if line.startswith(f"  gvtools {command}"):
+            build_parser().parse_args(line.split()[1:])
+
+
+def test_the_commands_start_without_heavy_imports():
+    code = (
+        "import sys, pipelines.cli as c; c.build_parser();"
+        "print([m for m in ('torch', 'open3d', 'pycolmap', 'matplotlib') if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_a_run_and_what_it_leaves(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main([str(a) for a in reconstruct(scan, "--out", out)]) == 0
+    names = {path.name for path in out.iterdir()}
+    assert names >= {"run.json", "rounds.jsonl", "memory.npz", "memory.ply", "growth.png",
+                     "metrics.json", "round_000", "round_001", "round_002"}  # fmt: skip
+    assert (out / "growth.png").read_bytes().startswith(b"\x89PNG")
+    record = json.loads((out / "run.json").read_text())
+    assert record["config"]["voxel"] > 0
+    assert record["versions"]["numpy"] == np.__version__
+    assert capsys.readouterr().out == ""
+
+
+def test_no_such_folder(capsys, tmp_path):
+    line = refused(capsys, *reconstruct(tmp_path / "nowhere", "--out", tmp_path / "run"))
+    assert "nowhere" in line
+
+
+def test_an_empty_folder_says_what_was_looked_for(capsys, tmp_path):
+    (tmp_path / "empty").mkdir()
+    line = refused(capsys, *reconstruct(tmp_path / "empty", "--out", tmp_path / "run"))
+    assert "COLMAP" in line
+    assert "transforms.json" in line
+
+
+def test_an_unreadable_image(capsys, scan, tmp_path):
+    path = scan / "frame-000003.color.png"
+    path.write_bytes(path.read_bytes()[:200])
+    line = refused(capsys, *reconstruct(scan, "--out", tmp_path / "run"))
+    assert path.name in line
+
+
+def test_depth_of_another_size(capsys, scan, tmp_path):
+    Image.fromarray(np.full((50, 50), 1000, np.uint16)).save(scan / "frame-000000.depth.png")
+    line = refused(capsys, *reconstruct(scan, "--out", tmp_path / "run"))
+    assert "frame-000000" in line
+    assert "50" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [(lambda pose: pose * np.nan, "NaN"), (lambda pose: np.diag([2, 2, 2, 1.0]) @ pose, "scale")],
+)
+def test_a_pose_that_is_none(capsys, scan, tmp_path, change, text):
+    path = scan / "frame-000001.pose.txt"
+    np.savetxt(path, change(np.loadtxt(path)))
+    line = refused(capsys, *reconstruct(scan, "--out", tmp_path / "run"))
+    assert "frame-000001" in line
+    assert text in line
+
+
+def test_a_rotation_orthonormal_to_4e_4_is_accepted(scan, tmp_path):
+    path = scan / "frame-000001.pose.txt"
+    pose = np.loadtxt(path)
+    pose[:3, :3] *= 1 + 2e-4
+    np.savetxt(path, pose)
+    assert main([str(a) for a in reconstruct(scan, "--out", tmp_path / "run")]) == 0
+
+
+def test_context_and_targets_that_overlap(capsys, scan, tmp_path):
+    line = refused(
+        capsys, "reconstruct", scan, "--context", "all", "--targets", "first:2",
+        "--out", tmp_path / "run",
+    )  # fmt: skip
+    assert "--allow-overlap" in line
+
+
+def test_an_unknown_option(capsys, scan, tmp_path):
+    line = refused(capsys, *reconstruct(scan, "--out", tmp_path / "run"), "--voxle", "1")
+    assert "--voxle" in line
+
+
+def test_an_unknown_setting_names_the_nearest(capsys, scan, tmp_path):
+    out = tmp_path / "run"
+    line = refused(capsys, *reconstruct(scan, "--out", out), "--set", "splat.bnad=1")
+    assert "splat.band" in line
+    assert not out.exists()
+
+
+def test_an_output_folder_of_another_run_is_left_alone(capsys, scan, tmp_path):
+    out = tmp_path / "run"
+    assert main([str(a) for a in reconstruct(scan, "--out", out)]) == 0
+    memory = (out / "memory.npz").read_bytes()
+    line = refused(capsys, *reconstruct(scan, "--out", out, "--seed", 3, "--resume"))
+    assert "another run" in line
+    assert (out / "memory.npz").read_bytes() == memory
+
+
+def limited(size: int) -> None:
+    """No file of the process may grow beyond ``size`` bytes: the system then fails the write."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+def test_a_disk_that_fills_up(scan, tmp_path):
+    """A real failing write (EFBIG) in the middle of round 1; round 0 stands, resuming works."""
+    whole, out = tmp_path / "whole", tmp_path / "run"
+    assert main([str(a) for a in reconstruct(scan, "--out", whole)]) == 0
+    sizes = [
+        json.loads(line)["bytes"] for line in (whole / "rounds.jsonl").read_text().splitlines()
+    ]
+    assert sizes[0] < sizes[2]
+    last = (whole / "memory.npz").stat().st_size
+    command = [sys.executable, "-m", "pipelines.cli", *map(str, reconstruct(scan, "--out", out))]
+    process = subprocess.run(
+        command, capture_output=True, text=True, check=False,
+        preexec_fn=lambda: limited(last - 2000), cwd=Path(__file__).parents[2],
+    )  # fmt: skip
+    assert process.returncode == 2, process.stderr
+    line = process.stderr.strip().splitlines()[-1]
+    assert line.startswith("gvtools: ")
+    assert "--resume" in line
+    done = [path.name for path in sorted(out.glob("round_*"))]
+    assert "round_000" in done
+    assert "round_002" not in done
+    assert main([str(a) for a in reconstruct(scan, "--out", out, "--resume")]) == 0
+    assert (out / "memory.npz").read_bytes() == (whole / "memory.npz").read_bytes()
+
+
+def test_a_model_without_images_is_refused(capsys, tmp_path):
+    from gvtools.cameras import Cameras
+    from gvtools.scenes.colmap import write_colmap
+
+    K = np.array([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
+    camera = Cameras(K, np.eye(4)[None], np.array([64]), np.array([48]), ("a.png",))
+    write_colmap(tmp_path / "sparse" / "0", camera)
+    line = refused(capsys, *reconstruct(tmp_path, "--out", tmp_path / "run"))
+    assert "a.png" in line or "image" in line
+
+
+def test_a_malformed_text_model_is_refused(capsys, tmp_path):
+    model = tmp_path / "sparse"
+    model.mkdir()
+    (tmp_path / "images").mkdir()
+    (model / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32\n")
+    (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+    (model / "points3D.txt").write_text("")
+    line = refused(capsys, *reconstruct(tmp_path, "--out", tmp_path / "run"))
+    assert "parameters" in line
+
+
+def test_a_debug_run_shows_where(scan, tmp_path):
+    from gvtools.errors import GvError
+
+    shutil.rmtree(scan)
+    with pytest.raises(GvError):
+        main([str(a) for a in reconstruct(scan, "--out", tmp_path / "run", "--debug")])

@@ -1,0 +1,300 @@
+"""``gvtools evaluate`` on real runs of a tiny recording."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from test_cli import refused
+from tiny_scan import write_scan
+
+from gvtools.evaluation.images import psnr
+from gvtools.evaluation.view_figures import FIGURES
+from gvtools.runs.finished import open_run
+from gvtools.scenes.project import open_project
+from pipelines.cli import main
+
+RUN = ("--context", "first:3", "--views-per-round", "2", "--quiet")
+
+
+def reconstruct(scan, out, *more: object) -> None:
+    assert main(["reconstruct", str(scan), "--out", str(out), *RUN, *map(str, more)]) == 0
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    return write_scan(tmp_path_factory.mktemp("scan"), views=7)
+
+
+@pytest.fixture(scope="module")
+def finished(scan, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "held-out"
+    reconstruct(scan, out, "--targets", "range:3-6")
+    return out
+
+
+@pytest.fixture(scope="module")
+def measured(finished, tmp_path_factory):
+    out = tmp_path_factory.mktemp("figures")
+    assert main(["evaluate", str(finished), "--out", str(out), "--quiet"]) == 0
+    return out, json.loads((out / "evaluation.json").read_text())
+
+
+def test_the_figures_that_scripts_read_stand_at_the_top(measured):
+    _, figures = measured
+    for name in ("psnr", "ssim", "lpips", "psnr_valid", "psnr_generated", "depth_rel_valid",
+                 "depth_rel_generated", "coverage", "views", "seconds_per_view"):  # fmt: skip
+        assert name in figures
+    assert figures["views"] == 4
+    assert figures["psnr_valid"] > 20
+    assert figures["depth_rel_valid"] < 1e-3
+    assert figures["lpips"] is None
+    assert "vgg16-397923af.pth" in figures["notes"]["lpips"]
+
+
+def test_figures_are_of_the_runs_pictures_by_region(measured, finished):
+    _, figures = measured
+    views = {view["name"]: view for view in figures["runs"][0]["images"]["views"]}
+    for number, entry, target, truth in open_run(finished).targets():
+        assert truth is not None
+        reference = truth.load().rgb
+        view = views[target.name]
+        assert view["round"] == number
+        assert view["psnr"] == pytest.approx(psnr(target.picture, reference))
+        expected = psnr(target.picture, reference, mask=target.observed)
+        assert view["psnr_valid"] == pytest.approx(expected)
+        expected = psnr(target.picture, reference, mask=target.generated)
+        assert view["psnr_generated"] == (None if expected is None else pytest.approx(expected))
+        assert not (target.observed & target.generated).any()
+        assert view["observed"] == pytest.approx(entry["observed"])
+
+
+def test_means_are_over_views_and_rounds_with_intervals(measured):
+    _, figures = measured
+    images = figures["runs"][0]["images"]
+    values = [view["psnr"] for view in images["views"]]
+    mean = images["mean"]["psnr"]
+    assert mean["mean"] == pytest.approx(np.mean(values))
+    assert min(values) <= mean["low"] <= mean["mean"] <= mean["high"] <= max(values)
+    assert mean["n"] == 4
+    assert [part["round"] for part in images["rounds"]] == [1, 2]
+    assert images["rounds"][1]["psnr"]["mean"] == pytest.approx(np.mean(values[2:]))
+    assert set(images["mean"]) == set(FIGURES)
+
+
+def test_consistency_and_poses_have_a_status_and_the_true_pictures_beside(measured):
+    _, figures = measured
+    run = figures["runs"][0]
+    for kind in ("generated", "true_pictures"):
+        part = run["consistency"][kind]
+        assert part["depth_reprojection"]["mean_relative_depth"] < 0.01
+        assert len(part["depth_reprojection"]["pairs"]) == 3
+        assert "status" in part["geometric_verification"]
+        score = part["feature_consistency"]
+        assert score["same_image"] < score["score"]["mean"] < score["unrelated"]
+        assert part["met3r"]["score"]["mean"] is None
+        assert "met3r" in part["met3r"]["status"]
+    poses = run["poses"]
+    if poses["status"] == "measured":
+        assert poses["pictures"] == 4
+        assert len(poses["failures"]) == 4 - poses["located"]
+
+
+def test_what_was_measured_is_written_beside_the_scores(measured, scan):
+    _, figures = measured
+    run = figures["runs"][0]
+    names = open_project(scan).names
+    assert run["split"]["context"] == list(names[:3])
+    assert run["split"]["rounds"] == [list(names[3:5]), list(names[5:])]
+    assert run["seed"] == 0
+    assert run["versions"]["gvtools"]
+    assert run["config"]["completer"] == "inpaint"
+
+
+def test_every_table_is_there_in_every_form(measured):
+    out, _ = measured
+    for table in ("summary", "views", "published_dl3dv", "published_scannetv2"):
+        for suffix in (".csv", ".md", ".tex"):
+            assert (out / f"{table}{suffix}").stat().st_size > 100
+    rows = (out / "published_dl3dv.csv").read_text().splitlines()
+    assert sum("published" in row for row in rows) == 8
+    ours = next(row for row in rows if "measured here" in row)
+    assert ours.startswith("gvtools")
+    assert "data set: a scene of one's own" in (out / "published_dl3dv.md").read_text()
+
+
+def test_targets_without_truth_have_no_image_figures(scan, tmp_path):
+    reconstruct(scan, tmp_path / "run", "--targets", "interpolate:2")
+    assert main(["evaluate", str(tmp_path / "run"), "--quiet", "--parts", "images"]) == 0
+    figures = json.loads((tmp_path / "run/evaluation/evaluation.json").read_text())
+    assert figures["psnr"] is None
+    assert figures["notes"]["psnr"] == "no target has a true picture"
+    assert figures["views"] == 2
+
+
+def test_several_runs_are_scenes(finished, scan, tmp_path):
+    reconstruct(scan, tmp_path / "other", "--targets", "range:3-4", "--seed", 4)
+    runs = [str(finished), str(tmp_path / "other")]
+    out = tmp_path / "both"
+    assert main(["evaluate", *runs, "--out", str(out), "--parts", "images", "--quiet"]) == 0
+    figures = json.loads((out / "evaluation.json").read_text())
+    means = [run["images"]["mean"]["psnr"]["mean"] for run in figures["runs"]]
+    assert figures["psnr"] == pytest.approx(np.mean(means))
+    assert figures["over_scenes"]["psnr"]["n"] == figures["scenes"] == 2
+    assert (out / "views_001.csv").is_file()
+
+
+def test_the_protocol_splits_runs_and_measures(scan, tmp_path):
+    wide = write_scan(tmp_path / "wide", views=9)
+    out = tmp_path / "out"
+    words = ["evaluate", str(wide), "--protocol", "pass", "--out", str(out), "--quiet"]
+    assert main([*words, "--parts", "images", "--completer", "none"]) == 0
+    split = json.loads((out / "split.json").read_text())
+    assert len(split["context"]) == 2
+    assert [len(names) for names in split["rounds"]] == [6]
+    figures = json.loads((out / "evaluation.json").read_text())
+    assert figures["runs"][0]["split"]["rounds"] == split["rounds"]
+    # Once more: the run is there, and is measured again.
+    assert main([*words, "--parts", "images", "--completer", "none"]) == 0
+
+
+def test_wrong_input_ends_in_one_line(finished, scan, tmp_path, capsys):
+    assert "run.json" in refused(capsys, "evaluate", scan)
+    assert "--parts" in refused(capsys, "evaluate", finished, "--parts", "images,speed")
+    assert "--out" in refused(capsys, "evaluate", finished, finished)
+    assert "did you mean" in refused(capsys, "evaluate", finished, "--against", "scannet")
+    assert "--protocol" in refused(capsys, "evaluate", finished, "--stride", 2)
+    assert "--out" in refused(capsys, "evaluate", scan, "--protocol", "long")
+    line = refused(capsys, "evaluate", finished, "--lpips-weights", tmp_path)
+    assert "vgg16-397923af.pth is absent" in line
+    wide = refused(capsys, "evaluate", scan, "--protocol", "long", "--out", tmp_path / "long")
+    assert "expected at least 20" in wide
+    assert not (finished / "evaluation").exists()
+
+
+def test_a_project_that_changed_or_went_is_said(scan, tmp_path, capsys):
+    copy = tmp_path / "scan"
+    shutil.copytree(scan, copy)
+    reconstruct(copy, tmp_path / "run", "--targets", "range:3-4")
+    pose = copy / "frame-000003.pose.txt"
+    text = pose.read_text()
+    matrix = np.loadtxt(pose)
+    matrix[0, 3] += 0.1
+    np.savetxt(pose, matrix)
+    assert "another one now" in refused(capsys, "evaluate", tmp_path / "run", "--quiet")
+    pose.write_text(text)
+    copy.rename(tmp_path / "moved")
+    assert "no such folder" in refused(capsys, "evaluate", tmp_path / "run", "--quiet")
+    words = ["evaluate", str(tmp_path / "run"), "--project", str(tmp_path / "moved"), "--quiet"]
+    assert main([*words, "--parts", "images"]) == 0
+
+
+def test_damaged_rounds_are_named(scan, tmp_path, capsys):
+    reconstruct(scan, tmp_path / "run", "--targets", "range:3-4")
+    next((tmp_path / "run/round_001").glob("depth_*.npz")).write_bytes(b"")
+    line = refused(capsys, "evaluate", tmp_path / "run", "--quiet")
+    assert "round_001" in line
+    shutil.rmtree(tmp_path / "run/round_001")
+    assert "no round of targets" in refused(capsys, "evaluate", tmp_path / "run")
+
+
+def test_what_is_beside_published_rows_says_what_it_stands_on(scan, tmp_path):
+    """Masked pictures, few located views and one project twice are no ranking on a data set."""
+    from PIL import Image
+
+    masked = write_scan(tmp_path / "masked", views=7)
+    for path in masked.glob("*.color.png"):
+        with Image.open(path) as image:
+            rgba = image.convert("RGBA")
+        rgba.putalpha(Image.fromarray((np.arange(96)[None] > 20).repeat(72, 0).astype("u1") * 255))
+        rgba.save(path)
+    runs = [tmp_path / "a" / "run", tmp_path / "b" / "run"]
+    for seed, run in enumerate(runs):
+        reconstruct(masked, run, "--targets", "range:3-4", "--seed", seed)
+    out = tmp_path / "out"
+    words = ["evaluate", *map(str, runs), "--out", str(out), "--data-set", "dl3dv", "--seed", "7"]
+    assert main([*words, "--against", "dl3dv", "--quiet"]) == 0
+    text = (out / "published_dl3dv.md").read_text()
+    assert "compared pixels: inside masks here" in text
+    assert "scenes: a single one here" in text
+    figures = json.loads((out / "evaluation.json").read_text())
+    assert [run["name"] for run in figures["runs"]] == ["a/run", "b/run"]
+    assert figures["evaluation"]["seed"] == 7
+    assert figures["evaluation"]["bootstrap"] == {"level": 0.95, "resamples": 2000}
+    assert figures["protocol_row"]["probed"] == 4
+    assert figures["runs"][0]["images"]["settings"]["masked_share"] == pytest.approx(21 / 96)
+    summary = (out / "summary.csv").read_text()
+    assert "all scenes,psnr" in summary
+
+
+def test_a_feature_network_of_ones_own(finished, tmp_path, monkeypatch, capsys):
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np\n"
+        "class Means:\n"
+        "    name = 'means'\n"
+        "    def features(self, rgb):\n"
+        "        h, w = rgb.shape[0] // 8, rgb.shape[1] // 8\n"
+        "        cells = rgb[: h * 8, : w * 8].reshape(h, 8, w, 8, 3).mean(axis=(1, 3))\n"
+        "        return (cells.transpose(2, 0, 1) / 255 - 0.5).astype(np.float32)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    out = tmp_path / "out"
+    words = ["evaluate", str(finished), "--out", str(out), "--parts", "consistency", "--quiet"]
+    assert main([*words, "--features", "mine:Means"]) == 0
+    figures = json.loads((out / "evaluation.json").read_text())
+    part = figures["runs"][0]["consistency"]["generated"]["feature_consistency"]
+    assert part["network"] == "means"
+    assert "cannot be made" in refused(capsys, *words, "--features", "mine:Medians")
+    assert "expected name and features" in refused(capsys, *words, "--features", "json:JSONEncoder")
+
+
+@pytest.mark.parametrize("damage", ["seed", "report", "record", "view", "twice", "decided"])
+def test_damage_and_contradictions_end_in_one_line(damage, finished, scan, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    report = run / "round_002" / "report.json"
+    words: list[object] = ["evaluate", run]
+    if damage == "seed":
+        words += ["--seed", "-1"]
+    elif damage == "report":
+        report.write_text(report.read_text()[:100])
+    elif damage == "record":
+        record = json.loads((run / "run.json").read_text())
+        record.pop("schedule")
+        (run / "run.json").write_text(json.dumps(record))
+    elif damage == "view":
+        data = json.loads(report.read_text())
+        data["views"][0].pop("coverage")
+        report.write_text(json.dumps(data))
+    elif damage == "twice":
+        words += [run, "--out", tmp_path / "out"]
+    else:
+        words = ["evaluate", scan, "--protocol", "pass", "--out", tmp_path / "p"]
+        words += ["--set", "rounds=1"]
+    told = {"seed": "at least 0", "report": "no readable report", "record": "schedule",
+            "view": "no report of this version", "twice": "given twice",
+            "decided": "decided by --protocol"}  # fmt: skip
+    if damage == "decided":
+        words[1] = write_scan(tmp_path / "wide", views=9)
+    assert told[damage] in refused(capsys, *words)
+    assert not (tmp_path / "p" / "split.json").exists()
+
+
+@pytest.mark.parametrize("stem", ["x/../../../secret", "link"])
+def test_files_outside_the_run_are_refused(finished, tmp_path, capsys, stem):
+    run, out = tmp_path / "run", tmp_path / "figures"
+    shutil.copytree(finished, run)
+    report = run / "round_001" / "report.json"
+    content = json.loads(report.read_text())
+    own = report.parent / f"generated_{content['views'][0]['stem']}.png"
+    # generated_x/../../../secret.png is outside; so is what a link leads to.
+    secret = own.rename(tmp_path / "secret.png")
+    (report.parent / "generated_x").mkdir()
+    (report.parent / "generated_link.png").symlink_to(secret)
+    content["views"][0]["stem"] = stem
+    report.write_text(json.dumps(content))
+    arguments = ("evaluate", run, "--out", out, "--parts", "images", "--quiet")
+    assert "lies outside" in refused(capsys, *arguments)
+    assert not out.exists()

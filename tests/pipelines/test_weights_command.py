@@ -1,0 +1,348 @@
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import geoverse_models as micro
+import published_folder as published
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from gvtools.completers.geoverse import from_pretrained, named
+from gvtools.completers.geoverse.config_json import to_json
+from gvtools.completers.geoverse.weights.published import VIDEO_SIZES, WHOLE_FILE
+from pipelines.cli import build_parser, main
+from pipelines.commands.weights import _progress
+from pipelines.console import Console
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+PLAIN = micro.config()
+ACTIONS = ("list", "check", "create", "truncate-wan", "empty-prompt")
+
+
+def weights(*arguments: object) -> int:
+    return main(["weights", *map(str, arguments)])
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one line with which the command ends, status 2."""
+    try:
+        status = weights(*arguments)
+    except SystemExit as stop:
+        status = int(stop.code or 0)
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert status == 2
+    assert len(lines) == 1
+    assert lines[0].startswith("gvtools: ")
+    return lines[0]
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    micro.model(PLAIN).save_pretrained(tmp_path / "own")
+    return tmp_path / "own"
+
+
+@pytest.fixture
+def micro_file(tmp_path: Path) -> Path:
+    path = tmp_path / "micro.json"
+    path.write_text(json.dumps(to_json(PLAIN)))
+    return path
+
+
+# list
+
+
+@pytest.fixture(scope="module")
+def listed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    path = tmp_path_factory.mktemp("list") / "list.json"
+    assert weights("list", "--json", path) == 0
+    found = json.loads(path.read_text())
+    assert "approximate" in found["notes"][0]
+    return {entry["config"]: entry for entry in found["configs"]}
+
+
+def test_published_files_have_their_published_numbers(listed: dict[str, Any]) -> None:
+    files = {file["name"]: file for file in listed["base"]["published"]}
+    # Tensors and parameters of the official networks; safetensors keep six shared names less.
+    for name, tensors, parameters, size in (
+        ("geometry", 437, 135_366_599, 0.5e9),
+        ("level1", 430, 783_326_716, 3.0e9),
+        ("cascade", 378, 472_541_268, 1.8e9),
+        ("rgb_head", 456, 422_536_396, 1.6e9),
+    ):
+        file = files[name]
+        assert (file["tensors"], file["parameters"]) == (tensors, parameters)
+        # As the publisher states them, in units of 2 to the power of 30 or of 10 to that of 9.
+        assert size <= file["bytes"] <= 1.1 * size * 1.024**3
+        assert file["needed"]
+        assert file["licence"]
+        assert file["source"]
+    assert files["level1"]["path"] == "checkpoints/da3_level1.pt"
+    assert files["statistics1"]["path"].startswith("model_stats/da3/")
+    assert not files["geometry_head"]["needed"]
+    assert files.keys() == {
+        "geometry", "level1", "cascade", "rgb_head", "statistics0", "statistics1", "geometry_head",
+    }  # fmt: skip
+    added = {file["name"]: file for file in listed["base"]["beside"]}
+    assert not added["extension"]["needed"]
+    assert added["video"]["needed"]
+    whole = sum(file["parameters"] for name, file in files.items() if name != "geometry_head")
+    shared = 6 * 32
+    own = listed["base"]["own"]
+    assert own["path"] == WHOLE_FILE
+    assert own["parameters"] == whole + shared + added["extension"]["parameters"]
+    assert own["bytes"] == 4 * own["parameters"]
+
+
+def test_nothing_is_published_of_the_small_one(listed: dict[str, Any]) -> None:
+    tiny = listed["tiny"]
+    assert tiny["published"] == tiny["beside"] == []
+    assert tiny["own"]["tensors"] > 500
+
+
+def test_the_video_prior_has_the_size_of_its_networks() -> None:
+    pytest.importorskip("diffusers", reason="the extra wan is not installed")
+    from gvtools.completers.geoverse.video_prior.wan_folder import dtype_of, expected_tensors
+
+    sizes = {
+        "num_layers": 16,
+        "num_attention_heads": 40,
+        "attention_head_dim": 128,
+        "ffn_dim": 13824,
+        "text_dim": 4096,
+        "vace_layers": [0, 5, 10, 15],
+    }
+    for component, config in (("transformer", sizes), ("vae", {})):
+        tensors = expected_tensors(config, component=component)
+        numbers = {name: prod(shape) for name, shape in tensors.items()}
+        size = sum(
+            n * (4 if component == "vae" else dtype_of(name, torch.bfloat16).itemsize)
+            for name, n in numbers.items()
+        )
+        assert VIDEO_SIZES[component] == (len(tensors), sum(numbers.values()), size)
+
+
+def test_the_list_is_readable(capsys: pytest.CaptureFixture[str], micro_file: Path) -> None:
+    assert weights("list") == 0
+    text = capsys.readouterr().out
+    for part in ("checkpoints/da3_level1.pt", "3.13 GB", "783,326,716", "Apache-2.0", "optional",
+                 "approximate", "tiny: nothing of its size is published"):  # fmt: skip
+        assert part in text
+    assert weights("list", micro_file) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("micro: nothing")
+    assert WHOLE_FILE in text
+    assert weights("list", "tiny", "--quiet") == 0
+    assert weights("--quiet", "list", "tiny") == 0
+    assert main(["weights", "--quiet", "list", "tiny"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_an_unknown_configuration_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "'large'; expected base or tiny, or a config.json" in refused(capsys, "list", "large")
+
+
+# check
+
+
+def test_a_folder_that_fits(capsys: pytest.CaptureFixture[str], own: Path, tmp_path: Path) -> None:
+    assert weights("check", own) == 0
+    text = capsys.readouterr().out
+    assert "geoverse  ok (geoverse.safetensors, " in text
+    assert text.endswith("ok: true\n")
+    assert weights("check", own, "--json", tmp_path / "check.json") == 0
+    found = json.loads((tmp_path / "check.json").read_text())
+    assert found["ok"] is True
+    assert found["config"] == "micro"
+    assert found["problem"] is None
+    (part,) = found["parts"]
+    assert part["parameters"] == sum(t.numel() for t in load_file(own / WHOLE_FILE).values())
+    assert part["missing"] == part["unexpected"] == part["misshapen"] == []
+
+
+def test_what_does_not_fit_is_said_for_each_part(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    bare = replace(PLAIN, level1=replace(PLAIN.level1, depth_condition=False))
+    folder = published.write_published(micro.model(bare), tmp_path / "published")
+    assert weights("check", folder) == 0
+    assert "absent: pretrained_models/da3/dpt_decoder.pt" in capsys.readouterr().out
+    (folder / published.CASCADE).unlink()
+    content = torch.load(folder / published.LEVEL1)["ema"]
+    content["blocks.0.qkv"] = content.pop("blocks.0.attn.qkv.weight")
+    torch.save({"ema": content}, folder / published.LEVEL1)
+    assert weights("check", folder, "--json", tmp_path / "check.json") == 2
+    line = capsys.readouterr().err.strip()
+    assert "2 of 7 parts cannot be loaded, first " in line
+    assert "da3_level1.pt: of 94 tensors missing: blocks.0.attn.qkv.weight; unexpected: " in line
+    found = json.loads((tmp_path / "check.json").read_text())
+    assert found["ok"] is False
+    assert found["problem"] in line
+    parts = {part["name"]: part for part in found["parts"]}
+    assert parts["level1"]["missing"] == ["blocks.0.attn.qkv.weight"]
+    assert parts["level1"]["unexpected"] == ["blocks.0.qkv"]
+    assert parts["cascade"]["path"] is None
+    assert not parts["cascade"]["ok"]
+    assert parts["rgb_head"]["passed_over"] == ["encoder.mask"]
+    assert [name for name, part in parts.items() if part["ok"]] == [
+        "geometry", "rgb_head", "statistics0", "statistics1", "geometry_head",
+    ]  # fmt: skip
+    assert weights("check", folder) == 2
+    text = capsys.readouterr().out
+    assert "cascade        does not fit: neither" in text
+    assert text.endswith("ok: false\n")
+
+
+def test_the_configuration_may_be_another_than_the_folders(
+    capsys: pytest.CaptureFixture[str], own: Path, micro_file: Path
+) -> None:
+    assert weights("check", own, "--config", micro_file, "--quiet") == 0
+    assert weights("check", own, "--config", own, "--quiet") == 0
+    line = refused(capsys, "check", own, "--config", "tiny", "--quiet")
+    assert "missing: " in line
+    assert "of another shape: " in line
+
+
+def test_a_folder_that_is_none(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    report = tmp_path / "check.json"
+    line = refused(capsys, "check", tmp_path / "absent", "--json", report)
+    assert "absent does not exist" in line
+    found = json.loads(report.read_text())
+    assert found["ok"] is False
+    assert found["problem"] in line
+    assert "neither config.json nor a published file" in refused(capsys, "check", tmp_path)
+
+
+# create
+
+
+def test_a_created_model_is_untrained_and_its_seeds_own(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, micro_file: Path
+) -> None:
+    state = torch.get_rng_state()
+    for folder, seed in (("a", 0), ("b", 0), ("c", 1)):
+        assert weights("create", micro_file, tmp_path / folder, "--seed", seed) == 0
+    assert torch.equal(torch.get_rng_state(), state)
+    assert "UNTRAINED" in capsys.readouterr().out
+    files = [(tmp_path / folder / WHOLE_FILE).read_bytes() for folder in "ab"]
+    assert files[0] == files[1]
+    a, c = (from_pretrained(tmp_path / folder) for folder in "ac")
+    name = "geometry.backbone.pretrained.patch_embed.proj.weight"
+    assert not torch.equal(a.state_dict()[name], c.state_dict()[name])
+    assert a.config == replace(PLAIN, trained=False)
+    assert weights("check", tmp_path / "c") == 0
+    assert "(GeoVerse micro, untrained, seed 1)" in capsys.readouterr().out
+    # Such a model runs.
+    assert torch.isfinite(a.generate(micro.batch()).decoded.rgb).all()
+
+
+def test_nothing_is_overwritten(
+    capsys: pytest.CaptureFixture[str], own: Path, micro_file: Path, tmp_path: Path
+) -> None:
+    before = {path: path.read_bytes() for path in own.iterdir()}
+    assert "nothing is overwritten" in refused(capsys, "create", micro_file, own)
+    assert {path: path.read_bytes() for path in own.iterdir()} == before
+    assert "nothing is overwritten" in refused(capsys, "create", micro_file, micro_file)
+    (tmp_path / "new" / "video").mkdir(parents=True)
+    assert weights("create", micro_file, tmp_path / "new") == 0
+    assert "'huge'" in refused(capsys, "create", "huge", tmp_path / "huge")
+    assert not (tmp_path / "huge").exists()
+
+
+def test_a_created_model_says_that_it_lacks_the_video_prior(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "control.json"
+    path.write_text(json.dumps(to_json(micro.config(injection="control"))))
+    assert weights("create", path, tmp_path / "model") == 0
+    assert f"truncate-wan SOURCE {tmp_path / 'model' / 'video'}" in capsys.readouterr().out
+    assert "video: absent" in refused(capsys, "check", tmp_path / "model", "--quiet")
+
+
+# the video prior
+
+
+def test_the_video_prior_is_cut_and_completed(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    pytest.importorskip("diffusers", reason="the extra wan is not installed")
+    import tiny_wan
+
+    source, folder = tmp_path / "wan", tmp_path / "model"
+    tiny_wan.transformer(6, (0, 2, 4)).save_pretrained(source / "transformer")
+    tiny_wan.vae().save_pretrained(source / "vae")
+    config = micro.config(injection="control", video=tiny_wan.CONFIG)
+    micro.model(config).save_pretrained(folder)
+    video = folder / "video"
+    assert weights("truncate-wan", source, video, "--blocks", 4) == 0
+    text = capsys.readouterr().out
+    size = sum(path.stat().st_size for path in video.rglob("*.safetensors")) / 1e3
+    assert f"of {size:.3g} kB written" in text or "kB written" in text
+    assert f"gvtools weights empty-prompt TEXT_ENCODER {video}" in text
+    assert json.loads((video / "transformer" / "config.json").read_text())["num_layers"] == 4
+    assert "is there already" in refused(capsys, "truncate-wan", source, video)
+    assert "empty_prompt.safetensors is absent" in refused(capsys, "check", folder, "--quiet")
+    assert "no folder" in refused(capsys, "empty-prompt", tmp_path, tmp_path / "absent")
+    line = refused(capsys, "empty-prompt", tmp_path / "absent", video)
+    assert "transformers" in line
+    save_file({"embedding": tiny_wan.prompt()}, video / "empty_prompt.safetensors")
+    assert "nothing is overwritten" in refused(capsys, "empty-prompt", tmp_path, video)
+    assert weights("check", folder) == 0
+    assert "video     ok (video, " in capsys.readouterr().out
+    assert from_pretrained(folder).video is not None
+    shutil.rmtree(video / "vae")
+    assert "vae" in refused(capsys, "check", folder, "--quiet")
+
+
+def test_progress_on_and_off_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for quiet, interactive, wanted in (
+        (False, False, "2 MB of 2 MB written\n"),
+        (False, True, "\r1 MB of 2 MB written\r2 MB of 2 MB written\n"),
+        (True, False, ""),
+    ):
+        console = Console(quiet=quiet)
+        monkeypatch.setattr(console, "interactive", interactive)
+        report = _progress(console)
+        report(1_000_000, 2_000_000)
+        report(2_000_000, 2_000_000)
+        assert capsys.readouterr().out == wanted
+
+
+# the command itself
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+def test_every_help_of_an_action_starts_with_two_examples(
+    action: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        weights(action, "--help")
+    assert stop.value.code == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  gvtools")]
+    assert len(lines) == 2
+    for line in lines:
+        build_parser().parse_args(line.split()[1:])
+
+
+def test_a_wrong_action_or_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in ((), ("lst",), ("check",), ("list", "--jsn", "x"), ("create", "tiny")):
+        refused(capsys, *arguments)
+
+
+def test_debug_shows_where(tmp_path: Path) -> None:
+    with pytest.raises(Exception, match="does not exist"):
+        weights("check", tmp_path / "absent", "--debug")
+
+
+def test_the_shipped_configurations_are_their_classes() -> None:
+    assert named("base").video is not None
+    assert named("tiny").video is None

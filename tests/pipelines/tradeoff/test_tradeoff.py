@@ -1,0 +1,173 @@
+"""``gvtools tradeoff`` on a small scan, from the command line."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tiny_scan import write_scan
+
+from gvtools.errors import OptionError
+from gvtools.runs.folder_lock import held_folder
+from pipelines.cli import build_parser, main
+from pipelines.commands.tradeoff import asked_for
+from pipelines.config import PROFILES, RunConfig, difference, with_profile, with_settings
+from pipelines.tradeoff.search import EQUAL
+from pipelines.tradeoff.trial import applied
+from viz.plots.pareto import draw_pareto
+
+# Another edge than the first guess, as if it had been measured.
+WIDER = ("--set", "fusion.voxel_scale=1.25")
+TIMES = ("fixed", "per_target")
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory) -> Path:
+    return write_scan(tmp_path_factory.mktemp("scan"))
+
+
+@pytest.fixture(scope="module")
+def swept(scan, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("sweep") / "out"
+    command = ["tradeoff", str(scan), "--out", str(out), "--budget", "1h", "--quiet"]
+    assert main([*command, *WIDER]) == 0
+    return out
+
+
+def test_a_sweep_leaves_table_front_plot_and_profile(swept):
+    found = json.loads((swept / "tradeoff.json").read_text())
+    trials = list(csv.DictReader((swept / "trials.csv").read_text().splitlines()))
+    assert len(trials) == len(found["trials"]) > 12
+    assert (swept / "front.png").read_bytes()[:4] == b"\x89PNG"
+    front = found["front"]
+    assert front and [row["psnr"] for row in front] == sorted(row["psnr"] for row in front)
+    best = found["recommended"]
+    # Smaller pictures are another product.
+    whole = [
+        trial
+        for trial in found["trials"]
+        if trial["share"] == 1 and "max_side" not in trial["settings"]
+    ]
+    assert whole and best["psnr"] >= max(trial["psnr"] for trial in whole) - EQUAL
+    names = {row["knob"] for row in found["marginal"]}
+    assert {"voxel edge", "completer", "projection"} <= names
+    for row in found["marginal"]:
+        assert row["time"] > 0 and row["bytes"] > 0
+    coarse = next(row for row in found["marginal"] if row["knob"] == "voxel edge")
+    assert coarse["observations"] > 1.2 and coarse["bytes"] > 1
+    # Runs leave nothing behind but their outcomes.
+    assert all(path.suffix == ".json" for path in (swept / "trials").iterdir())
+
+
+def test_the_profile_is_what_reconstruct_takes_and_gives_its_figures(scan, swept, tmp_path):
+    best = json.loads((swept / "tradeoff.json").read_text())["recommended"]
+    arguments = ["reconstruct", str(scan), "--context", "every:2", "--targets", "every:2+1"]
+    arguments += ["--config", str(swept / "profile.json"), "--out", str(tmp_path / "run")]
+    assert main([*arguments, "--quiet"]) == 0
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["observations"] == best["observations"]
+    assert found["psnr"] == pytest.approx(best["psnr"], abs=1e-6)
+
+
+def test_a_profile_is_tried_as_reconstruct_runs_it(scan, swept, tmp_path):
+    trials = json.loads((swept / "tradeoff.json").read_text())["trials"]
+    tried = next(t for t in trials if t["label"] == "profile accurate" and t["share"] == 1)
+    arguments = ["reconstruct", str(scan), "--context", "every:2", "--targets", "every:2+1"]
+    arguments += ["--profile", "accurate", "--out", str(tmp_path / "run"), "--quiet"]
+    assert main([*arguments, *WIDER]) == 0
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["observations"] == tried["observations"]
+    assert found["psnr"] == pytest.approx(tried["psnr"], abs=1e-6)
+
+
+@pytest.mark.parametrize("own", [[], ["max_side=200"], ["voxel=0.03", "profile=accurate"]])
+def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
+    file = tmp_path / "given.json"
+    file.write_text('{"profile": "accurate", "savings": {"minor_holes": 0.07}}')
+    arguments = ["tradeoff", "scan", "--out", "out", "--config", str(file)]
+    args = build_parser().parse_args(arguments + [word for text in own for word in ("--set", text)])
+    start = asked_for(args)
+    assert start.profile == "accurate" and start.memory.same_direction == 0
+    for name, changes in PROFILES.items():
+        wanted = with_settings(with_profile(RunConfig(), name), ["savings.minor_holes=0.07"])
+        wanted = with_settings(wanted, [text for text in own if "profile" not in text])
+        wanted = replace(wanted, context=start.context, targets=start.targets)
+        assert asked_for(args, name) == wanted, changes
+        # As a trial reaches it, from the start with the edge that it has.
+        found = replace(start, voxel=start.voxel or 0.02)
+        tried = applied(found, difference(found, wanted))
+        assert replace(tried, profile=name) == wanted
+
+
+def test_a_second_sweep_takes_over_what_is_there(scan, swept, capsys):
+    before = {path: path.stat().st_mtime_ns for path in (swept / "trials").iterdir()}
+    assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "1B"]) == 2
+    assert "expected seconds" in capsys.readouterr().err
+    assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "1kB", *WIDER]) == 0
+    captured = capsys.readouterr()
+    assert "no trial is within the budget" in captured.err
+    after = {path: path.stat().st_mtime_ns for path in (swept / "trials").iterdir()}
+    assert all(after[path] == stamp for path, stamp in before.items())
+    assert not (swept / "profile.json").exists()
+
+
+def test_a_project_that_is_read_otherwise_is_tried_anew(scan, swept, capsys):
+    before = set((swept / "trials").iterdir())
+    arguments = ["tradeoff", str(scan), "--out", str(swept), "--limit", "1"]
+    assert main([*arguments, "--depth-unit", "0.002", "--quiet", *WIDER]) == 0
+    assert set((swept / "trials").iterdir()) - before
+    assert "trials were left out for --limit" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--targets", "orbit:3"], "no views of the project"),
+        (["--limit", "100MB"], "expected a time"),
+        (["--set", "splat.bandd=1"], "did you mean"),
+        (["--set", "rounds=1"], "give fewer --targets"),
+    ],
+)
+def test_what_cannot_be_swept_is_one_line(scan, tmp_path, capsys, more, said):
+    assert main(["tradeoff", str(scan), "--out", str(tmp_path / "x"), *more]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_plot_without_trials_is_refused():
+    with pytest.raises(OptionError, match="without trials"):
+        draw_pareto([], front=[], title="nothing")
+
+
+def test_a_damaged_trial_is_made_anew(scan, swept, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(swept, out)
+    start = json.loads((out / "tradeoff.json").read_text())["trials"][0]
+    files = {path: json.loads(path.read_text())["outcome"] for path in (out / "trials").iterdir()}
+    # Sweeps of the same project that was read otherwise may lie there, too.
+    damaged = [
+        path
+        for path, outcome in files.items()
+        if (outcome["settings"], outcome["targets"]) == (start["settings"], start["targets"])
+    ]
+    for path in damaged:
+        path.write_text("{")
+    command = ["tradeoff", str(scan), "--out", str(out), "--budget", "1h", "--quiet"]
+    assert main([*command, *WIDER]) == 0
+    whole = [path for path in damaged if path.read_text() != "{"]
+    again = [json.loads(path.read_text())["outcome"] for path in whole]
+    assert again == [files[path] | {key: again[0][key] for key in TIMES} for path in whole] != []
+
+
+def test_a_folder_takes_one_sweep_at_a_time(scan, tmp_path, capsys):
+    with held_folder(tmp_path / "out"):
+        assert main(["tradeoff", str(scan), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "another process is at work" in capsys.readouterr().err
+    file = tmp_path / "file"
+    file.write_text("mine")
+    assert main(["tradeoff", str(scan), "--out", str(file), "--quiet"]) == 2
+    assert "is a file" in capsys.readouterr().err and file.read_text() == "mine"

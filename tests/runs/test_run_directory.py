@@ -1,0 +1,255 @@
+"""What a run's folder accepts, and when a resumed run is the same run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_scan import write_colmap_scan, write_scan
+
+from gvtools.errors import ProjectError
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.runs.folder import RunDirectory
+from pipelines.cli import main
+from pipelines.console import write_json
+
+RUN = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2", "--quiet")
+
+
+@pytest.fixture
+def scan(tmp_path):
+    return write_scan(tmp_path / "scan")
+
+
+def reconstruct(scan, out, *options: object) -> int:
+    return main(["reconstruct", str(scan), "--out", str(out), *RUN, *map(str, options)])
+
+
+def test_a_first_attempt_that_failed_does_not_bind_the_next(scan, tmp_path):
+    out = tmp_path / "run"
+    broken = scan / "frame-000001.color.png"
+    whole = broken.read_bytes()
+    # Its header is right, so that it is found out in round 0, with run.json written.
+    broken.write_bytes(whole[: len(whole) // 2])
+    assert reconstruct(scan, out, "--voxel", "0.02") == 2
+    broken.write_bytes(whole)
+    assert reconstruct(scan, out, "--voxel", "0.03") == 0
+    assert json.loads((out / "run.json").read_text())["config"]["voxel"] == 0.03
+
+
+def test_the_settings_of_a_run_with_rounds_bind(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    shutil.rmtree(out / "round_002")
+    assert reconstruct(scan, out, "--resume", "--voxel", "0.3") == 2
+    assert "config differ" in capsys.readouterr().err
+
+
+def test_a_changed_reading_of_the_project_is_another_run(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out, "--depth-max", "2.5") == 0
+    assert reconstruct(scan, out, "--resume", "--depth-max", "2.6") == 2
+    assert "reading" in capsys.readouterr().err
+    # The same through the folder's own file, which no option tells of.
+    other = tmp_path / "other"
+    assert reconstruct(scan, other) == 0
+    (scan / "rgbd.json").write_text(json.dumps({"depth_unit": 0.002}))
+    assert reconstruct(scan, other, "--resume") == 2
+    assert "pixels" in capsys.readouterr().err
+
+
+def test_a_changed_camera_is_another_run(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    pose = scan / "frame-000001.pose.txt"
+    matrix = np.loadtxt(pose)
+    matrix[0, 3] += 0.01
+    np.savetxt(pose, matrix)
+    assert reconstruct(scan, out, "--resume") == 2
+    assert "cameras" in capsys.readouterr().err
+
+
+def test_changed_sparse_points_are_another_run(tmp_path, capsys):
+    """Computed depth stands on them."""
+    project = write_colmap_scan(tmp_path / "colmap")
+    out = tmp_path / "run"
+    words = ("--completer", "none", "--context", "first:3", "--targets", "last:1")
+    assert reconstruct(project, out, *words, "--voxel", "0.03") == 0
+    assert reconstruct(project, out, *words, "--voxel", "0.03", "--resume") == 0
+    other = write_colmap_scan(tmp_path / "other", points=70)
+    shutil.rmtree(project / "sparse")
+    shutil.copytree(other / "sparse", project / "sparse")
+    assert reconstruct(project, out, *words, "--voxel", "0.03", "--resume") == 2
+    assert "(points differ)" in capsys.readouterr().err
+
+
+def test_removing_a_round_forgets_it_and_what_came_after(scan, tmp_path):
+    out, again = tmp_path / "run", tmp_path / "again"
+    assert reconstruct(scan, out) == 0
+    whole = (out / "memory.npz").read_bytes()
+    shutil.copytree(out, again)
+    shutil.rmtree(again / "round_001")
+    directory = RunDirectory(again)
+    record = json.loads((again / "run.json").read_text())
+    record.pop("versions")
+    with directory.taken_up(record, resume=True) as done:
+        assert done == 1
+    assert reconstruct(scan, again, "--resume") == 0
+    assert SpatialMemory.load(again / "memory.npz").rounds == (0, 1, 2)
+    assert (again / "memory.npz").read_bytes() == whole
+
+
+def test_a_folder_in_use_is_refused(tmp_path):
+    first = RunDirectory(tmp_path / "run")
+    with first.taken_up({"a": 1}, resume=False):
+        second = RunDirectory(tmp_path / "run")
+        with (
+            pytest.raises(ProjectError, match="another process"),
+            second.taken_up({"a": 1}, resume=True),
+        ):
+            pass
+    with second.taken_up({"a": 1}, resume=True) as done:
+        assert done == 0
+
+
+def test_a_file_in_the_folders_place_is_refused_untouched(tmp_path):
+    (tmp_path / "run").write_text("mine")
+    with (
+        pytest.raises(ProjectError, match="is a file"),
+        RunDirectory(tmp_path / "run").taken_up({}, resume=False),
+    ):
+        pass
+    assert (tmp_path / "run").read_text() == "mine"
+
+
+def test_a_voxel_too_small_to_be_addressed_is_blamed(scan, tmp_path, capsys):
+    assert reconstruct(scan, tmp_path / "run", "--voxel", "1e-9") == 2
+    assert "voxel edge" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_cuda_without_a_device_is_refused_before_anything_is_written(
+    scan, tmp_path, capsys, monkeypatch
+):
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for more in ((), ("--dry-run",)):
+        assert reconstruct(scan, tmp_path / "run", "--device", "cuda", *more) == 2
+        assert "no CUDA device" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_json_holds_the_figures(scan, tmp_path):
+    file = tmp_path / "figures.json"
+    assert reconstruct(scan, tmp_path / "run", "--json", file) == 0
+    assert json.loads(file.read_text()) == json.loads((tmp_path / "run/metrics.json").read_text())
+
+
+def test_a_demo_in_a_folder_with_files_is_refused_before_its_sample(tmp_path, capsys, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    write_json(tmp_path / "here" / "mine.json", {})
+    assert main(["demo", "--out", ".", "--quiet"]) == 2
+    assert "no run.json" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
+
+
+def test_figures_split_the_picture_by_what_observations_support(scan, tmp_path):
+    """A target's support keeps observed and generated apart, also within a round."""
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    for number in (1, 2):
+        report = json.loads((out / f"round_00{number}" / "report.json").read_text())
+        shares = [view["coverage"] for view in report["views"]]
+        # The round's line, the table and the report tell one coverage.
+        assert np.isclose(np.mean(shares), report["coverage_before"])
+        told = [view["coverage"] for view in metrics["views"] if view["round"] == number]
+        assert told == shares
+        for view in report["views"]:
+            with Image.open(out / f"round_00{number}" / f"valid_{view['stem']}.png") as image:
+                support = np.asarray(image)
+            assert set(np.unique(support)) <= {0, 128, 255}
+            assert np.isclose((support == 255).mean(), view["observed"])
+    # Both context views and the walk's ends differ enough that later targets meet generated pixels.
+    assert any(
+        (np.asarray(Image.open(path)) == 128).any() for path in out.glob("round_*/valid_*.png")
+    )
+
+
+def test_another_programs_record_is_refused_untouched(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "run.json").write_text('{"experiment": "mine"}')
+    (out / "memory.ply").write_text("precious")
+    for more in ((), ("--resume",)):
+        assert reconstruct(scan, out, *more) == 2
+        assert "another run" in capsys.readouterr().err
+    assert (out / "memory.ply").read_text() == "precious"
+    (out / "memory.ply").unlink()
+    assert reconstruct(scan, out) == 2
+    assert json.loads((out / "run.json").read_text()) == {"experiment": "mine"}
+
+
+def test_a_run_whose_rounds_were_deleted_is_not_overwritten(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    memory = (out / "memory.npz").read_bytes()
+    for folder in out.glob("round_*"):
+        shutil.rmtree(folder)
+    assert reconstruct(scan, out, "--voxel", "0.3") == 2
+    assert "another run" in capsys.readouterr().err
+    assert reconstruct(scan, out) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert (out / "memory.npz").read_bytes() == memory
+    assert reconstruct(scan, out, "--resume") == 0
+    assert (out / "memory.npz").read_bytes() == memory
+
+
+def test_a_run_without_its_first_round_is_done_anew(scan, tmp_path):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    memory = (out / "memory.npz").read_bytes()
+    shutil.rmtree(out / "round_000")
+    assert reconstruct(scan, out) == 2
+    assert reconstruct(scan, out, "--resume") == 0
+    assert (out / "memory.npz").read_bytes() == memory
+    assert sorted(path.name for path in out.glob("round_*")) == [f"round_00{i}" for i in range(3)]
+
+
+def test_a_kill_while_the_record_is_written_leaves_a_usable_folder(scan, tmp_path):
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / ".run.json.part").write_text("{")
+    assert reconstruct(scan, out, "--resume") == 0
+    assert not (out / ".run.json.part").exists()
+
+
+def test_a_memory_that_went_with_a_removed_round_is_said(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    shutil.move(out / "memory.npz", out / "round_002" / "memory.npz")
+    shutil.rmtree(out / "round_002")
+    assert reconstruct(scan, out, "--resume") == 2
+    assert "another --out" in capsys.readouterr().err
+
+
+def test_a_dry_run_tells_what_a_run_would_be_refused_for(scan, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert reconstruct(scan, out) == 0
+    assert reconstruct(scan, out, "--dry-run") == 2
+    assert reconstruct(scan, out, "--dry-run", "--resume") == 0
+    assert reconstruct(scan, out, "--dry-run", "--resume", "--voxel", "0.3") == 2
+    assert "another run" in capsys.readouterr().err
+
+
+def test_a_completer_may_be_named_in_its_section(scan, tmp_path):
+    file = tmp_path / "config.json"
+    file.write_text(json.dumps({"completer": {"name": "inpaint", "sweeps": 3}}))
+    assert reconstruct(scan, tmp_path / "run", "--config", file) == 0
+    config = json.loads((tmp_path / "run" / "run.json").read_text())["config"]
+    assert config["completer"] == "inpaint"
+    assert config["completer_options"] == {"sweeps": 3}

@@ -1,0 +1,55 @@
+"""The group that ``torchrun`` starts, and its end."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+THREADS = Path("/proc/self/task")
+PROGRAM = """
+import sys
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+
+from gvtools.training.processes import started
+
+
+def threads() -> int:
+    return sum("gloo" in name.read_text() for name in Path("/proc/self/task").glob("*/comm"))
+
+
+with started("cpu") as processes:
+    import torch._dynamo  # as optimizers do, on their first step
+
+    dist.all_reduce(torch.ones(3))
+    before = threads()
+print(f"threads {before} then {threads()}.")
+"""
+
+
+@pytest.mark.skipif(not THREADS.exists(), reason="the system lists no threads in /proc")
+def test_no_thread_of_the_group_outlives_it(tmp_path):
+    """One that did could abort the process at its end."""
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "torch.distributed.run", "--standalone"),
+            *("--nproc-per-node", "2", str(program)),
+        ],
+        cwd=Path(__file__).resolve().parents[2],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.count("then 0.") == 2 and "threads 0" not in done.stdout

@@ -1,0 +1,324 @@
+"""``gvtools train`` on the micro configuration: it learns, goes on, and runs on two processes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gvtools.completers.geoverse import from_pretrained
+from gvtools.training.records import read_log
+from gvtools.training.state import load_state
+from pipelines.cli import main
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SHORT = ["--device", "cpu", "--sheets", "0", "--quiet"]
+
+
+def train(out: Path, stage: str, *more: str) -> int:
+    return main(["train", "micro", "--stage", stage, "--out", str(out), *SHORT, *more])
+
+
+def steps(stage: str, count: int) -> list[str]:
+    return ["--set", f"{stage}.optimizer.steps={count}"]
+
+
+def weights_of(folder: Path) -> dict[str, torch.Tensor]:
+    return from_pretrained(folder / "weights").state_dict()
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """All four stages, a few steps each."""
+    out = tmp_path_factory.mktemp("training")
+    torch.set_num_threads(1)
+    assert train(out, "encoder", *steps("encoder", 24)) == 0
+    assert train(out, "denoiser", *steps("denoiser", 6)) == 0
+    assert train(out, "reflow", *steps("reflow", 3)) == 0
+    assert train(out, "heads", *steps("heads", 4)) == 0
+    return out
+
+
+def test_the_loss_falls_and_every_stage_leaves_weights_that_load(trained):
+    records = read_log(trained / "encoder")
+    assert records[-1]["step"] == 24
+    assert records[-1]["loss"] < records[0]["loss"]
+    encoder = from_pretrained(trained / "encoder" / "weights")
+    assert not encoder.config.trained
+    assert float(encoder.level_statistics[1].var.std()) > 0
+    student = from_pretrained(trained / "reflow" / "weights")
+    assert student.config.trained
+    # The student's stage moves level 1 alone.
+    teacher = weights_of(trained / "denoiser")
+    for name, tensor in student.state_dict().items():
+        same = torch.equal(tensor, teacher[name])
+        if not name.startswith("level1."):
+            assert same, name
+    assert any(
+        not torch.equal(tensor, teacher[name])
+        for name, tensor in student.state_dict().items()
+        if name.startswith("level1.")
+    )
+
+
+def moved(before: Path, after: Path) -> set[str]:
+    one, two = weights_of(before), weights_of(after)
+    return {name for name, tensor in two.items() if not torch.equal(tensor, one[name])}
+
+
+def of_rays(name: str) -> bool:
+    return name.startswith("geometry.head.") and "_aux" in name
+
+
+def test_the_last_stage_moves_the_heads_alone(trained):
+    names = moved(trained / "reflow", trained / "heads")
+    colors = {name for name in names if name.startswith("rgb_head.")}
+    rays = {name for name in names if of_rays(name)}
+    assert colors and rays
+    # Layers that depth and rays share stay, since both are told from other features.
+    depth = names - colors - rays
+    assert depth and all(
+        name.startswith(("geometry.head.scratch.refinenet", "geometry.head.scratch.output_conv"))
+        for name in depth
+    )
+    assert from_pretrained(trained / "heads" / "weights").config.trained
+    record = read_log(trained / "heads")[-1]
+    for name in ("origin", "direction", "rgb", "hf", "rgb_decoded", "depth", "depth_decoded"):
+        assert 0 < record[name] < 10, name
+
+
+def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
+    shutil.copytree(trained / "reflow", tmp_path / "reflow")
+    rays = ["--set", "heads.rgb=0", "--set", "heads.depth=0", *steps("heads", 2)]
+    assert train(tmp_path, "heads", *rays) == 0
+    names = moved(trained / "reflow", tmp_path / "heads")
+    assert names and all(of_rays(name) for name in names)
+    assert set(read_log(tmp_path / "heads")[-1]).isdisjoint({"rgb", "depth"})
+
+
+@pytest.mark.slow
+def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
+    """Over many steps on the same few samples."""
+    shutil.copytree(trained / "reflow", tmp_path / "reflow")
+    more = ["--set", "heads.ray=0", "--set", "data.pool=8", *steps("heads", 30)]
+    more += ["--set", "heads.optimizer.batch=8"]
+    assert train(tmp_path, "heads", *more) == 0
+    records = read_log(tmp_path / "heads")
+    first, last = records[0], records[-1]
+    assert last["rgb"] < first["rgb"] and last["depth"] < first["depth"]
+
+
+def test_a_training_without_that_stage_says_so(tmp_path, capsys):
+    assert main(["train", "base", "--stage", "heads", "--out", str(tmp_path / "base")]) == 2
+    assert "this training has no stage heads" in capsys.readouterr().err
+
+
+def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
+    again = tmp_path / "again"
+    assert train(again, "encoder", *steps("encoder", 24), "--until", "9") == 0
+    assert not (again / "encoder" / "weights").exists()
+    assert train(again, "encoder", *steps("encoder", 24), "--resume") == 0
+    whole, parts = weights_of(trained / "encoder"), weights_of(again / "encoder")
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+LATER = {"denoiser": ("encoder", 6), "reflow": ("denoiser", 3), "heads": ("reflow", 4)}
+
+
+@pytest.mark.parametrize("stage", LATER)
+def test_a_later_stage_resumes_exactly_as_well(trained, tmp_path, stage):
+    before, count = LATER[stage]
+    shutil.copytree(trained / before, tmp_path / before)
+    assert train(tmp_path, stage, *steps(stage, count), "--until", "2") == 0
+    assert not (tmp_path / stage / "weights").exists()
+    assert train(tmp_path, stage, *steps(stage, count), "--resume") == 0
+    assert not moved(trained / stage, tmp_path / stage)
+
+
+@pytest.mark.slow
+def test_a_killed_training_goes_on_to_the_uninterrupted_one(tmp_path):
+    """Killed in the middle of whatever it does after its first state."""
+    root = Path(__file__).resolve().parents[2]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+    def started(out: str, *more: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "pipelines.cli", "train", "micro", "--stage", "encoder"]
+        command += ["--out", str(tmp_path / out), *SHORT, *steps("encoder", 24), *more]
+        return subprocess.Popen(command, cwd=root, env=environment)
+
+    assert started("whole").wait() == 0
+    assert started("killed", "--until", "4").wait() == 0
+    begun = started("killed", "--resume")
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        begun.wait(timeout=8)
+    begun.kill()
+    begun.wait()
+    assert started("killed", "--resume").wait() == 0
+    assert not moved(tmp_path / "whole" / "encoder", tmp_path / "killed" / "encoder")
+
+
+def test_finished_stages_are_left_as_they_are(trained, tmp_path, capsys):
+    """Else the next stage, whose state names its start by its bytes, might not go on."""
+    shutil.copytree(trained, tmp_path / "out")
+    out, counts = tmp_path / "out", {"encoder": 24, "denoiser": 6, "reflow": 3, "heads": 4}
+    files = sorted(path for path in out.rglob("*") if path.is_file())
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+    more = [word for stage, count in counts.items() for word in steps(stage, count)]
+    loud = [word for word in SHORT if word != "--quiet"]
+    assert main(["train", "micro", "--out", str(out), *loud, *more, "--resume"]) == 0
+    assert capsys.readouterr().out.count("finished before") == len(counts)
+    assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in files} == before
+
+
+def test_all_stages_until_a_step_end_there(tmp_path):
+    more = [*SHORT, *steps("encoder", 3), "--until", "2"]
+    assert main(["train", "micro", "--out", str(tmp_path), *more]) == 0
+    assert read_log(tmp_path / "encoder")[-1]["step"] == 2
+    assert not (tmp_path / "denoiser").exists()
+
+
+def test_a_student_is_sampled_by_the_bounds_that_it_was_distilled_for(trained, tmp_path):
+    shutil.copytree(trained / "denoiser", tmp_path / "denoiser")
+    bounds = ["--set", "reflow.bounds=[1,0.4,0]", "--set", "reflow.guidance=1.5"]
+    assert train(tmp_path, "reflow", *steps("reflow", 1), *bounds) == 0
+    assert train(tmp_path, "heads", *steps("heads", 1), *bounds) == 0
+    for stage in ("reflow", "heads"):
+        flow = from_pretrained(tmp_path / stage / "weights").config.flow
+        assert flow.level1 == (1, 0.4, 0) and flow.guidance == 1
+    own = from_pretrained(trained / "heads" / "weights").config.flow
+    assert len(own.level1) == 4
+
+
+@pytest.mark.parametrize("stage", ["reflow", "heads"])
+def test_what_learns_from_an_untrained_denoiser_is_refused(trained, tmp_path, capsys, stage):
+    shutil.copytree(trained / "encoder", tmp_path / "encoder")
+    assert train(tmp_path, stage) == 2
+    assert "its denoisers are untrained" in capsys.readouterr().err
+    assert not (tmp_path / stage).exists()
+
+
+def test_an_unfinished_stage_is_not_passed_over(trained, tmp_path, capsys):
+    shutil.copytree(trained / "denoiser", tmp_path / "denoiser")
+    assert train(tmp_path, "reflow", *steps("reflow", 3), "--until", "1") == 0
+    assert train(tmp_path, "heads", *steps("heads", 1)) == 2
+    said = capsys.readouterr().err
+    assert "stage reflow was begun and is not finished" in said and said.count("\n") == 1
+
+
+def test_every_stage_draws_what_it_makes(trained, tmp_path):
+    shutil.copytree(trained / "encoder", tmp_path / "encoder")
+    sheets = [word for word in SHORT if word not in ("--sheets", "0")] + ["--sheets", "1"]
+    for stage, out in (("encoder", tmp_path / "own"), ("denoiser", tmp_path)):
+        command = ["train", "micro", "--stage", stage, "--out", str(out), *sheets]
+        assert main([*command, *steps(stage, 2), "--until", "1"]) == 0
+        with Image.open(out / stage / "sheets" / "step_000001.png") as sheet:
+            picture = np.asarray(sheet)
+        assert picture.shape[2] == 3 and picture.std() > 10
+
+
+@pytest.mark.parametrize("where", ["out", "json"])
+def test_results_that_cannot_be_written_are_refused_before_anything_is_trained(
+    tmp_path, capsys, where
+):
+    (tmp_path / "file").write_text("")
+    options = {
+        "out": ["--out", str(tmp_path / "file")],
+        "json": ["--out", str(tmp_path / "x"), "--json", str(tmp_path / "absent" / "x.json")],
+    }
+    assert main(["train", "micro", *SHORT, *options[where]]) == 2
+    said = capsys.readouterr().err
+    assert str(tmp_path) in said and said.count("\n") == 1
+    assert not (tmp_path / "x").exists()
+
+
+def test_batches_across_different_context_counts_are_refused_at_once(tmp_path, capsys):
+    assert train(tmp_path, "encoder", "--set", "encoder.optimizer.batch=12") == 2
+    assert "optimizer.batch = 12" in capsys.readouterr().err
+    more = ["--set", "encoder.optimizer.batch=24", "--set", "encoder.optimizer.accumulate=3"]
+    assert train(tmp_path, "encoder", *more, "--until", "1") == 0
+
+
+def test_a_training_is_not_mixed_with_another(trained, tmp_path, capsys):
+    assert train(trained, "encoder", *steps("encoder", 24)) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert train(trained, "encoder", *steps("encoder", 25), "--resume") == 2
+    assert "options.optimizer.steps = 24, now 25" in capsys.readouterr().err
+    assert train(tmp_path / "new", "denoiser") == 2
+    assert "run --stage encoder first" in capsys.readouterr().err
+    assert train(tmp_path / "new", "encoder", "--set", "encoder.optimizer.stepz=3") == 2
+    assert "did you mean 'steps'" in capsys.readouterr().err
+    assert main(["train", "huge", "--out", str(tmp_path / "x")]) == 2
+    assert "known: base, micro, tiny" in capsys.readouterr().err
+
+
+def test_a_torn_state_is_one_clear_line(trained, tmp_path, capsys):
+    folder = tmp_path / "torn" / "encoder"
+    folder.mkdir(parents=True)
+    whole = (trained / "encoder" / "state.pt").read_bytes()
+    (folder / "state.pt").write_bytes(whole[: len(whole) // 2])
+    assert train(tmp_path / "torn", "encoder", "--resume") == 2
+    assert "cannot be read" in capsys.readouterr().err
+
+
+def test_bad_batches_are_skipped_and_counted(tmp_path):
+    more = ["--set", "encoder.optimizer.largest_loss=1e-6", *steps("encoder", 2)]
+    assert train(tmp_path, "encoder", *more) == 0
+    assert read_log(tmp_path / "encoder")[-1]["skipped"] == 2
+    state = torch.load(tmp_path / "encoder" / "state.pt", weights_only=True)
+    loaded = load_state(tmp_path / "encoder", state["identity"])
+    assert loaded is not None and loaded.progress.skipped == 2
+
+
+@pytest.mark.slow
+def test_two_processes_see_what_one_would(tmp_path):
+    """The same global batch on two CPU processes gives the same curve."""
+    arguments = ["train", "micro", "--stage", "encoder", *SHORT, *steps("encoder", 4)]
+    arguments += ["--set", "encoder.statistics=1"]
+    assert main([*arguments, "--out", str(tmp_path / "one")]) == 0
+    command = [
+        *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
+        *("-m", "pipelines.cli", *arguments, "--out", str(tmp_path / "two")),
+    ]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    one, two = (read_log(tmp_path / name / "encoder")[-1] for name in ("one", "two"))
+    for name in ("loss", "depth", "rgb", "ray", "pose"):
+        assert two[name] == pytest.approx(one[name], rel=1e-4), json.dumps([one, two])
+
+
+def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
+    out = tmp_path / "packed"
+    assert main(["weights", "pack", str(trained), str(out)]) == 0
+    assert str(trained / "heads" / "weights") in capsys.readouterr().out
+    student, packed = weights_of(trained / "heads"), from_pretrained(out).state_dict()
+    for name, tensor in student.items():
+        assert torch.allclose(packed[name], tensor, rtol=2e-3, atol=1e-5), name
+    whole = (trained / "heads" / "weights" / "geoverse.safetensors").stat().st_size
+    assert (out / "geoverse.safetensors").stat().st_size < 0.6 * whole
+    settings = json.loads((out / "training_encoder.json").read_text())
+    assert settings["encoder"]["optimizer"]["steps"] == 24 and settings["data"]["cache"] is None
+    last = json.loads((out / "log_reflow.jsonl").read_text().splitlines()[-1])
+    assert last["step"] == 3
+    shutil.copytree(trained, tmp_path / "again")
+    os.utime(tmp_path / "again" / "reflow" / "weights" / "geoverse.safetensors")
+    assert main(["weights", "pack", str(tmp_path / "again"), str(out)]) == 2
+    assert "an earlier stage made" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "again" / "heads")
+    assert main(["weights", "pack", str(tmp_path / "again"), str(out)]) == 0
+    assert (out / "log_reflow.jsonl").exists() and not (out / "log_heads.jsonl").exists()
+    assert main(["weights", "pack", str(tmp_path / "nothing"), str(out)]) == 2
+    assert "no finished denoiser" in capsys.readouterr().err
+    assert main(["weights", "pack", str(trained), str(trained / "inside")]) == 2
+    assert "choose another folder" in capsys.readouterr().err

@@ -1,0 +1,243 @@
+"""``gvtools train`` with parameters shared out over two processes: what one process would do."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gvtools.completers.geoverse import GeoVerse, from_pretrained
+from gvtools.completers.geoverse.config import GeoVerseConfig, read
+from gvtools.completers.geoverse.config_json import to_json
+from gvtools.training.denoiser_stage import DenoiserStage
+from gvtools.training.draws import Draws
+from gvtools.training.options import SHIPPED, shipped_or_read
+from gvtools.training.records import read_log
+from gvtools.training.samples import TrainingSamples
+from pipelines.cli import main
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SHARDED = ("--set", "parallel=sharded")
+STEPS = 3
+# Two processes' samples lie in different groups, so that their numbers of context views differ.
+LARGE = ("--set", f"denoiser.optimizer.steps={STEPS}", "--set", "denoiser.optimizer.batch=16")
+PARTS = ("--set", "denoiser.optimizer.accumulate=2")
+
+
+def arguments(training: str, stage: str, out: Path, *more: str) -> list[str]:
+    return ["train", training, "--stage", stage, "--out", str(out), "--device", "cpu", *more]
+
+
+def on_two(training: str, stage: str, out: Path, *more: str) -> str:
+    """Train on two processes; what the first one says."""
+    command = [
+        *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
+        *("-m", "pipelines.cli", *arguments(training, stage, out, *more)),
+    ]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def same_record(found: Path, wanted: Path) -> None:
+    """The last records of two stages agree, but for what is no mean over samples."""
+    one, two = read_log(wanted)[-1], read_log(found)[-1]
+    assert one.keys() == two.keys()
+    for name, value in one.items():
+        if name not in ("seconds", "depth_rel", "rgb_psnr") and not name.endswith("_pixels"):
+            assert math.isfinite(value)
+            assert two[name] == pytest.approx(value, rel=1e-4), json.dumps([one, two])
+
+
+def tensors(stage: Path) -> dict[str, torch.Tensor]:
+    return from_pretrained(stage / "weights", video=False).state_dict()
+
+
+def same_weights(found: Path, wanted: Path) -> None:
+    """Equal but for rounding, which Adam blows up to a step where a gradient is next to nothing."""
+    one, two = tensors(wanted), tensors(found)
+    apart = sum(int(((one[name] - two[name]).abs() > 1e-5).sum()) for name in one)
+    assert apart <= 1e-3 * sum(tensor.numel() for tensor in one.values())
+
+
+def same_gradients(found: Path, wanted: Path, most: float) -> None:
+    """Of the one step that was made, as Adam's averages have them; of every parameter.
+
+    Args:
+        most: by which a parameter's gradients may differ, of its gradient's norm; and besides by a
+            millionth of the greatest one, which is what rounding leaves of a gradient that is 0.
+    """
+    one, two = (
+        torch.load(stage / "state.pt", weights_only=True)["optimizer"]["state"]
+        for stage in (wanted, found)
+    )
+    assert one.keys() == two.keys()
+    greatest = max(float(entry["exp_avg"].norm()) for entry in one.values())
+    for index, entry in one.items():
+        gradient, other = entry["exp_avg"], two[index]["exp_avg"]
+        assert float((gradient - other).norm()) <= most * float(gradient.norm()) + 1e-6 * greatest
+
+
+def model_of(config: GeoVerseConfig) -> GeoVerse:
+    """A model in which nothing is zero, so that every parameter that is trained has a gradient."""
+    torch.manual_seed(5)
+    model = GeoVerse(config)
+    for parameter in model.parameters():
+        if not parameter.any():
+            torch.nn.init.normal_(parameter, std=0.05)
+    return model
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory) -> Path:
+    """Weights that every training here starts from."""
+    folder = tmp_path_factory.mktemp("start")
+    model_of(read(SHIPPED / "micro_model.json")).save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def one(start, tmp_path_factory) -> Path:
+    """What one process comes to."""
+    out = tmp_path_factory.mktemp("one")
+    more = ["--init", str(start), "--sheets", str(STEPS), *LARGE, *PARTS, "--quiet"]
+    assert main(arguments("micro", "denoiser", out, *more)) == 0
+    return out / "denoiser"
+
+
+@pytest.fixture(scope="module")
+def two(start, tmp_path_factory) -> tuple[Path, str]:
+    """What two processes come to, and what they say."""
+    out = tmp_path_factory.mktemp("two")
+    more = ["--init", str(start), "--sheets", str(STEPS), *LARGE, *PARTS, *SHARDED]
+    return out / "denoiser", on_two("micro", "denoiser", out, *more)
+
+
+def test_two_processes_that_share_parameters_out_see_what_one_would(one, two):
+    config, folder = shipped_or_read("micro")
+    samples = TrainingSamples(config, config.model_config(folder))
+    contexts = [samples.batch(range(n, n + 1)).views.context for n in range(0, 16 * STEPS, 8)]
+    assert any(a != b for a, b in zip(contexts[::2], contexts[1::2], strict=True))
+    same_record(two[0], one)
+    same_weights(two[0], one)
+    pictures = [
+        np.asarray(Image.open(stage / "sheets" / f"step_{STEPS:06d}.png"), dtype=float)
+        for stage in (one, two[0])
+    ]
+    assert np.abs(pictures[0] - pictures[1]).mean() < 0.1
+
+
+def test_each_of_them_holds_its_half_of_what_is_trained(start, two):
+    pattern = r"share ([\d,]+) parameters out, the first holds ([\d,]+) of them; ([\d,]+)"
+    said = re.search(pattern, two[1])
+    assert said is not None, two[1]
+    shared, own, whole = (int(number.replace(",", "")) for number in said.groups())
+    model = from_pretrained(start)
+    counts = {
+        name: sum(p.numel() for p in part.parameters()) for name, part in model.named_children()
+    }
+    frozen = sum(p.numel() for n, p in model.named_parameters() if n.endswith("t_embedder.W"))
+    assert whole <= counts["geometry"] + frozen
+    assert shared + whole == sum(counts.values())
+    assert own == pytest.approx(shared / 2, rel=0.02)
+
+
+def test_what_they_save_goes_on_exactly_and_in_one_process(start, one, two, tmp_path):
+    more = ["--init", str(start), *LARGE, *PARTS]
+    on_two("micro", "denoiser", tmp_path / "a", *more, *SHARDED, "--until", "1")
+    assert not (tmp_path / "a" / "denoiser" / "weights").exists()
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+
+    more += ["--resume", "--sheets", "0"]
+    on_two("micro", "denoiser", tmp_path / "a", *more, *SHARDED)
+    whole, parts = tensors(two[0]), tensors(tmp_path / "a" / "denoiser")
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+    # One process shares nothing out, whatever the setting.
+    assert main(arguments("micro", "denoiser", tmp_path / "b", *more, *SHARDED, "--quiet")) == 0
+    same_weights(tmp_path / "b" / "denoiser", one)
+
+
+def test_a_batch_that_is_bad_in_one_process_is_skipped_by_both(start, tmp_path):
+    """Also where the one goes on to its backward pass, in which the processes meet."""
+    config, folder = shipped_or_read("micro")
+    model = from_pretrained(start, config=config.model_config(folder))
+    stage, samples = DenoiserStage(model, config.denoiser), TrainingSamples(config, model.config)
+    losses = [
+        float(stage(samples.batch(part), Draws(0, "denoiser", 0, tuple(part)))[0].detach())
+        for part in (range(0, 4), range(4, 8))
+    ]
+    most = sum(losses) / 2
+    assert min(losses) < 0.99 * most
+    more = ["--init", str(start), "--sheets", "0", "--set", "denoiser.optimizer.batch=8"]
+    more += ["--set", "denoiser.optimizer.steps=4"]
+    more += ["--set", f"denoiser.optimizer.largest_loss={most}"]
+    assert main(arguments("micro", "denoiser", tmp_path / "one", *more, *PARTS, "--quiet")) == 0
+    on_two("micro", "denoiser", tmp_path / "two", *more, *SHARDED)
+    assert 0 < read_log(tmp_path / "one" / "denoiser")[-1]["skipped"] < 4
+    same_record(tmp_path / "two" / "denoiser", tmp_path / "one" / "denoiser")
+
+
+def test_the_encoders_stage_is_shared_out_as_well(tmp_path):
+    more = ["--set", "encoder.optimizer.steps=2", "--set", "encoder.statistics=1"]
+    assert main(arguments("micro", "encoder", tmp_path / "one", *more, "--quiet")) == 0
+    on_two("micro", "encoder", tmp_path / "two", *more, *SHARDED)
+    same_record(tmp_path / "two" / "encoder", tmp_path / "one" / "encoder")
+    same_weights(tmp_path / "two" / "encoder", tmp_path / "one" / "encoder")
+
+
+def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
+    """All stages of a model with the video prior, in one call."""
+    pytest.importorskip("diffusers", reason="the extra wan is not installed")
+    import published_folder
+    import tiny_wan
+
+    micro = read(SHIPPED / "micro_model.json")
+    config = replace(
+        micro,
+        video=replace(tiny_wan.CONFIG, prompt="zeros"),
+        injection="control",
+        level1=replace(micro.level1, depth=4),
+        control=replace(micro.control, layers=(0, 1, 2, 3)),
+    )
+    folder = tmp_path / "start"
+    published_folder.write_published(model_of(config), folder)
+    tiny_wan.transformer().save_pretrained(folder / "video" / "transformer")
+    tiny_wan.vae().save_pretrained(folder / "video" / "vae")
+    (tmp_path / "model.json").write_text(json.dumps(to_json(config)))
+    data = json.loads((SHIPPED / "micro.json").read_text())
+    data["model"] = "model.json"
+    data["reflow"]["guidance"] = 1.5
+    stages = ("denoiser", "reflow", "heads")
+    for stage in stages:
+        data[stage]["optimizer"]["steps"] = 1
+    training = tmp_path / "training.json"
+    training.write_text(json.dumps(data))
+    more = ["--init", "gld", str(folder), "--sheets", "1"]
+    # The same samples together: the video prior's noise goes by a sample's place among them.
+    both = [f"{stage}.optimizer.accumulate=2" for stage in stages]
+    parts = [*(word for text in both for word in ("--set", text)), "--quiet"]
+    assert main(arguments(str(training), "all", tmp_path / "one", *more, *parts)) == 0
+    on_two(str(training), "all", tmp_path / "two", *more, *SHARDED)
+    for stage in stages:
+        same_record(tmp_path / "two" / stage, tmp_path / "one" / stage)
+        # A later stage starts from weights that are the same but for rounding (``same_weights``).
+        most = 1e-4 if stage == stages[0] else 1e-2
+        same_gradients(tmp_path / "two" / stage, tmp_path / "one" / stage, most)
+        assert (tmp_path / "two" / stage / "weights" / "video" / "vae").is_dir()
+        assert from_pretrained(tmp_path / "two" / stage / "weights").video is not None

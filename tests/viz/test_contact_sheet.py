@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+import pytest
+from matplotlib import colormaps
+from PIL import Image
+
+from gvtools.errors import ShapeError
+from viz.report.contact_sheet import (
+    ERROR_MAP,
+    SUPPORT,
+    WORST,
+    TargetPictures,
+    Tile,
+    contact_row,
+    error_map,
+    support_map,
+)
+
+RNG = np.random.default_rng(0)
+
+
+def opened(tile: Tile) -> Image.Image:
+    kind, data = tile.uri.split(";base64,")
+    image = Image.open(io.BytesIO(base64.b64decode(data)))
+    assert kind == f"data:image/{str(image.format).lower()}"
+    assert image.size == (tile.width, tile.height)
+    return image.convert("RGB")
+
+
+def pictures(height: int = 300, width: int = 400, **more) -> TargetPictures:
+    x = np.linspace(0, 255, width)
+    rgb = np.broadcast_to(x[None, :, None], (height, width, 3)).astype(np.uint8)
+    left = np.broadcast_to(np.arange(width) < width // 2, (height, width))
+    return TargetPictures(
+        "view", hint=rgb, observed=left, supported=left, completion=rgb, **more
+    )  # fmt: skip
+
+
+def test_the_error_map_is_the_mean_absolute_difference():
+    picture = RNG.integers(0, 256, (20, 30, 3)).astype(np.uint8)
+    truth = RNG.integers(0, 256, (20, 30, 3)).astype(np.uint8)
+    level = np.abs(picture / 255 - truth / 255).mean(axis=2) / WORST
+    expected = colormaps[ERROR_MAP](np.clip(level, 0, 1))[..., :3] * 255
+    # A step of the map's 256 colours.
+    assert np.abs(error_map(picture, truth) - expected).max() < 5
+    assert (error_map(picture, picture) == error_map(picture, picture)[0, 0]).all()
+
+
+def test_what_the_mask_leaves_out_is_grey():
+    picture = np.zeros((4, 4, 3), np.uint8)
+    mask = np.zeros((4, 4), bool)
+    mask[0] = True
+    shown = error_map(picture, picture + 255, mask=mask)
+    assert (shown[1:] == 128).all()
+    assert shown[0, 0, 0] > 200
+
+
+def test_pictures_of_two_sizes_are_refused():
+    with pytest.raises(ShapeError, match=r"\(4, 4, 3\).*\(4, 5, 3\)"):
+        error_map(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.uint8))
+
+
+def test_observed_generated_and_holes_have_a_colour_each():
+    observed = np.array([[True, False, False]])
+    supported = np.array([[True, True, False]])
+    shown = support_map(observed, supported)[0]
+    assert ["#" + bytes(pixel.tolist()).hex() for pixel in shown] == [
+        color.lower() for color in SUPPORT.values()
+    ]
+
+
+def test_the_tiles_stand_in_order_and_hold_the_pictures():
+    white = np.full((30, 20, 3), 255, np.uint8)
+    truth = pictures().completion
+    tiles = contact_row(pictures(truth=truth, context=white, context_name="given"), side=200)
+    assert [tile.label for tile in tiles] == [
+        "context", "hint", "validity", "completion", "truth", "error"
+    ]  # fmt: skip
+    shown = {tile.label: np.asarray(opened(tile)) for tile in tiles}
+    assert shown["context"].shape == (30, 20, 3)
+    assert shown["hint"].shape == (150, 200, 3)
+    assert np.diff(shown["completion"][75, :, 0].astype(int)).mean() == pytest.approx(1.28, abs=0.1)
+    assert shown["error"].max() < 20
+    left, right = shown["validity"][0, 0], shown["validity"][0, -1]
+    assert "#" + bytes(left.tolist()).hex() == SUPPORT["observed"].lower()
+    assert "#" + bytes(right.tolist()).hex() == SUPPORT["hole"]
+    assert "50% observed" in tiles[2].alt
+    assert "given" in tiles[0].alt
+
+
+def test_without_truth_and_context_no_empty_tiles():
+    assert [tile.label for tile in contact_row(pictures())] == ["hint", "validity", "completion"]

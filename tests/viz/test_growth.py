@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pytest
+from PIL import Image
+
+from gvtools.errors import OptionError
+from viz.plots.growth import COLORS, draw_growth, growth_text
+
+
+def rounds(count: int = 3) -> list[dict]:
+    return [
+        {
+            "round": k,
+            "points": 1000 + 200 * k,
+            "voxels": 600 + 150 * k,
+            "added": 1000 if k == 0 else 200,
+            "merged": 300 if k == 0 else 40,
+            "rejected": 0 if k == 0 else 25,
+            "observed": 1000,
+            "generated": 200 * k,
+            "coverage_before": None if k == 0 else 0.5 + 0.1 * k,
+            "coverage_after": None if k == 0 else 0.7 + 0.1 * k,
+            "seconds": {"depth": 0.1, "fuse": 0.5, "project": 0.2, "complete": 1.0, "align": 0.0},
+            "bytes": 50_000,
+        }
+        for k in range(count)
+    ]
+
+
+def heights(axes, label):
+    container = next(c for c in axes.containers if c.get_label() == label)
+    return [patch.get_height() for patch in container]
+
+
+def points(dots) -> np.ndarray:
+    return np.asarray(dots.get_offsets())
+
+
+def test_the_bars_are_the_figures():
+    panels: list[Any] = draw_growth(rounds(), title="room").axes
+    stored, fates, coverage, times = panels
+    assert heights(stored, "observed") == [1000, 1000, 1000]
+    assert heights(stored, "generated") == [0, 200, 400]
+    assert list(stored.lines[0].get_ydata()) == [600, 750, 900]
+    assert heights(fates, "added") == [1000, 200, 200]
+    assert heights(fates, "merged") == [300, 40, 40]
+    assert heights(fates, "rejected") == [0, 25, 25]
+    assert heights(fates, "new voxels") == [600, 150, 150]
+    before, after = (points(dots) for dots in coverage.collections[1:])
+    np.testing.assert_allclose(before, [[1, 60], [2, 70]])
+    np.testing.assert_allclose(after, [[1, 80], [2, 90]])
+    assert sum(bar.get_height() for bar in times.patches) == pytest.approx(3 * 1.8)
+
+
+def test_every_axis_names_its_quantity():
+    labels = [axes.get_ylabel() for axes in draw_growth(rounds(), title="room").axes]
+    assert labels == ["observations, voxels", "points, voxels (logarithmic)",
+                      "coverage, % of pixels", "seconds"]  # fmt: skip
+
+
+def test_a_picture_without_pyplot_state():
+    import matplotlib.pyplot as plt
+
+    before = plt.get_fignums(), matplotlib.get_backend()
+    buffer = io.BytesIO()
+    draw_growth(rounds(), title="room").savefig(buffer, format="png", dpi=50)
+    assert (plt.get_fignums(), matplotlib.get_backend()) == before
+    assert np.asarray(Image.open(buffer).convert("L")).std() > 20
+
+
+@pytest.mark.parametrize("count", [1, 40])
+def test_one_round_and_many(count):
+    draw_growth(rounds(count), title="room").savefig(io.BytesIO(), format="png", dpi=40)
+
+
+def test_a_run_without_anything_still_draws():
+    empty = rounds(1)
+    for key in ("voxels", "added", "merged", "observed", "generated"):
+        empty[0][key] = 0
+    empty[0]["seconds"] = {}
+    draw_growth(empty, title="room").savefig(io.BytesIO(), format="png", dpi=40)
+    assert "0 added" in growth_text(empty)
+
+
+def test_colours_stay_apart_for_the_colour_blind():
+    """Viénot's deuteranope simulation keeps the colours of one panel apart."""
+    lms = np.array([[17.8824, 43.5161, 4.11935], [3.45565, 27.1554, 3.86714],
+                    [0.0299566, 0.184309, 1.46709]])  # fmt: skip
+    deutan = np.array([[1, 0, 0], [0.494207, 0, 1.24827], [0, 0, 1]])
+    simulate = np.linalg.inv(lms) @ deutan @ lms
+    for panel in (("observed", "generated", "voxels"), ("added", "merged", "rejected")):
+        rgb = [np.array(matplotlib.colors.to_rgb(COLORS[name])) ** 2.2 for name in panel]
+        seen = [simulate @ color for color in rgb]
+        for i, first in enumerate(seen):
+            for second in seen[:i]:
+                assert np.abs(first - second).max() > 0.1
+
+
+def test_the_text_fits_and_tells_the_same():
+    text = growth_text(rounds(), width=72)
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= 72
+    bars = lines[1:4]
+    assert [bar.count("+") > 0 for bar in bars] == [False, True, True]
+    observed = [bar.count("#") for bar in bars]
+    assert max(observed) - min(observed) <= 1
+    assert bars[2].count("+") / bars[2].count("#") == pytest.approx(0.4, abs=0.05)
+    assert "60.0% -> 80.0%" in bars[1]
+    assert "200 added, 40 merged, 25 rejected, 150 new voxels" in lines[5]
+
+
+def test_nothing_to_draw_is_refused():
+    for call in (lambda: draw_growth([], title="x"), lambda: growth_text([])):
+        with pytest.raises(OptionError, match="no rounds"):
+            call()
+    with pytest.raises(OptionError, match="60 or more"):
+        growth_text(rounds(), width=40)

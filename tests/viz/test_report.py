@@ -1,0 +1,411 @@
+"""The report of a run: what it says, what it survives, and how it looks in a browser."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Browser, open_browser
+from PIL import Image
+from test_cli import refused
+from tiny_scan import write_scan
+
+from gvtools.cameras import Cameras
+from gvtools.scenes.project import open_project
+from pipelines.cli import main
+from pipelines.commands.report import write_report
+from pipelines.config import RunConfig
+from pipelines.reconstruction.plan import make_plan
+from pipelines.report.data import collect, read_sweep
+from pipelines.report.sheets import chosen_targets, nearest_camera
+from viz.report.contact_sheet import TargetPictures, contact_row
+from viz.report.content import SheetRow
+from viz.report.page import report_html
+
+RUN = ("--context", "first:3", "--targets", "range:3-6", "--views-per-round", "2", "--quiet")
+LABELS = ["context", "hint", "validity", "completion", "truth", "error"]
+
+
+class Page(HTMLParser):
+    """Tags, addresses and tables of a page."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.captions: list[str] = []
+        self.rows: list[list[str]] = []
+        self.said = ""
+        self._within: list[str] = []
+        text = path.read_text(encoding="utf-8")
+        self.feed(text)
+        self.style = text[text.index("<style>") : text.index("</style>")]
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self._within.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag == "tr":
+            self.rows.append([])
+
+    def handle_endtag(self, tag: str) -> None:
+        while self._within and self._within.pop() != tag:
+            pass
+
+    def handle_data(self, data: str) -> None:
+        inside = self._within[-1] if self._within else ""
+        if inside == "figcaption":
+            self.captions.append(data)
+        if inside in ("td", "th"):
+            self.rows[-1].append(data)
+        if inside != "style":
+            self.said += data
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    return write_scan(tmp_path_factory.mktemp("scan"), views=7)
+
+
+@pytest.fixture(scope="module")
+def finished(scan, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "wall"
+    assert main(["reconstruct", str(scan), "--out", str(out), *RUN]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def page(finished):
+    return written(finished)
+
+
+@pytest.fixture
+def own(finished, tmp_path):
+    """A copy to spoil."""
+    return Path(shutil.copytree(finished, tmp_path / "wall"))
+
+
+def written(run: Path, *more: object) -> Page:
+    assert main(["report", str(run), "--quiet", *map(str, more)]) == 0
+    return Page(run / "report.html")
+
+
+def test_nothing_is_asked_of_the_network_and_nothing_runs(page):
+    assert page.addresses
+    assert all(address.startswith(("data:", "#")) for address in page.addresses)
+    assert "url(" not in page.style
+    assert "@import" not in page.style
+    assert "script" not in page.tags
+
+
+def test_the_rounds_are_those_of_the_run(finished, page):
+    rounds = [json.loads(line) for line in (finished / "rounds.jsonl").read_text().splitlines()]
+    table = [row for row in page.rows if len(row) == 15]
+    assert len(table) == 1 + len(rounds)
+    at = {name: table[0].index(name) for name in ("observed", "generated", "rejected")}
+    for row, entry in zip(table[1:], rounds, strict=True):
+        assert row[0] == str(entry["round"])
+        for name, place in at.items():
+            assert int(row[place].replace("\u202f", "")) == entry[name]
+
+
+def test_the_figures_are_those_of_the_metrics(finished, page):
+    metrics = json.loads((finished / "metrics.json").read_text())
+    rows = {row[0]: row for row in page.rows if len(row) == 4}
+    for name, key in (("PSNR, dB", "psnr"), ("SSIM", "ssim")):
+        for cell, region in zip(rows[name][1:], ("", "_valid", "_generated"), strict=True):
+            assert float(cell) == pytest.approx(metrics[f"{key}{region}"], rel=1e-3)
+    each = [row for row in page.rows if row and row[0].startswith("frame-")]
+    assert [row[0] for row in each] == [view["name"] for view in metrics["views"]]
+
+
+def test_each_target_has_its_six_pictures(own, page):
+    assert page.captions == LABELS * 4
+    page = written(own, "--pictures", 3)
+    assert page.captions == LABELS * 3
+    assert "3 of 4 targets" in page.said
+    assert "the other 1 lie in wall/round_*" in page.said
+
+
+def test_settings_that_differ_come_first_and_all_are_there(page):
+    rows = page.rows
+    heads = [index for index, row in enumerate(rows) if row[:2] == ["setting", "value"]]
+    changed = [row[0] for row in rows[heads[0] + 1 : heads[1]]]
+    everything = [row[0] for row in rows[heads[1] + 1 :]]
+    assert set(changed) == {"context", "targets", "views_per_round", "rounds", "voxel"}
+    assert len(everything) > 40
+    assert "splat.band" in everything
+
+
+def test_an_evaluation_gives_intervals_and_estimated_poses(own):
+    assert main(["evaluate", str(own), "--parts", "images,poses", "--no-control", "--quiet"]) == 0
+    page = written(own)
+    assert "evaluation/evaluation.json" in page.said
+    assert "95 % interval" in page.said
+    report = collect(own)
+    assert report.poses is not None
+    assert report.poses.estimated is not None
+    located = report.poses.located
+    if located.any():
+        apart = report.poses.estimated[located] - report.poses.requested[located]
+        assert np.abs(apart).max() < 0.2
+    # An evaluation of other settings says nothing of this run.
+    record = json.loads((own / "run.json").read_text())
+    record["config"]["seed"] = 7
+    (own / "run.json").write_text(json.dumps(record))
+    report = collect(own)
+    assert report.figures_from == "metrics.json"
+    assert any("another state" in warning for warning in report.warnings)
+
+
+def test_a_run_that_is_not_finished(own):
+    shutil.rmtree(own / "round_002")
+    (own / "metrics.json").unlink()
+    page = written(own)
+    assert "1 of 2 rounds are done" in page.said
+    assert page.captions == LABELS * 2
+    assert "There is no metrics.json yet" in page.said
+
+
+def test_figures_of_another_state_are_left_out(own):
+    shutil.rmtree(own / "round_002")
+    report = collect(own)
+    assert report.figures_from is None
+    assert any("another state" in warning for warning in report.warnings)
+
+
+def test_a_project_that_is_gone(own, scan, capsys):
+    record = json.loads((own / "run.json").read_text())
+    record["project"] = str(own / "nowhere")
+    (own / "run.json").write_text(json.dumps(record))
+    page = written(own)
+    assert "no photographs" in capsys.readouterr().err
+    assert page.captions == ["hint", "validity", "completion"] * 4
+    assert "no error maps" in page.said
+    assert "context's cameras are missing" in page.said
+    shown = collect(own, project=scan).sheet
+    assert [tile.label for row in shown for tile in row.tiles] == LABELS * 4
+
+
+def test_a_run_that_has_its_project_open_writes_the_same_page(own, scan, page):
+    config = RunConfig(context="first:3", targets="range:3-6", views_per_round=2)
+    before = (own / "report.html").read_bytes()
+    (own / "report.html").unlink()
+    write_report(make_plan(open_project(scan), config), own)
+    assert (own / "report.html").read_bytes() == before
+
+
+def test_pictures_that_are_damaged_are_named(own):
+    (own / "round_001" / "generated_frame-000003.color.png").write_bytes(b"no picture")
+    page = written(own)
+    assert page.captions == LABELS * 3
+    assert "frame-000003.color.png (round 1) cannot be shown" in page.said
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda report: [1, 2], lambda report: {**report, "observed": None},
+     lambda report: {k: v for k, v in report.items() if k != "observed"},
+     lambda report: {**report, "views": [1]}, lambda report: {**report, "seconds": 3},
+     lambda report: {**report, "views": [{**report["views"][0], "camera": {}}]}],
+)  # fmt: skip
+def test_a_damaged_report_is_one_line(own, capsys, change):
+    path = own / "round_001" / "report.json"
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    assert "round_001/report.json: no report of this version" in refused(capsys, "report", own)
+
+
+@pytest.mark.parametrize("key", ["schedule", "context", "config", "project"])
+def test_a_damaged_record_is_one_line(own, capsys, key):
+    record = json.loads((own / "run.json").read_text())
+    (own / "run.json").write_text(json.dumps({**record, key: None}))
+    assert "no record of a run of this version" in refused(capsys, "report", own)
+
+
+@pytest.mark.parametrize("content", ['{"runs": [1]}', '{"runs": 3}', "[1, 2]", '{"runs": [{}]}'])
+def test_a_damaged_evaluation_leaves_the_runs_own_figures(own, content):
+    (own / "evaluation").mkdir()
+    (own / "evaluation" / "evaluation.json").write_text(content)
+    report = collect(own)
+    assert report.figures_from == "metrics.json"
+    assert len(report.warnings) == 1 and "evaluation.json" in report.warnings[0]
+
+
+def test_damaged_metrics_are_left_out(own):
+    metrics = json.loads((own / "metrics.json").read_text())
+    for change in ({"views": 3}, {"psnr": "high"}, {"notes": [3]}):
+        (own / "metrics.json").write_text(json.dumps({**metrics, **change}))
+        report = collect(own)
+        assert report.figures_from is None
+        assert any("metrics.json" in warning for warning in report.warnings)
+
+
+def test_a_picture_of_another_kind_costs_no_more_than_its_target(own):
+    Image.new("RGB", (96, 72)).save(own / "round_001" / "valid_frame-000003.color.png")
+    page = written(own)
+    assert page.captions == LABELS * 3
+    assert "frame-000003.color.png (round 1) cannot be shown" in page.said
+
+
+def test_no_picture_outside_the_run_is_shown(own, tmp_path):
+    for kind in ("guidance", "valid", "generated"):
+        inside = own / "round_001" / f"{kind}_frame-000003.color.png"
+        outside = tmp_path / f"{kind}.png"
+        inside.rename(outside)
+        inside.symlink_to(outside)
+    page = written(own)
+    assert page.captions == LABELS * 3
+    assert "lies outside" in page.said
+
+
+def test_what_is_no_run_is_refused(own, tmp_path, capsys):
+    assert "run.json" in refused(capsys, "report", tmp_path)
+    assert ".html" in refused(capsys, "report", own, "--out", tmp_path / "memory.npz")
+    assert "--pictures" in refused(capsys, "report", own, "--pictures", 0)
+    (own / "round_001" / "report.json").write_text("{}")
+    assert "round_001" in refused(capsys, "report", own, "--out", tmp_path / "a.html")
+    shutil.rmtree(own / "round_000")
+    assert "no round is done" in refused(capsys, "report", own, "--out", tmp_path / "a.html")
+    assert not (tmp_path / "a.html").exists()
+
+
+def test_a_sweep_beside_the_run_is_drawn(own):
+    outcome = {
+        "settings": {}, "targets": 4, "fixed": 1.0, "per_target": 0.5, "bytes": 1e6,
+        "observations": 10, "psnr": 20.0, "psnr_valid": None, "psnr_generated": None,
+        "ssim": None, "depth_rel": None, "coverage": 1.0,
+    }  # fmt: skip
+    better = {**outcome, "psnr": 25.0, "per_target": 2.0}
+    worse = {**outcome, "psnr": 19.0, "per_target": 3.0}
+    names = {"start": outcome, "profile fast": better, "voxel 2": worse}
+    trials = [{"label": label, "share": 1.0, **trial} for label, trial in names.items()]
+    # Trials on a share of the targets are no figures of whole runs.
+    trials.append({"label": "voxel 4", "share": 0.25, **outcome, "psnr": 99.0})
+    record = json.loads((own / "run.json").read_text())
+    sweep = {"project": record["project"], "reading": record["reading"], "targets": 4,
+             "budget": 60, "budget_of": "seconds", "trials": trials,
+             "recommended": better}  # fmt: skip
+    # Beside the run, as README has it, and above it, as a trial has it.
+    beside = own.parent / "sweep"
+    beside.mkdir()
+    (beside / "tradeoff.json").write_text(json.dumps(sweep))
+    assert read_sweep(own, of=record) is not None
+    for key, other in (("project", "/elsewhere"), ("reading", {"depth_unit": 2})):
+        (beside / "tradeoff.json").write_text(json.dumps({**sweep, key: other}))
+        (own.parent / "tradeoff.json").write_text(json.dumps({**sweep, key: other}))
+        assert read_sweep(own, of=record) is None
+    (own.parent / "tradeoff.json").write_text(json.dumps(sweep))
+    found = collect(own).trade_off
+    assert found is not None
+    assert [point["kind"] for point in found.trials] == ["start", "profile", "trial"]
+    assert [point["seconds"] for point in found.front] == [3.0, 9.0]
+    assert found.budget == 60
+    assert "Trade-off" in written(own).said
+    (own.parent / "tradeoff.json").write_text("[]")
+    assert any("no trade-off of this version" in warning for warning in collect(own).warnings)
+
+
+def test_no_text_of_a_users_files_becomes_markup(own, tmp_path):
+    evil = "<img src=x onerror=\"alert(1)\"><script>alert('2')</script>&amp;"
+    report = collect(own)
+    black = np.zeros((4, 6, 3), np.uint8)
+    none = np.zeros((4, 6), bool)
+    tiles = contact_row(
+        TargetPictures(evil, black, none, none, black, truth=black, context=black,
+                       context_name=evil)
+    )  # fmt: skip
+    views = [{**view, "name": evil} for view in report.views]
+    report = replace(
+        report, title=evil, facts=[("project", evil)], changed=[(evil, evil, evil)],
+        settings={evil: evil}, warnings=[evil], notes=[evil], views=views, sheet_note=evil,
+        sheet=[SheetRow(evil, tiles)], figures_from=evil, poses_note=evil,
+        pose_errors=[(evil, 1.0, None)],
+    )  # fmt: skip
+    (tmp_path / "evil.html").write_text(report_html(report), encoding="utf-8")
+    page = Page(tmp_path / "evil.html")
+    assert "script" not in page.tags
+    assert all(address.startswith(("data:", "#")) for address in page.addresses)
+    # Shown as it was written, in every place.
+    assert page.said.count(evil) >= 13
+
+
+def test_every_round_is_shown_by_its_worst_target_first():
+    reports = [{"views": [{"name": f"{r}{k}", "coverage": k} for k in range(n)]}
+               for r, n in enumerate((0, 3, 2, 4))]  # fmt: skip
+    psnr: dict[str, float | None] = {"10": 30.0, "11": 20.0, "12": 25.0, "20": 9.0, "21": 8.0}
+    assert chosen_targets(reports, psnr, 3) == [(1, 1), (2, 1), (3, 0)]
+    # Then the best; where nothing was measured, coverage decides.
+    assert chosen_targets(reports, psnr, 6) == [(1, 0), (1, 1), (2, 0), (2, 1), (3, 0), (3, 3)]
+    assert len(chosen_targets(reports, psnr, 100)) == 9
+    assert chosen_targets(reports, psnr, 2) == [(1, 1), (3, 0)]
+    assert chosen_targets(reports[:1], psnr, 5) == []
+
+
+def test_the_context_view_beside_a_target_stands_and_looks_alike():
+    """Of equal places the one that looks alike, of equal directions the one that stands near."""
+    turned = np.diag([-1.0, 1, -1, 1])
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[1] = turned
+    poses[2, 0, 3], poses[3, 0, 3] = -4, -9  # centres at x = 4 and 9
+    size = np.full(4, 64)
+    cameras = Cameras(np.tile(np.eye(3), (4, 1, 1)), poses, size, size, tuple("abcd"))
+    asked = np.eye(4)
+    assert nearest_camera(cameras, turned) == 1
+    for x, row in ((0.5, 0), (3.0, 2), (8.0, 3)):
+        asked[0, 3] = -x
+        assert nearest_camera(cameras, asked) == row
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with open_browser() as opened:
+        yield opened
+
+
+@pytest.mark.parametrize(("width", "columns"), [(390, 2), (1280, 6)])
+def test_the_page_in_a_browser(browser: Browser, finished, page, width, columns):
+    file = finished / "report.html"
+    browser.resize(width, 844)
+    browser.driver.get(file.as_uri())
+    shown = browser.driver.execute_script(
+        """
+        const boxes = (name) => [...document.querySelectorAll(name)].map(
+            (e) => e.getBoundingClientRect().toJSON());
+        return {
+            wide: document.documentElement.scrollWidth,
+            broken: [...document.images].filter((i) => !i.complete || !i.naturalWidth).length,
+            images: boxes("img"),
+            sections: [...document.querySelectorAll("section")].map(
+                (e) => [e.id, e.getBoundingClientRect().height]),
+            first: boxes(".tiles:first-of-type figure").slice(0, 6),
+            letters: getComputedStyle(document.body).fontSize,
+        };
+        """
+    )
+    assert shown["wide"] <= width
+    assert shown["broken"] == 0
+    assert len(shown["images"]) > 20
+    assert all(box["width"] > 100 and box["height"] > 50 for box in shown["images"])
+    assert [name for name, _ in shown["sections"]] == [
+        "growth", "figures", "pictures", "trajectories", "time", "settings"
+    ]  # fmt: skip
+    assert all(height > 80 for _, height in shown["sections"])
+    top = shown["first"][0]["top"]
+    assert sum(abs(box["top"] - top) < 1 for box in shown["first"]) == columns
+    assert shown["letters"] == "16px"
+    asked = [url for url in browser.foreign_requests() if not url.startswith("file:")]
+    assert asked == []
+    assert browser.console_errors() == []
+    files = {
+        event["params"]["request"]["url"]
+        for event in browser.events()
+        if event["method"] == "Network.requestWillBeSent"
+        and event["params"]["request"]["url"].startswith("file:")
+    }
+    assert files == {file.as_uri()}
+    assert browser.picture().std() > 20

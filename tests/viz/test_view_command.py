@@ -1,0 +1,254 @@
+"""``gvtools view``: pictures without a display, Open3D's window, and options that do not fit."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gvtools.errors import OptionError
+from gvtools.memory.spatial_memory import SpatialMemory
+from pipelines.cli import main
+from pipelines.commands import view
+from pipelines.console import Console
+from pipelines.inputs.view_source import ViewSource
+from viz.run_view.point_colors import MODES
+from viz.run_view.render import picture_of
+from viz.web.viewer import BUDGET, LOCAL, PORT
+
+CAMERA = "frame-000004.color.png"
+
+
+@pytest.fixture(scope="module")
+def folder(small_run):
+    return small_run
+
+
+@contextmanager
+def display(tmp_path):
+    """An X server without a screen; skipped, with the reason, where there is none."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("no Xvfb (Debian: xvfb)")
+    read, write = os.pipe()
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-nolisten", "tcp"]
+    with (tmp_path / "xvfb.log").open("wb") as log:
+        server = subprocess.Popen(command, pass_fds=[write], stderr=log)
+    os.close(write)
+    try:
+        with os.fdopen(read) as told:
+            yield f":{told.readline().strip()}"
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def refused(capsys, *arguments):
+    assert main(["view", *map(str, arguments)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1 and error.startswith("gvtools: ")
+    return error
+
+
+def test_the_parser_knows_what_the_viewers_know():
+    assert (view.LOCAL, view.PORT, view.MAX_POINTS) == (LOCAL, PORT, BUDGET)
+    assert LOCAL == "127.0.0.1"
+    assert tuple(MODES) == view.COLORS
+
+
+def test_a_picture_needs_no_display(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    out = tmp_path / "shot.png"
+    options = ("--screenshot", str(out), "--camera", CAMERA, "--round", "1")
+    assert main(["view", str(folder), *options]) == 0
+    assert "rendered by the project's own splatter" in capsys.readouterr().out
+    memory = SpatialMemory.load(folder / "memory.npz")
+    memory.forget(round=2)
+    row = next(i for i in range(len(memory.views)) if memory.views[i].camera.names[0] == CAMERA)
+    expected = picture_of(memory.project(memory.views[row].camera))
+    np.testing.assert_array_equal(np.array(Image.open(out)), expected)
+
+
+def test_the_splatter_steps_in_for_open3d_and_says_so(folder, tmp_path, monkeypatch, capsys):
+    from viz.open3d import screenshot
+
+    # A child that cannot render, as without EGL and X.
+    monkeypatch.setattr(screenshot, "CHILD", ("-c", "raise RuntimeError('no EGL')"))
+    out = tmp_path / "shot.png"
+    assert main(["view", str(folder), "--open3d", "--screenshot", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "rendered by the project's own splatter (Open3D cannot: no EGL)" in said
+    assert np.array(Image.open(out)).std() > 10
+
+
+def test_bad_options_are_refused_in_one_line(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    shot = ("--screenshot", tmp_path / "x.png")
+    assert "no such file or folder" in refused(capsys, tmp_path / "absent", *shot)
+    assert "such as 'frame-000000" in refused(capsys, folder, *shot, "--camera", "nobody")
+    assert "rounds 0 to 2" in refused(capsys, folder, "--round", "3")
+    assert "ends with .png" in refused(capsys, folder, "--screenshot", tmp_path / "x.jpg")
+    assert "no display" in refused(capsys, folder, "--open3d")
+    assert "--live" in refused(capsys, folder, "--live", *shot)
+    assert "expected 1 to 65535" in refused(capsys, folder, "--port", "99999")
+    # 192.0.2.1 is nobody's, by RFC 5737.
+    assert "cannot listen" in refused(capsys, folder, "--host", "192.0.2.1")
+    assert not (tmp_path / "x.png").exists()
+
+
+@pytest.mark.slow
+def test_the_open3d_window_shows_the_run_and_steps_through_it(folder, tmp_path):
+    code = f"""
+from pathlib import Path
+import numpy as np
+from pipelines.inputs.view_source import ViewSource
+from viz.open3d.window import Open3dViewer
+
+said = []
+viewer = Open3dViewer(ViewSource(Path({str(folder)!r})).read(), say=said.append)
+viewer.look_from(0)
+def look():
+    for _ in range(3):
+        viewer.window.poll_events()
+        viewer.window.update_renderer()
+    return np.rint(255 * np.asarray(viewer.window.capture_screen_float_buffer(True))).astype("u1")
+pictures = [look()]
+viewer.step_round(-2)
+pictures.append(look())
+viewer.step_round(2)
+viewer.next_mode()
+pictures.append(look())
+viewer.toggle_cameras()
+pictures.append(look())
+viewer.look_from(4)
+viewer.window.destroy_window()
+np.save({str(tmp_path / "pictures.npy")!r}, pictures)
+print("\\n".join(said))
+"""
+    with display(tmp_path) as name:
+        environment = {**os.environ, "DISPLAY": name, "LIBGL_ALWAYS_SOFTWARE": "1"}
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True,
+            timeout=120, check=False,
+        )  # fmt: skip
+    if "GLFW" in done.stderr and done.returncode:
+        pytest.skip("the X server has no OpenGL (Debian: libgl1-mesa-dri)")
+    assert done.returncode == 0, done.stderr
+    last, first, colored, bare = np.load(tmp_path / "pictures.npy").astype(int)
+    covered = [(picture < 250).any(axis=2).mean() for picture in (first, last)]
+    assert covered[1] > covered[0] > 0.05
+    assert np.abs(colored - last).mean() > 3 and (bare != colored).any()
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("round 0 of 2") and "0 generated" in lines[0]
+    assert lines[2].startswith("round 2 of 2") and "round: round that" in lines[2]
+
+
+@pytest.mark.slow
+def test_open3d_renders_a_picture_where_there_is_a_display(folder, tmp_path, capsys, monkeypatch):
+    with display(tmp_path) as name:
+        monkeypatch.setenv("DISPLAY", name)
+        pictures = []
+        for extra in ((), ("--open3d",)):
+            out = tmp_path / f"shot{len(extra)}.png"
+            options = ("--screenshot", str(out), "--camera", "frame-000001.color.png", *extra)
+            assert main(["view", str(folder), *options]) == 0
+            pictures.append(np.array(Image.open(out)).astype(int))
+    said = capsys.readouterr().out
+    if "Open3D cannot" in said:
+        pytest.skip(said.splitlines()[-1])
+    assert "rendered by Open3D" in said
+    # Both show the same thing from the same place, each in its own way.
+    assert np.abs(pictures[0] - pictures[1]).mean() < 20
+
+
+def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(folder, tmp_path, capsys):
+    pytest.importorskip("viser", reason="viser is not installed")
+    port = free_port()
+    later = tmp_path / "run"
+    threading.Timer(1.0, shutil.copytree, (folder, later)).start()
+
+    def reached() -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
+    with view.live_viewer(later, Console(), "--port", str(port)):
+        end = time.monotonic() + 60
+        while not reached():
+            assert time.monotonic() < end
+            time.sleep(0.2)
+        # Told by this process, whose progress bar it has to go around.
+        said = ""
+        while f"{later}: look at http://127.0.0.1:{port} (Ctrl-C ends)\n" not in said:
+            assert time.monotonic() < end
+            time.sleep(0.1)
+            said += capsys.readouterr().out
+    assert not reached()
+
+
+def test_a_run_that_fails_at_once_says_no_more_than_why(tmp_path, capfd):
+    with pytest.raises(OptionError), view.live_viewer(tmp_path / "run", Console()):
+        # While the viewer is still starting.
+        time.sleep(0.3)
+        raise OptionError("no such project")
+    said = capfd.readouterr()
+    assert "Traceback" not in said.err and "KeyboardInterrupt" not in said.err
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_a_round_that_came_while_the_viewer_started_is_shown(folder, tmp_path, capsys):
+    growing, later = tmp_path / "growing", tmp_path / "later"
+    shutil.copytree(folder, growing)
+    (growing / "round_002").rename(later)
+    source = ViewSource(growing)
+    shown = source.read()
+    later.rename(growing / "round_002")
+    rounds: list[int] = []
+    following = view.Following(source, shown, lambda r: rounds.append(r.last_round), Console())
+    following.look()
+    following.look()
+    assert rounds == [2]
+    assert capsys.readouterr().out == "round 2 is there\n"
+
+
+@pytest.mark.parametrize("report", ['{"round": 2,', "[]", '{"round": 2, "views": []}'])
+def test_a_report_that_cannot_be_read_does_not_end_the_viewer(folder, tmp_path, capsys, report):
+    growing, kept = tmp_path / "growing", tmp_path / "kept"
+    shutil.copytree(folder, growing)
+    (growing / "round_002").rename(kept)
+    source, rounds = ViewSource(growing), list[int]()
+    following = view.Following(
+        source, source.read(), lambda run: rounds.append(run.last_round), Console()
+    )
+    (growing / "round_002").mkdir()
+    (growing / "round_002" / "report.json").write_text(report)
+    for _ in range(3):
+        following.look()
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and "round_002" in said
+    shutil.rmtree(growing / "round_002")
+    kept.rename(growing / "round_002")
+    following.look()
+    assert rounds == [2]
+
+
+def test_an_interrupted_start_is_no_interrupted_run(folder, monkeypatch, capsys):
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ViewSource, "read", interrupted)
+    assert main(["view", str(folder)]) == 0
+    assert capsys.readouterr() == ("viewer ended\n", "")

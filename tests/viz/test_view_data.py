@@ -1,0 +1,241 @@
+"""What viewers show: cameras, counts, pictures, colours and what is drawn of a large memory."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from memory_scenes import points
+from PIL import Image
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.memory.spatial_memory import SpatialMemory
+from pipelines.inputs.view_source import ViewSource
+from viz.plots.palette import COLORS, GREY
+from viz.run_view.detail import detail
+from viz.run_view.point_colors import (
+    MODES,
+    VIRIDIS,
+    depth_errors,
+    point_colors,
+    view_counts,
+    viridis,
+)
+from viz.run_view.render import RunRenderer, picture_of
+from viz.run_view.view import CONTEXT, TARGET, inside
+
+
+@pytest.fixture(scope="module")
+def folder(small_run):
+    return small_run
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    return ViewSource(folder).read()
+
+
+def rgb(color):
+    return [int(color[k : k + 2], 16) for k in (1, 3, 5)]
+
+
+def test_counts_are_those_of_the_rounds_and_of_the_memory_itself(run, folder):
+    lines = [json.loads(line) for line in (folder / "rounds.jsonl").read_text().splitlines()]
+    assert run.last_round == 2 and run.whole
+    bare = ViewSource(folder / "memory.npz").read()
+    for number, line in enumerate(lines):
+        expected = (line["observed"], line["generated"])
+        for shown in (run, bare):
+            counts = shown.counts(number)
+            assert (counts.observed, counts.generated) == expected
+    assert lines[2]["generated"] > lines[1]["generated"] > 0
+
+
+def test_cameras_are_the_context_and_the_targets_with_their_rounds(run):
+    kinds = [(shown.kind, shown.round) for shown in run.cameras]
+    assert kinds == [(CONTEXT, 0)] * 3 + [(TARGET, 1)] * 2 + [(TARGET, 2)] * 2
+    assert run.cameras[3].name == "frame-000004.color.png"
+    # The walk's cameras hold -y to be up.
+    np.testing.assert_allclose(run.up(), [0, -1, 0], atol=1e-6)
+
+
+def test_pictures_are_the_rounds_files_and_the_projects_truth(run, folder):
+    target = run.cameras[3]
+    pictures = run.pictures(target)
+    assert list(pictures) == ["guidance", "completion", "memory after", "truth"]
+    stored = Image.open(folder / "round_001" / f"generated_{target.stem}.png")
+    np.testing.assert_array_equal(pictures["completion"], np.array(stored))
+    truth = Image.open(folder.parent / "scan" / target.name)
+    np.testing.assert_array_equal(pictures["truth"], np.array(truth))
+    assert list(run.pictures(run.cameras[0])) == ["truth"]
+
+
+def test_a_run_whose_project_is_gone_shows_what_it_has(folder, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(folder, copy)
+    record = json.loads((copy / "run.json").read_text())
+    (copy / "run.json").write_text(json.dumps({**record, "project": str(tmp_path / "gone")}))
+    source = ViewSource(copy)
+    shown = source.read()
+    assert "truth" not in shown.pictures(shown.cameras[3])
+    assert "gone" in str(source.lacking())
+    # Told where the project lies now, it has them again.
+    moved = ViewSource(copy, project=folder.parent / "scan").read()
+    assert "truth" in moved.pictures(moved.cameras[3])
+
+
+def test_no_file_outside_the_run_is_read(folder, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(folder, copy)
+    secret = tmp_path / "guidance_secret.png"
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(secret)
+    path = copy / "round_001" / "report.json"
+    report = json.loads(path.read_text())
+    # guidance_x/../../../guidance_secret.png is outside; so is what a link leads to.
+    (copy / "round_001" / "guidance_x").mkdir()
+    (copy / "round_001" / "guidance_link.png").symlink_to(secret)
+    for stem in ("x/../../../guidance_secret", "link"):
+        report["views"][0]["stem"] = stem
+        path.write_text(json.dumps(report))
+        shown = ViewSource(copy).read()
+        with pytest.raises(ProjectError, match="lies outside"):
+            shown.pictures(shown.cameras[3])
+    with pytest.raises(ProjectError, match="lies outside"):
+        inside(copy, copy / ".." / "other")
+
+
+@pytest.mark.parametrize("mode", list(MODES))
+def test_every_mode_colours_every_point_and_says_how_to_read_it(run, mode):
+    count = len(run.memory)
+    whole = point_colors(run.memory, mode, true_depth=run.recorded_depth)
+    rows = np.arange(0, count, 7)
+    some = point_colors(run.memory, mode, rows=rows, true_depth=run.recorded_depth)
+    assert whole.rgb.shape == (count, 3) and whole.rgb.dtype == np.uint8
+    np.testing.assert_array_equal(whole.rgb[rows], some.rgb)
+    assert whole.legend.text
+
+
+def test_colours_say_what_is_so(run):
+    memory = run.memory
+    made = memory.generated
+    np.testing.assert_array_equal(
+        point_colors(memory, "color").rgb, memory.records.color[: len(memory)]
+    )
+    source = point_colors(memory, "source").rgb.astype(int)
+    # Blue stands out where observed, red over blue where generated.
+    assert (source[~made, 2] > source[~made, 0]).all() and (source[made, 0] > source[made, 2]).all()
+    by_round = point_colors(memory, "round").rgb
+    rounds = run.round_of_points()
+    assert (by_round[rounds == 0] == rgb(GREY)).all()
+    assert (by_round[rounds == 2] == rgb(VIRIDIS[-1])).all()
+    confidence = point_colors(memory, "confidence").rgb.astype(int)
+    order = np.argsort(memory.confidence)
+    # Viridis grows in green from end to end.
+    assert (np.diff(confidence[order, 1]) >= 0).all()
+    assert {color for color, _ in point_colors(memory, "source").legend.swatches} == {
+        COLORS["observed"], COLORS["generated"],
+    }  # fmt: skip
+    with pytest.raises(OptionError, match="colour mode"):
+        point_colors(memory, "colour")
+
+
+def test_viridis_runs_through_its_anchors():
+    np.testing.assert_array_equal(viridis(np.linspace(0, 1, 9)), [rgb(c) for c in VIRIDIS])
+    np.testing.assert_array_equal(
+        viridis(np.array([-1.0, 2.0])), [rgb(VIRIDIS[0]), rgb(VIRIDIS[-1])]
+    )
+
+
+def test_views_of_a_voxel_are_counted(run):
+    memory = run.memory
+    voxel = np.floor(memory.records.position * (1.0 / memory.voxel)).astype(int)
+    view = memory.records.view[: len(memory)]
+    seen: dict = {}
+    for place, number in zip(map(tuple, voxel.tolist()), view.tolist(), strict=True):
+        seen.setdefault(place, set()).add(number)
+    expected = [len(seen[place]) for place in map(tuple, voxel.tolist())]
+    np.testing.assert_array_equal(view_counts(memory), expected)
+    assert max(expected) > 1
+
+
+def test_depth_errors_are_those_that_were_put_in(run):
+    rows = np.arange(len(run.memory))
+    errors = depth_errors(run.memory, rows, run.recorded_depth)
+    context = ~run.memory.generated
+    # A wall and a square, recorded to the millimetre and averaged within voxels.
+    assert np.nanmedian(errors[context]) < 0.005
+
+    def a_tenth_farther(name):
+        depth = run.recorded_depth(name)
+        return None if depth is None else depth * np.float32(1.1)
+
+    wrong = depth_errors(run.memory, rows, a_tenth_farther)
+    assert np.nanmedian(wrong[context]) == pytest.approx(0.1 / 1.1, abs=0.005)
+    nothing = depth_errors(run.memory, rows, lambda name: None)
+    assert np.isnan(nothing).all()
+
+
+def test_what_is_drawn_is_even_and_does_not_change_as_the_memory_grows(run, folder):
+    memory = run.memory
+    everything = detail(memory, len(memory))
+    assert everything.edge == 0 and len(everything.rows) == len(memory)
+    drawn = detail(memory, 800)
+    assert 200 < len(drawn.rows) <= 800 and drawn.size >= drawn.edge > 0
+    np.testing.assert_array_equal(drawn.rows, detail(memory, 800).rows)
+    # Every cell of each source has its point.
+    cells = np.floor(memory.records.position / drawn.edge).astype(int)
+    keys = np.column_stack([cells, memory.generated])
+    assert len(np.unique(keys, axis=0)) == len(np.unique(keys[drawn.rows], axis=0))
+    # The points of earlier rounds are drawn before the last round as after it.
+    earlier = SpatialMemory.load(folder / "memory.npz")
+    earlier.forget(round=2)
+    budget = memory.voxels
+    now, before = detail(memory, budget), detail(earlier, budget)
+    assert now.edge == before.edge == memory.voxel
+    assert set(before.rows.tolist()) < set(now.rows.tolist())
+
+
+@pytest.mark.parametrize("budget", [1, 2, 5, 16])
+def test_a_budget_below_the_cells_around_the_origin_is_kept(budget):
+    memory = SpatialMemory(0.1)
+    corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    memory.fuse(points(corners), round=0)
+    memory.fuse(points(np.array(corners) * 0.9), round=1, generated=True)
+    drawn = detail(memory, budget)
+    assert 1 <= len(drawn.rows) <= budget
+    assert np.isfinite([drawn.edge, drawn.size]).all()
+
+
+def test_rendering_goes_back_and_forth_between_rounds_exactly(run, folder):
+    camera = run.cameras[5].camera
+    renderer = RunRenderer(run)
+    pictures = {n: picture_of(renderer.render(camera, round=n)) for n in (2, 0, 1, 2)}
+    for number, picture in pictures.items():
+        memory = SpatialMemory.load(folder / "memory.npz")
+        for later in range(2, number, -1):
+            memory.forget(round=later)
+        np.testing.assert_array_equal(picture, picture_of(memory.project(camera)))
+    assert (pictures[0] != pictures[2]).any()
+    assert len(run.memory) == len(SpatialMemory.load(folder / "memory.npz"))
+    tinted = picture_of(renderer.render(camera, round=2, mode="source"))
+    assert (tinted != pictures[2]).any()
+
+
+def test_starting_a_viewer_imports_neither_torch_nor_open3d(folder):
+    pytest.importorskip("viser", reason="viser is not installed")
+    code = (
+        "import sys; from pathlib import Path\n"
+        "import pipelines.cli; pipelines.cli.build_parser()\n"
+        "from pipelines.inputs.view_source import ViewSource\n"
+        "from viz.web.viewer import WebViewer\n"
+        f"source = ViewSource(Path({str(folder)!r}))\n"
+        "viewer = WebViewer(source.read(), port=18230)\n"
+        "source.lacking(); viewer.stop()\n"
+        "print(sorted({'torch', 'open3d', 'matplotlib'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,464 @@
+"""The web viewer as a person meets it, in a headless browser, and what it lets nobody reach."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import http.client
+import io
+import shutil
+import socket
+import sys
+import threading
+import time
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import Browser, open_browser
+from memory_scenes import camera
+from PIL import Image
+
+from gvtools.memory.io.ply import write_ply
+from pipelines.inputs.view_source import ViewSource
+from viz.run_view.render import RunRenderer, picture_of
+from viz.run_view.view import TARGET
+
+pytest.importorskip("viser", reason="viser is not installed (extra web)")
+
+from viz.web.frame import FIELD_OF_VIEW, PageFrame, home
+from viz.web.guard import address_of, is_loopback, is_own_page
+from viz.web.pictures import GAP, ROW_WIDTH
+from viz.web.splats import LONGEST
+from viz.web.viewer import WebViewer
+
+# A page in software on a busy machine.
+PATIENCE = 60.0
+# Where the scene shows, free of the controls: the window is 1280 x 800, the controls on the right.
+SCENE = np.s_[60:460, 20:930]
+
+
+@pytest.fixture(scope="module")
+def folder(small_run):
+    return small_run
+
+
+@pytest.fixture(scope="module")
+def viewer(folder):
+    found = WebViewer(ViewSource(folder).read(), port=free_port())
+    yield found
+    found.stop()
+
+
+@pytest.fixture(scope="module")
+def browser(viewer):
+    with open_browser() as found:
+        found.driver.get(viewer.url)
+        wait(lambda: "observations after round 2" in found.text())
+        close_notes(found)
+        yield found
+        # Whatever the tests did, nothing went wrong on the page and nothing left the machine.
+        assert found.console_errors() == []
+        assert found.foreign_requests() == []
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def wait(condition, patience=PATIENCE):
+    """What ``condition`` gives once it gives something."""
+    end = time.monotonic() + patience
+    while not (found := condition()):
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.1)
+    return found
+
+
+def close_notes(browser: Browser) -> None:
+    """Click away what the page says of a machine without a graphics card."""
+    for button in browser.driver.find_elements("css selector", ".mantine-Notification-closeButton"):
+        button.click()
+
+
+def choose(browser: Browser, shown: str, option: str) -> None:
+    """Open the menu that shows one text and click another."""
+    menus = browser.driver.find_elements("css selector", "input[role=combobox]")
+    next(m for m in menus if m.get_attribute("value") == shown).click()
+
+    def visible():
+        options = browser.driver.find_elements("css selector", "[role=option]")
+        return [o for o in options if o.is_displayed() and o.text == option]
+
+    wait(visible)[0].click()
+
+
+def steady(browser: Browser, differs_from=None):
+    """The scene once two looks at it agree, and it is another one than before."""
+
+    def look():
+        first = browser.picture()[SCENE]
+        time.sleep(0.3)
+        second = browser.picture()[SCENE]
+        if not np.array_equal(first, second):
+            return None
+        if differs_from is not None and np.array_equal(second, differs_from):
+            return None
+        return (second,)
+
+    return wait(look)[0]
+
+
+def painted(picture) -> int:
+    """Pixels that are not background."""
+    return int((picture < 250).any(axis=2).sum())
+
+
+def test_the_slider_shows_the_memory_growing(browser, viewer):
+    counts = [viewer.run.counts(number) for number in range(3)]
+    thumb = browser.driver.find_element("css selector", "[role=slider]")
+    last = steady(browser)
+    assert painted(last) > 0.05 * last[..., 0].size
+    sizes = [painted(last)]
+    for number in (1, 0):
+        thumb.send_keys("\ue012")  # the left arrow
+        wait(lambda number=number: f"observations after round {number}" in browser.text())
+        text = browser.text()
+        assert f"{counts[number].observed + counts[number].generated:,} observations" in text
+        assert f"{counts[number].generated:,} generated" in text
+        last = steady(browser, last)
+        sizes.append(painted(last))
+    assert sizes[0] > sizes[1] > sizes[2] > 0
+    thumb.send_keys("\ue014\ue014")
+    wait(lambda: "observations after round 2" in browser.text())
+
+
+@pytest.mark.slow
+def test_colours_tell_generated_from_observed(browser, viewer):
+    plain = steady(browser)
+    choose(browser, "colour", "observed / generated")
+    wait(lambda: "where a point comes from" in browser.text())
+    tinted = steady(browser, plain).astype(int)
+    red, green, blue = np.moveaxis(tinted, -1, 0)
+    assert ((red > blue + 60) & (green > blue + 30)).sum() > 200, "nothing orange"
+    assert ((blue > red + 60) & (blue > green)).sum() > 200, "nothing blue"
+    choose(browser, "observed / generated", "view count")
+    wait(lambda: "views with observations in the point's voxel" in browser.text())
+    assert (steady(browser, tinted) != tinted).any()
+    choose(browser, "view count", "colour")
+    wait(lambda: "as photographed or completed" in browser.text())
+
+
+def test_a_click_on_a_camera_flies_there_and_shows_its_pictures(browser, viewer):
+    client = next(iter(viewer.server.get_clients().values()))
+    # The last one stands in front of no other.
+    target = viewer.run.cameras[-1]
+    x, y = on_screen(client, viewer, target)
+    click(browser, x, y)
+    wait(lambda: f"{target.name}, {TARGET}, round 2" in browser.text())
+    text = browser.text()
+    for title in ("guidance", "completion", "truth", "before the round"):
+        assert title in text
+    _, goal = viewer.frame.placement(target.camera)
+    wait(lambda: np.linalg.norm(np.array(client.camera.position) - goal) < 1e-3)
+    (row,) = wait(lambda: shown_picture(browser))
+    pictures = viewer.run.pictures(target)
+    width = pictures["completion"].shape[1]
+    factor = (row.shape[1] - 2 * GAP) // (3 * width)
+    assert row.shape[1] == 3 * factor * width + 2 * GAP >= ROW_WIDTH
+    for number, title in enumerate(("guidance", "completion", "truth")):
+        left = number * (factor * width + GAP)
+        part = row[factor // 2 :: factor, left : left + factor * width][:, factor // 2 :: factor]
+        assert np.abs(part.astype(int) - pictures[title]).mean() < 6, title
+
+
+@pytest.mark.slow
+def test_the_splatter_renders_the_viewers_own_view(browser, viewer):
+    before = steady(browser)
+    choose(browser, "points", "splats")
+    steady(browser, before)
+    client = next(iter(viewer.server.get_clients().values()))
+    camera = viewer.frame.client_camera(client, longest=LONGEST)
+    expected = picture_of(RunRenderer(viewer.run).render(camera, round=2))
+    canvas = browser.driver.find_element("css selector", "canvas").rect
+    size = (round(canvas["width"]), round(canvas["height"]))
+    whole = np.array(Image.fromarray(expected).resize(size))
+
+    def alike():
+        left, top = round(canvas["x"]), round(canvas["y"])
+        seen = browser.picture()[top : top + size[1], left : left + size[0]]
+        return np.abs(seen[60:400, 20:900].astype(int) - whole[60:400, 20:900]).mean() < 10
+
+    wait(alike)
+    choose(browser, "splats", "points")
+
+
+@pytest.mark.slow
+def test_the_ply_is_downloaded(browser, viewer, folder, tmp_path):
+    browser.driver.execute_cdp_cmd(
+        "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
+    )
+    buttons = browser.driver.find_elements("css selector", "button")
+    next(b for b in buttons if b.text == "Download PLY").click()
+    path = tmp_path / "run.ply"
+    wait(path.is_file)
+    assert path.read_bytes() == (folder / "memory.ply").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_page_follows_a_run_that_grows(folder, tmp_path):
+    growing = tmp_path / "growing"
+    shutil.copytree(folder, growing)
+    later = tmp_path / "later"
+    (growing / "round_002").rename(later)
+    source = ViewSource(growing)
+    run = source.read()
+    # As a run at work has it: the memory after the last whole round.
+    run.memory.forget(round=2)
+    run.memory.save(growing / "memory.npz")
+    viewer = WebViewer(source.read(), port=free_port())
+    try:
+        with open_browser() as browser:
+            browser.driver.get(viewer.url)
+            wait(lambda: "observations after round 1" in browser.text())
+            assert "not finished: 1 of 2 rounds done" in browser.text()
+            shutil.copy(folder / "memory.npz", growing / "memory.npz")
+            later.rename(growing / "round_002")
+            viewer.update(source.read())
+            wait(lambda: "observations after round 2" in browser.text())
+            assert "not finished" not in browser.text()
+    finally:
+        viewer.stop()
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/run.json", "/../../../../../../../etc/hostname", "/%2e%2e/%2e%2e/%2e%2e/etc/hostname",
+     "/..%2f..%2f..%2f..%2fetc%2fhostname", "//etc/hostname", "/etc/hostname",
+     "/..\\..\\..\\etc\\hostname"],
+)  # fmt: skip
+def test_no_file_is_served_but_the_page(viewer, folder, path):
+    def get(address):
+        connection = http.client.HTTPConnection("127.0.0.1", viewer.server.get_port(), timeout=20)
+        connection.request("GET", address)
+        return connection.getresponse()
+
+    assert get("/").status == 200
+    assert get(path).status == 404
+
+
+def test_nobody_else_is_served_and_nothing_is_shared(viewer):
+    assert viewer.url.startswith("http://127.0.0.1:")
+    # A page may ask for an address in the open; it gets none.
+    assert viewer.server.request_share_url() is None
+    if sys.platform != "linux":
+        pytest.skip("listening addresses are read from /proc")
+    listening = {
+        line.split()[1]
+        for table in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
+        if line.split()[1].endswith(f":{viewer.server.get_port():04X}") and line.split()[3] == "0A"
+    }
+    assert {address.split(":")[0] for address in listening} == {"0100007F"}
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [("http://127.0.0.1:{port}", None), (None, None), ("http://evil.example", 403), ("null", 403),
+     ("http://localhost:{port}", 403), ("http://127.0.0.1:1", 403)],
+)  # fmt: skip
+def test_no_other_page_in_the_browser_can_read_the_run(viewer, origin, status):
+    assert handshake(viewer, origin, f"127.0.0.1:{viewer.server.get_port()}") == (status or 101)
+
+
+def test_a_name_that_a_foreign_page_gave_to_this_machine_is_refused(viewer):
+    port = viewer.server.get_port()
+    assert handshake(viewer, f"http://evil.example:{port}", f"evil.example:{port}") == 403
+    # A tunnel's end has a port of its own.
+    assert handshake(viewer, "http://localhost:9", "localhost:9") == 101
+    assert is_own_page("http://[::1]:8080", "[::1]:8080", "::1")
+    assert is_own_page("http://box:8080", "box:8080", "box")
+    assert not is_own_page("http://[::1", "[::1", "::1")
+
+
+def handshake(viewer, origin, host) -> int:
+    """The status with which a request for a WebSocket is answered."""
+    connection = http.client.HTTPConnection("127.0.0.1", viewer.server.get_port(), timeout=20)
+    headers = {
+        "Host": host, "Upgrade": "websocket", "Connection": "Upgrade",
+        "Sec-WebSocket-Key": base64.b64encode(bytes(16)).decode(), "Sec-WebSocket-Version": "13",
+    }  # fmt: skip
+    if origin is not None:
+        headers["Origin"] = origin.format(port=viewer.server.get_port())
+    connection.request("GET", "/", headers=headers)
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+def test_the_page_is_called_after_the_run(viewer):
+    for encoding in ("identity", "gzip"):
+        connection = http.client.HTTPConnection("127.0.0.1", viewer.server.get_port(), timeout=20)
+        connection.request("GET", "/?x=1", headers={"Accept-Encoding": encoding})
+        response = connection.getresponse()
+        assert response.headers.get_all("Content-Length") == [response.headers["Content-Length"]]
+        body = response.read()
+        page = gzip.decompress(body) if encoding == "gzip" else body
+        assert b"<title>run - gvtools</title>" in page
+
+
+def test_addresses_are_written_and_judged_as_they_are():
+    assert address_of("127.0.0.1", 8080) == "http://127.0.0.1:8080"
+    assert address_of("::1", 9401) == "http://[::1]:9401"
+    assert all(map(is_loopback, ("127.0.0.1", "127.0.0.2", "::1", "localhost")))
+    assert not any(map(is_loopback, ("0.0.0.0", "::", "192.168.1.5", "box")))
+
+
+def cloud(folder, scale, size=(4.0, 5.0, 2.0)):
+    """A PLY of points in a box, ``scale`` units a metre, far from the world's origin."""
+    where = np.random.default_rng(0).uniform(-0.5, 0.5, (4000, 3)) * size + (7, -3, 2)
+    vertices = np.zeros(len(where), [*((a, "<f8") for a in "xyz"),
+                                     *((c, "u1") for c in ("red", "green", "blue"))])  # fmt: skip
+    for k, axis in enumerate("xyz"):
+        vertices[axis] = scale * where[:, k]
+    write_ply(folder / f"{scale:g}.ply", vertices)
+    return ViewSource(folder / f"{scale:g}.ply").read()
+
+
+def test_scenes_of_any_scale_are_the_same_on_the_page(tmp_path):
+    sent = []
+    for scale in (1.0, 1000.0, 0.001):
+        viewer = WebViewer(cloud(tmp_path, scale), port=free_port())
+        try:
+            start = viewer.server.initial_camera
+            nodes = viewer._points._nodes.values()
+            points = np.concatenate([node.points for node in nodes])
+            assert start.near < np.linalg.norm(points - start.position, axis=1).min()
+            assert start.far > np.linalg.norm(points - start.position, axis=1).max()
+            sizes = [node.point_size for node in nodes]
+            ends = (points.min(axis=0), points.max(axis=0), start.position, start.look_at, sizes)
+            sent.append(np.concatenate(ends))
+            # What a client sees goes back to the scene's own units.
+            pose = camera(center=scale * np.array([7.0, -3.0, 1.0]), rotation=(0.1, 0.2, 0.3))
+            wxyz, position = viewer.frame.placement(pose)
+            seen = SimpleNamespace(
+                wxyz=wxyz, position=position, fov=1.0, image_width=320, image_height=240
+            )
+            client: Any = SimpleNamespace(camera=seen)
+            back = viewer.frame.client_camera(client, longest=320)
+            np.testing.assert_allclose(back.cam_from_world, pose.cam_from_world, atol=1e-9 * scale)
+        finally:
+            viewer.stop()
+    for other in sent[1:]:
+        # The memory's voxels, not what is on the page, lie differently.
+        np.testing.assert_allclose(other, sent[0], rtol=0.02, atol=0.06)
+
+
+@pytest.mark.parametrize(
+    ("size", "up"), [((4, 5, 2), (0, 0, 1)), ((4, 2, 5), (0, -1, 0)), ((4, 2, 2), (0, -1, 0))]
+)
+def test_a_cloud_without_cameras_is_seen_whole_and_upright_from_outside(tmp_path, size, up):
+    run = cloud(tmp_path, 1.0, size)
+    np.testing.assert_array_equal(run.up(), up)
+    frame = PageFrame.of(run)
+    position, look_at = home(run, frame)
+    ahead = (look_at - position) / np.linalg.norm(look_at - position)
+    right = np.cross(ahead, run.up()) / np.linalg.norm(np.cross(ahead, run.up()))
+    away = frame.points(run.memory.records.position) - position
+    depth = away @ ahead
+    assert depth.min() > 0
+    reach = np.tan(FIELD_OF_VIEW / 2) * depth
+    assert (np.abs(away @ right) < reach).all()
+    assert (np.abs(away @ np.cross(right, ahead)) < reach).all()
+    # From above, along the side that reaches least.
+    assert position @ run.up() > look_at @ run.up()
+
+
+def test_of_two_cameras_selected_one_after_the_other_the_last_is_shown(folder):
+    run = ViewSource(folder).read()
+    slow, fast = run.cameras[3], run.cameras[4]
+    asked, go_on = threading.Event(), threading.Event()
+
+    def frame_of(name):
+        if threading.current_thread().name == "first":
+            asked.set()
+            assert go_on.wait(PATIENCE)
+        return run.frame_of(name)
+
+    viewer = WebViewer(replace(run, cameras=(slow, fast), frame_of=frame_of), port=free_port())
+    client = SimpleNamespace(
+        client_id=0, atomic=nullcontext, flush=lambda: None,
+        camera=SimpleNamespace(wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=1.0),
+    )  # fmt: skip
+    try:
+        first = threading.Thread(target=viewer._clicked, args=(slow, client), name="first")
+        first.start()
+        assert asked.wait(PATIENCE)
+        second = threading.Thread(target=viewer._clicked, args=(fast, client))
+        second.start()
+        second.join()
+        go_on.set()
+        first.join()
+        panel = viewer._panel
+        assert fast.name in panel._camera.value and fast.name in panel._caption.content
+        np.testing.assert_allclose(
+            client.camera.position, viewer.frame.placement(fast.camera)[1], atol=1e-9
+        )
+    finally:
+        go_on.set()
+        viewer.stop()
+
+
+def test_points_cost_fifteen_bytes_and_stay_within_the_budget(folder):
+    run = ViewSource(folder).read()
+    viewer = WebViewer(run, port=free_port(), budget=900)
+    try:
+        nodes = viewer._points._nodes.values()
+        drawn = sum(len(node.points) for node in nodes)
+        assert 300 < drawn <= 900
+        assert sum(n.points.nbytes + n.colors.nbytes for n in nodes) == 15 * drawn
+        assert viewer._points.drawn(0) < viewer._points.drawn(2) == drawn
+    finally:
+        viewer.stop()
+
+
+def on_screen(client, viewer, shown) -> tuple[float, float]:
+    """Where the middle of a camera's frustum is in the canvas, CSS pixels."""
+    seen = viewer.frame.client_camera(client, longest=LONGEST)
+    pose = shown.camera.world_from_cam[0]
+    inside = pose[:3, 3] + 0.9 * viewer._cameras._depth / viewer.frame.scale * pose[:3, 2]
+    xy, z = seen.project(inside[None])
+    assert z[0, 0] > 0
+    scale = client.camera.image_width / seen.width[0]
+    return tuple(xy[0, 0] * scale)
+
+
+def click(browser: Browser, x: float, y: float) -> None:
+    """Press and let go of the mouse at a place of the canvas."""
+    box = browser.driver.find_element("css selector", "canvas").rect
+    place = {"x": box["x"] + x, "y": box["y"] + y, "button": "left", "clickCount": 1}
+    for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+        browser.driver.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": kind, **place})
+        time.sleep(0.4)
+
+
+def shown_picture(browser: Browser):
+    """The picture in the panel as the page decoded it, (H, W, 3) uint8 in a tuple; or None."""
+    script = """
+        const image = [...document.images].find(i => i.naturalWidth > 700 && i.complete);
+        if (!image) return null;
+        const canvas = document.createElement("canvas");
+        canvas.width = image.naturalWidth; canvas.height = image.naturalHeight;
+        canvas.getContext("2d").drawImage(image, 0, 0);
+        return canvas.toDataURL("image/png").split(",")[1];
+    """
+    data = browser.driver.execute_script(script)
+    if data is None:
+        return None
+    return (np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")),)

@@ -1,0 +1,1 @@
+"""A window on a run, and pictures of it without a display."""

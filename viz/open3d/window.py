@@ -1,0 +1,190 @@
+"""The Open3D window: the same data and colours as the web viewer, and keys for rounds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gvtools.errors import OptionError
+from viz.run_view.detail import detail, point_pixels
+from viz.run_view.point_colors import MODES, point_colors
+from viz.run_view.view import RunView
+from viz.web.cameras import KINDS
+from viz.web.frame import PageFrame, home
+
+if TYPE_CHECKING:
+    import open3d as o3d
+
+BUDGET = 4_000_000
+WIDTH, HEIGHT = 1280, 800
+# GLFW's numbers of the arrow keys.
+RIGHT, LEFT, DOWN, UP = 262, 263, 264, 265
+KEYS = (
+    "right, left: a round on or back; C: next colour; up, down: look from the next or previous "
+    "camera; F: cameras on or off; Q: end"
+)
+# Depth of a camera's pyramid, as a share of the typical depth.
+SHARE = 0.04
+
+
+class Open3dViewer:
+    """One window.
+
+    Args:
+        run: what to show.
+        round: to begin with; None for the last.
+        mode: of viz.run_view.point_colors.MODES.
+        say: told, in one line, what is shown whenever that has changed.
+
+    Raises:
+        OptionError: no window can be opened.
+    """
+
+    def __init__(
+        self,
+        run: RunView,
+        *,
+        round: int | None = None,
+        mode: str = "color",
+        say: Callable[[str], None] = print,
+    ) -> None:
+        import open3d as o3d
+
+        self.run = run
+        self.round = run.last_round if round is None else round
+        self.mode = mode
+        self._say = say
+        self._camera = 0
+        self._with_cameras = True
+        self._drawn = detail(run.memory, BUDGET)
+        self._rounds = run.round_of_points()[self._drawn.rows]
+        self._cloud = o3d.geometry.PointCloud()
+        self._pyramids: list[tuple[int, o3d.geometry.LineSet]] = []
+        self._rgb = np.zeros((0, 3))
+        self._fill()
+        self.window = o3d.visualization.VisualizerWithKeyCallback()
+        if os.name == "posix" and not (
+            os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        ):
+            raise OptionError("--open3d: no display; expected X or Wayland; use --screenshot FILE")
+        if not self.window.create_window(f"gvtools: {run.title}", WIDTH, HEIGHT):
+            raise OptionError("--open3d: no window could be opened; use --screenshot FILE")
+        self.window.add_geometry(self._cloud)
+        self._pyramids = [self._pyramid(o3d, k) for k in range(len(run.cameras))]
+        self._add_pyramids()
+        self._bind()
+        self.look_from(0)
+
+    def run_until_closed(self) -> None:
+        """Show the window until it is closed."""
+        self._say(KEYS)
+        self._tell()
+        self.window.run()
+        self.window.destroy_window()
+
+    def step_round(self, step: int) -> None:
+        """Go ``step`` rounds on."""
+        self.round = int(np.clip(self.round + step, 0, self.run.last_round))
+        self._refresh()
+
+    def next_mode(self) -> None:
+        """The next colour mode."""
+        modes = list(MODES)
+        self.mode = modes[(modes.index(self.mode) + 1) % len(modes)]
+        self._rgb = np.zeros((0, 3))
+        self._refresh()
+
+    def look_from(self, number: int) -> None:
+        """Stand where a camera of the run stood; without cameras, in front of the whole cloud."""
+        if not self.run.cameras:
+            position, look_at = home(self.run, PageFrame.of(self.run))
+            view, turn = self.window.get_view_control(), self.run.memory.frame.axes.T
+            view.set_front(turn @ (position - look_at))
+            view.set_up(turn @ self.run.up())
+            return
+        import open3d as o3d
+
+        self._camera = number % len(self.run.cameras)
+        shown = self.run.cameras[self._camera]
+        view = self.window.get_view_control()
+        parameters = view.convert_to_pinhole_camera_parameters()
+        local = self.run.memory.frame.seen_from(shown.camera)
+        width, height = parameters.intrinsic.width, parameters.intrinsic.height
+        focal = float(shown.camera.K[0, 1, 1] * height / shown.camera.height[0])
+        # The window takes its own centre alone.
+        parameters.intrinsic = o3d.camera.PinholeCameraIntrinsic(
+            width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5
+        )
+        self.window.get_render_option().point_size = point_pixels(focal, self._drawn, self.run)
+        parameters.extrinsic = local.cam_from_world[0]
+        view.convert_from_pinhole_camera_parameters(parameters, allow_arbitrary=True)
+
+    def toggle_cameras(self) -> None:
+        """Show or hide the cameras."""
+        self._with_cameras = not self._with_cameras
+        self._refresh()
+
+    def _fill(self) -> None:
+        import open3d as o3d
+
+        memory, rows = self.run.memory, self._drawn.rows
+        if not len(self._rgb):
+            found = point_colors(memory, self.mode, rows=rows, true_depth=self.run.recorded_depth)
+            self._rgb = found.rgb / 255.0
+            self._legend = found.legend
+        there = self._rounds <= self.round
+        self._cloud.points = o3d.utility.Vector3dVector(memory.records.position[rows[there]])
+        self._cloud.colors = o3d.utility.Vector3dVector(self._rgb[there])
+
+    def _refresh(self) -> None:
+        self._fill()
+        self.window.update_geometry(self._cloud)
+        for _, pyramid in self._pyramids:
+            self.window.remove_geometry(pyramid, reset_bounding_box=False)
+        self._add_pyramids()
+        self._tell()
+
+    def _add_pyramids(self) -> None:
+        for number, pyramid in self._pyramids:
+            if self._with_cameras and number <= self.round:
+                self.window.add_geometry(pyramid, reset_bounding_box=False)
+
+    def _pyramid(self, o3d: Any, index: int) -> tuple[int, o3d.geometry.LineSet]:
+        shown = self.run.cameras[index]
+        local = self.run.memory.frame.seen_from(shown.camera)
+        lines = o3d.geometry.LineSet.create_camera_visualization(
+            int(local.width[0]),
+            int(local.height[0]),
+            local.K[0],
+            local.cam_from_world[0],
+            SHARE * self.run.typical_depth,
+        )
+        color = KINDS[shown.kind]
+        lines.paint_uniform_color([int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+        return shown.round, lines
+
+    def _bind(self) -> None:
+        def on(key: int, action: Callable[[], None]) -> None:
+            def pressed(window: object) -> bool:
+                action()
+                return False
+
+            self.window.register_key_callback(key, pressed)
+
+        on(RIGHT, lambda: self.step_round(1))
+        on(LEFT, lambda: self.step_round(-1))
+        on(UP, lambda: self.look_from(self._camera + 1))
+        on(DOWN, lambda: self.look_from(self._camera - 1))
+        on(ord("C"), self.next_mode)
+        on(ord("F"), self.toggle_cameras)
+
+    def _tell(self) -> None:
+        counts = self.run.counts(self.round)
+        scale = f" ({' to '.join(self._legend.scale)})" if self._legend.scale else ""
+        self._say(
+            f"round {self.round} of {self.run.last_round}: {counts.observed:,} observed, "
+            f"{counts.generated:,} generated; {MODES[self.mode]}: {self._legend.text}{scale}"
+        )

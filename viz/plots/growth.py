@@ -1,0 +1,159 @@
+"""How a memory grew, round by round: a figure, and the same in characters for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError
+from viz.plots.canvas import Rounds, check_rounds, chosen, figure_of, round_axis
+from viz.plots.coverage import coverage_panel
+from viz.plots.palette import COLORS, HATCHES
+from viz.plots.timing import times_panel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FATES = ("added", "merged", "rejected", "new voxels")
+
+
+def draw_growth(
+    rounds: Rounds, *, title: str | None = None, panels: Sequence[str] | None = None
+) -> Figure:
+    """What is stored, what became of the points, coverage, and time.
+
+    Args:
+        rounds: the lines of a run's ``rounds.jsonl``, in order.
+        title: what was reconstructed.
+        panels: of "stored", "fates", "coverage" and "time"; None is all four.
+
+    Returns:
+        A figure with its own Agg canvas; no state of pyplot is touched.
+
+    Raises:
+        OptionError: no rounds, or no such panel.
+    """
+    check_rounds(rounds)
+    known = {
+        "stored": partial(stored_panel, rounds=rounds),
+        "fates": partial(fates_panel, rounds=rounds),
+        "coverage": partial(coverage_panel, rounds=rounds),
+        "time": partial(times_panel, rounds=rounds),
+    }
+    heading = None if title is None else f"{title}: growth of the memory"
+    return figure_of(chosen(known, panels), title=heading)
+
+
+def growth_text(rounds: Rounds, width: int = 72) -> str:
+    """The growth as lines of characters: a bar of what is stored for each round, and the figures.
+
+    Args:
+        rounds: the lines of a run's ``rounds.jsonl``, in order.
+        width: of a line, at least 60 characters.
+
+    Raises:
+        OptionError: no rounds, or a width below 60.
+    """
+    check_rounds(rounds)
+    if width < 60:
+        raise OptionError(f"growth: {width} characters wide; expected 60 or more")
+    legend = "round  observations  # observed  + generated"
+    head = legend.ljust(width - 18) + "coverage".rjust(18)
+    room = width - 8 - 9 - 18
+    largest = max(1, max(entry["observed"] + entry["generated"] for entry in rounds))
+    lines = [head]
+    for entry in rounds:
+        total = entry["observed"] + entry["generated"]
+        length = round(room * total / largest)
+        # What is there at all is drawn at least once.
+        plus = min(
+            length, max(bool(entry["generated"]), round(room * entry["generated"] / largest))
+        )
+        bar = "#" * (length - plus) + "+" * plus
+        covered = "-"
+        if entry["coverage_after"] is not None:
+            covered = f"{_share(entry['coverage_before'])} -> {_share(entry['coverage_after'])}"
+        count = _count(total).rjust(8)
+        lines.append(f"{entry['round']:>5}  {count}  {bar.ljust(room)}{covered.rjust(18)}")
+    new_voxels = _new_voxels(rounds)
+    for entry, voxels in zip(rounds, new_voxels, strict=True):
+        text = (
+            f"{entry['round']:>5}  {_count(entry['added'])} added, {_count(entry['merged'])} "
+            f"merged, {_count(entry['rejected'])} rejected, {_count(voxels)} new voxels"
+        )
+        lines.append(text)
+    return "\n".join(lines)
+
+
+def _new_voxels(rounds: Rounds) -> list[int]:
+    totals = [0, *(entry["voxels"] for entry in rounds)]
+    return [after - before for before, after in pairwise(totals)]
+
+
+def stored_panel(axes: Axes, *, rounds: Rounds) -> None:
+    """Observations by origin on top of each other, and the voxels that hold them."""
+    round_axis(axes, rounds)
+    at = range(len(rounds))
+    observed = [entry["observed"] for entry in rounds]
+    generated = [entry["generated"] for entry in rounds]
+    axes.bar(at, observed, color=COLORS["observed"], label="observed")
+    axes.bar(
+        at, generated, bottom=observed, color=COLORS["generated"], hatch=HATCHES["generated"],
+        edgecolor="white", linewidth=0, label="generated",
+    )  # fmt: skip
+    voxels = [entry["voxels"] for entry in rounds]
+    axes.plot(at, voxels, "o-", color=COLORS["voxels"], markersize=4, label="voxels")
+    axes.set_title("stored after each round")
+    axes.set_ylabel("observations, voxels")
+    _engineering(axes)
+    axes.set_ylim(0, 1.22 * max(1, *(a + b for a, b in zip(observed, generated, strict=True))))
+    axes.legend(ncols=3, loc="upper left", frameon=False, fontsize="small")
+
+
+def fates_panel(axes: Axes, *, rounds: Rounds) -> None:
+    """What became of the points that arrived in each round."""
+    round_axis(axes, rounds)
+    values = {name: [entry[name] for entry in rounds] for name in FATES[:3]}
+    values["new voxels"] = _new_voxels(rounds)
+    step = 0.8 / len(FATES)
+    for k, name in enumerate(FATES):
+        at = [i + (k - (len(FATES) - 1) / 2) * step for i in range(len(rounds))]
+        axes.bar(
+            at, values[name], step, color=COLORS[name], hatch=HATCHES.get(name),
+            edgecolor="white", linewidth=0, label=name,
+        )  # fmt: skip
+    axes.set_title("what became of the points that arrived")
+    axes.set_ylabel("points, voxels (logarithmic)")
+    # Round 0 takes all the context in and would hide every later round on a linear axis.
+    positive = [value for row in values.values() for value in row if value > 0]
+    if positive:
+        axes.set_yscale("log")
+        axes.minorticks_off()
+        low, high = min(positive) / 3, max(positive)
+        # A share of the decades above the bars is the legend's.
+        axes.set_ylim(low, high * (high / low) ** 0.25)
+        _engineering(axes)
+    axes.legend(
+        ncols=4, loc="upper right", frameon=False, fontsize="small", handlelength=1.2,
+        columnspacing=0.9,
+    )  # fmt: skip
+
+
+def _engineering(axes: Axes) -> None:
+    from matplotlib.ticker import FuncFormatter
+
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _count(value)))
+
+
+def _count(value: float) -> str:
+    for unit, name in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= unit:
+            return f"{value / unit:.3g}{name}"
+    return f"{value:g}"
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1%}"

@@ -1,0 +1,159 @@
+"""Where cameras stand and look: what was given, what was asked for, where pictures look from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import OptionError
+from viz.plots.canvas import chosen, figure_of
+from viz.plots.palette import BLACK, BLUE, GREY, ORANGE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Viewing directions are drawn so long, as a share of the cameras' extent, and at most so many.
+ARROW = 0.07
+MOST_ARROWS = 80
+# The mean of the cameras' up directions says nothing where it is shorter.
+LEAST_UP = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """Camera-to-world poses in one world frame, scene units, OpenCV axes.
+
+    Attributes:
+        context: (C, 4, 4), of the views that were given.
+        requested: (T, 4, 4), of the targets, in their order.
+        estimated: (T, 4, 4), where the completed pictures look from, NaN where that was not found;
+            None where nobody looked for it.
+    """
+
+    context: NDArray[np.float64]
+    requested: NDArray[np.float64]
+    estimated: NDArray[np.float64] | None = None
+
+    @property
+    def located(self) -> NDArray[np.bool_]:
+        """(T,) which of the targets have an estimated pose."""
+        if self.estimated is None:
+            return np.zeros(len(self.requested), np.bool_)
+        return np.asarray(np.isfinite(self.estimated).all(axis=(1, 2)))
+
+
+def draw_trajectories(
+    poses: Trajectories, *, title: str | None = None, panels: Sequence[str] | None = None
+) -> Figure:
+    """From above ("top") and from the side ("side"), in scene units around the cameras' mean.
+
+    Up is the mean of the context cameras' up directions (of the targets' without context); where
+    they cancel out, the direction in which the cameras spread least. The horizontal axis is the
+    one along which they spread most.
+
+    Args:
+        poses: at least one camera.
+        title: what was reconstructed.
+        panels: of "top" and "side"; None is both.
+
+    Raises:
+        OptionError: no cameras, or no such panel.
+    """
+    if not len(poses.context) + len(poses.requested):
+        raise OptionError("trajectories: no cameras; expected those of a run")
+    axes = principal_axes(np.concatenate([poses.context, poses.requested]), poses.context)
+    known = {
+        "top": partial(_panel, poses=poses, axes_of_plot=axes[[0, 1]], names=("right", "forward")),
+        "side": partial(_panel, poses=poses, axes_of_plot=axes[[0, 2]], names=("right", "up")),
+    }
+    return figure_of(chosen(known, panels), title=title)
+
+
+def principal_axes(
+    world_from_cam: NDArray[np.float64], upright: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(3, 3) orthonormal rows right, forward, up of a right-handed frame, in world coordinates.
+
+    Args:
+        world_from_cam: (N, 4, 4) poses; along "right" their centres spread most.
+        upright: (M, 4, 4) poses whose mean up direction is up; those of ``world_from_cam`` where
+            there are none.
+    """
+    centres = world_from_cam[:, :3, 3] - world_from_cam[:, :3, 3].mean(axis=0)
+    spread = np.linalg.svd(centres)[2]
+    # A camera's y axis points down.
+    up = -(upright if len(upright) else world_from_cam)[:, :3, 1].mean(axis=0)
+    up = spread[2] if np.linalg.norm(up) < LEAST_UP else up / np.linalg.norm(up)
+    flat = centres - np.outer(centres @ up, up)
+    right = np.linalg.svd(flat)[2][0]
+    if np.abs(flat).max() < 1e-9 * max(1.0, float(np.abs(centres).max())):
+        right = world_from_cam[0, :3, 0]
+    right = right - (right @ up) * up
+    length = np.linalg.norm(right)
+    right = right / length if length > 1e-9 else np.linalg.svd(up[None])[2][1]
+    # Of the two directions the one in which the cameras' own right points.
+    if right @ world_from_cam[:, :3, 0].mean(axis=0) < 0:
+        right = -right
+    return np.stack([right, np.cross(up, right), up])
+
+
+def _panel(
+    axes: Axes,
+    *,
+    poses: Trajectories,
+    axes_of_plot: NDArray[np.float64],
+    names: tuple[str, str],
+) -> None:
+    everything = np.concatenate([poses.context, poses.requested])[:, :3, 3]
+    middle = everything.mean(axis=0)
+    extent = float(np.ptp(everything, axis=0).max()) or 1.0
+
+    def flat(world_from_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        place = (world_from_cam[:, :3, 3] - middle) @ axes_of_plot.T
+        look = world_from_cam[:, :3, 2] @ axes_of_plot.T
+        return place, look
+
+    def arrows(world_from_cam: NDArray[np.float64], color: str) -> None:
+        place, look = flat(world_from_cam[:: max(1, -(-len(world_from_cam) // MOST_ARROWS))])
+        ends = place + ARROW * extent * look
+        axes.plot(*np.stack([place, ends]).transpose(2, 0, 1), color=color, linewidth=0.8)
+
+    if len(poses.context):
+        arrows(poses.context, BLUE)
+        place, _ = flat(poses.context)
+        axes.scatter(
+            place[:, 0], place[:, 1], s=16, color=BLUE, label=f"context ({len(place)})", zorder=3
+        )
+    if len(poses.requested):
+        arrows(poses.requested, ORANGE)
+        place, _ = flat(poses.requested)
+        axes.plot(*place.T, color=ORANGE, linewidth=0.6, alpha=0.6)
+        axes.scatter(
+            place[:, 0], place[:, 1], s=34, marker="s", facecolor="none", edgecolor=ORANGE,
+            linewidth=1.6, label=f"requested ({len(place)})", zorder=4,
+        )  # fmt: skip
+    if poses.estimated is not None:
+        rows = poses.located
+        there, _ = flat(poses.estimated[rows])
+        here, _ = flat(poses.requested[rows])
+        axes.plot(*np.stack([here, there]).transpose(2, 0, 1), color=GREY, linewidth=1, zorder=5)
+        axes.scatter(
+            there[:, 0], there[:, 1], s=26, marker="x", color=BLACK, linewidth=1.2, zorder=6,
+            label=f"estimated ({int(rows.sum())} of {len(rows)} located)",
+        )  # fmt: skip
+    axes.set_title("from above" if names[1] == "forward" else "from the side")
+    axes.set_xlabel(f"{names[0]}, scene units")
+    axes.set_ylabel(f"{names[1]}, scene units")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.08, 0.14)
+    axes.grid(color="#dddddd", linewidth=0.6)
+    axes.legend(
+        ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.08), frameon=False, fontsize="small",
+        handletextpad=0.3, columnspacing=1.0,
+    )  # fmt: skip

@@ -1,0 +1,84 @@
+"""The report of a run: one HTML file that holds its pictures, and asks the network for nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from viz.plots.canvas import check_rounds
+from viz.report import sections
+from viz.report.content import RunReport
+from viz.report.html_parts import bulleted, paragraph, section, text
+
+STYLE = Path(__file__).with_name("report.css")
+# A page that a browser holds to asking nobody for anything.
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+
+def report_html(report: RunReport) -> str:
+    """The page.
+
+    Raises:
+        OptionError: no rounds.
+    """
+    check_rounds(report.rounds)
+    parts = {
+        "growth": ("Growth", sections.growth(report)),
+        "figures": ("Observed and generated", sections.figures(report)),
+        "pictures": ("Pictures", sections.pictures(report)),
+        "trajectories": ("Trajectories", sections.trajectories(report)),
+        "time": ("Time", sections.time(report)),
+        "trade-off": ("Trade-off", sections.trade_off(report)),
+        "settings": ("Settings", sections.settings(report)),
+    }
+    shown = {name: part for name, part in parts.items() if part[1]}
+    links = "".join(f'<a href="#{name}">{text(head)}</a>' for name, (head, _) in shown.items())
+    body = "\n".join(section(name, head, content) for name, (head, content) in shown.items())
+    style = STYLE.read_text(encoding="utf-8")
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>{text(report.title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
+        f"<h1>{text(report.title)}</h1>\n{_facts(report)}\n<nav>{links}</nav>\n"
+        f"{_warnings(report)}\n{_key_figures(report)}\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _facts(report: RunReport) -> str:
+    said = "; ".join(f"{name} {value}" for name, value in report.facts)
+    return paragraph(said, "quiet")
+
+
+def _warnings(report: RunReport) -> str:
+    if not report.warnings:
+        return ""
+    return f'<div class="warnings"><strong>Warnings</strong>{bulleted(report.warnings)}</div>'
+
+
+def _key_figures(report: RunReport) -> str:
+    last = report.rounds[-1]
+    seconds = sum(entry["seconds"].get("total") or 0 for entry in report.rounds)
+    covered = [view["coverage"] for entry in report.rounds for view in entry["views"]]
+    found = report.figures
+    cards = [
+        ("observations", last["points"]),
+        ("of them generated", f"{last['generated'] / max(1, last['points']):.1%}"),
+        (
+            "coverage before a round",
+            f"{sum(covered) / len(covered):.1%}" if covered else None,
+        ),
+        *(
+            (f"PSNR, {where}", f"{found[f'psnr{region}']:.2f} dB")
+            for region, where in sections.REGIONS.items()
+            if found.get(f"psnr{region}") is not None
+        ),
+        ("seconds of all rounds", f"{seconds:.1f}"),
+    ]
+    return (
+        '<div class="key">'
+        + "".join(
+            f"<div><b>{text(value)}</b><span>{text(name)}</span></div>" for name, value in cards
+        )
+        + "</div>"
+    )

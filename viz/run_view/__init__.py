@@ -1,0 +1,1 @@
+"""A run prepared for viewers: its points by round, their colours and detail."""

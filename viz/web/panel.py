@@ -1,0 +1,226 @@
+"""The web viewer's controls, and the pictures of the selected camera side by side."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gvtools.errors import GvError
+from viz.run_view.detail import Detail
+from viz.run_view.point_colors import MODES, VIRIDIS, Legend
+from viz.run_view.view import CONTEXT, TARGET, RunView, ShownCamera
+from viz.web.cameras import KINDS
+from viz.web.pictures import ShownPictures
+
+if TYPE_CHECKING:
+    import viser
+
+NO_CAMERA = "none"
+# As points, or as the project's splatter renders the viewer's own view.
+LOOKS = ("points", "splats")
+# Of the panel with the selected camera's pictures, CSS pixels: a little over half of the scene in a
+# window of 1280. It can be moved, made larger and folded away.
+PICTURES_WIDTH = 500
+
+
+class Panel:
+    """Controls on the right, pictures below left.
+
+    Args:
+        server: that shows them.
+        mode: colours to begin with.
+        on_round: told the round to show.
+        on_mode: told the colour mode, of MODES.
+        on_look: told whether splats instead of points.
+        on_camera: told the camera that was chosen, and by whom.
+        on_size: told the points' size in spacings.
+        on_kinds: told which kinds of cameras to show.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        *,
+        mode: str,
+        on_round: Callable[[int], None],
+        on_mode: Callable[[str], None],
+        on_look: Callable[[bool], None],
+        on_camera: Callable[[ShownCamera, viser.ClientHandle | None], None],
+        on_size: Callable[[float], None],
+        on_kinds: Callable[[dict[str, bool]], None],
+    ) -> None:
+        gui = server.gui
+        self._gui = gui
+        self._run: RunView | None = None
+        self._by_label: dict[str, ShownCamera] = {}
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(320)
+        # A slider of no length cannot be drawn; set_run gives it the run's.
+        self._round = gui.add_slider("Round", 0, 1, 1, 0, disabled=True)
+        self._counts = gui.add_html("")
+        # Of each client, as each has a camera of its own.
+        self._near: dict[int, viser.GuiHtmlHandle] = {}
+        self._mode = gui.add_dropdown("Colour", tuple(MODES.values()), initial_value=MODES[mode])
+        self._legend = gui.add_html("")
+        self._look = gui.add_dropdown("Look", LOOKS)
+        self._size = gui.add_slider("Point size", 0.25, 4.0, 0.25, 1.0, hint="in spacings")
+        self._camera = gui.add_dropdown("Camera", (NO_CAMERA,), hint="choose or click one")
+        kinds = {
+            kind: gui.add_checkbox(label, initial_value=True, hint=f"show the {kind} cameras")
+            for kind, label in ((CONTEXT, "Context"), (TARGET, "Targets"))
+        }
+        self._note = gui.add_html(_key_of_cameras())
+        download = gui.add_button("Download PLY")
+        self._pictures = gui.add_panel(visible=False)
+        with self._pictures.add_tab("Pictures"):
+            self._caption = gui.add_html("")
+            self._strip = gui.add_image(np.full((8, 24, 3), 255, np.uint8), jpeg_quality=88)
+        self._pictures.float(x=12, y=-12, width=PICTURES_WIDTH)
+
+        self._round.on_update(lambda event: on_round(int(event.target.value)))
+        self._mode.on_update(lambda _: on_mode(self.mode))
+        self._look.on_update(lambda event: on_look(event.target.value == LOOKS[1]))
+        self._size.on_update(lambda event: on_size(float(event.target.value)))
+        for box in kinds.values():
+            box.on_update(lambda _: on_kinds({kind: b.value for kind, b in kinds.items()}))
+
+        @self._camera.on_update
+        def _(event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
+            # Without a client the choice was set from here, by a click in the scene.
+            if event.client is not None and self._camera.value in self._by_label:
+                on_camera(self._by_label[self._camera.value], event.client)
+
+        @download.on_click
+        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            if event.client is not None and self._run is not None:
+                self._download(self._run, event.client)
+
+    @property
+    def round(self) -> int:
+        """The round that is looked at."""
+        return int(self._round.value)
+
+    @property
+    def mode(self) -> str:
+        """The colour mode that is looked at, of MODES."""
+        return next(mode for mode, label in MODES.items() if label == self._mode.value)
+
+    def set_run(self, run: RunView, drawn: Detail, *, go_to: int) -> None:
+        """Take a run, or its growth, over, and go to a round."""
+        self._run = run
+        self._drawn = drawn
+        if run.last_round:
+            self._round.max = run.last_round
+            self._round.disabled = False
+        if go_to != self.round:
+            _set(self._round, go_to)
+        self._by_label = {_label(shown): shown for shown in run.cameras}
+        labels = (NO_CAMERA, *self._by_label)
+        if self._camera.options != labels:
+            chosen = self._camera.value
+            self._camera.options = labels
+            _set(self._camera, chosen if chosen in labels else NO_CAMERA)
+
+    def set_size(self, spacing: float) -> None:
+        """Say what a size of 1 is."""
+        self._size.hint = f"in spacings of {spacing:.3g} scene units"
+
+    def set_counts(self, run: RunView, number: int, drawn: int) -> None:
+        """Say what the memory holds after a round, and how much of it is drawn."""
+        counts = run.counts(number)
+        total = counts.observed + counts.generated
+        lines = [
+            f"<b>{total:,}</b> observations after round {number}",
+            f"{counts.observed:,} observed, {counts.generated:,} generated",
+        ]
+        if counts.voxels is not None:
+            lines.append(f"{counts.voxels:,} voxels")
+        if self._drawn.edge:
+            lines.append(f"{drawn:,} points drawn, one a cell of {self._drawn.edge:.3g}")
+        if not run.whole:
+            lines.append(f"not finished: {run.last_round} of {(run.planned or 1) - 1} rounds done")
+        self._counts.content = _small("<br>".join(lines))
+
+    def set_near(self, client: viser.ClientHandle, near: int, coarse: int) -> None:
+        """Say how many points near its camera a client is shown, in place of how many others."""
+        line = f"near you all {near:,} observations, in place of {coarse:,} points"
+        shown = self._near.get(client.client_id)
+        if shown is not None:
+            shown.content, shown.visible = _small(line), near > 0
+        elif near:
+            order = self._counts.order + 0.5
+            self._near[client.client_id] = client.gui.add_html(_small(line), order=order)
+
+    def set_legend(self, legend: Legend) -> None:
+        """How to read the colours."""
+        parts = [escape(legend.text)]
+        if legend.scale is not None:
+            low, high = (escape(end) for end in legend.scale)
+            parts.append(
+                f'<div style="height:.8em;background:linear-gradient(90deg,{",".join(VIRIDIS)})">'
+                '</div><div style="display:flex;justify-content:space-between">'
+                f"<span>{low}</span><span>{high}</span></div>"
+            )
+        parts += [_swatch(color, meaning) for color, meaning in legend.swatches]
+        self._legend.content = _small("".join(f"<div>{part}</div>" for part in parts))
+
+    def select(self, shown: ShownCamera) -> None:
+        """Let the list of cameras name the one that was clicked."""
+        if _label(shown) in self._by_label:
+            _set(self._camera, _label(shown))
+
+    def set_pictures(self, pictures: ShownPictures) -> None:
+        """Show what there is to see of a camera."""
+        if pictures.row is not None:
+            self._strip.image = pictures.row
+        self._strip.visible = pictures.row is not None
+        cells = "".join(
+            f'<span style="flex:1;text-align:center">{name}</span>' for name in pictures.names
+        )
+        self._caption.content = _small(f'{pictures.title}<div style="display:flex">{cells}</div>')
+        self._pictures.visible = True
+
+    def set_note(self, text: str) -> None:
+        """Something that the user should know of the run."""
+        self._note.content = _key_of_cameras() + _small(escape(text))
+
+    def _download(self, run: RunView, client: viser.ClientHandle) -> None:
+        from gvtools.memory.io.ply import export_memory_ply
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"{run.title}.ply"
+            try:
+                export_memory_ply(run.memory, path)
+                content = path.read_bytes()
+            except (GvError, OSError) as error:
+                client.add_notification("No PLY", str(error), color="red")
+                return
+        client.send_file_download(path.name, content, save_immediately=True)
+
+
+def _set(control: Any, value: object) -> None:
+    """Its value, which viser's types call read-only although it takes one."""
+    control.value = value
+
+
+def _label(shown: ShownCamera) -> str:
+    return f"{shown.kind} {shown.round}: {shown.name}"
+
+
+def _key_of_cameras() -> str:
+    swatches = "".join(_swatch(color, f"{kind} camera") for kind, color in KINDS.items())
+    return _small(swatches)
+
+
+def _swatch(color: str, meaning: str) -> str:
+    box = f"display:inline-block;width:.8em;height:.8em;margin-right:.4em;background:{color}"
+    return f'<span style="margin-right:1em"><span style="{box}"></span>{escape(meaning)}</span>'
+
+
+def _small(html: str) -> str:
+    return f'<div style="padding:0 .8em .4em;font-size:.85em;line-height:1.45">{html}</div>'
