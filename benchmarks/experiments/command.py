@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 SUMMARY = "measure the generative core on scenes that no training saw, against classical fillers"
 EXAMPLES = (
     "python -m benchmarks.experiments completion --scenes 64 --markdown completion.md",
-    "python -m benchmarks.experiments few-steps --teacher training/tiny/denoiser/weights --json steps.json",
+    "python -m benchmarks.experiments few-steps --teacher DIR --json steps.json",
 )
 # Each module has run(options) -> (figures, tables), and in READS the options that it looks at.
 EXPERIMENTS = {

@@ -113,7 +113,7 @@ class RunView:
         return Counts(int(there.sum()) - generated, generated, voxels)
 
     def colors(self, mode: str, rows: NDArray[np.int64]) -> PointColors:
-        """Colours of observations, those in ``rows`` (P,), as viz.run_view.point_colors has them."""
+        """Colours of observations, those in ``rows`` (P,), see point_colors."""
         counts = self._view_counts if mode == "views" else None
         return point_colors(
             self.memory, mode, rows=rows, true_depth=self.recorded_depth, counts=counts
