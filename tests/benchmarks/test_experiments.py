@@ -110,7 +110,7 @@ def weights(tmp_path_factory) -> Path:
     steps = [f"{name}.optimizer.steps=2" for name in ("encoder", "denoiser", "reflow")]
     settings = [part for text in (*steps, "encoder.statistics=1") for part in ("--set", text)]
     options = ["--out", str(out), "--sheets", "0", "--quiet", "--device", "cpu"]
-    assert main(["train", "micro", *options, *settings]) == 0
+    assert run_command(["train", "micro", *options, *settings]) == 0
     return out
 
 
