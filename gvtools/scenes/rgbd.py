@@ -8,16 +8,15 @@ they become a scene. Every supported layout publishes intrinsics whose first pix
 
 from __future__ import annotations
 
-import difflib
-import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, field_validator
 
 from gvtools.cameras import invert_rigid, rigid_transform
 from gvtools.errors import GvError, OptionError, ProjectError
@@ -32,6 +31,7 @@ from gvtools.scenes.photographs import (
 )
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.undistort import undistortion
+from gvtools.settings import Settings, changes, with_file
 
 Float64 = NDArray[np.float64]
 
@@ -39,35 +39,33 @@ SIDECAR = "rgbd.json"
 MILLIMETRES = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class RgbdOptions:
+Matrix = tuple[tuple[float, ...], ...]
+
+
+class RgbdOptions(Settings):
     """What a posed RGB-D folder does not tell by itself; None means the layout's own value.
 
     The same names may stand in a file ``rgbd.json`` in the folder; values given here win.
     Intrinsics are as published with such recordings: the first pixel's centre is (0, 0).
-
-    Attributes:
-        depth_unit: metres per stored unit (TUM 1/5000, others 1/1000).
-        color_K: (3, 3) intrinsics of the colour camera, pixels.
-        depth_K: (3, 3) intrinsics of the depth camera, pixels; None: depth is of the colour
-            camera.
-        color_from_depth: (4, 4) rigid, metres; None with ``depth_K`` given: the same place.
-        depth_max: metres; greater readings are ignored.
-        max_time_difference: seconds between colour, depth and pose of one frame (TUM).
     """
 
-    depth_unit: float | None = None
-    color_K: ArrayLike | None = None
-    depth_K: ArrayLike | None = None
-    color_from_depth: ArrayLike | None = None
-    depth_max: float | None = None
-    max_time_difference: float = 0.02
+    depth_unit: float | None = Field(None, gt=0)
+    """One stored unit (TUM 1/5000, others 1/1000). [m]"""
+    color_K: Matrix | None = None
+    """(3, 3) intrinsics of the colour camera. [px]"""
+    depth_K: Matrix | None = None
+    """(3, 3) intrinsics of the depth camera; none: depth is of the colour camera. [px]"""
+    color_from_depth: Matrix | None = None
+    """(4, 4) rigid; none with ``depth_K`` given: the same place. [m]"""
+    depth_max: float | None = Field(None, gt=0)
+    """Greater readings are ignored. [m]"""
+    max_time_difference: float = Field(0.02, gt=0)
+    """Between colour, depth and pose of one frame (TUM). [s]"""
 
-    def __post_init__(self) -> None:
-        for name in ("depth_unit", "depth_max", "max_time_difference"):
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, (int, float)) and 0 < value < np.inf):
-                raise OptionError(f"{name}: {value!r}; expected a positive number")
+    @field_validator("color_K", "depth_K", "color_from_depth", mode="before")
+    @classmethod
+    def _listed(cls, value: Any) -> Any:
+        return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,32 +116,16 @@ def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOption
     """``options`` over those of the folder's ``rgbd.json``, and a finding when that was read.
 
     Raises:
-        OptionError: the file has an unknown key or a wrong value.
-        ProjectError: the file is no JSON object.
+        OptionError: the file is no JSON object, or has an unknown key or a wrong value.
     """
     options = options or RgbdOptions()
     path = root / SIDECAR
     if not path.is_file():
         return options, []
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ProjectError(f"{path}: no JSON ({error}); expected an object of options") from None
-    known = {item.name: item.default for item in fields(RgbdOptions)}
-    if not isinstance(values, dict):
-        raise ProjectError(f"{path}: expected an object with keys out of {', '.join(known)}")
-    for key in values:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-            raise OptionError(f"{path}: unknown key {key!r}; {hint}")
-    given = {name: getattr(options, name) for name in known}
-    given = {name: value for name, value in given.items() if value is not known[name]}
-    try:
-        merged = RgbdOptions(**{**values, **given})
-    except OptionError as error:
-        raise OptionError(f"{path}: {error}") from None
-    return merged, [Finding("info", f"options read from {SIDECAR}: {', '.join(sorted(values))}")]
+    read = with_file(RgbdOptions(), path)
+    merged = read.replaced(**{name: getattr(options, name) for name in options.model_fields_set})
+    names = ", ".join(sorted(changes(RgbdOptions(), read)))
+    return merged, [Finding("info", f"options read from {SIDECAR}: {names}")]
 
 
 def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:

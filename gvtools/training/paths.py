@@ -11,9 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
 from gvtools.cameras import Cameras
-from gvtools.options import check_range
+from gvtools.errors import OptionError
+from gvtools.settings import Settings
 from gvtools.training.ray_cast import cast
 from gvtools.training.solid_geometry import Geometry, clearance
 
@@ -24,31 +26,31 @@ ATTEMPTS = 40
 PROBE = 8
 
 
-@dataclass(frozen=True, kw_only=True)
-class PathOptions:
-    """Ranges that paths are drawn from.
+class PathOptions(Settings):
+    """Ranges that paths are drawn from, each with its lower end first."""
 
-    Attributes:
-        fov: degrees, along the pictures' longer side.
-        travel: length of a path, in mean depths of its first view.
-        turn: degrees that the view turns over a path.
-        clearance: least distance to anything, in mean depths of the first view.
-        nearest: least z-depth of a pixel, in mean depths of the first view.
-    """
+    section = "paths"
 
     fov: tuple[float, float] = (50.0, 80.0)
+    """Along the pictures' longer side, at most 170. [degrees]"""
     travel: tuple[float, float] = (0.15, 1.3)
+    """Length of a path. [mean depths of its first view]"""
     turn: tuple[float, float] = (5.0, 110.0)
-    clearance: float = 0.06
-    nearest: float = 0.08
+    """How far the view turns over a path, at most 360. [degrees]"""
+    clearance: float = Field(0.06, gt=0)
+    """Least distance to anything. [mean depths of the first view]"""
+    nearest: float = Field(0.08, ge=0)
+    """Least z-depth of a pixel. [mean depths of the first view]"""
 
-    def __post_init__(self) -> None:
-        for name, most in (("fov", 170.0), ("travel", None), ("turn", 360.0)):
+    @model_validator(mode="after")
+    def _check(self) -> PathOptions:
+        for name, most in (("fov", 170.0), ("travel", np.inf), ("turn", 360.0)):
             low, high = getattr(self, name)
-            check_range(f"paths.{name}", low, least=0)
-            check_range(f"paths.{name}", high, least=low, most=most)
-        check_range("paths.clearance", self.clearance, above=0)
-        check_range("paths.nearest", self.nearest, least=0)
+            if not 0 <= low <= high <= most:
+                raise OptionError(
+                    f"paths.{name} [{low}, {high}]; expected 0 <= low <= high <= {most:g}"
+                )
+        return self
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from gvtools.training.encoder_stage import EncoderStage, measure_statistics
 from gvtools.training.heads_stage import HeadsStage
 from gvtools.training.loop import Reporting, Trainer, check_parts
 from gvtools.training.names import STAGES
-from gvtools.training.options import ReflowStageOptions, TrainingConfig
+from gvtools.training.options import ReflowStageOptions, TrainingSettings
 from gvtools.training.processes import Processes
 from gvtools.training.records import TrainingLog, read_log
 from gvtools.training.reflow_stage import ReflowStage
@@ -62,7 +62,7 @@ class StageRun:
 
     def __init__(
         self,
-        config: TrainingConfig,
+        config: TrainingSettings,
         stage: str,
         out: Path,
         *,
@@ -73,7 +73,7 @@ class StageRun:
         self.config, self.stage, self.out = config, stage, out
         self.folder = out / stage
         self.processes = processes
-        self.model_config = config.model_config(model_folder)
+        self.model_config = config.network(model_folder)
         self.init = init
         self.options = getattr(config, stage)
         if self.options is None:
@@ -124,7 +124,7 @@ class StageRun:
             say(f"{self.stage}: goes on after step {trainer.progress.step}")
         if self.processes.first:
             self.folder.mkdir(parents=True, exist_ok=True)
-            text = json.dumps(to_json(self.config), indent=2) + "\n"
+            text = json.dumps(self.config.to_dict(), indent=2) + "\n"
             write_text(self.folder / SETTINGS, text)
         samples.start(trainer, self.processes)
         check_parts(self.options.optimizer, self.processes, samples.group)
@@ -230,7 +230,7 @@ class StageRun:
 
     def _identity(self, samples: TrainingSamples) -> dict[str, Any]:
         """What may not change between the parts of a stage."""
-        data = to_json(self.config.data)
+        data = self.config.data.to_dict()
         for name in ("workers", "cache"):
             data.pop(name)
         model = to_json(self.model_config)
@@ -243,7 +243,7 @@ class StageRun:
             "seed": self.config.seed,
             "model": model,
             "photographs": list(samples.photographs),
-            "options": to_json(self.options),
+            "options": self.options.to_dict(),
             "start": None if self._source is None else _fingerprint(self._source),
             "data": data,
         }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 from gvtools.runs.folder import RunDirectory
@@ -40,11 +39,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.scenes.project import open_project
 
     if args.context is None:
-        config = replace(config, context=",".join(context))
+        config = config.replaced(context=",".join(context))
     if args.targets is None:
-        config = replace(config, targets=",".join(targets))
+        config = config.replaced(targets=",".join(targets))
     if args.views_per_round is None and args.rounds is None:
-        config = replace(config, views_per_round=4)
+        config = config.replaced(views_per_round=4)
     reconstruct(
         open_project(sample),
         config,

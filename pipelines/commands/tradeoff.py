@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from gvtools.errors import OptionError
 
 if TYPE_CHECKING:
-    from pipelines.config import RunConfig
     from pipelines.console import Console
+    from pipelines.reconstruction.settings import RunSettings
     from pipelines.tradeoff.outcome import Outcome
     from pipelines.tradeoff.search import Search
 
@@ -64,13 +64,12 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: a project or settings that cannot be run, or a budget that is none.
     """
-    from dataclasses import replace
-
     from gvtools.runs.folder_lock import held_folder
     from gvtools.runs.identity import run_identity
-    from pipelines import config as settings
+    from gvtools.settings import changes
     from pipelines.commands.scene_arguments import open_scene, reading_of
     from pipelines.reconstruction.plan import make_plan
+    from pipelines.reconstruction.settings import RunSettings
     from pipelines.tradeoff.search import Search
     from pipelines.tradeoff.search_axes import knobs_of
     from pipelines.tradeoff.trial import Trials, applied
@@ -94,7 +93,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             f"--targets {args.targets}: no views of the project; expected a selection of them, "
             "since a trial is measured against their pictures"
         )
-    config = replace(config, voxel=plan.config.voxel, memory=plan.config.memory)
+    config = config.replaced(voxel=plan.config.voxel, memory=plan.config.memory)
     with held_folder(args.out):
         identity = run_identity(plan, reading_of(args))
         trials = Trials(scene, config, plan.targets.cameras.names, args.out / "trials", identity)
@@ -116,37 +115,35 @@ def run(args: argparse.Namespace, console: Console) -> None:
             of_bytes=kind == "bytes",
         )
         profiles = [
-            (f"profile {name}", settings.difference(config, asked_for(args, name)))
-            for name in settings.PROFILES
+            (f"profile {name}", changes(config, asked_for(args, name))) for name in config.profiles
         ]
         search.sweep(profiles, fits)
 
         def profile(outcome: Outcome) -> Mapping[str, Any]:
             """Everything but which views are given and which are completed."""
-            changed = settings.changed_settings(applied(config, outcome.settings))
+            changed = changes(RunSettings(), applied(config, outcome.settings))
             return {key: changed[key] for key in changed if key not in ("context", "targets")}
 
         _write(search, args.out, scene.root.name, identity, kind, budget, fits, profile, console)
 
 
-def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunConfig:
+def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunSettings:
     """The run that the arguments ask for, or would with another profile.
 
     A profile finds its own voxel edge, unless one is given.
     """
-    from dataclasses import replace
+    from gvtools.settings import with_file, with_profile, with_texts
+    from pipelines.reconstruction.settings import RunSettings
 
-    from pipelines import config as settings
-
-    config = settings.RunConfig()
+    config = RunSettings()
     if args.config:
-        config = settings.with_file(config, args.config, profile=profile)
+        config = with_file(config, args.config, profile=profile)
     elif profile is not None:
-        config = settings.with_profile(config, profile)
+        config = with_profile(config, profile)
     named = [text for text in args.set if text.partition("=")[0].strip() == "profile"]
     texts = args.set if profile is None else [text for text in args.set if text not in named]
-    config = settings.with_settings(config, texts)
-    return replace(config, context=args.context, targets=args.targets)
+    config = with_texts(config, texts)
+    return config.replaced(context=args.context, targets=args.targets)
 
 
 def parse_budget(text: str | None) -> tuple[str, float | None]:

@@ -152,8 +152,8 @@ def knobs_of(plan: Plan) -> list[Knob]:
         ]  # fmt: skip
     if plan.source.name != RecordedDepth.name:
         knobs.append(
-            _values("views explained, share of pixels", "savings.explained",
-                    (0.7, 0.8, 0.9, None), config.savings.explained)
+            _values("views explained, share of pixels", "savings.depth_from_memory",
+                    (0.7, 0.8, 0.9, None), config.savings.depth_from_memory)
         )  # fmt: skip
     if plan.source.name == "plane-sweep":
         knobs += [

@@ -7,7 +7,7 @@ import json
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +19,19 @@ from gvtools.evaluation.view_figures import view_figures
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.round_files import TargetFiles, read_target
 from gvtools.scenes.scene import Scene, View
+from gvtools.settings import with_values
 from pipelines.commands.reconstruct import reconstruct
-from pipelines.config import RunConfig, with_setting
 from pipelines.console import Console, write_json
 from pipelines.reconstruction.measure import mean_of
+from pipelines.reconstruction.settings import RunSettings
 from pipelines.tradeoff.outcome import Outcome
 
 
-def applied(config: RunConfig, settings: Mapping[str, Any]) -> RunConfig:
+def applied(config: RunSettings, settings: Mapping[str, Any]) -> RunSettings:
     """A run's settings with a trial's; one that names a completer says all of its options."""
     if "completer" in settings:
-        config = replace(config, completer_options={})
-    for key, value in settings.items():
-        config = with_setting(config, key, value)
-    return config
+        config = config.replaced(completer_options={})
+    return with_values(config, settings)
 
 
 class _Silent(Console):
@@ -60,7 +59,7 @@ class Trials:
     def __init__(
         self,
         scene: Scene,
-        config: RunConfig,
+        config: RunSettings,
         names: Sequence[str],
         folder: Path,
         identity: Mapping[str, Any],
@@ -113,7 +112,7 @@ class Trials:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def _run(self, settings: Mapping[str, Any], names: Sequence[str]) -> Outcome:
-        config = with_setting(applied(self.config, settings), "targets", ",".join(names))
+        config = applied(self.config, settings).replaced(targets=",".join(names))
         out = self.folder / "running"
         shutil.rmtree(out, ignore_errors=True)
         start = time.perf_counter()

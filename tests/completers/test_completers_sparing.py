@@ -16,8 +16,9 @@ from gvtools.completers.holes import hole_reach
 from gvtools.completers.inpaint import InpaintCompleter
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
+from gvtools.settings import with_profile, with_values
 from pipelines.cli import main
-from pipelines.config import RunConfig, with_profile, with_setting
+from pipelines.reconstruction.settings import RunSettings
 
 HEIGHT, WIDTH = 60, 80
 
@@ -158,7 +159,7 @@ def test_a_run_hands_its_savings_on(tmp_path, monkeypatch, profile):
     scan = write_scan(tmp_path / "scan", views=4)
     options = ("--context", "first:3", "--targets", "range:3-3", "--profile", profile, "--quiet")
     assert main(["reconstruct", str(scan), "--out", str(tmp_path / "run"), *options]) == 0
-    savings = with_profile(RunConfig(), profile).savings
+    savings = with_profile(RunSettings(), profile).savings
     names = ("minor_holes", "one_step", "half_size", "no_prior", "near_holes")
     assert told == [{name: getattr(savings, name) for name in names}]
 
@@ -166,7 +167,7 @@ def test_a_run_hands_its_savings_on(tmp_path, monkeypatch, profile):
 @pytest.mark.parametrize("name", ["minor_holes", "one_step", "half_size", "no_prior"])
 def test_a_faster_profile_spares_more(name):
     shares = [
-        getattr(with_profile(RunConfig(), profile).savings, name)
+        getattr(with_profile(RunSettings(), profile).savings, name)
         for profile in ("accurate", "balanced", "fast")
     ]
     assert shares == sorted(set(shares)) and shares[0] == 0
@@ -174,4 +175,4 @@ def test_a_faster_profile_spares_more(name):
 
 def test_a_negative_share_is_refused():
     with pytest.raises(OptionError, match="minor_holes"):
-        with_setting(RunConfig(), "savings.minor_holes", -0.1)
+        with_values(RunSettings(), {"savings.minor_holes": -0.1})

@@ -92,7 +92,7 @@ def train(training: str, out: Path, stage: str, *more: str) -> int:
 def unseen_targets(training: str) -> ViewBatch:
     """Real cameras and context views; nothing is projected into the targets."""
     config, folder = shipped_or_read(training)
-    views = TrainingSamples(config, config.model_config(folder)).aside(0, 2).views
+    views = TrainingSamples(config, config.network(folder)).aside(0, 2).views
     shown = torch.zeros_like(views.valid)
     shown[:, : views.context] = views.valid[:, : views.context]
     images, depth = views.images * (shown > 0), views.depth * (shown > 0)
@@ -212,7 +212,7 @@ def test_other_starts_are_one_clear_line(published, training, tmp_path, capsys):
 def test_the_training_of_base_is_the_papers():
     """Training details of the paper: 504 x 504, 8 views, 32 samples, 300k and 50k iterations."""
     config, folder = shipped_or_read("base")
-    assert config.model_config(folder) == named("base")
+    assert config.network(folder) == named("base")
     assert config.parallel == "sharded"
     assert (config.data.views, config.data.size) == (8, (504, 504))
     for stage, steps, rate in ((config.denoiser, 300_000, 3e-5), (config.reflow, 50_000, 1e-5)):
@@ -221,7 +221,7 @@ def test_the_training_of_base_is_the_papers():
         assert (options.betas, options.clip, options.ema) == ((0.9, 0.95), 1.0, 0.9995)
         assert options.precision == "bfloat16"
         assert stage.context_weight == 0.25
-    assert config.reflow.bounds is None and config.model_config().flow.level1[0::3] == (1.0, 0.0)
+    assert config.reflow.bounds is None and config.network().flow.level1[0::3] == (1.0, 0.0)
 
 
 def test_an_unknown_way_of_sharing_is_refused(tmp_path, capsys):

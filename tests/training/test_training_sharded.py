@@ -131,7 +131,7 @@ def two(start, tmp_path_factory) -> tuple[Path, str]:
 
 def test_two_processes_that_share_parameters_out_see_what_one_would(one, two):
     config, folder = shipped_or_read("micro")
-    samples = TrainingSamples(config, config.model_config(folder))
+    samples = TrainingSamples(config, config.network(folder))
     contexts = [samples.batch(range(n, n + 1)).views.context for n in range(0, 16 * STEPS, 8)]
     assert any(a != b for a, b in zip(contexts[::2], contexts[1::2], strict=True))
     same_record(two[0], one)
@@ -176,7 +176,7 @@ def test_what_they_save_goes_on_exactly_and_in_one_process(start, one, two, tmp_
 def test_a_batch_that_is_bad_in_one_process_is_skipped_by_both(start, tmp_path):
     """Also where the one goes on to its backward pass, in which the processes meet."""
     config, folder = shipped_or_read("micro")
-    model = from_pretrained(start, config=config.model_config(folder))
+    model = from_pretrained(start, config=config.network(folder))
     stage, samples = DenoiserStage(model, config.denoiser), TrainingSamples(config, model.config)
     losses = [
         float(stage(samples.batch(part), Draws(0, "denoiser", 0, tuple(part)))[0].detach())

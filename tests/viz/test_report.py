@@ -19,8 +19,8 @@ from gvtools.cameras import Cameras
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
 from pipelines.commands.report import write_report
-from pipelines.config import RunConfig
 from pipelines.reconstruction.plan import make_plan
+from pipelines.reconstruction.settings import RunSettings
 from pipelines.report.data import collect, read_sweep
 from pipelines.report.sheets import chosen_targets, nearest_camera
 from viz.report.contact_sheet import TargetPictures, contact_row
@@ -156,7 +156,7 @@ def test_an_evaluation_gives_intervals_and_estimated_poses(own):
         assert np.abs(apart).max() < 0.2
     # An evaluation of other settings says nothing of this run.
     record = json.loads((own / "run.json").read_text())
-    record["config"]["seed"] = 7
+    record["settings"]["seed"] = 7
     (own / "run.json").write_text(json.dumps(record))
     report = collect(own)
     assert report.figures_from == "metrics.json"
@@ -193,7 +193,7 @@ def test_a_project_that_is_gone(own, scan, capsys):
 
 
 def test_a_run_that_has_its_project_open_writes_the_same_page(own, scan, page):
-    config = RunConfig(context="first:3", targets="range:3-6", views_per_round=2)
+    config = RunSettings(context="first:3", targets="range:3-6", views_per_round=2)
     before = (own / "report.html").read_bytes()
     (own / "report.html").unlink()
     write_report(make_plan(open_project(scan), config), own)
@@ -220,7 +220,7 @@ def test_a_damaged_report_is_one_line(own, capsys, change):
     assert "round_001/report.json: no report of this version" in refused(capsys, "report", own)
 
 
-@pytest.mark.parametrize("key", ["schedule", "context", "config", "project"])
+@pytest.mark.parametrize("key", ["schedule", "context", "settings", "derived", "project"])
 def test_a_damaged_record_is_one_line(own, capsys, key):
     record = json.loads((own / "run.json").read_text())
     (own / "run.json").write_text(json.dumps({**record, key: None}))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,9 +12,10 @@ from tiny_scan import write_scan
 
 from gvtools.errors import OptionError
 from gvtools.runs.folder_lock import held_folder
+from gvtools.settings import changes, with_profile, with_texts
 from pipelines.cli import build_parser, main
 from pipelines.commands.tradeoff import asked_for
-from pipelines.config import PROFILES, RunConfig, difference, with_profile, with_settings
+from pipelines.reconstruction.settings import RunSettings
 from pipelines.tradeoff.search import EQUAL
 from pipelines.tradeoff.trial import applied
 from viz.plots.pareto import draw_pareto
@@ -92,15 +92,15 @@ def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
     args = build_parser().parse_args(arguments + [word for text in own for word in ("--set", text)])
     start = asked_for(args)
     assert start.profile == "accurate" and start.memory.same_direction == 0
-    for name, changes in PROFILES.items():
-        wanted = with_settings(with_profile(RunConfig(), name), ["savings.minor_holes=0.07"])
-        wanted = with_settings(wanted, [text for text in own if "profile" not in text])
-        wanted = replace(wanted, context=start.context, targets=start.targets)
-        assert asked_for(args, name) == wanted, changes
+    for name in RunSettings.profiles:
+        wanted = with_texts(with_profile(RunSettings(), name), ["savings.minor_holes=0.07"])
+        wanted = with_texts(wanted, [text for text in own if "profile" not in text])
+        wanted = wanted.replaced(context=start.context, targets=start.targets)
+        assert asked_for(args, name) == wanted, name
         # As a trial reaches it, from the start with the edge that it has.
-        found = replace(start, voxel=start.voxel or 0.02)
-        tried = applied(found, difference(found, wanted))
-        assert replace(tried, profile=name) == wanted
+        found = start.replaced(voxel=start.voxel or 0.02)
+        tried = applied(found, changes(found, wanted))
+        assert tried.replaced(profile=name) == wanted
 
 
 def test_a_second_sweep_takes_over_what_is_there(scan, swept, capsys):

@@ -14,9 +14,10 @@ from gvtools.completers.base import create
 from gvtools.completers.effort import sparing
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.errors import GvError, OptionError, ProjectError
+from gvtools.settings import with_texts, with_values
 from pipelines.commands.tradeoff import parse_budget
-from pipelines.config import RunConfig, with_setting, with_settings
 from pipelines.reconstruction.plan import Plan
+from pipelines.reconstruction.settings import RunSettings
 from pipelines.tradeoff.outcome import Outcome, front
 from pipelines.tradeoff.search import FINAL, SHARES, Search, marginal_values
 from pipelines.tradeoff.search_axes import (
@@ -271,7 +272,7 @@ def test_a_budget_that_is_none_is_refused(text):
         parse_budget(text)
 
 
-def knobs_in(source: str, config: RunConfig) -> dict[str, Knob]:
+def knobs_in(source: str, config: RunSettings) -> dict[str, Knob]:
     """The knobs of a run whose depth comes from ``source``, by name."""
     cameras = SimpleNamespace(width=np.array([640]), height=np.array([480]))
     plan = SimpleNamespace(
@@ -283,27 +284,27 @@ def knobs_in(source: str, config: RunConfig) -> dict[str, Knob]:
 
 
 def test_what_is_swept_is_what_the_run_has():
-    recorded = knobs_in("recorded", RunConfig(completer="none"))
+    recorded = knobs_in("recorded", RunSettings(completer="none"))
     assert "stereo planes" not in recorded and "views explained, share of pixels" not in recorded
-    computed = knobs_in("plane-sweep", RunConfig(completer="none"))
+    computed = knobs_in("plane-sweep", RunSettings(completer="none"))
     planes, explained = computed["stereo planes"], computed["views explained, share of pixels"]
     assert planes.levels[planes.usual].settings == {"stereo.planes": None}
-    assert explained.levels[explained.usual].settings == {"savings.explained": 0.9}
-    assert explained.levels[-1].settings == {"savings.explained": None}
+    assert explained.levels[explained.usual].settings == {"savings.depth_from_memory": 0.9}
+    assert explained.levels[-1].settings == {"savings.depth_from_memory": None}
     # A value that is not among the usual ones is one of the levels, too.
-    own = with_setting(RunConfig(completer="none"), "savings.explained", 0.95)
+    own = with_values(RunSettings(completer="none"), {"savings.depth_from_memory": 0.95})
     explained = knobs_in("da3", own)["views explained, share of pixels"]
-    assert explained.levels[explained.usual].settings == {"savings.explained": 0.95}
+    assert explained.levels[explained.usual].settings == {"savings.depth_from_memory": 0.95}
     # Every level is a setting that a run takes.
     for knob in computed.values():
         for level in knob.levels:
             for key, value in level.settings.items():
-                with_setting(RunConfig(), key, value)
+                with_values(RunSettings(), {key: value})
 
 
 @pytest.mark.parametrize("footprints", [0.0, 0.7, 1.0, 4.0])
 def test_far_voxels_are_swept_from_the_widest_to_those_of_near_ones(footprints):
-    config = with_setting(RunConfig(completer="none"), "memory.footprints", footprints)
+    config = with_values(RunSettings(completer="none"), {"memory.footprints": footprints})
     knob = knobs_in("recorded", config)["far voxels"]
     values = [level.settings["memory.footprints"] for level in knob.levels]
     assert values == sorted(set(values), reverse=True)
@@ -327,7 +328,7 @@ def test_a_knob_of_one_completer_says_nothing_of_the_others():
      ["completer=exemplar", "completer.reach=0.1"]],
 )  # fmt: skip
 def test_every_completer_can_be_tried_from_any_start(texts):
-    config = with_settings(RunConfig(), texts)
+    config = with_texts(RunSettings(), texts)
     knobs = list(knobs_in("recorded", config).values())
     at = [knob.name for knob in knobs].index("completer")
     names = [level.name for level in knobs[at].levels]
@@ -364,10 +365,10 @@ def test_a_video_prior_is_swept_where_the_weights_have_one(tmp_path, texts, shar
         # What the prior is read from; nothing is completed here.
         (weights / "video").mkdir()
         core = ["completer=geoverse", f"completer.weights={weights}"]
-        config = with_settings(RunConfig(), [*core, *texts])
+        config = with_texts(RunSettings(), [*core, *texts])
         knobs = knobs_in("recorded", config)
         assert (name in knobs) == (injection == "control")
-    runs = [with_settings(config, [f"{k}={v}" for k, v in level.settings.items()])
+    runs = [with_texts(config, [f"{k}={v}" for k, v in level.settings.items()])
             for level in knobs[name].levels]  # fmt: skip
     told = []
     for run in runs:
