@@ -24,7 +24,7 @@ from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
 from gvtools.scenes.selection import select
-from gvtools.scenes.synthetic import write_room
+from gvtools.procedural.room_sample import write_room
 
 SETTINGS = {
     "320 px, 2 sources": StereoOptions(max_side=320, sources=2, best=1),

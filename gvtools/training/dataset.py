@@ -17,10 +17,10 @@ from gvtools.settings import Settings
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.corruption import CorruptionOptions, drawn
 from gvtools.training.hints import Clip, HintOptions
-from gvtools.training.layouts import scene
-from gvtools.training.paths import PathOptions, camera_path
-from gvtools.training.photographs import check_split, photograph_names
-from gvtools.training.renderer import SUPERSAMPLE, developed, radiance
+from gvtools.procedural.layouts import scene
+from gvtools.procedural.paths import PathOptions, camera_path
+from gvtools.procedural.photographs import check_split, photograph_names
+from gvtools.procedural.render import SUPERSAMPLE, developed, radiance
 from gvtools.training.view_sample import Sample, make_sample
 
 # Streams of random numbers of one sample.

@@ -11,8 +11,8 @@ from gvtools.training.dataset import MixedViews, ProceduralViews
 from gvtools.training.dataset import Samples as DataSet
 from gvtools.training.loader import BatchLoader
 from gvtools.training.loop import Trainer
+from gvtools.procedural.photographs import photograph_names
 from gvtools.training.options import TrainingSettings
-from gvtools.training.photographs import photograph_names
 from gvtools.training.processes import Processes
 from gvtools.training.sample_pool import PooledViews
 from gvtools.training.view_sample import collated

@@ -79,7 +79,7 @@ def free_folder(path: Path, *, resume: bool) -> Path:
 def _write(name: str, folder: Path, seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Write the sample; returns the names of context and targets."""
     if name == "room":
-        from gvtools.scenes.synthetic import write_room
+        from gvtools.procedural.room_sample import write_room
 
         room = write_room(folder, seed=seed)
         return room.context, room.targets

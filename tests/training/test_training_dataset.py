@@ -20,7 +20,7 @@ from gvtools.training.corruption import (
 )
 from gvtools.training.dataset import MixedViews, ProceduralViews
 from gvtools.training.hints import Clip, observed, projected
-from gvtools.training.photographs import photograph_names
+from gvtools.procedural.photographs import photograph_names
 from gvtools.training.view_sample import Sample, collated
 
 CLEAN = ProceduralViews(faults=None)

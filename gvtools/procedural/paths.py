@@ -15,9 +15,9 @@ from pydantic import Field, model_validator
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError
+from gvtools.procedural.geometry import Geometry, clearance
+from gvtools.procedural.ray_cast import cast
 from gvtools.settings import Settings
-from gvtools.training.ray_cast import cast
-from gvtools.training.solid_geometry import Geometry, clearance
 
 Float64 = NDArray[np.float64]
 

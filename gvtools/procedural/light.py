@@ -1,11 +1,11 @@
-"""Light on the surfaces of a procedural scene: from above and below, from afar, and from a lamp."""
+"""Light on the surfaces of a procedural scene: from above and below, from afar, and from lamps."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gvtools.kernels import FAST, compiled
-from gvtools.training.ray_intervals import SAME, enter_solid, leave_rooms, turned
+from gvtools.procedural.intervals import SAME, enter_solid, leave_rooms, turned
 
 # A surface point is lifted by this share of its way to the lamp, or it would shade itself.
 LIFT = 1e-6
@@ -28,25 +28,32 @@ def light_on(geometry, look, p, normal, light, o, d, local, floats, codes):
             facing = look.sun[0, 0] * normal[0, i] + look.sun[0, 1] * normal[1, i]
             facing += look.sun[0, 2] * normal[2, i]
             light[k, i] = below + (above - below) * up + sun * max(facing, 0.0)
-    if look.lamp[1, 1] <= 0:
-        return
     way = floats[len(floats) - 1]
-    for i in range(count):
-        way[i] = 1.0
-    if look.shadows:
-        _ways_to_lamp(geometry, look.lamp, p, normal, way, o, d, local, floats, codes)
-    falloff = 1.0 / (look.reach * look.reach)
-    for i in range(count):
-        x = look.lamp[0, 0] - p[0, i]
-        y = look.lamp[0, 1] - p[1, i]
-        z = look.lamp[0, 2] - p[2, i]
+    for lamp in look.lamps:
+        if lamp[1, 1] <= 0:
+            continue
+        for i in range(count):
+            way[i] = 1.0
+        if look.shadows:
+            _ways_to_lamp(geometry, lamp, p, normal, way, o, d, local, floats, codes)
+        _add_lamp(lamp, look.reach, p, normal, way, light)
+
+
+@compiled(fastmath=FAST)
+def _add_lamp(lamp, reach, p, normal, way, light):
+    """Add a lamp's light where nothing stands on the way."""
+    falloff = 1.0 / (reach * reach)
+    for i in range(len(way)):
+        x = lamp[0, 0] - p[0, i]
+        y = lamp[0, 1] - p[1, i]
+        z = lamp[0, 2] - p[2, i]
         squared = x * x + y * y + z * z
         facing = x * normal[0, i] + y * normal[1, i] + z * normal[2, i]
         strength = max(facing, 0.0) / np.sqrt(squared + 1e-12) * 1.25 / (1.0 + squared * falloff)
         strength = strength if way[i] >= 1.0 else 0.0
-        light[0, i] += strength * look.lamp[1, 0]
-        light[1, i] += strength * look.lamp[1, 1]
-        light[2, i] += strength * look.lamp[1, 2]
+        light[0, i] += strength * lamp[1, 0]
+        light[1, i] += strength * lamp[1, 1]
+        light[2, i] += strength * lamp[1, 2]
 
 
 @compiled(fastmath=FAST)
@@ -64,6 +71,8 @@ def _ways_to_lamp(geometry, lamp, p, normal, way, o, d, local, floats, codes):
         for i in range(count):
             way[i] = min(way[i] + SAME, 1.0)
     for n in range(len(geometry.kind)):
+        if not geometry.shades[n]:
+            continue
         first, last = _near_the_way(geometry, n, o, d)
         if first >= last:
             continue

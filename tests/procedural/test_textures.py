@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from gvtools.errors import OptionError
-from gvtools.scenes.room_textures import decode_srgb
-from gvtools.training.patterns import color, noise, pattern
-from gvtools.training.photographs import LONGEST, PHOTOGRAPHS, photograph, photograph_names
-from gvtools.training.textures import LEVELS, OFFSETS, SIDE, picture, stacked, texture
+from gvtools.procedural.color import decode_srgb
+from gvtools.procedural.patterns import color, noise, pattern
+from gvtools.procedural.photographs import LONGEST, PHOTOGRAPHS, photograph, photograph_names
+from gvtools.procedural.textures import LEVELS, OFFSETS, SIDE, picture, stacked, texture
 
 
 def test_splits_share_no_photograph() -> None:

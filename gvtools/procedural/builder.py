@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.training.shading import Look
-from gvtools.training.solid_geometry import BOX, Geometry
-from gvtools.training.textures import picture, stacked, texture
+from gvtools.procedural.shading import Look
+from gvtools.procedural.geometry import BOX, Geometry
+from gvtools.procedural.textures import level_starts, picture, stacked, texture
 
 Float64 = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ class Light:
 
     ambient: Float64
     sun: Float64
-    lamp: Float64
+    lamps: Float64
     reach: float
     shadows: bool
 
@@ -59,7 +59,7 @@ class SceneBuilder:
     photographs: Sequence[str]
     rooms: list[tuple[Float64, Float64]] = field(default_factory=list)
     room_material: list[list[int]] = field(default_factory=list)
-    solids: list[tuple[int, Float64, Float64, Float64, int]] = field(default_factory=list)
+    solids: list[tuple[int, Float64, Float64, Float64, int, bool]] = field(default_factory=list)
     cutters: list[list[tuple[Float64, Float64]]] = field(default_factory=list)
     cutter_material: list[int] = field(default_factory=list)
     textures: list[NDArray[np.uint8]] = field(default_factory=list)
@@ -86,10 +86,24 @@ class SceneBuilder:
         rng = self.rng
         photographic = only == "picture" and len(self.photographs)
         draw = picture if photographic else texture
-        self.textures.append(draw(rng, self.photographs))
+        image = draw(rng, self.photographs)
         size = np.exp(rng.uniform(np.log(0.5), np.log(4.0))) if tile is None else tile
-        place = rng.uniform(0, 4, 2) if offset is None else np.asarray(offset, np.float64)
-        sides = np.broadcast_to(np.asarray(size, np.float64), (2,)).copy()
+        place = rng.uniform(0, 4, 2) if offset is None else offset
+        return self.coated(image, size, gain=gain, offset=place, emission=emission)
+
+    def coated(
+        self,
+        image: NDArray[np.uint8],
+        tile: ArrayLike,
+        *,
+        gain: ArrayLike = 1.0,
+        offset: ArrayLike = 0.0,
+        emission: float = 0.0,
+    ) -> int:
+        """A material with a given texture: square, as large as the scene's others."""
+        self.textures.append(image)
+        sides = np.broadcast_to(np.asarray(tile, np.float64), (2,)).copy()
+        place = np.broadcast_to(np.asarray(offset, np.float64), (2,)).copy()
         tint = np.broadcast_to(np.asarray(gain, np.float64), (3,)).copy()
         self.materials.append((len(self.textures) - 1, sides, place, tint, emission))
         return len(self.materials) - 1
@@ -117,6 +131,7 @@ class SceneBuilder:
         tilt: float = 0.0,
         cuts: Sequence[tuple[ArrayLike, ArrayLike]] = (),
         cut_material: int | None = None,
+        shades: bool = True,
     ) -> None:
         """A solid, and boxes of its own frame that are cut out of it.
 
@@ -129,13 +144,14 @@ class SceneBuilder:
             tilt: about its own first axis, before the yaw.
             cuts: lowest and highest corners.
             cut_material: of the surfaces that cutting makes; None for ``material``.
+            shades: whether it keeps a lamp's light away.
         """
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         c, s = np.cos(tilt), np.sin(tilt)
         lean = np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
         self.solids.append(
-            (kind, lean @ turn, np.asarray(centre, np.float64), np.asarray(half, float), material)
+            (kind, lean @ turn, np.asarray(centre, float), np.asarray(half, float), material, shades)
         )
         boxes = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in cuts]
         self.cutters.append(boxes)
@@ -150,8 +166,8 @@ class SceneBuilder:
         """Everything put in so far, for rays."""
         count = len(self.solids)
         boxes = [box for boxes in self.cutters for box in boxes]
-        kind, rotation, centre, half, material = (
-            zip(*self.solids, strict=True) if count else ((),) * 5
+        kind, rotation, centre, half, material, shades = (
+            zip(*self.solids, strict=True) if count else ((),) * 6
         )
         ends = np.cumsum([0, *(len(boxes) for boxes in self.cutters)])
         return Geometry(
@@ -162,6 +178,7 @@ class SceneBuilder:
             np.array(centre, np.float64).reshape(count, 3),
             np.array(half, np.float64).reshape(count, 3),
             np.array(material, np.int64),
+            np.array(shades, np.bool_),
             ends.astype(np.int64),
             np.array(boxes, np.float64).reshape(len(boxes), 2, 3),
             np.array(self.cutter_material, np.int64),
@@ -170,6 +187,7 @@ class SceneBuilder:
     def look(self, light: Light) -> Look:
         """Materials and a light, for shading."""
         rows, tile, offset, gain, emission = zip(*self.materials, strict=True)
+        side = len(self.textures[0])
         return Look(
             np.array(rows, np.int64),
             np.array(tile, np.float64),
@@ -177,9 +195,11 @@ class SceneBuilder:
             np.array(gain, np.float64),
             np.array(emission, np.float64),
             stacked(self.textures),
+            level_starts(side),
+            side,
             light.ambient,
             light.sun,
-            light.lamp,
+            light.lamps,
             float(light.reach),
             bool(light.shadows),
         )

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.kernels import FAST, compiled
-from gvtools.training.ray_intervals import enter_solid, leave_rooms, turned
-from gvtools.training.solid_geometry import Geometry
+from gvtools.procedural.intervals import enter_solid, leave_rooms, turned
+from gvtools.procedural.geometry import Geometry
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -32,7 +32,7 @@ class Surfaces:
         depth: (V, H, W) float64 z-depth, metres; 0 for a camera that stands in no room.
         room: (V, H, W) int64, whose wall it is, where it is one.
         solid: (V, H, W) int64, -1 for a wall.
-        code: (V, H, W) int64, see ``solid_geometry``.
+        code: (V, H, W) int64, see ``geometry``.
         cutter: (V, H, W) int64, -1 where nothing was cut.
     """
 

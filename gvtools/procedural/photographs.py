@@ -74,9 +74,9 @@ def photograph(name: str) -> NDArray[np.uint8]:
         file = Path(spec.origin).parent / "datasets" / "images" / f"{name[8:]}.jpg"
         image = Image.open(file).convert("RGB")
     else:
-        from gvtools.scenes import room_textures
+        import skimage.data
 
-        image = Image.fromarray(room_textures.photograph(name))
+        image = Image.fromarray(np.asarray(getattr(skimage.data, name)())).convert("RGB")
     if max(image.size) > LONGEST:
         image.thumbnail((LONGEST, LONGEST), Image.Resampling.LANCZOS)
     return np.asarray(image)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.training.scene_builder import CEILING, SceneBuilder
+from gvtools.procedural.builder import CEILING, SceneBuilder
 
 Float64 = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.training.scene_builder import SceneBuilder
-from gvtools.training.solid_geometry import BALL, BOX, TUBE
+from gvtools.procedural.builder import SceneBuilder
+from gvtools.procedural.geometry import BALL, BOX, TUBE
 
 Float64 = NDArray[np.float64]
 

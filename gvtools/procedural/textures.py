@@ -14,17 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.kernels import compiled
-from gvtools.scenes.room_textures import decode_srgb
-from gvtools.training.patterns import color, pattern
-from gvtools.training.photographs import photograph
+from gvtools.procedural.color import decode_srgb
+from gvtools.procedural.patterns import color, pattern
+from gvtools.procedural.photographs import photograph
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-SIDE = 128  # texels along a side of the finest level
-LEVELS = SIDE.bit_length()
-# Where each level starts, and the number of all texels.
-OFFSETS = np.cumsum([0] + [(SIDE >> level) ** 2 for level in range(LEVELS)])
+SIDE = 128  # texels along a side of a training scene's finest level
 PHOTOGRAPH_SHARE = 0.5
 
 
@@ -84,10 +81,19 @@ def _image(name: str) -> Image:
     return Image.fromarray(photograph(name))
 
 
+def level_starts(side: int) -> NDArray[np.int64]:
+    """(levels + 1,) where each level of a texture starts, and the number of all its texels."""
+    sizes = [(side >> level) ** 2 for level in range(side.bit_length())]
+    return np.cumsum([0, *sizes]).astype(np.int64)
+
+
 def stacked(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-    """(T, OFFSETS[-1], 3) float32 linear light: every texture at all its levels, row by row."""
+    """(T, texels, 3) float32 linear light: every texture at all its levels, row by row.
+
+    Textures are square, of one size, and their side is a power of two.
+    """
     encoded = np.stack(images)
-    out = np.empty((len(encoded), OFFSETS[-1], 3), np.float32)
+    out = np.empty((len(encoded), level_starts(encoded.shape[1])[-1], 3), np.float32)
     _fill(encoded, decode_srgb(np.arange(256, dtype=np.uint8)), out)
     return out
 

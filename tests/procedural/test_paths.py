@@ -6,9 +6,9 @@ from reference_rays import is_free
 
 from gvtools.errors import OptionError
 from gvtools.training.context_choice import ContextOptions, chosen_context
-from gvtools.training.layouts import scene
-from gvtools.training.paths import PathOptions, camera_path
-from gvtools.training.ray_cast import cast
+from gvtools.procedural.layouts import scene
+from gvtools.procedural.paths import PathOptions, camera_path
+from gvtools.procedural.ray_cast import cast
 
 SIZE = (48, 64)
 

@@ -5,13 +5,13 @@ import pytest
 from reference_rays import first_surface, is_free
 
 from gvtools.cameras import Cameras
-from gvtools.training.layouts import scene
-from gvtools.training.paths import camera_path
-from gvtools.training.ray_cast import cast
-from gvtools.training.renderer import developed, radiance
-from gvtools.training.scene_builder import ProceduralScene, SceneBuilder
-from gvtools.training.shading import Look
-from gvtools.training.solid_geometry import BALL, BOX, TUBE, clearance
+from gvtools.procedural.layouts import scene
+from gvtools.procedural.paths import camera_path
+from gvtools.procedural.ray_cast import cast
+from gvtools.procedural.render import developed, radiance
+from gvtools.procedural.builder import ProceduralScene, SceneBuilder
+from gvtools.procedural.shading import Look
+from gvtools.procedural.geometry import BALL, BOX, TUBE, clearance
 
 SEEDS = range(8)
 SIZE = (20, 20)
@@ -78,7 +78,7 @@ def test_solids_on_their_own_and_from_within_their_hull() -> None:
 
 
 def _towards(eye: np.ndarray, aim: np.ndarray) -> Cameras:
-    from gvtools.scenes.synthetic import look_at
+    from gvtools.procedural.room_sample import look_at
 
     K = np.array([[16.0, 0, 20], [0, 16, 20], [0, 0, 1]])
     return Cameras(K[None], look_at(eye, aim)[None], np.array([40]), np.array([40]), ("a",))

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.kernels import FAST, compiled
-from gvtools.scenes.room_textures import encode_srgb
-from gvtools.training.lighting import light_on
-from gvtools.training.ray_cast import CODES, FLOATS, rectangles, trace_row, world_rays
-from gvtools.training.shading import Look, add_colors, surface_places, texture_levels
-from gvtools.training.solid_geometry import Geometry
+from gvtools.procedural.color import encode_srgb
+from gvtools.procedural.light import light_on
+from gvtools.procedural.ray_cast import CODES, FLOATS, rectangles, trace_row, world_rays
+from gvtools.procedural.shading import Look, add_colors, surface_places, texture_levels
+from gvtools.procedural.geometry import Geometry
 
 Float32 = NDArray[np.float32]
 
@@ -51,7 +51,7 @@ def radiance(
 
 
 def developed(light: Float32, exposure: float) -> NDArray[np.uint8]:
-    """(..., 3) linear light to 8-bit sRGB by the tone curve of the project's sample room."""
+    """(..., 3) linear light to 8-bit sRGB by the tone curve of ``color.encode_srgb``."""
     out = np.empty(light.shape, np.uint8)
     _develop(light.reshape(-1), np.float32(exposure * (STEPS - 1) / BRIGHTEST), _TONES, out.ravel())
     return out
@@ -103,7 +103,7 @@ def _color_row(geometry, look, view, rays, centers, rects, row, supersample, pix
             geometry, look, ends[3:], points[:3], hits[0], hits[1], hits[2], hits[3], points[3:6],
             hits[4], place, level,
         )  # fmt: skip
-        texture_levels(t, pixel, level, squares, level)
+        texture_levels(look, t, pixel, level, squares, level)
         light = floats[4 + 2 * total : 7 + 2 * total]
         light_on(
             geometry, look, points[:3], points[3:6], light, ends[:3], ends[3:], local, floats,

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.training.clutter import add_clutter
-from gvtools.training.openings import add_frames, add_openings, add_side_room
-from gvtools.training.photographs import check_split, photograph_names
-from gvtools.training.scene_builder import Light, ProceduralScene, SceneBuilder
-from gvtools.training.solid_geometry import Geometry, clearance
+from gvtools.procedural.clutter import add_clutter
+from gvtools.procedural.openings import add_frames, add_openings, add_side_room
+from gvtools.procedural.photographs import check_split, photograph_names
+from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
+from gvtools.procedural.geometry import Geometry, clearance
 
 Float64 = NDArray[np.float64]
 Range = tuple[float, float]
@@ -224,4 +224,4 @@ def _light(rng: np.random.Generator, geometry: Geometry) -> Light:
     strength = rng.uniform(0.2, 1.4) * (rng.random() < 0.8)
     lamp = np.stack([place, strength * np.array([1.05, 0.98, rng.uniform(0.75, 1.0)])])
     reach = rng.uniform(0.3, 0.8) * float(np.linalg.norm(high - low))
-    return Light(ambient, sun, lamp, reach, bool(strength > 0 and rng.random() < 0.6))
+    return Light(ambient, sun, lamp[None], reach, bool(strength > 0 and rng.random() < 0.6))

@@ -8,13 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.kernels import FAST, compiled
-from gvtools.training.textures import LEVELS, OFFSETS, SIDE
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-
-STARTS = OFFSETS.astype(np.int64)
 
 
 class Look(NamedTuple):
@@ -27,11 +24,13 @@ class Look(NamedTuple):
         gain: (P, 3) factor on the texture.
         emission: (P,) light of the surface's own, for what lies outside windows.
         texels: (T, texels, 3) float32, see ``textures.stacked``.
+        starts: (levels + 1,), see ``textures.level_starts``.
+        side: texels along a side of the finest level.
         ambient: (2, 3) light from above and from below.
         sun: (2, 3) direction towards it (unit length), and its light.
-        lamp: (2, 3) position, and its light on a surface that faces it from half its reach.
-        reach: metres; the lamp's light falls off as 1 / (1 + (distance / reach)²).
-        shadows: whether solids and walls keep the lamp's light away.
+        lamps: (L, 2, 3) position, and its light on a surface that faces it from half its reach.
+        reach: metres; a lamp's light falls off as 1 / (1 + (distance / reach)²).
+        shadows: whether solids and walls keep the lamps' light away.
     """
 
     texture: Int64
@@ -40,9 +39,11 @@ class Look(NamedTuple):
     gain: Float64
     emission: Float64
     texels: Float32
+    starts: Int64
+    side: int
     ambient: Float64
     sun: Float64
-    lamp: Float64
+    lamps: Float64
     reach: float
     shadows: bool
 
@@ -131,20 +132,21 @@ def _solid_place(geometry, n, code, i, d, p, normal):
 
 
 @compiled(fastmath=FAST)
-def texture_levels(t, pixel, spread, squares, level):
+def texture_levels(look, t, pixel, spread, squares, level):
     """Level of resolution at which a texel is as wide as a ray's share of the surface.
 
     ``pixel`` is the ray's share of the image at z-depth 1; ``squares`` (count,) float32 is scratch.
     """
-    factor = (pixel * SIDE) ** 2
+    factor = (pixel * look.side) ** 2
     for i in range(len(t)):
         squares[i] = np.float32(max(t[i] * t[i] * spread[i] * factor, 1e-9))
+    coarsest = len(look.starts) - 1 - 1.001
     bits = squares.view(np.int32)
     for i in range(len(t)):
         # A float's exponent is its logarithm's integer part; the mantissa's is near a parabola.
         mantissa = np.float64(bits[i] & 0x7FFFFF) / 8388608.0
         log = np.float64((bits[i] >> 23) - 127) + mantissa * (1.3465 - 0.3465 * mantissa)
-        level[i] = min(max(0.5 * log, 0.0), LEVELS - 1.001)
+        level[i] = min(max(0.5 * log, 0.0), coarsest)
 
 
 @compiled(inline="always")
@@ -166,7 +168,7 @@ def add_colors(look, what, place, level, light, samples, color):
         for step in range(2):
             coarse = np.float32(level[i] - fine)
             share = coarse if step else np.float32(1) - coarse
-            side = SIDE >> (fine + step)
+            side = look.side >> (fine + step)
             x = place[0, i] * side - 0.5
             y = place[1, i] * side - 0.5
             left = np.floor(x)
@@ -175,8 +177,8 @@ def add_colors(look, what, place, level, light, samples, color):
             fy = np.float32(y - top)
             c0 = _mirrored(np.int64(left), side)
             c1 = _mirrored(np.int64(left) + 1, side)
-            r0 = STARTS[fine + step] + side * _mirrored(np.int64(top), side)
-            r1 = STARTS[fine + step] + side * _mirrored(np.int64(top) + 1, side)
+            r0 = look.starts[fine + step] + side * _mirrored(np.int64(top), side)
+            r1 = look.starts[fine + step] + side * _mirrored(np.int64(top) + 1, side)
             lower = share * fy
             upper = share - lower
             a = upper - upper * fx

@@ -33,6 +33,7 @@ class Geometry(NamedTuple):
         centre: (N, 3).
         half: (N, 3) half extents along the local axes.
         material: (N,).
+        shades: (N,) bool, whether it keeps a lamp's light away.
         first_cutter: (N + 1,) where each solid's cutters start.
         cutter: (M, 2, 3) lowest and highest corner, frame of their solid.
         cutter_material: (M,) of the surfaces that cutting makes.
@@ -45,6 +46,7 @@ class Geometry(NamedTuple):
     centre: Float64
     half: Float64
     material: Int64
+    shades: NDArray[np.bool_]
     first_cutter: Int64
     cutter: Float64
     cutter_material: Int64
