@@ -44,7 +44,7 @@ class Trajectory:
 
 
 def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
-    """The poses of a trajectory file.
+    r"""The poses of a trajectory file.
 
     Args:
         path: a text file; blank lines and lines that start with # are passed over.
@@ -64,7 +64,7 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
     ...     file = Path(folder) / "path.txt"
-    ...     _ = file.write_text("0.0 1 2 3 0 0 0 1\\n0.1 1 2 4 0 0 0 1\\n")
+    ...     _ = file.write_text("0.0 1 2 3 0 0 0 1\n0.1 1 2 4 0 0 0 1\n")
     ...     track = read_poses(file)
     >>> track.poses[1, :3, 3], track.stamps
     (array([1., 2., 4.]), array([0. , 0.1]))

@@ -39,7 +39,7 @@ def _type_checking_imports() -> dict[str, str]:
 
 
 def test_the_lazy_table_says_what_the_type_checker_sees() -> None:
-    assert gvtools._SOURCES == _type_checking_imports()
+    assert _type_checking_imports() == gvtools._SOURCES
     assert sorted(gvtools.__all__) == sorted({*gvtools._SOURCES, "__version__"})
 
 
