@@ -74,9 +74,9 @@ def settings_page() -> str:
     text = [
         "# Settings",
         "",
-        "Settings come from the defaults, then `--profile`, then a JSON file (`--config`), then the "
-        "options, then `--set NAME=VALUE`. The resolved ones are written to `run.json`. A name that "
-        "does not exist is an error which names the nearest one.",
+        "Settings come from the defaults, then `--profile`, then a JSON file (`--config`), then "
+        "the options, then `--set NAME=VALUE`. The resolved ones are written to `run.json`. A name "
+        "that does not exist is an error which names the nearest one.",
         "",
         "| setting | default | range | meaning |",
         "|---|---|---|---|",
