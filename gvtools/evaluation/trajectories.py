@@ -122,6 +122,15 @@ def absolute_errors(
     Raises:
         ShapeError: wrong shapes, no rotations, or values that are not finite or beyond LARGEST.
         OptionError: an unknown alignment.
+
+    >>> import numpy as np
+    >>> reference = np.tile(np.eye(4), (4, 1, 1))
+    >>> reference[:, :3, 3] = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 1]]
+    >>> estimate = reference.copy()
+    >>> estimate[:, :3, 3] *= 0.5  # the same path at half the scale
+    >>> errors = absolute_errors(reference, estimate, align="sim3")
+    >>> errors.status, round(errors.scale, 6), round(errors.translation.rmse, 6)
+    ('aligned', 2.0, 0.0)
     """
     first, second = _poses(reference, estimate)
     status, fit = _aligned(first, second, align, refuse_mirrored)
@@ -162,6 +171,15 @@ def relative_errors(
     Raises:
         ShapeError: wrong shapes, no rotations, or values that are not finite or beyond LARGEST.
         OptionError: an unknown alignment, or a delta below 1.
+
+    >>> import numpy as np
+    >>> reference = np.tile(np.eye(4), (5, 1, 1))
+    >>> reference[:, 0, 3] = np.arange(5)  # one unit a frame
+    >>> estimate = reference.copy()
+    >>> estimate[:, 0, 3] *= 1.1
+    >>> errors = relative_errors(reference, estimate, align="none")
+    >>> round(errors.translation.mean, 6), errors.translation.n
+    (0.1, 4)
     """
     if delta < 1:
         raise OptionError(f"RPE delta {delta}; expected 1 frame or more")

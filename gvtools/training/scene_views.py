@@ -207,7 +207,7 @@ def _reduced(view: View, size: tuple[int, int], detail: int) -> _Reduced:
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
     if frame.mask is not None:
         depth = np.where(frame.mask, depth, np.float32(0))
-    camera = view.camera.cropped(left, top, columns, rows)
+    camera = view.camera.cropped(left, top, width=columns, height=rows)
     factor = max(1, min(detail, rows // size[0], columns // size[1]))
     parts = [
         _resized(frame.rgb[window], depth[window], camera, (size[0] * times, size[1] * times))
