@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gvtools.completers.geoverse.config import GeoVerseConfig, named, read
-from gvtools.completers.geoverse.config_json import from_json, to_json
 from gvtools.completers.geoverse.flow import check_bounds
 from gvtools.completers.geoverse.objective.objective import LossWeights
 from gvtools.errors import OptionError
+from gvtools.networks.config_json import from_json, to_json
 from gvtools.options import check_range
 from gvtools.training.corruption import GENTLE, CorruptionOptions
 

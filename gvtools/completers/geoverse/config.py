@@ -8,7 +8,6 @@ from importlib import resources
 from pathlib import Path
 
 from gvtools.completers.geoverse.conditioning import HintConfig
-from gvtools.completers.geoverse.config_json import from_json, to_json
 from gvtools.completers.geoverse.control import ControlConfig
 from gvtools.completers.geoverse.denoiser import DenoiserConfig
 from gvtools.completers.geoverse.flow import check_bounds
@@ -16,6 +15,7 @@ from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
 from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
 from gvtools.completers.geoverse.video_prior.prior import VideoPriorConfig
 from gvtools.errors import CheckpointError, OptionError
+from gvtools.networks.config_json import from_json, to_json
 from gvtools.networks.depth_anything.network import DepthAnythingConfig
 from gvtools.options import check_range
 
