@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 from gvtools.completers.geoverse.weights.folder import save_pretrained
 from gvtools.completers.geoverse.weights.published import WHOLE_FILE
 from gvtools.errors import CheckpointError, GvError, ProjectError
+from gvtools.networks.tensors import save_tensors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
