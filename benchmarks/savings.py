@@ -21,7 +21,7 @@ from typing import Any
 
 from gvtools.completers.base import create
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
-from gvtools.completers.geoverse.weights.folder_parts import config_of
+from gvtools.completers.geoverse.weights.checks import config_of
 from gvtools.runs.folder import RunDirectory
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene

@@ -19,7 +19,6 @@ from benchmarks.experiments.judging import COLUMNS, Judged, judge, perceptual, r
 from benchmarks.experiments.options import ExperimentOptions
 from benchmarks.experiments.rows import geoverse
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.control import ControlConfig
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
@@ -32,6 +31,7 @@ from gvtools.completers.geoverse.weights.folder import (
 from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
 from gvtools.errors import OptionError
 from gvtools.evaluation.tables import Table
+from gvtools.networks.config_json import to_json
 from gvtools.settings import with_texts
 from gvtools.training.options import TrainingSettings, shipped_or_read
 from gvtools.training.processes import started

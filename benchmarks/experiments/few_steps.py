@@ -15,7 +15,7 @@ from benchmarks.experiments.options import ExperimentOptions
 from benchmarks.experiments.rows import geoverse, with_heads_of
 from gvtools.completers.base import Completer
 from gvtools.completers.geoverse.completer import SHIPPED
-from gvtools.completers.geoverse.weights.folder_parts import config_of
+from gvtools.completers.geoverse.weights.checks import config_of
 from gvtools.evaluation.tables import Table
 
 READS = ("weights", "teacher", "scenes", "size", "seed")

@@ -13,13 +13,14 @@ import torch
 from torch import nn
 
 from gvtools.completers.geoverse.config import FlowConfig, GeoVerseConfig
-from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior
-from gvtools.completers.geoverse.weights.folder_parts import config_of
+from gvtools.completers.geoverse.weights.checks import config_of
+from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pretrained
 from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER, WHOLE_FILE
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text
+from gvtools.networks.config_json import to_json
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.copies import Copies, models_of
 from gvtools.training.denoiser_stage import DenoiserStage
@@ -163,8 +164,6 @@ class StageRun:
 
     def _start(self, say: Callable[[str], None]) -> GeoVerse:
         """The model that the stage begins with; every process makes the same."""
-        from gvtools.completers.geoverse.weights.folder import from_pretrained
-
         before = [name for name in STAGES[: STAGES.index(self.stage)]]
         if not self.init:
             self._refuse_unfinished(before)
@@ -265,7 +264,7 @@ class StageRun:
                 if self.stage == "reflow":
                     config = _distilled(config, self.options)
                 whole.config = replace(config, trained=self.stage in GENERATIVE)
-                whole.save_pretrained(self.folder / WEIGHTS)
+                save_pretrained(whole, self.folder / WEIGHTS)
                 self._link_video()
         # The next stage starts from them, in every process.
         self.processes.wait()

@@ -169,7 +169,7 @@ def knobs_of(plan: Plan) -> list[Knob]:
 def _core(given: Mapping[str, Any]) -> GeoVerseConfig:
     """The generative core's configuration, with a run's options of it."""
     from gvtools.completers.geoverse.completer import GeoVerseCompleter
-    from gvtools.completers.geoverse.weights.folder_parts import config_of
+    from gvtools.completers.geoverse.weights.checks import config_of
 
     core = create("geoverse", **given)
     assert isinstance(core, GeoVerseCompleter)

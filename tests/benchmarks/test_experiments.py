@@ -12,6 +12,7 @@ from benchmarks.experiments.classical import CLASSICAL, classical
 from benchmarks.experiments.judging import COLUMNS, best, judge, records, table
 from benchmarks.experiments.rows import FILL, HINTS, INPAINT, with_heads_of
 from gvtools.completers.geoverse import from_pretrained
+from gvtools.completers.geoverse.weights.folder import save_pretrained
 from gvtools.guidance import Guidance
 from pipelines.cli import main as run_command
 
@@ -181,7 +182,7 @@ def test_a_teacher_is_judged_with_the_students_heads(weights):
     with torch.no_grad():
         student.rgb_head.decoder_pred.bias.add_(1)
     folder = last.parent / "changed"
-    student.save_pretrained(folder)
+    save_pretrained(student, folder)
     with with_heads_of(before, folder) as merged:
         found = from_pretrained(merged)
         assert found.config.trained

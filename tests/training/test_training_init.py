@@ -15,9 +15,10 @@ from torch import Tensor
 from gvtools.completers.geoverse import GeoVerse, from_pretrained
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig, named, read
-from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.denoiser import Conditions
 from gvtools.completers.geoverse.plucker import camera_condition
+from gvtools.completers.geoverse.weights.folder import save_pretrained
+from gvtools.networks.config_json import to_json
 from gvtools.training.options import SHIPPED, shipped_or_read
 from gvtools.training.samples import TrainingSamples
 from pipelines.cli import main
@@ -162,7 +163,7 @@ def test_a_training_goes_on_from_gld_without_the_encoders_stage(
 
 def test_ones_own_start_is_that_of_the_first_stage(published, training, tmp_path, capsys):
     own = tmp_path / "own"
-    from_pretrained(published, config=small_base()).save_pretrained(own)
+    save_pretrained(from_pretrained(published, config=small_base()), own)
     few = ["--set", "encoder.statistics=1"]
     assert train(training, tmp_path / "out", "all", "--init", str(own), *few) == 0
     said = capsys.readouterr().out
@@ -188,7 +189,7 @@ def test_a_training_goes_on_from_the_published_files_that_it_began_with(
 
 def test_other_starts_are_one_clear_line(published, training, tmp_path, capsys):
     own = tmp_path / "own"
-    from_pretrained(published, config=small_base()).save_pretrained(own)
+    save_pretrained(from_pretrained(published, config=small_base()), own)
     part = tmp_path / "part"
     (part / "checkpoints").mkdir(parents=True)
     (part / "checkpoints" / "da3_level1.pt").symlink_to(published / "checkpoints/da3_level1.pt")

@@ -19,7 +19,8 @@ from PIL import Image
 
 from gvtools.completers.geoverse import GeoVerse, from_pretrained
 from gvtools.completers.geoverse.config import GeoVerseConfig, read
-from gvtools.completers.geoverse.config_json import to_json
+from gvtools.completers.geoverse.weights.folder import save_pretrained
+from gvtools.networks.config_json import to_json
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.draws import Draws
 from gvtools.training.options import SHIPPED, shipped_or_read
@@ -108,7 +109,7 @@ def model_of(config: GeoVerseConfig) -> GeoVerse:
 def start(tmp_path_factory) -> Path:
     """Weights that every training here starts from."""
     folder = tmp_path_factory.mktemp("start")
-    model_of(read(SHIPPED / "micro_model.json")).save_pretrained(folder)
+    save_pretrained(model_of(read(SHIPPED / "micro_model.json")), folder)
     return folder
 
 

@@ -26,9 +26,8 @@ from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.model_views import context_depth, view_batch
 from gvtools.completers.geoverse.postprocess import Completed, averaged, brought_back, corrected
 from gvtools.completers.geoverse.resampling import model_size
+from gvtools.completers.geoverse.weights.checks import check_headers, config_of
 from gvtools.completers.geoverse.weights.folder import from_pretrained
-from gvtools.completers.geoverse.weights.folder_check import check_headers
-from gvtools.completers.geoverse.weights.folder_parts import config_of
 from gvtools.completers.holes import hole_reach
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance

@@ -1,4 +1,4 @@
-"""Nested configuration dataclasses to JSON and back, strictly: an unknown key is an error."""
+"""Plain configuration dataclasses: to JSON and back, strictly, and their ranges."""
 
 from __future__ import annotations
 
@@ -12,6 +12,42 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 from gvtools.errors import OptionError
 
 T = TypeVar("T")
+
+
+def check_range(
+    name: str,
+    value: float | None,
+    *,
+    ge: float | None = None,
+    gt: float | None = None,
+    le: float | None = None,
+    lt: float | None = None,
+) -> None:
+    """Refuse a number outside its range; None, for fields that may be left open, passes.
+
+    Args:
+        name: as the user writes it.
+        value: the number.
+        ge: lower end, included.
+        gt: lower end, not included.
+        le: upper end, included.
+        lt: upper end, not included.
+
+    Raises:
+        OptionError: NaN, or out of the range.
+    """
+    if value is None:
+        return
+    inside = (
+        (ge is None or value >= ge)
+        and (gt is None or value > gt)
+        and (le is None or value <= le)
+        and (lt is None or value < lt)
+    )
+    if not inside or value != value:
+        ends = {"at least": ge, "more than": gt, "at most": le, "less than": lt}
+        wanted = " and ".join(f"{word} {end:g}" for word, end in ends.items() if end is not None)
+        raise OptionError(f"{name} {value}; expected {wanted or 'a number'}")
 
 
 def to_json(value: Any) -> Any:
