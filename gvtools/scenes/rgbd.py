@@ -1,17 +1,18 @@
 """Posed RGB-D folders: what their layouts have in common.
 
-A layout's reader finds frames, poses and intrinsics and describes them as a ``Recording``; here
-they become a scene. Every supported layout publishes intrinsics whose first pixel centre is
-(0, 0), as Kinect drivers and Open3D count; they are moved by half a pixel to the project's
-(0.5, 0.5) in this file, once.
+A layout is one file that defines an ``RgbdLayout``, and a line in ``project.LAYOUTS``. Its
+``record`` finds frames, poses and intrinsics and describes them as a ``Recording``; here they
+become a scene. Every supported layout publishes intrinsics whose first pixel centre is (0, 0), as
+Kinect drivers and Open3D count; they are moved by half a pixel to the project's (0.5, 0.5) in this
+file, once.
 """
 
 from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ from gvtools.scenes.undistort import undistortion
 Float64 = NDArray[np.float64]
 
 SIDECAR = "rgbd.json"
+PICTURES = (".jpg", ".jpeg", ".png")
 MILLIMETRES = 1e-3
 
 
@@ -112,6 +114,101 @@ class Recording:
     color_from_depth: Float64 | None = None
     depth_unit: float = MILLIMETRES
     findings: Sequence[Finding] = field(default_factory=tuple)
+
+
+@dataclass(frozen=True)
+class RgbdLayout:
+    """A way to lay out a posed RGB-D recording in a folder.
+
+    Attributes:
+        looks_like: its name and what its folder holds, for messages.
+        matches: whether a folder is of this layout.
+        record: finds frames, poses and intrinsics in a folder, with the options that were given.
+    """
+
+    looks_like: str
+    matches: Callable[[Path], bool]
+    record: Callable[[Path, RgbdOptions], Recording]
+
+    def read(self, root: Path, *, options: RgbdOptions | None = None) -> Scene:
+        """The folder ``root`` as a scene, metric, in the poses' own world frame.
+
+        Args:
+            root: the folder.
+            options: what the folder does not tell by itself.
+
+        Raises:
+            ProjectError: a file is absent or malformed, or no frame is complete.
+            ShapeError: a pose with NaN, a scale or a mirror.
+            OptionError: a wrong option in the folder's ``rgbd.json``.
+        """
+        root = Path(root)
+        resolved, findings = resolve_options(root, options)
+        recording = self.record(root, resolved)
+        return rgbd_scene(replace(recording, findings=[*findings, *recording.findings]), resolved)
+
+
+def posed_frames(
+    files: Sequence[tuple[Path, Path, Path]], *shapes: tuple[int, int]
+) -> tuple[list[RgbdFrame], list[Finding]]:
+    """Frames of which each has a pose file of its own.
+
+    Pictures without a pose file, and those whose pose is infinite because the tracker lost them,
+    are left out and reported.
+
+    Args:
+        files: picture, depth map and pose of each frame; the last two may be absent.
+        shapes: that a pose's matrix may have.
+
+    Raises:
+        ProjectError: a pose that is no matrix of these shapes.
+    """
+    frames, unposed, lost = [], [], []
+    for color, depth, pose in files:
+        if not pose.is_file():
+            unposed.append(color.name)
+            continue
+        matrix = load_matrix(pose, *shapes)
+        if np.isinf(matrix).any():
+            lost.append(color.name)
+            continue
+        depth_or_none = depth if depth.is_file() else None
+        frames.append(RgbdFrame(color.name, color, depth_or_none, matrix, str(pose)))
+    findings = [
+        Finding(
+            "warning", f"{len(names)} of {len(files)} frames {reason}: dropped ({named(names)})"
+        )
+        for names, reason in ((unposed, "have no pose"), (lost, "were lost by the tracker"))
+        if names
+    ]
+    return frames, findings
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """The folder's pictures in natural order of their names."""
+    paths = (path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    return sorted(paths, key=lambda path: natural_key(path.name))
+
+
+def pinhole(fx: float, fy: float, cx: float, cy: float) -> Float64:
+    """(3, 3) intrinsics, pixels."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def open3d_intrinsics(path: Path) -> Float64:
+    """(3, 3) intrinsics of Open3D's JSON form, which lists them column by column.
+
+    Raises:
+        ProjectError: no such JSON.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]
+        return np.array(values, np.float64).reshape(3, 3).T
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ProjectError(
+            f"{path}: {type(error).__name__} ({error}); expected Open3D's form with "
+            "'intrinsic_matrix' as nine numbers, column by column"
+        ) from None
 
 
 def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOptions, list[Finding]]:

@@ -47,7 +47,7 @@ def test_sevenscenes_incomplete_frames_are_dropped_and_counted(tmp_path):
     scene = read_sevenscenes(root)
     assert len(scene) == 3
     assert [view.has_depth for view in scene] == [True, False, True]
-    assert "1 pictures have no pose: dropped (frame-000001.color.png)" in messages(scene)
+    assert "1 of 4 frames have no pose: dropped (frame-000001.color.png)" in messages(scene)
     assert "1 poses have no picture: dropped" in messages(scene)
     assert "1 frames have no depth map" in messages(scene)
 
