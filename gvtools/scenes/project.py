@@ -9,7 +9,7 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.colmap_files import find_model
 from gvtools.scenes.photographs import named
 from gvtools.scenes.redwood import REDWOOD
-from gvtools.scenes.rgbd import RgbdOptions
+from gvtools.scenes.rgbd_recording import RgbdOptions
 from gvtools.scenes.scannet import SCANNET
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.sevenscenes import SEVENSCENES

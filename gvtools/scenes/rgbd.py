@@ -9,16 +9,15 @@ file, once.
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gvtools.cameras import invert_rigid, rigid_transform
 from gvtools.errors import GvError, OptionError, ProjectError
@@ -31,89 +30,11 @@ from gvtools.scenes.photographs import (
     named,
     rotation_findings,
 )
+from gvtools.scenes.rgbd_recording import Float64, Recording, RgbdFrame, RgbdOptions
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.undistort import undistortion
 
-Float64 = NDArray[np.float64]
-
 SIDECAR = "rgbd.json"
-PICTURES = (".jpg", ".jpeg", ".png")
-MILLIMETRES = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class RgbdOptions:
-    """What a posed RGB-D folder does not tell by itself; None means the layout's own value.
-
-    The same names may stand in a file ``rgbd.json`` in the folder; values given here win.
-    Intrinsics are as published with such recordings: the first pixel's centre is (0, 0).
-
-    Attributes:
-        depth_unit: metres per stored unit (TUM 1/5000, others 1/1000).
-        color_K: (3, 3) intrinsics of the colour camera, pixels.
-        depth_K: (3, 3) intrinsics of the depth camera, pixels; None: depth is of the colour
-            camera.
-        color_from_depth: (4, 4) rigid, metres; None with ``depth_K`` given: the same place.
-        depth_max: metres; greater readings are ignored.
-        max_time_difference: seconds between colour, depth and pose of one frame (TUM).
-    """
-
-    depth_unit: float | None = None
-    color_K: ArrayLike | None = None
-    depth_K: ArrayLike | None = None
-    color_from_depth: ArrayLike | None = None
-    depth_max: float | None = None
-    max_time_difference: float = 0.02
-
-    def __post_init__(self) -> None:
-        for name in ("depth_unit", "depth_max", "max_time_difference"):
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, (int, float)) and 0 < value < np.inf):
-                raise OptionError(f"{name}: {value!r}; expected a positive number")
-
-
-@dataclass(frozen=True, eq=False)
-class RgbdFrame:
-    """One frame of a recording.
-
-    Attributes:
-        name: the view's name.
-        color: the picture.
-        depth: the depth map, None when the frame has none.
-        world_from_cam: (4, 4) as read.
-        where: the pose's file, for messages.
-    """
-
-    name: str
-    color: Path
-    depth: Path | None
-    world_from_cam: Float64
-    where: str
-
-
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """What a layout's reader found.
-
-    Attributes:
-        root: the folder.
-        frames: with a pose each.
-        color_K: (3, 3) as published (integer pixel centres).
-        distortion: k1, k2, p1, p2, k3 of the colour camera as OpenCV has them; empty for none.
-        depth_K: (3, 3) as published, None where depth is of the colour camera.
-        color_from_depth: (4, 4), metres; None: the same place.
-        depth_unit: metres per stored unit.
-        findings: what was met.
-    """
-
-    root: Path
-    frames: Sequence[RgbdFrame]
-    color_K: Float64
-    distortion: tuple[float, ...] = ()
-    depth_K: Float64 | None = None
-    color_from_depth: Float64 | None = None
-    depth_unit: float = MILLIMETRES
-    findings: Sequence[Finding] = field(default_factory=tuple)
 
 
 @dataclass(frozen=True)
@@ -148,69 +69,6 @@ class RgbdLayout:
         return rgbd_scene(replace(recording, findings=[*findings, *recording.findings]), resolved)
 
 
-def posed_frames(
-    files: Sequence[tuple[Path, Path, Path]], *shapes: tuple[int, int]
-) -> tuple[list[RgbdFrame], list[Finding]]:
-    """Frames of which each has a pose file of its own.
-
-    Pictures without a pose file, and those whose pose is infinite because the tracker lost them,
-    are left out and reported.
-
-    Args:
-        files: picture, depth map and pose of each frame; the last two may be absent.
-        shapes: that a pose's matrix may have.
-
-    Raises:
-        ProjectError: a pose that is no matrix of these shapes.
-    """
-    frames, unposed, lost = [], [], []
-    for color, depth, pose in files:
-        if not pose.is_file():
-            unposed.append(color.name)
-            continue
-        matrix = load_matrix(pose, *shapes)
-        if np.isinf(matrix).any():
-            lost.append(color.name)
-            continue
-        depth_or_none = depth if depth.is_file() else None
-        frames.append(RgbdFrame(color.name, color, depth_or_none, matrix, str(pose)))
-    findings = [
-        Finding(
-            "warning", f"{len(names)} of {len(files)} frames {reason}: dropped ({named(names)})"
-        )
-        for names, reason in ((unposed, "have no pose"), (lost, "were lost by the tracker"))
-        if names
-    ]
-    return frames, findings
-
-
-def pictures_in(folder: Path) -> list[Path]:
-    """The folder's pictures in natural order of their names."""
-    paths = (path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-    return sorted(paths, key=lambda path: natural_key(path.name))
-
-
-def pinhole(fx: float, fy: float, cx: float, cy: float) -> Float64:
-    """(3, 3) intrinsics, pixels."""
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-
-
-def open3d_intrinsics(path: Path) -> Float64:
-    """(3, 3) intrinsics of Open3D's JSON form, which lists them column by column.
-
-    Raises:
-        ProjectError: no such JSON.
-    """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]
-        return np.array(values, np.float64).reshape(3, 3).T
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ProjectError(
-            f"{path}: {type(error).__name__} ({error}); expected Open3D's form with "
-            "'intrinsic_matrix' as nine numbers, column by column"
-        ) from None
-
-
 def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOptions, list[Finding]]:
     """``options`` over those of the folder's ``rgbd.json``, and a finding when that was read.
 
@@ -226,16 +84,9 @@ def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOption
         values = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ProjectError(f"{path}: no JSON ({error}); expected an object of options") from None
-    known = {item.name: item.default for item in fields(RgbdOptions)}
     if not isinstance(values, dict):
-        raise ProjectError(f"{path}: expected an object with keys out of {', '.join(known)}")
-    for key in values:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-            raise OptionError(f"{path}: unknown key {key!r}; {hint}")
-    given = {name: getattr(options, name) for name in known}
-    given = {name: value for name, value in given.items() if value is not known[name]}
+        raise ProjectError(f"{path}: expected an object of options")
+    given = {name: getattr(options, name) for name in options.model_fields_set}
     try:
         merged = RgbdOptions(**{**values, **given})
     except OptionError as error:
@@ -293,26 +144,6 @@ def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:
     ]
     views = tuple(item.view() for item in photographs)
     return Scene(root, "rgbd", views, None, tuple(findings), metric=True)
-
-
-def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
-    """A matrix in a text file.
-
-    Raises:
-        ProjectError: absent, no numbers, or of none of ``shapes``.
-    """
-    expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
-    try:
-        matrix = np.array(
-            [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        ).astype(np.float64)
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise ProjectError(f"{path}: unreadable ({reason}); expected {expected} numbers") from None
-    if matrix.shape not in shapes:
-        shape = "x".join(str(length) for length in matrix.shape)
-        raise ProjectError(f"{path}: {shape} numbers; expected {expected}")
-    return matrix
 
 
 def _corner_origin(K: ArrayLike, *, what: str) -> Float64:

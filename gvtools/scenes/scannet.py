@@ -14,9 +14,9 @@ import numpy as np
 
 from gvtools.cameras import rigid_transform
 from gvtools.errors import ProjectError
-from gvtools.scenes.rgbd import (
+from gvtools.scenes.rgbd import RgbdLayout
+from gvtools.scenes.rgbd_recording import (
     Recording,
-    RgbdLayout,
     RgbdOptions,
     load_matrix,
     pictures_in,

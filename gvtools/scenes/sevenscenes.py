@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.rgbd import Recording, RgbdLayout, RgbdOptions, load_matrix, posed_frames
+from gvtools.scenes.rgbd import RgbdLayout
+from gvtools.scenes.rgbd_recording import Recording, RgbdOptions, load_matrix, posed_frames
 from gvtools.scenes.scene import Finding
 
 COLOR_SUFFIXES = (".color.png", ".color.jpg", ".color.jpeg")

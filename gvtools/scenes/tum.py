@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.quaternions import rotation_from_quaternion
-from gvtools.scenes.rgbd import (
+from gvtools.scenes.rgbd import RgbdLayout
+from gvtools.scenes.rgbd_recording import (
     Recording,
     RgbdFrame,
-    RgbdLayout,
     RgbdOptions,
     load_matrix,
     open3d_intrinsics,
