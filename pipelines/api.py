@@ -68,15 +68,15 @@ def reconstruct(
     """
     from gvtools.runs.finished import open_run
     from gvtools.scenes.project import open_project
-    from pipelines import config as run_settings
+    from gvtools.settings import with_profile, with_values
     from pipelines.commands.reconstruct import reconstruct as run_reconstruct
     from pipelines.console import Console
+    from pipelines.reconstruction.settings import RunSettings
 
-    config = run_settings.with_profile(run_settings.RunConfig(), profile)
+    config = with_profile(RunSettings(), profile)
     named = {"context": context, "targets": targets, "completer": completer}
     chosen = {key: value for key, value in named.items() if value is not None}
-    for key, value in {**chosen, **(settings or {})}.items():
-        config = run_settings.with_setting(config, key, value)
+    config = with_values(config, {**chosen, **(settings or {})})
     folder = run_reconstruct(
         open_project(Path(project)),
         config,

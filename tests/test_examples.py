@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gvtools.scenes.synthetic import write_room
 
 import gvtools
-from gvtools.scenes.synthetic import write_room
 
 FOLDER = Path(gvtools.__file__).parent.parent / "examples"
 SCRIPTS = sorted(FOLDER.glob("0*.py"))

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.procedural.materials import PICTURES, Texture, globe, paint, picture, planks, tiled
 from gvtools.scenes.ray_casting import Patch
 from gvtools.scenes.room_builder import Builder, Place, Triple
 from gvtools.scenes.room_light import Lamp, Solid
-from gvtools.procedural.materials import PICTURES, Texture, globe, paint, picture, planks, tiled
 
 Float64 = NDArray[np.float64]
 

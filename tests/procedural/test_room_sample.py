@@ -10,10 +10,10 @@ from scipy.ndimage import map_coordinates
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.colmap import read_colmap
 from gvtools.procedural.furnished_room import furnished_room
-from gvtools.scenes.scene import Frame, Scene
 from gvtools.procedural.room_sample import RoomSample, look_at, write_room
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.scene import Frame, Scene
 
 SIZE = {"views": 6, "width": 240, "height": 180}
 

@@ -276,20 +276,15 @@ def test_what_is_no_run_is_refused(own, tmp_path, capsys):
 
 def test_a_sweep_beside_the_run_is_drawn(own):
     outcome = {
-        "settings": {}, "targets": 4, "fixed": 1.0, "per_target": 0.5, "bytes": 1e6,
-        "observations": 10, "psnr": 20.0, "psnr_valid": None, "psnr_generated": None,
-        "ssim": None, "depth_rel": None, "coverage": 1.0,
+        "label": "start", "settings": {}, "seconds": 3.0, "bytes": 1e6, "observations": 10,
+        "psnr": 20.0,
     }  # fmt: skip
-    better = {**outcome, "psnr": 25.0, "per_target": 2.0}
-    worse = {**outcome, "psnr": 19.0, "per_target": 3.0}
-    names = {"start": outcome, "profile fast": better, "voxel 2": worse}
-    trials = [{"label": label, "share": 1.0, **trial} for label, trial in names.items()]
-    # Trials on a share of the targets are no figures of whole runs.
-    trials.append({"label": "voxel 4", "share": 0.25, **outcome, "psnr": 99.0})
+    better = {**outcome, "label": "profile fast", "psnr": 25.0, "seconds": 9.0}
+    worse = {**outcome, "label": "voxel 2", "psnr": 19.0, "seconds": 13.0}
     record = json.loads((own / "run.json").read_text())
-    sweep = {"project": record["project"], "reading": record["reading"], "targets": 4,
-             "budget": 60, "budget_of": "seconds", "trials": trials,
-             "recommended": better}  # fmt: skip
+    sweep = {"project": record["project"], "reading": record["reading"],
+             "budget": 60, "budget_of": "seconds", "trials": [outcome, better, worse],
+             "front": [outcome, better], "recommended": better}  # fmt: skip
     # Beside the run, as README has it, and above it, as a trial has it.
     beside = own.parent / "sweep"
     beside.mkdir()

@@ -5,8 +5,8 @@ import importlib.util
 import numpy as np
 import pytest
 
+from benchmarks.experiments.perceptual_distance import SqueezeNetDistance
 from gvtools.errors import CheckpointError, ShapeError
-from gvtools.evaluation.perceptual_distance import SqueezeNetDistance
 
 pytest.importorskip("h5py", reason="the network's weights are read with h5py")
 

@@ -3,14 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gvtools.errors import ShapeError
-from gvtools.evaluation.generated_pixels import (
+from benchmarks.experiments.generated_pixels import (
     GeneratedScore,
     figures,
     gradient_energy,
     paired_interval,
     score,
 )
+from gvtools.errors import ShapeError
 
 RNG = np.random.default_rng(0)
 SHAPE = (2, 12, 16)
