@@ -11,6 +11,7 @@ from gvtools.errors import OptionError
 
 if TYPE_CHECKING:
     from pipelines.console import Console
+    from pipelines.reconstruction.settings import RunSettings
 
 SUMMARY = "try a run's settings on held-out views: what each gives and takes, and what to choose"
 EXAMPLES = (
