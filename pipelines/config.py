@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from gvtools.completers.effort import EffortPolicy
 from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.errors import OptionError
@@ -18,6 +19,7 @@ from gvtools.memory.spatial_memory import MemoryOptions
 from gvtools.memory.splat.api import DEVICES, SplatOptions
 from gvtools.options import check_range
 from gvtools.scenes.reduced import SMALLEST
+from gvtools.settings import Settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,36 +65,17 @@ class SavingsOptions:
             fused; the pictures are the same.
         joined: 2 x 2 pixels become one point, their mean, where they are together at most this many
             voxel edges wide, unless the surface is steep; 0 lifts each by itself.
-        minor_holes: a view with no unknown pixel farther than this share of the image diagonal from
-            a known one is left to ``inpaint`` where the completer is a costly one (geoverse,
-            exemplar); 0 leaves it none.
-        one_step: targets that are completed together take one step of the generative core instead
-            of the model's own number where none of their unknown pixels is farther than this share
-            of the diagonal from a known one; 0 spares none.
-        half_size: likewise, they are completed in pictures of half the model's size.
-        no_prior: likewise, they are completed without the video prior of a model that has one.
-        near_holes: steps of the generative core after the first one look at tokens near holes
-            alone, where there is no video prior.
         explained: a context view whose depth would have to be computed takes memory's instead where
             the views before it explain this share of its pixels; None computes all.
     """
 
     reuse: bool = True
     joined: float = 1.0
-    minor_holes: float = 0.02
-    one_step: float = 0.1
-    half_size: float = 0.1
-    no_prior: float = 0.1
-    near_holes: bool = True
     explained: float | None = 0.9
 
     def __post_init__(self) -> None:
         check_range("savings.explained", self.explained, above=0, most=1)
         check_range("savings.joined", self.joined, least=0)
-        check_range("savings.minor_holes", self.minor_holes, least=0)
-        check_range("savings.one_step", self.one_step, least=0)
-        check_range("savings.half_size", self.half_size, least=0)
-        check_range("savings.no_prior", self.no_prior, least=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +103,7 @@ class RunConfig:
         splat: see SplatOptions.
         fusion: see FusionOptions.
         savings: see SavingsOptions.
+        effort: see EffortPolicy.
         completer_options: options of the completer by name.
     """
 
@@ -142,6 +126,7 @@ class RunConfig:
     splat: SplatOptions = field(default_factory=SplatOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
     savings: SavingsOptions = field(default_factory=SavingsOptions)
+    effort: EffortPolicy = field(default_factory=EffortPolicy)
     completer_options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -155,7 +140,7 @@ class RunConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return asdict(self)
+        return {**asdict(self), "effort": self.effort.to_dict()}
 
 
 # What each profile changes; "balanced" is the defaults.
@@ -163,19 +148,14 @@ PROFILES: dict[str, dict[str, Any]] = {
     "fast": {
         "max_side": 480,
         "views_per_round": 12,
-        "savings.minor_holes": 0.05,
-        "savings.one_step": 0.3,
-        "savings.half_size": 0.3,
-        "savings.no_prior": 0.3,
+        "effort.inpaint_below": 0.05,
+        "effort.reduced_below": 0.3,
     },
     "balanced": {},
     "accurate": {
         "fusion.voxel_loss": 0.0,
-        "savings.minor_holes": 0.0,
-        "savings.one_step": 0.0,
-        "savings.half_size": 0.0,
-        "savings.no_prior": 0.0,
-        "savings.near_holes": False,
+        "effort.inpaint_below": 0.0,
+        "effort.reduced_below": 0.0,
         "savings.explained": None,
         "memory.same_direction": 0.0,
         "memory.observations_per_voxel": 64,
@@ -254,6 +234,8 @@ def with_setting(config: RunConfig, key: str, value: Any) -> RunConfig:
     if head not in names or key == "completer_options":
         raise _unknown(key, config)
     current = getattr(config, head)
+    if isinstance(current, Settings):
+        return _with(config, head, current.replaced(**{rest: value}))
     if is_dataclass(current) and not isinstance(current, type):
         known = [entry.name for entry in fields(current)]
         if rest not in known:

@@ -52,7 +52,6 @@ def _swept(
         sweeps: dict[str, dict[str, Completer]] = {
             "level 1": {
                 "3+1, own bounds": geoverse(folder),
-                "3+1, after the first near holes alone": geoverse(folder, near_holes=True),
                 **{f"{n}+1, equal steps": geoverse(folder, steps=n) for n in LEVEL1},
             },
             "cascade": {f"3+{n}, own bounds": geoverse(folder, cascade_steps=n) for n in CASCADE},

@@ -138,8 +138,8 @@ def knobs_of(plan: Plan) -> list[Knob]:
         knobs += [
             replace(knob, completer="geoverse")
             for knob in (
-                _numbers("holes left to inpaint, share of the diagonal", "savings.minor_holes",
-                         (0.1, 0.05, 0.02, 0.0), config.savings.minor_holes),
+                _numbers("holes left to inpaint, share of the diagonal", "effort.inpaint_below",
+                         (0.1, 0.05, 0.02, 0.0), config.effort.inpaint_below),
                 _values("cascade steps", "completer.cascade_steps", (1, 2, 4, None),
                         given.get("cascade_steps")),
                 _values("model resolution, px", "completer.image_size",
@@ -147,7 +147,8 @@ def knobs_of(plan: Plan) -> list[Knob]:
                         given.get("image_size")),
                 _values("precision", "completer.precision", ("bfloat16", "float32"),
                         given.get("precision", "auto")),
-                *_priors(core, given, config.savings.no_prior),
+                _numbers("holes of reduced effort, share of the diagonal", "effort.reduced_below",
+                         (1e6, 0.3, 0.1, 0.0), config.effort.reduced_below),
             )
         ]  # fmt: skip
     if plan.source.name != RecordedDepth.name:
@@ -174,20 +175,6 @@ def _core(given: Mapping[str, Any]) -> GeoVerseConfig:
     core = create("geoverse", **given)
     assert isinstance(core, GeoVerseCompleter)
     return config_of(core.folder)
-
-
-def _priors(core: GeoVerseConfig, given: Mapping[str, Any], spared: float) -> list[Knob]:
-    """The video prior left out, used for large holes and for all, where the core has one."""
-    if core.video is None:
-        return []
-    every = 1e6
-    # The completer's own option stands above the run's.
-    own = given.get("no_prior_holes")
-    key = "savings.no_prior" if own is None else "completer.no_prior_holes"
-    return [
-        _numbers("holes without video prior, share of the diagonal", key,
-                 (every, 0.1, 0.0), spared if own is None else float(own))
-    ]  # fmt: skip
 
 
 def _numbers(name: str, key: str, values: Sequence[float], start: float) -> Knob:
