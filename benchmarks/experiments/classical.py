@@ -6,7 +6,6 @@ Depth is filled in its logarithm. A view that nothing is known of becomes mid-gr
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch

@@ -164,8 +164,9 @@ class GeoVerseCompleter(Completer):
         return surface_fill(context, guidance, shared=self.settings.shared_fill)
 
     def _effort(self, part: Guidance) -> _Effort:
-        """What a pass takes: its own number of steps in whole pictures, or, where all holes are
-        small, one step in pictures of half the size without a video prior.
+        """The model's own steps and picture size, or less where all holes of the pass are small.
+
+        That is one step, half the picture size, and no video prior.
         """
         reduced = False
         if self.reduced_below > 0:

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 from gvtools.completers.base import create
-from gvtools.completers.effort import sparing
-from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.errors import GvError, OptionError, ProjectError
 from pipelines.commands.tradeoff import parse_budget
 from pipelines.config import RunConfig, with_setting, with_settings
@@ -324,7 +322,7 @@ def test_a_knob_of_one_completer_says_nothing_of_the_others():
 @pytest.mark.parametrize(
     "texts",
     [[], ["completer=geoverse"], ["completer=geoverse", "completer.steps=2"],
-     ["completer=exemplar", "completer.reach=0.1"]],
+     ["completer=inpaint", "completer.reach=0.1"]],
 )  # fmt: skip
 def test_every_completer_can_be_tried_from_any_start(texts):
     config = with_settings(RunConfig(), texts)
@@ -345,37 +343,15 @@ def test_every_completer_can_be_tried_from_any_start(texts):
 
 
 @pytest.mark.parametrize(
-    ("texts", "shares", "usual_share"),
-    [
-        ([], [1e6, 0.1, 0.0], 0.1),
-        (["savings.no_prior=0.3"], [1e6, 0.3, 0.1, 0.0], 0.3),
-        (["profile=accurate"], [1e6, 0.1, 0.0], 0.0),
-        (["completer.no_prior_holes=0.2"], [1e6, 0.2, 0.1, 0.0], 0.2),
-        (["completer.no_prior_holes=0"], [1e6, 0.1, 0.0], 0.0),
-    ],
+    ("texts", "usual_share"),
+    [([], 0.1), (["effort.reduced_below=0.2"], 0.2), (["profile=accurate"], 0.0)],
 )
-def test_a_video_prior_is_swept_where_the_weights_have_one(tmp_path, texts, shares, usual_share):
-    pytest.importorskip("safetensors", reason="weights are read with safetensors")
-    import geoverse_models as micro
-
-    name = "holes without video prior, share of the diagonal"
-    for injection in ("none", "control"):
-        weights = micro.weights_folder(tmp_path / injection, micro.config(injection=injection))
-        # What the prior is read from; nothing is completed here.
-        (weights / "video").mkdir()
-        core = ["completer=geoverse", f"completer.weights={weights}"]
-        config = with_settings(RunConfig(), [*core, *texts])
-        knobs = knobs_in("recorded", config)
-        assert (name in knobs) == (injection == "control")
-    runs = [with_settings(config, [f"{k}={v}" for k, v in level.settings.items()])
-            for level in knobs[name].levels]  # fmt: skip
-    told = []
-    for run in runs:
-        completer = create(run.completer, **run.completer_options)
-        completer = sparing(completer, 0.0, no_prior=run.savings.no_prior)
-        assert isinstance(completer, GeoVerseCompleter)
-        told.append(completer.no_prior_holes or 0.0)
-    assert told == shares and told[knobs[name].usual] == usual_share
+def test_reduced_effort_is_swept_for_the_generative_core(texts, usual_share):
+    config = with_settings(RunConfig(), ["completer=geoverse", *texts])
+    knob = knobs_in("recorded", config)["holes of reduced effort, share of the diagonal"]
+    shares = [level.settings["effort.reduced_below"] for level in knob.levels]
+    assert shares == sorted({1e6, 0.3, 0.1, 0.0, usual_share}, reverse=True)
+    assert shares[knob.usual] == usual_share
 
 
 def test_what_an_earlier_sweep_gave_takes_no_time():
