@@ -23,7 +23,8 @@ from gvtools.completers.base import _REGISTRY
 from gvtools.completers.settings import CompleterSettings
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
-from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.runs.folder import RunDirectory
+from gvtools.runs.round_files import read_target
 from gvtools.similarity import align_depth_scale
 from pipelines.cli import main
 
@@ -94,7 +95,7 @@ def test_texts_become_the_types_of_the_fields(painter):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"strenght": 1}, "'completer.strength'"),
+        ({"strength": 1, "strenght": 1}, "'completer.strength'"),
         ({}, "required"),
         ({"strength": "much"}, "expected .*number"),
         ({"strength": -1}, "completer.strength -1; expected at least 0"),
@@ -121,9 +122,13 @@ def test_a_completer_of_ones_own_serves_a_run_and_is_made_once(painter, tmp_path
     own = ["--completer", "painter", "--set", "completer.strength=0.3"]
     assert main(["reconstruct", str(scan), "--out", str(out), "--quiet", *words, *own]) == 0
     assert _Painter.made == 1
-    memory = SpatialMemory.load(out / "memory.npz")
-    painted = memory.colors[memory.generated]
-    assert len(painted) and np.isin(painted, (76, 77)).all()
+    for number in (1, 2):
+        folder = RunDirectory(out).round_path(number)
+        for entry in RunDirectory(out).reports()[number]["views"]:
+            target = read_target(folder, entry)
+            assert target.generated.any() and entry["fused_pixels"] > 0
+            # 0.3 of 255.
+            assert np.isin(target.picture[target.generated], (76, 77)).all()
 
 
 def test_a_taken_name_and_a_malformed_reference_are_refused(painter):

@@ -302,15 +302,13 @@ def test_one_scale_a_pass_stands_on_centres_and_on_the_context():
         return pass_scale(Geometry(depth, depth + 1, ray, sure), cameras, context)
 
     agreed = of(fitting / 2.0, truth)
-    assert agreed.status is ScaleStatus.CAMERA_CENTRES and agreed.scale == pytest.approx(
-        2.0, rel=1e-4
-    )
+    assert agreed.status is ScaleStatus.CAMERA_CENTRES
+    assert agreed.scale == pytest.approx(2.0, rel=1e-4)
     # The context's own depth is better evidence than the centres, and stands in for them.
     for cameras in (known, known[:2]):
         other = of(fitting / 50.0, truth, cameras)
-        assert other.status is ScaleStatus.CONTEXT_DEPTH and other.scale == pytest.approx(
-            50.0, rel=1e-4
-        )
+        assert other.status is ScaleStatus.CONTEXT_DEPTH
+        assert other.scale == pytest.approx(50.0, rel=1e-4)
     # A model that misses the depth of its own context is not believed.
     noise = torch.from_numpy(np.random.default_rng(2).uniform(0.01, 9, fitting.shape)).float()
     missed = of(noise, truth)

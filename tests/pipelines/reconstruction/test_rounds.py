@@ -111,8 +111,9 @@ def test_depth_of_another_unit_is_aligned_with_the_memory(memory, factor):
     assert scale["scale"] == pytest.approx(1 / factor, rel=1e-5)
     assert scale["overlap_px"] == result.guidance.valid.sum()
     assert total.added > 0
-    points = memory.positions[memory.generated]
-    np.testing.assert_allclose(points[:, 2], 2, rtol=1e-3)
+    shown = memory.project(camera("t0", (24, 32), x=0.3))
+    assert shown.generated.any()
+    np.testing.assert_allclose(shown.depth[shown.generated], 2, rtol=1e-3)
 
 
 def test_a_scale_that_the_completer_refuses_gives_no_points(memory):
