@@ -19,9 +19,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gvtools.completers.base import create
-from gvtools.completers.geoverse.completer import GeoVerseCompleter
-from gvtools.completers.geoverse.weights.checks import config_of
 from gvtools.runs.folder import RunDirectory
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
@@ -44,14 +41,10 @@ OFF: dict[str, dict[str, Any]] = {
     },
     "four pixels a point where voxels are coarser": {"savings.pixel_binning": 0.0},
     "observed content projected once": {"savings.reuse": False},
-    "small holes left to inpaint": {"savings.minor_holes": 0.0},
-    "middle holes in one step": {"savings.one_step": 0.0},
-    "middle holes in half the size": {"savings.half_size": 0.0},
-    "middle holes without the video prior": {"savings.no_prior": 0.0},
-    "later steps near holes alone": {"savings.near_holes": False},
+    "small holes left to inpaint": {"effort.inpaint_below": 0.0},
+    "reduced effort for middle holes": {"effort.reduced_below": 0.0},
     "explained views without computed depth": {"savings.depth_from_memory": None},
 }
-COSTLY = ("geoverse", "exemplar")
 
 
 @dataclass
@@ -81,13 +74,8 @@ class Row:
 def rows_of(config: RunSettings, *, computed: bool) -> dict[str, Row]:
     """All savings off, each alone, all on; those that this run does not have are left out."""
     idle = set()
-    if config.completer not in COSTLY:
-        idle.add("small holes left to inpaint")
     if config.completer != "geoverse":
-        idle |= {"middle holes in one step", "middle holes in half the size"}
-        idle |= {"later steps near holes alone", "middle holes without the video prior"}
-    elif not _has_prior(config):
-        idle.add("middle holes without the video prior")
+        idle |= {"small holes left to inpaint", "reduced effort for middle holes"}
     if not computed:
         idle.add("explained views without computed depth")
 
@@ -101,12 +89,6 @@ def rows_of(config: RunSettings, *, computed: bool) -> dict[str, Row]:
     rows = {"none": without(set(OFF))}
     rows |= {name: without(set(OFF) - {name}) for name in OFF if name in used}
     return rows | {"all": without(set())}
-
-
-def _has_prior(config: RunSettings) -> bool:
-    """Whether the generative core's weights have a video prior."""
-    core = create(config.completer, **config.completer_options)
-    return isinstance(core, GeoVerseCompleter) and config_of(core.folder).video is not None
 
 
 def main() -> None:

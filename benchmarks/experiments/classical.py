@@ -6,13 +6,12 @@ Depth is filled in its logarithm. A view that nothing is known of becomes mid-gr
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gvtools.completers.base import Completion, ContextView
+from gvtools.completers.base import Completer, Completion, ContextView
 from gvtools.completers.geoverse.fill import push_pull
 from gvtools.guidance import Guidance
 
@@ -23,8 +22,7 @@ Filler = Callable[[Float32, NDArray[np.bool_]], Float32]
 RADIUS = 3
 
 
-@dataclass
-class ClassicalCompleter:
+class ClassicalCompleter(Completer):
     """One filler for colour and for log depth.
 
     Attributes:
@@ -32,8 +30,9 @@ class ClassicalCompleter:
         fill: see Filler.
     """
 
-    name: str
-    fill: Filler
+    def __init__(self, name: str, fill: Filler) -> None:
+        super().__init__()
+        self.name, self.fill = name, fill
 
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0

@@ -1,6 +1,6 @@
 """Quality against steps: level 1 from 49 to 1 with one cascade step, and the cascade's own.
 
-Of weights with a video prior also against how small the holes are that do without it.
+Also against how small the holes are that are completed with reduced effort.
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ from benchmarks.experiments.judging import judge, perceptual, records, table
 from benchmarks.experiments.options import ExperimentOptions
 from benchmarks.experiments.rows import geoverse, with_heads_of
 from gvtools.completers.base import Completer
-from gvtools.completers.geoverse.completer import SHIPPED
-from gvtools.completers.geoverse.weights.checks import config_of
 from gvtools.evaluation.tables import Table
 
 READS = ("weights", "teacher", "scenes", "size", "seed")
@@ -25,10 +23,10 @@ CASCADE = (1, 2, 4, 8, 24)
 SWEPT = {
     "level 1": "the level 1 steps",
     "cascade": "the cascade steps",
-    "video prior": "the holes that do without the video prior",
+    "reduced effort": "the holes that are completed with reduced effort",
 }
-# Holes that do without a video prior, shares of the image diagonal.
-WITHOUT_PRIOR = (0.0, 0.1, 0.3, 1e6)
+# Hole radii, shares of the image diagonal.
+REDUCED_BELOW = (0.0, 0.1, 0.3, 1e6)
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
@@ -52,16 +50,14 @@ def _swept(
         sweeps: dict[str, dict[str, Completer]] = {
             "level 1": {
                 "3+1, own bounds": geoverse(folder),
-                "3+1, after the first near holes alone": geoverse(folder, near_holes=True),
                 **{f"{n}+1, equal steps": geoverse(folder, steps=n) for n in LEVEL1},
             },
             "cascade": {f"3+{n}, own bounds": geoverse(folder, cascade_steps=n) for n in CASCADE},
+            "reduced effort": {
+                f"3+1, reduced up to {share:g}": geoverse(folder).with_reduced_effort(share)
+                for share in REDUCED_BELOW
+            },
         }
-        if config_of(folder or SHIPPED).video is not None:
-            sweeps["video prior"] = {
-                f"3+1, none for holes up to {share:g}": geoverse(folder, no_prior_holes=share)
-                for share in WITHOUT_PRIOR
-            }
         for sweep, methods in sweeps.items():
             cases = held_out_cases(options.scenes, seed=options.seed, size=side)
             judged = judge(methods, cases, distance=distance, seed=options.seed)

@@ -6,9 +6,20 @@ from gvtools.completers.base import (
     Completer,
     Completion,
     ContextView,
+    ScaleAlignment,
+    ScaleStatus,
     available,
     create,
     register,
 )
 
-__all__ = ["Completer", "Completion", "ContextView", "available", "create", "register"]
+__all__ = [
+    "Completer",
+    "Completion",
+    "ContextView",
+    "ScaleAlignment",
+    "ScaleStatus",
+    "available",
+    "create",
+    "register",
+]

@@ -1,18 +1,20 @@
-"""What fills the holes of projected memory: the protocol, its data, and the registry by name.
+"""What fills the holes of projected memory: the contract, its data, and the registry by name.
 
-A completer is added with one file and one line in ``_FACTORIES``. Its options are the fields of a
-dataclass; the module is imported when the completer is created, not before.
+A completer is added with one file, which holds a subclass of ``Completer``, and one line in
+``_REGISTRY``. Its module is imported when the completer is created, not before.
 """
 
 from __future__ import annotations
 
 import difflib
-import inspect
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
 from functools import cached_property
 from importlib import import_module
-from typing import Any, Protocol, get_type_hints, runtime_checkable
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
+from gvtools.similarity import ScaleFit
 
 Float32 = NDArray[np.float32]
 
@@ -56,12 +59,103 @@ class ContextView:
                 )
 
     @cached_property
-    def spoilt(self) -> int:
-        """How many pixels have colours that are not finite; counted once."""
+    def nonfinite_pixels(self) -> int:
+        """How many pixels have a colour that is not finite; counted once."""
         # A sum is finite only where everything is, and takes a third of the time.
         with np.errstate(invalid="ignore"):
             total = self.rgb.sum(dtype=np.float64)
         return 0 if np.isfinite(total) else int((~np.isfinite(self.rgb)).any(-1).sum())
+
+
+class ScaleStatus(str, Enum):
+    """What the scale of a view's generated depth rests on, or why there is none."""
+
+    MEMORY_DEPTH = "memory_depth"
+    MEMORY_FIELD = "memory_field"
+    MEMORY_SURFACES = "memory_surfaces"
+    CONTEXT_DEPTH = "context_depth"
+    CAMERA_CENTRES = "camera_centres"
+    NOTHING_TO_COMPLETE = "nothing_to_complete"
+    UNSUPPORTED = "unsupported"
+    CONTRADICTED = "contradicted"
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the view's generated depth may be fused."""
+        return self not in (ScaleStatus.UNSUPPORTED, ScaleStatus.CONTRADICTED)
+
+
+_IN_WORDS = {
+    ScaleStatus.MEMORY_DEPTH: "one factor to the memory's depth",
+    ScaleStatus.MEMORY_FIELD: "a smooth field of factors to the memory's depth",
+    ScaleStatus.MEMORY_SURFACES: "the memory's own surfaces, continued",
+    ScaleStatus.CONTEXT_DEPTH: "the depth of the context views",
+    ScaleStatus.CAMERA_CENTRES: "the camera centres",
+    ScaleStatus.NOTHING_TO_COMPLETE: "nothing to complete",
+    ScaleStatus.UNSUPPORTED: "refused: too little to find a scale from",
+    ScaleStatus.CONTRADICTED: "refused: known depth contradicts it",
+}
+
+
+@dataclass(frozen=True)
+class ScaleAlignment:
+    """The outcome of bringing one view's generated depth into scene units.
+
+    Attributes:
+        status: see ``ScaleStatus``.
+        scale: factor that takes the completion's depth to scene units; 1 where the completer has
+            applied its own, NaN where refused.
+        residual: median relative deviation from the memory's depth (0.01 = 1 %); NaN unknown.
+        overlap_px: pixels on which both depths are known, as far as they were counted.
+        inlier_share: share of these that agree with the scale, by weight; NaN unknown.
+        centres: camera centres that the scale was looked for in; 0 where none were.
+        correlation: of predicted and given camera centres; NaN unknown.
+    """
+
+    status: ScaleStatus
+    scale: float = 1.0
+    residual: float = float("nan")
+    overlap_px: int = 0
+    inlier_share: float = float("nan")
+    centres: int = 0
+    correlation: float = float("nan")
+
+    @classmethod
+    def of_fit(cls, fit: ScaleFit) -> ScaleAlignment:
+        """The outcome of comparing a completion's depth with the memory's."""
+        status = ScaleStatus.MEMORY_DEPTH
+        if not fit.ok:
+            compared = np.isfinite(fit.residual)
+            status = ScaleStatus.CONTRADICTED if compared else ScaleStatus.UNSUPPORTED
+        return cls(status, fit.scale, fit.residual, fit.support, fit.inlier_share)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the depth may be fused."""
+        return self.status.accepted
+
+    def describe(self) -> str:
+        """One line with the figures that are known."""
+        figures = [f"{self.overlap_px} common pixels"]
+        if np.isfinite(self.residual):
+            figures.append(f"median deviation {self.residual:.1%}")
+        if self.centres:
+            figures.append(f"{self.centres} camera centres")
+        if np.isfinite(self.correlation):
+            figures.append(f"correlation {self.correlation:.2f}")
+        return f"{_IN_WORDS[self.status]} ({', '.join(figures)})"
+
+    def to_json(self) -> dict[str, Any]:
+        """As a round's report holds it."""
+        return {
+            "status": self.status.value,
+            "accepted": self.accepted,
+            "description": self.describe(),
+            "scale": self.scale,
+            "residual": self.residual,
+            "overlap_px": self.overlap_px,
+            "inlier_share": self.inlier_share,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +168,9 @@ class Completion:
         confidence: (V, H, W) float32 in [0, 1]; below 1 where generated, 0 where nothing is known.
         rays: (V, H, W, 6) float32 Plücker rays, world frame, from completers that predict them.
         spent: what the completion cost and met, such as ``seconds``, ``steps``, ``unfilled``.
-        support: for each view, what the scale of its generated depth stands on, by the completer's
-            own account: "..." of its evidence, or "refused: ..." with the reason, and then its
-            depth is 0 where it was generated. None, of a view or of all, where depth has no scale
-            to find.
+        scale_alignment: for each view, how the completer brought its depth into scene units; the
+            generated depth of a refused view is 0. None, of a view or of all, leaves the alignment
+            to the run, which compares depth with the memory's.
     """
 
     rgb: Float32
@@ -85,7 +178,7 @@ class Completion:
     confidence: Float32
     rays: Float32 | None = None
     spent: Mapping[str, float] = field(default_factory=dict)
-    support: tuple[str | None, ...] | None = None
+    scale_alignment: tuple[ScaleAlignment | None, ...] | None = None
 
     def __post_init__(self) -> None:
         shape = self.depth.shape
@@ -94,28 +187,58 @@ class Completion:
                 f"completion: rgb {self.rgb.shape}, depth {shape}, confidence "
                 f"{self.confidence.shape}; expected (V, H, W, 3), (V, H, W) and (V, H, W)"
             )
-        if self.support is not None and len(self.support) != shape[0]:
+        if self.scale_alignment is not None and len(self.scale_alignment) != shape[0]:
             raise ShapeError(
-                f"completion: support of {len(self.support)} views; expected {shape[0]}"
+                f"completion: scale alignment of {len(self.scale_alignment)} views; "
+                f"expected {shape[0]}"
             )
         if self.rays is not None and self.rays.shape != (*shape, 6):
             raise ShapeError(f"completion: rays {self.rays.shape}; expected {(*shape, 6)}")
 
 
-@runtime_checkable
-class Completer(Protocol):
-    """Fills what memory does not know of the target views.
+class Completer(ABC):
+    """Fills what memory does not know of the target views. A run makes one and keeps it.
 
-    One with ``joint`` = True gets all targets of a round at once. One with ``costly`` = True is
-    spared views whose holes are small, and one with a field ``one_step_holes``,
-    ``half_size_holes``, ``no_prior_holes`` or ``near_holes`` that is None is spared what those of
-    middle size do not need (see ``sparing``). One that reads weights names them in an attribute
-    ``files``: they decide the result. What a user should be told before a run may stand in
-    ``notes``.
+    Attributes:
+        name: under which it is registered.
+        settings_type: its options as a ``gvtools.settings.Settings`` model; None has none. A type
+            of any kind here, so that the contract needs no more than numpy.
+        batches_targets: True takes all targets of a round of one picture size in a call; False
+            takes one, which then shows what the completions before it added to the memory.
+        costly: whether views with small holes are better left to ``inpaint``, see ``EffortPolicy``.
+        settings: the options of this one.
     """
 
     name: str
+    settings_type: ClassVar[type[Any] | None] = None
+    batches_targets: bool = False
+    costly: bool = False
 
+    def __init__(self, **options: Any) -> None:
+        if self.settings_type is None and options:
+            raise OptionError(f"completer {self.name}: no option {min(options)!r}; it has none")
+        self.settings: Any = self.settings_type(**options) if self.settings_type else None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that decide the result, such as weights: a run is not resumed with others."""
+        return ()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should be told before a run."""
+        return ()
+
+    def with_reduced_effort(self, below: float) -> Completer:
+        """This completer, with less effort where holes are small; itself where it knows of none.
+
+        Args:
+            below: greatest radius of such holes, see ``hole_radius``; what is reduced is the
+                completer's matter.
+        """
+        return self
+
+    @abstractmethod
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:
@@ -126,7 +249,6 @@ class Completer(Protocol):
             guidance: the memory projected into the target cameras.
             seed: the same input and seed give the same bytes on the same machine.
         """
-        ...
 
 
 def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
@@ -145,14 +267,14 @@ def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
             f"guidance: rgb {guidance.rgb.shape}, depth {guidance.depth.shape}, valid {shape}; "
             "expected (V, H, W, 3), (V, H, W) and (V, H, W)"
         )
-    wrong = {view.name: view.spoilt for view in context}
+    wrong = {view.name: view.nonfinite_pixels for view in context}
     finite = np.isfinite(guidance.depth) & np.isfinite(guidance.confidence)
     colors = np.isfinite(guidance.rgb)
     # Channel by channel takes many times as long.
     if not colors.all():
         finite &= colors.all(-1)
-    spoilt = (guidance.valid & ~finite).sum(axis=(1, 2)).tolist()
-    wrong |= dict(zip(guidance.cameras.names, spoilt, strict=True))
+    nonfinite = (guidance.valid & ~finite).sum(axis=(1, 2)).tolist()
+    wrong |= dict(zip(guidance.cameras.names, nonfinite, strict=True))
     for name, count in wrong.items():
         if count:
             raise ShapeError(
@@ -161,111 +283,51 @@ def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
             )
 
 
-_FACTORIES: dict[str, Callable[..., Completer] | str] = {
+_REGISTRY: dict[str, type[Completer] | str] = {
     "none": "gvtools.completers.none:NoneCompleter",
     "inpaint": "gvtools.completers.inpaint:InpaintCompleter",
-    "exemplar": "gvtools.completers.exemplar:ExemplarCompleter",
     "geoverse": "gvtools.completers.geoverse.completer:GeoVerseCompleter",
 }
 
 
-def register(name: str, factory: Callable[..., Completer] | str) -> None:
+def register(name: str, kind: type[Completer] | str) -> None:
     """Make a completer known by ``name``.
 
     Args:
         name: a new name.
-        factory: a dataclass or callable that returns a completer, or "module:attribute" of one.
+        kind: a subclass of ``Completer``, or "module:class" of one.
 
     Raises:
-        OptionError: the name is taken by another factory, or the string has no colon.
+        OptionError: the name is taken by another one, or the string has no colon.
     """
-    if isinstance(factory, str) and factory.count(":") != 1:
-        raise OptionError(f"completer {name}: {factory!r}; expected 'module:attribute'")
-    if _FACTORIES.get(name, factory) != factory:
+    if isinstance(kind, str) and kind.count(":") != 1:
+        raise OptionError(f"completer {name}: {kind!r}; expected 'module:class'")
+    if _REGISTRY.get(name, kind) != kind:
         raise OptionError(
-            f"completer {name}: the name is taken by {_FACTORIES[name]}; choose another"
+            f"completer {name}: the name is taken by {_REGISTRY[name]}; choose another"
         )
-    _FACTORIES[name] = factory
+    _REGISTRY[name] = kind
 
 
 def available() -> tuple[str, ...]:
     """The names that ``create`` knows, in order of registration."""
-    return tuple(_FACTORIES)
+    return tuple(_REGISTRY)
 
 
-def create(name: str, /, **options: object) -> Completer:
-    """The completer called ``name`` with its options.
-
-    Args:
-        name: one of ``available()``.
-        options: values by field name; a text is converted to the field's type.
+def create(name: str, /, **options: Any) -> Completer:
+    """The completer called ``name`` with its options, see its ``settings_type``.
 
     Raises:
-        OptionError: unknown name, unknown option (the nearest one is named), a required option
-            that is absent, or a value that does not convert.
+        OptionError: an unknown name or option (the nearest one is named), a required option that
+            is absent, or a value that does not convert or is out of its range.
     """
-    if name not in _FACTORIES:
-        raise OptionError(f"no completer {name!r}; {_nearest(name, available())}")
-    factory = _FACTORIES[name]
-    if isinstance(factory, str):
-        module, attribute = factory.split(":")
-        factory = getattr(import_module(module), attribute)
-    known, required = _option_types(factory)
-    for key in options:
-        if key not in known:
-            hint = _nearest(key, tuple(known)) if known else "it has no options"
-            raise OptionError(f"completer {name}: no option {key!r}; {hint}")
-    for key in required:
-        if key not in options:
-            raise OptionError(f"completer {name}: option {key!r} is required and was not given")
-    values = {key: _convert(name, key, known[key], value) for key, value in options.items()}
-    return factory(**values)
-
-
-def _option_types(factory: Callable[..., Completer]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """The type of every option of a factory, and the options without a default."""
-    if is_dataclass(factory):
-        hints = get_type_hints(factory)
-        options = [entry for entry in fields(factory) if entry.init]
-        bare = tuple(
-            entry.name
-            for entry in options
-            if entry.default is MISSING and entry.default_factory is MISSING
-        )
-        return {entry.name: hints[entry.name] for entry in options}, bare
-    hints = get_type_hints(factory) if inspect.isfunction(factory) else {}
-    parameters = inspect.signature(factory).parameters.values()
-    bare = tuple(p.name for p in parameters if p.default is inspect.Parameter.empty)
-    return {p.name: hints.get(p.name, Any) for p in parameters}, bare
-
-
-def _convert(completer: str, key: str, kind: Any, value: object) -> object:
-    """``value`` as the field's type; only lossless conversions."""
-    choices = tuple(getattr(kind, "__args__", ())) or (kind,)
-    if value is None and type(None) in choices:
-        return None
-    for choice in choices:
-        if choice is Any or (isinstance(choice, type) and type(value) is choice):
-            return value
-    for choice in choices:
-        if choice is float and type(value) is int:
-            return float(value)
-        if isinstance(value, str):
-            text = value.strip()
-            if choice is type(None) and text.lower() in ("none", "null"):
-                return None
-            if choice is bool and text.lower() in ("true", "false"):
-                return text.lower() == "true"
-            if choice in (int, float):
-                try:
-                    return choice(text)
-                except ValueError:
-                    continue
-    expected = " or ".join(getattr(choice, "__name__", str(choice)) for choice in choices)
-    raise OptionError(f"completer {completer}: option {key} = {value!r}; expected {expected}")
-
-
-def _nearest(word: str, known: Sequence[str]) -> str:
-    """A hint that names the closest of ``known``, or all of them."""
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+    if name not in _REGISTRY:
+        near = difflib.get_close_matches(name, available(), n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(available())}"
+        raise OptionError(f"no completer {name!r}; {hint}")
+    kind = _REGISTRY[name]
+    if isinstance(kind, str):
+        module, _, attribute = kind.partition(":")
+        kind = getattr(import_module(module), attribute)
+    made: Completer = kind(**options)
+    return made

@@ -20,8 +20,8 @@ def rim_distance(known: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.asarray(distance_transform_edt(~known), np.float64)
 
 
-def hole_reach(valid: NDArray[np.bool_]) -> float:
-    """How far the pixel farthest from what is known lies from it, as a share of the diagonal.
+def hole_radius(valid: NDArray[np.bool_]) -> float:
+    """Largest distance of a hole's pixel to a valid one, as a share of the image diagonal.
 
     Args:
         valid: (H, W) bool, where something is known.

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from gvtools.completers.base import Completion, ContextView, check_views
+from gvtools.completers.base import Completer, Completion, ContextView, check_views
 from gvtools.guidance import Guidance
 
 
-@dataclass(frozen=True)
-class NoneCompleter:
+class NoneCompleter(Completer):
     """Returns the guidance as it is; invalid pixels are 0 in colour, depth and confidence."""
 
-    name: ClassVar[str] = "none"
+    name = "none"
 
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0

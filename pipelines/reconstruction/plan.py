@@ -13,6 +13,7 @@ from pipelines.console import Console
 from pipelines.reconstruction.voxel_edge import automatic_voxel
 
 if TYPE_CHECKING:
+    from gvtools.completers.base import Completer
     from gvtools.depth.source import DepthSource
     from gvtools.scenes.scene import Scene
     from pipelines.reconstruction.settings import RunSettings
@@ -32,9 +33,9 @@ class Plan:
         schedule: per round (from 1) the rows of the targets.
         source: where depth comes from.
         source_reason: why from there, in words.
+        completer: of the whole run, under its effort policy.
         ignored: settings of stereo that this source does not look at.
         weights: files of networks that decide the result.
-        notes: what the completer has the user told.
     """
 
     scene: Scene
@@ -45,9 +46,9 @@ class Plan:
     schedule: tuple[tuple[int, ...], ...]
     source: DepthSource
     source_reason: str
+    completer: Completer
     ignored: tuple[str, ...] = ()
     weights: tuple[Path, ...] = ()
-    notes: tuple[str, ...] = ()
 
     @property
     def derived(self) -> dict[str, Any]:
@@ -85,7 +86,7 @@ def make_plan(
         )
     settings, config = config, _on_device(config)
     scene = reduced(scene, config.max_side)
-    completer = create(config.completer, **config.completer_options)
+    completer = config.effort.applied(create(config.completer, **config.completer_options))
     # By name: a project may list its views in any order, and merging depends on theirs.
     context = tuple(sorted(select(scene.names, config.context)))
     targets = resolve_targets(
@@ -112,7 +113,7 @@ def make_plan(
             config = at_scale(config, scale)
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = config.replaced(rounds=len(schedule))
-    weights = [*getattr(chosen.source, "files", ()), *getattr(completer, "files", ())]
+    weights = [*getattr(chosen.source, "files", ()), *completer.files]
     return Plan(
         scene,
         settings,
@@ -122,9 +123,9 @@ def make_plan(
         schedule,
         chosen.source,
         chosen.reason,
+        completer,
         chosen.ignored,
         tuple(weights),
-        tuple(getattr(completer, "notes", ())),
     )
 
 
@@ -204,7 +205,7 @@ def describe(plan: Plan, console: Console) -> None:
             f"{len(targets.cameras) - scheduled} of {len(targets.cameras)} targets are in no "
             "round; raise --rounds or --views-per-round"
         )
-    for note in plan.notes:
+    for note in plan.completer.notes:
         console.warn(note)
     if plan.ignored:
         console.warn(

@@ -5,20 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.completers.base import Completer, Completion, ContextView
+from gvtools.completers.base import Completer, Completion, ContextView, ScaleAlignment
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, together
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.projection_cache import FollowedCamera
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.scenes.scene import Frame, Scene, View
-from gvtools.similarity import ScaleFit, align_depth_scale
+from gvtools.similarity import align_depth_scale
 from pipelines.reconstruction.depth_cache import KeptDepth, depth_report
 from pipelines.reconstruction.prefetch import ahead
 from pipelines.reconstruction.settings import RunSettings
@@ -157,9 +157,9 @@ def complete_targets(
 ) -> tuple[list[TargetResult], FuseReport]:
     """Rounds 1, 2, ...: complete, align and fuse the round's targets.
 
-    A completer that looks at several targets at once (``joint``) gets all of one size together; for
-    any other, each view is completed on what the views before it added, so that they agree with
-    each other.
+    A completer that takes several targets in a call (``batches_targets``) gets all of one size
+    together; for any other, each view is completed on what the views before it added, so that they
+    agree with each other.
 
     Args:
         targets: the round's cameras, following ``memory``.
@@ -186,7 +186,7 @@ def complete_targets(
         results.append(result)
         total += report
 
-    if getattr(completer, "joint", False):
+    if completer.batches_targets:
         with clock.stage("project"):
             known = [target.guidance() for target in targets]
         with clock.stage("complete"):
@@ -227,7 +227,7 @@ def _row(completion: Completion, index: int) -> Completion:
         completion.confidence[rows],
         rays,
         completion.spent,
-        None if completion.support is None else completion.support[rows],
+        None if completion.scale_alignment is None else completion.scale_alignment[rows],
     )
 
 
@@ -242,26 +242,17 @@ def _align_and_fuse(
     valid, depth = guidance.valid[0], completion.depth[0]
     confidence = completion.confidence[0]
     with clock.stage("align"):
-        fit = align_depth_scale(
-            depth,
-            guidance.depth[0],
-            valid=valid & (depth > 0),
-            confidence=guidance.confidence[0],
-            max_residual=config.fusion.max_scale_residual,
-        )
-    said = None if completion.support is None else completion.support[0]
-    if said is not None:
-        fit = _vouched(fit, said)
+        alignment = _scale_alignment(guidance, completion, config)
     made = ~valid & (depth > 0)
     fused = made & (confidence >= config.fusion.min_confidence) & (confidence > 0)
     report = FuseReport()
-    if not fit.ok:
+    if not alignment.accepted:
         fused = np.zeros_like(fused)
     elif fused.any():
         with clock.stage("fuse"):
             points = back_project(
                 np.rint(np.clip(completion.rgb[0], 0, 1) * 255).astype(np.uint8),
-                (depth * np.float32(fit.scale)).astype(np.float32),
+                (depth * np.float32(alignment.scale)).astype(np.float32),
                 guidance.cameras,
                 frame=memory.frame,
                 # Unused outside the mask, where it must still be positive.
@@ -277,25 +268,29 @@ def _align_and_fuse(
         "observed": float((valid & ~guidance.generated[0]).mean()),
         "completed": float((valid | made).mean()),
         "fused_pixels": int(fused.sum()),
-        "scale": {
-            "status": fit.status,
-            "scale": fit.scale,
-            "inlier_share": fit.inlier_share,
-            "residual": fit.residual,
-            "support": fit.support,
-            "by": said,
-        },
+        "scale": alignment.to_json(),
         "fuse": asdict(report),
     }
     return TargetResult(guidance, completion, fused, figures), report
 
 
-def _vouched(fit: ScaleFit, said: str) -> ScaleFit:
-    """The fit of a completion whose scale the completer found itself.
+def _scale_alignment(
+    guidance: Guidance, completion: Completion, config: RunSettings
+) -> ScaleAlignment:
+    """How the depth of a completion, a batch of one, gets into scene units.
 
-    Its known pixels are the memory's own, so the comparison with them tells nothing: a refusal
-    stands, and a view that the memory does not know is accepted.
+    Where the completer aligned it itself, its known pixels are the memory's own, so that comparing
+    them would tell nothing: its outcome stands, a refusal as well.
     """
-    if said.startswith("refused"):
-        return replace(fit, status=said, scale=float("nan"))
-    return replace(fit, status="aligned", scale=1.0)
+    by_completer = completion.scale_alignment and completion.scale_alignment[0]
+    if by_completer:
+        return by_completer
+    depth = completion.depth[0]
+    fit = align_depth_scale(
+        depth,
+        guidance.depth[0],
+        valid=guidance.valid[0] & (depth > 0),
+        confidence=guidance.confidence[0],
+        max_residual=config.fusion.max_scale_residual,
+    )
+    return ScaleAlignment.of_fit(fit)

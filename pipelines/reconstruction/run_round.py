@@ -9,8 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gvtools.completers.base import ContextView, create
-from gvtools.completers.effort import sparing
+from gvtools.completers.base import ContextView
 from gvtools.depth.from_memory import MEMORY, explained_depth
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap
@@ -127,14 +126,7 @@ def _complete(
         writing: list[Future[None]] = []
         results, total = rounds.complete_targets(
             targets, number, memory=memory,
-            completer=sparing(
-                create(config.completer, **config.completer_options),
-                config.savings.minor_holes,
-                one_step=config.savings.one_step,
-                half_size=config.savings.half_size,
-                no_prior=config.savings.no_prior,
-                near_holes=config.savings.near_holes,
-            ),
+            completer=plan.completer,
             context=context, config=config, clock=clock, progress=console.track,
             done=lambda at, result: writing.append(
                 pool.submit(write_target, folder, stems[at], result)
@@ -158,11 +150,11 @@ def _complete(
             stems, cameras, results, known, grown, strict=True
         )
     ]
-    refused = [view for view in views if view["scale"]["status"] != "aligned"]
+    refused = [view for view in views if not view["scale"]["accepted"]]
     if refused:
         console.warn(
             f"round {number}: {len(refused)} of {len(results)} completions give no points, first "
-            f"{refused[0]['name']}: {refused[0]['scale']['status']}"
+            f"{refused[0]['name']}: {refused[0]['scale']['description']}"
         )
     return total, {
         "coverage_before": _mean([guidance.coverage for guidance in known]),

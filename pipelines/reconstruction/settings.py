@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
+from gvtools.completers.effort import EffortPolicy
 from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.memory.back_projection import BackProjectionOptions
@@ -52,21 +53,6 @@ class SavingsOptions(Settings):
     pixel_binning: float = Field(1.0, ge=0)
     """2 x 2 pixels become one point, their mean, where they are together at most this many voxel
     edges wide, unless the surface is steep; 0 lifts each by itself. [voxel edges]"""
-    minor_holes: float = Field(0.02, ge=0)
-    """A view with no unknown pixel farther than this share of the image diagonal from a known one
-    is left to ``inpaint`` where the completer is a costly one (geoverse, exemplar); 0 leaves it
-    none."""
-    one_step: float = Field(0.1, ge=0)
-    """Targets that are completed together take one step of the generative core instead of the
-    model's own number where none of their unknown pixels is farther than this share of the diagonal
-    from a known one; 0 spares none."""
-    half_size: float = Field(0.1, ge=0)
-    """Likewise, they are completed in pictures of half the model's size."""
-    no_prior: float = Field(0.1, ge=0)
-    """Likewise, they are completed without the video prior of a model that has one."""
-    near_holes: bool = True
-    """Steps of the generative core after the first one look at tokens near holes alone, where there
-    is no video prior."""
     depth_from_memory: float | None = Field(0.9, gt=0, le=1)
     """A context view whose depth would have to be computed takes memory's instead where the views
     before it explain this share of its pixels; none computes all."""
@@ -79,20 +65,15 @@ class RunSettings(Settings):
         "fast": {
             "max_side": 480,
             "views_per_round": 12,
-            "savings.minor_holes": 0.05,
-            "savings.one_step": 0.3,
-            "savings.half_size": 0.3,
-            "savings.no_prior": 0.3,
+            "effort.inpaint_below": 0.05,
+            "effort.reduced_below": 0.3,
         },
         # The defaults.
         "balanced": {},
         "accurate": {
             "fusion.max_psnr_drop_db": 0.0,
-            "savings.minor_holes": 0.0,
-            "savings.one_step": 0.0,
-            "savings.half_size": 0.0,
-            "savings.no_prior": 0.0,
-            "savings.near_holes": False,
+            "effort.inpaint_below": 0.0,
+            "effort.reduced_below": 0.0,
             "savings.depth_from_memory": None,
             "memory.same_direction": 0.0,
             "memory.observations_per_voxel": 64,
@@ -135,3 +116,4 @@ class RunSettings(Settings):
     splat: SplatOptions = SplatOptions()
     fusion: FusionOptions = FusionOptions()
     savings: SavingsOptions = SavingsOptions()
+    effort: EffortPolicy = EffortPolicy()

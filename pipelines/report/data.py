@@ -191,12 +191,12 @@ def _warnings(record: Mapping[str, Any], reports: Sequence[Mapping[str, Any]]) -
     if failed:
         yield f"no depth was found for {len(failed)} of {len(depth)} context views: {_few(failed)}"
     for report in reports[1:]:
-        refused = [view for view in report["views"] if view["scale"]["status"] != "aligned"]
+        refused = [view for view in report["views"] if not view["scale"]["accepted"]]
         if refused:
             yield (
                 f"round {report['round']}: {len(refused)} of {len(report['views'])} completions "
                 f"gave no points: {_few([str(view['name']) for view in refused])} "
-                f"({refused[0]['scale']['status']})"
+                f"({refused[0]['scale']['description']})"
             )
 
 

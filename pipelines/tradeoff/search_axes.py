@@ -96,20 +96,14 @@ def _core_axes(config: RunSettings) -> list[SearchAxis]:
     core = config_of(completer.folder)
     steps = int(given.get("steps") or len(core.flow.level1))
     size = int(given["image_size"]) if given.get("image_size") else None
-    axes = [
+    return [
         _axis("generative steps", "completer.steps", (1, 3, 6), steps),
         _axis("model resolution, px", "completer.image_size", (core.image_size // 2, size), size),
-        _axis("holes left to inpaint, share of the diagonal", "savings.minor_holes",
-              (0.1, 0.02, 0.0), config.savings.minor_holes),
+        _axis("holes left to inpaint, share of the diagonal", "effort.inpaint_below",
+              (0.1, 0.02, 0.0), config.effort.inpaint_below),
+        _axis("holes of reduced effort, share of the diagonal", "effort.reduced_below",
+              (0.3, 0.1, 0.0), config.effort.reduced_below),
     ]  # fmt: skip
-    if core.video is not None:
-        # The completer's own option stands above the run's. A hole of 1e6 diagonals: none.
-        own = given.get("no_prior_holes")
-        key = "savings.no_prior" if own is None else "completer.no_prior_holes"
-        start = config.savings.no_prior if own is None else float(own)
-        name = "holes without video prior, share of the diagonal"
-        axes.append(_axis(name, key, (1e6, 0.1, 0.0), start))
-    return axes
 
 
 def _axis(name: str, key: str, values: Sequence[Any], start: Any) -> SearchAxis:

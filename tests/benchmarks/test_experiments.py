@@ -11,6 +11,7 @@ from benchmarks.experiments.cases import held_out_cases
 from benchmarks.experiments.classical import CLASSICAL, classical
 from benchmarks.experiments.judging import COLUMNS, best, judge, records, table
 from benchmarks.experiments.rows import FILL, HINTS, INPAINT, with_heads_of
+from gvtools.completers import Completer, Completion
 from gvtools.completers.geoverse import from_pretrained
 from gvtools.completers.geoverse.weights.folder import save_pretrained
 from gvtools.guidance import Guidance
@@ -83,12 +84,10 @@ def test_depth_of_opencvs_fillers_has_finer_steps_than_8_bits(name):
 
 
 def test_the_truth_wins_every_figure(cases):
-    class Truth:
+    class Truth(Completer):
         name = "truth"
 
         def complete(self, context, guidance, *, seed=0):
-            from gvtools.completers import Completion
-
             case = next(c for c in cases if c.guidance is guidance)
             return Completion(case.rgb, case.depth, np.ones_like(case.depth))
 

@@ -2,35 +2,64 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from pydantic import Field
+from tiny_scan import write_scan
 
 from gvtools.cameras import Cameras
-from gvtools.completers import Completer, Completion, ContextView, available, create, register
-from gvtools.completers.base import _FACTORIES
+from gvtools.completers import (
+    Completer,
+    Completion,
+    ContextView,
+    ScaleAlignment,
+    ScaleStatus,
+    available,
+    create,
+    register,
+)
+from gvtools.completers.base import _REGISTRY
+from gvtools.completers.settings import CompleterSettings
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
+from gvtools.runs.folder import RunDirectory
+from gvtools.runs.round_files import read_target
+from gvtools.similarity import align_depth_scale
+from pipelines.cli import main
 
 
-@dataclass(frozen=True)
-class _Painter:
-    strength: float
+class _PainterSettings(CompleterSettings):
+    strength: float = Field(ge=0)
     rounds: int = 2
     soft: bool = False
     limit: float | None = None
+
+
+class _Painter(Completer):
+    """Paints holes grey, as far away as the farthest that is known."""
+
     name = "painter"
+    settings_type = _PainterSettings
+    made = 0
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        type(self).made += 1
 
     def complete(self, context, guidance, *, seed=0):
-        return Completion(guidance.rgb, guidance.depth, guidance.confidence)
+        hole = ~guidance.valid
+        grey = np.float32(self.settings.strength)
+        depth = np.where(hole, guidance.depth.max(), guidance.depth)
+        confidence = np.where(hole, np.float32(0.5), np.minimum(guidance.confidence, 1))
+        return Completion(np.where(hole[..., None], grey, guidance.rgb), depth, confidence)
 
 
 @pytest.fixture
 def painter():
     register("painter", _Painter)
     yield
-    del _FACTORIES["painter"]
+    del _REGISTRY["painter"]
 
 
 def _camera(width: int = 8, height: int = 6) -> Cameras:
@@ -57,21 +86,21 @@ def test_listing_the_completers_imports_none_of_them():
 
 
 def test_texts_become_the_types_of_the_fields(painter):
-    made = create("painter", strength="0.25", rounds="3", soft="true", limit="none")
-    assert made == _Painter(0.25, 3, True, None)
-    whole = create("painter", strength=1, limit="2")
-    assert whole == _Painter(1.0, limit=2.0)
-    assert isinstance(vars(whole)["strength"], float)
+    made = create("painter", strength="0.25", rounds="3", soft="true", limit="none").settings
+    assert made == _PainterSettings(strength=0.25, rounds=3, soft=True, limit=None)
+    whole = create("painter", strength=1, limit="2").settings
+    assert (whole.strength, whole.limit) == (1.0, 2.0) and isinstance(whole.strength, float)
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"strenght": 1}, "'strength'"),
+        ({"strength": 1, "strenght": 1}, "'completer.strength'"),
         ({}, "required"),
-        ({"strength": "much"}, "expected float"),
-        ({"strength": 1, "rounds": 2.5}, "expected int"),
-        ({"strength": 1, "soft": "maybe"}, "expected bool"),
+        ({"strength": "much"}, "expected .*number"),
+        ({"strength": -1}, "completer.strength -1; expected at least 0"),
+        ({"strength": 1, "rounds": 2.5}, "expected .*integer"),
+        ({"strength": 1, "soft": "maybe"}, "expected .*boolean"),
     ],
 )
 def test_wrong_options_are_named(painter, options, words):
@@ -82,15 +111,31 @@ def test_wrong_options_are_named(painter, options, words):
 def test_an_unknown_name_meets_the_nearest_known():
     with pytest.raises(OptionError, match="did you mean 'inpaint'"):
         create("inpant")
-    with pytest.raises(OptionError, match="it has no options"):
+    with pytest.raises(OptionError, match="no option 'strength'; it has none"):
         create("none", strength=1)
+
+
+def test_a_completer_of_ones_own_serves_a_run_and_is_made_once(painter, tmp_path):
+    scan, out = write_scan(tmp_path / "scan"), tmp_path / "run"
+    _Painter.made = 0
+    words = ["--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2"]
+    own = ["--completer", "painter", "--set", "completer.strength=0.3"]
+    assert main(["reconstruct", str(scan), "--out", str(out), "--quiet", *words, *own]) == 0
+    assert _Painter.made == 1
+    for number in (1, 2):
+        folder = RunDirectory(out).round_path(number)
+        for entry in RunDirectory(out).reports()[number]["views"]:
+            target = read_target(folder, entry)
+            assert target.generated.any() and entry["fused_pixels"] > 0
+            # 0.3 of 255.
+            assert np.isin(target.picture[target.generated], (76, 77)).all()
 
 
 def test_a_taken_name_and_a_malformed_reference_are_refused(painter):
     register("painter", _Painter)
     with pytest.raises(OptionError, match="taken"):
         register("painter", "other:Thing")
-    with pytest.raises(OptionError, match="module:attribute"):
+    with pytest.raises(OptionError, match="module:class"):
         register("other", "no_colon")
 
 
@@ -124,3 +169,24 @@ def test_shapes_that_do_not_fit_are_refused():
         ContextView("a", _camera(), image, np.zeros((6, 7), np.float32))
     with pytest.raises(ShapeError, match="completion"):
         Completion(image, image[..., 0], image[..., 0])
+    with pytest.raises(ShapeError, match="scale alignment of 2 views; expected 1"):
+        none = (None, None)
+        Completion(image[None], image[None, ..., 0], image[None, ..., 0], scale_alignment=none)
+
+
+def test_a_fit_becomes_an_outcome_with_figures_and_words():
+    depth = np.random.default_rng(0).uniform(1, 2, (30, 40))
+    valid = np.ones(depth.shape, bool)
+    good = ScaleAlignment.of_fit(align_depth_scale(depth, 3 * depth, valid=valid))
+    assert (good.status, good.overlap_px) == (ScaleStatus.MEMORY_DEPTH, 1200) and good.accepted
+    assert good.scale == pytest.approx(3) and good.residual < 1e-9 and good.inlier_share == 1
+    shown = good.to_json()
+    assert shown["status"] == "memory_depth" and "1200 common pixels" in shown["description"]
+    noise = np.random.default_rng(1).uniform(0.1, 10, depth.shape)
+    for reference, where, status in (
+        (noise, valid, ScaleStatus.CONTRADICTED),
+        (depth, ~valid, ScaleStatus.UNSUPPORTED),
+    ):
+        bad = ScaleAlignment.of_fit(align_depth_scale(depth, reference, valid=where))
+        assert bad.status is status and not bad.accepted and np.isnan(bad.scale)
+        assert bad.describe().startswith("refused: ")

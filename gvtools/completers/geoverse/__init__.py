@@ -7,7 +7,6 @@ Start at ``model.py`` (the whole pass), ``config.py`` (its settings) and ``compl
 
 from __future__ import annotations
 
-from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.completers.geoverse.config import GeoVerseConfig, named
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.weights.checks import check_folder
@@ -15,7 +14,6 @@ from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pre
 
 __all__ = [
     "GeoVerse",
-    "GeoVerseCompleter",
     "GeoVerseConfig",
     "check_folder",
     "from_pretrained",

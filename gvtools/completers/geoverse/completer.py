@@ -2,140 +2,90 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
+from typing import Any
 
 import numpy as np
 import torch
 
-from gvtools.completers.base import Completion, ContextView, check_views
-from gvtools.completers.geoverse.color_field import COLOR_ALIGNMENTS
-from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.context_views import CHOICES, chosen_views
+from gvtools.completers.base import (
+    Completer,
+    Completion,
+    ContextView,
+    ScaleAlignment,
+    ScaleStatus,
+    check_views,
+)
+from gvtools.completers.geoverse.completer_settings import GeoVerseSettings
+from gvtools.completers.geoverse.context_views import covisible_views, nearest_views
 from gvtools.completers.geoverse.correction import seamless
-from gvtools.completers.geoverse.depth_scale import ALIGNMENTS
 from gvtools.completers.geoverse.fill import Filled
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.model_views import context_depth, view_batch
-from gvtools.completers.geoverse.postprocess import Completed, averaged, brought_back, corrected
+from gvtools.completers.geoverse.postprocess import (
+    Completed,
+    averaged,
+    corrected,
+    to_scene_scale,
+)
 from gvtools.completers.geoverse.resampling import model_size
-from gvtools.completers.geoverse.weights.checks import check_headers, config_of
+from gvtools.completers.geoverse.weights.checks import check_headers
 from gvtools.completers.geoverse.weights.folder import from_pretrained
-from gvtools.completers.holes import hole_reach
+from gvtools.completers.holes import hole_radius
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
-from gvtools.options import check_range
 
-PRECISIONS = ("auto", "float32", "bfloat16")
-DEVICES = ("auto", "cpu", "cuda")
 # The model that ships: see MODEL_CARD.md there.
 SHIPPED = Path(__file__).parent / "pretrained" / "tiny"
 
 
 @dataclass(frozen=True)
-class GeoVerseCompleter:
-    """The generative core (see ``model.py``), with the memory's pixels kept as they are.
+class _Effort:
+    """What a pass is given.
 
     Attributes:
-        weights: folder of a GeoVerse model, see ``gvtools weights list``; None for the small one
-            that ships.
-        steps: level-1 steps, equally spaced in time; None for the model's own interval bounds; 0
-            decodes the features of the filled projections as they are.
-        cascade_steps: level-0 steps, likewise.
-        guidance: classifier-free guidance scale; None for the model's own.
-        temperature: of the noise that level 1 starts from, see ``FlowConfig``; None for the
-            model's own.
-        context_views: most photographs in a pass; None for the model's own.
-        context_by: "seen" takes the photographs that see most of what the targets show, "near"
-            those that stand and look most like them; see ``context_views``.
-        views: most views in a pass, photographs and targets; None for the model's own.
-        alignment: how decoded depth gets the memory's scale, see ``depth_scale``; None for the
-            model's own. A correction has the memory's scale already.
-        color_alignment: whether decoded colours follow the memory's, see ``color_field``; None for
-            the model's own. A correction follows them already.
-        composition: "decoded" shows the decoding itself where a model's form is "correction", see
-            ``correction``; None for the model's own.
-        shared_fill: whether targets share what their holes are filled with, see ``surface_fill``.
-        one_step_holes: a pass takes one level-1 step where no unknown pixel of its targets lies
-            farther from a known one than this share of the image diagonal, and ``steps`` is None;
-            0 never. None leaves it to what a run spares, see ``sparing``; so do the next three.
-        no_prior_holes: likewise, a pass that does without the video prior.
-        half_size_holes: likewise, a pass in pictures of half the size.
-        near_holes: steps after the first look at what lies near holes alone, see ``near_tokens``.
-        image_size: longer side of the pictures in a pass, pixels, rounded to whole patches; None
-            for the model's own, which is also the most.
-        precision: "auto" is bfloat16 on a GPU and float32 on a CPU.
-        device: "auto" takes a GPU where there is one.
+        bounds: of the level-1 steps.
+        size: (H, W) of its pictures.
+        prior: whether a video prior is asked.
     """
 
-    name: ClassVar[str] = "geoverse"
-    joint: ClassVar[bool] = True
-    costly: ClassVar[bool] = True
+    bounds: tuple[float, ...]
+    size: tuple[int, int]
+    prior: bool
 
-    weights: str | None = None
-    steps: int | None = None
-    cascade_steps: int | None = None
-    guidance: float | None = None
-    temperature: float | None = None
-    context_views: int | None = None
-    context_by: str = "seen"
-    views: int | None = None
-    alignment: str | None = None
-    color_alignment: str | None = None
-    composition: str | None = None
-    shared_fill: bool = True
-    one_step_holes: float | None = None
-    no_prior_holes: float | None = None
-    half_size_holes: float | None = None
-    near_holes: bool | None = None
-    image_size: int | None = None
-    precision: str = "auto"
-    device: str = "auto"
 
-    def __post_init__(self) -> None:
-        check_range("completer.steps", self.steps, least=0)
-        check_range("completer.cascade_steps", self.cascade_steps, least=1)
-        check_range("completer.guidance", self.guidance, least=0)
-        check_range("completer.temperature", self.temperature, least=0)
-        check_range("completer.one_step_holes", self.one_step_holes, least=0)
-        check_range("completer.no_prior_holes", self.no_prior_holes, least=0)
-        check_range("completer.half_size_holes", self.half_size_holes, least=0)
-        check_range("completer.image_size", self.image_size, least=1)
-        check_range("completer.context_views", self.context_views, least=1)
-        check_range("completer.views", self.views, least=2)
-        for name, value, known in (
-            ("precision", self.precision, PRECISIONS),
-            ("device", self.device, DEVICES),
-            ("context_by", self.context_by, CHOICES),
-            ("alignment", self.alignment or ALIGNMENTS[0], ALIGNMENTS),
-            ("color_alignment", self.color_alignment or "none", COLOR_ALIGNMENTS),
-        ):
-            if value not in known:
-                raise OptionError(
-                    f"completer.{name} = {value!r}; expected one of {', '.join(known)}"
-                )
-        if self.composition not in (None, "decoded", "correction"):
-            raise OptionError(
-                f"completer.composition = {self.composition!r}; expected 'decoded' or 'correction'"
-            )
-        if self.device == "cuda" and not torch.cuda.is_available():
+class GeoVerseCompleter(Completer):
+    """The generative core (see ``model.py``), with the memory's pixels kept as they are."""
+
+    name = "geoverse"
+    settings_type = GeoVerseSettings
+    settings: GeoVerseSettings
+    batches_targets = True
+    costly = True
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.reduced_below = 0.0
+        if self.settings.device == "cuda" and not torch.cuda.is_available():
             raise OptionError("completer.device = 'cuda', and torch sees no CUDA device here")
-        if self.weights is None and not self.folder.is_dir():
+        if self.settings.weights is None and not self.folder.is_dir():
             raise OptionError(
                 "completer geoverse: the weights that ship are absent from this installation; "
                 "name a folder as 'gvtools weights list' describes it, with --weights DIR or --set "
                 "completer.weights=DIR"
             )
         # A folder that cannot be a model is refused before anything is computed.
-        form = _checked(str(self.folder.resolve()), self._times()).composition
-        if self.composition == "correction" and form != "correction":
+        self.config = check_headers(str(self.folder.resolve()))
+        form = self.config.composition
+        if self.settings.composition == "correction" and form != "correction":
             raise OptionError(
                 f"completer.composition = 'correction', and the model in {self.folder} is of the "
                 f"form {form!r}; leave the option out"
@@ -144,24 +94,30 @@ class GeoVerseCompleter:
     @property
     def folder(self) -> Path:
         """Of the weights."""
-        return SHIPPED if self.weights is None else Path(self.weights)
+        return SHIPPED if self.settings.weights is None else Path(self.settings.weights)
 
-    @property
+    @cached_property
     def model(self) -> GeoVerse:
-        """The model, on its device; kept from call to call."""
-        return _loaded(str(self.folder.resolve()), str(self._device()), self._times())
+        """The model, on its device; read when it is first needed."""
+        return from_pretrained(str(self.folder.resolve()), device=str(self._device))
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should be told before a run."""
-        if config_of(self.folder).trained:
+        """Whether the weights are untrained."""
+        if self.config.trained:
             return ()
         return (f"the weights in {self.folder} are untrained: what they complete is noise",)
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """What decides the result beside the views: everything in the weights folder."""
+        """Everything in the weights folder."""
         return tuple(sorted(path for path in self.folder.rglob("*") if path.is_file()))
+
+    def with_reduced_effort(self, below: float) -> GeoVerseCompleter:
+        """Passes whose holes have at most this radius take less; see ``_effort``."""
+        other = copy.copy(self)
+        other.reduced_below = below
+        return other
 
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
@@ -171,31 +127,26 @@ class GeoVerseCompleter:
         if not context:
             raise OptionError("completer geoverse needs at least one context view, and got none")
         check_views(context, guidance)
-        device = self._device()
-        model = self.model
         canvas = _Canvas(guidance)
         holes = [index for index in range(len(guidance)) if not guidance.valid[index].all()]
-        views = self.views or model.config.views
-        most = min(self.context_views or model.config.context, views - 1)
-        room = views - min(most, len(context))
+        views = self.settings.views or self.config.views
+        photographs = min(self.settings.context_views or self.config.context, views - 1)
+        room = views - min(photographs, len(context))
         passes = steps = 0
-        filled = self._filled(model, context, guidance.rows(holes)) if holes else None
+        filled = self._filled(context, guidance.rows(holes)) if holes else None
         for first in range(0, len(holes), room):
             rows = holes[first : first + room]
             part = guidance.rows(rows)
             fill = None if filled is None else filled.rows(range(first, first + len(rows)))
-            shown = part.depth if fill is None else fill.depth
-            chosen = chosen_views(context, part.cameras, shown, most, by=self.context_by)
-            reach = math.inf
-            if self.one_step_holes or self.no_prior_holes or self.half_size_holes:
-                reach = max(hole_reach(valid) for valid in part.valid)
-            bounds = self._bounds(model, reach)
-            size = self._size(model, part, reach)
-            prior = reach > (self.no_prior_holes or 0)
-            made = self._pass(model, device, chosen, part, fill, seed, size, bounds, prior)
-            canvas.put(rows, made, part)
+            depth = part.depth if fill is None else fill.depth
+            if self.settings.context_selection == "covisible":
+                chosen = covisible_views(context, part.cameras, depth, photographs)
+            else:
+                chosen = nearest_views(context, part.cameras, photographs)
+            effort = self._effort(part)
+            canvas.put(rows, self._pass(chosen, part, fill, effort=effort, seed=seed), part)
             passes += 1
-            steps += max(len(bounds) - 1, 0)
+            steps += max(len(effort.bounds) - 1, 0)
         spent = {
             "seconds": time.perf_counter() - start,
             "passes": float(passes),
@@ -203,100 +154,91 @@ class GeoVerseCompleter:
         }
         return canvas.completion(spent)
 
-    def _filled(
-        self, model: GeoVerse, context: Sequence[ContextView], guidance: Guidance
-    ) -> Filled | None:
+    def _filled(self, context: Sequence[ContextView], guidance: Guidance) -> Filled | None:
         """What the model sees in holes; None where it fills them itself."""
-        if model.config.hints.fill != "surfaces":
+        if self.config.hints.fill != "surfaces":
             return None
         # It needs more than torch and numpy.
         from gvtools.completers.geoverse.surface_fill import surface_fill
 
-        return surface_fill(context, guidance, shared=self.shared_fill)
+        return surface_fill(context, guidance, shared=self.settings.shared_fill)
+
+    def _effort(self, part: Guidance) -> _Effort:
+        """The model's own steps and picture size, or less where all holes of the pass are small.
+
+        That is one step, half the picture size, and no video prior.
+        """
+        reduced = False
+        if self.reduced_below > 0:
+            reduced = max(hole_radius(valid) for valid in part.valid) <= self.reduced_below
+        bounds = interval_bounds(1) if reduced else self.config.flow.level1
+        if self.settings.steps is not None:
+            bounds = interval_bounds(self.settings.steps) if self.settings.steps else ()
+        longest = min(self.settings.image_size or math.inf, self.config.image_size)
+        size = model_size(
+            *part.depth.shape[1:],
+            longest=int(longest) // 2 if reduced else int(longest),
+            patch=self.config.patch,
+        )
+        return _Effort(bounds, size, prior=not reduced)
 
     def _pass(
         self,
-        model: GeoVerse,
-        device: torch.device,
         context: Sequence[ContextView],
         part: Guidance,
         fill: Filled | None,
+        *,
+        effort: _Effort,
         seed: int,
-        size: tuple[int, int],
-        bounds: tuple[float, ...],
-        prior: bool,
     ) -> Completed:
         """One pass of the model over context views and a few targets."""
+        options, size = self.settings, effort.size
         batch, cameras = view_batch(context, part, size, fill=fill)
-        batch = batch.to(device)
         # A photograph and a target of one name must not start from the same noise.
         names = [f"context {view.name}" for view in context]
         names += [f"target {name}" for name in part.cameras.names]
         filled = None
-        if model.config.composition == "correction" and self.composition != "decoded":
+        if self.config.composition == "correction" and options.composition != "decoded":
             filled = averaged(part) if fill is None else fill
-        # Where memory tells of every pixel, the model's own scale is of no use.
-        told = filled is not None and bool((filled.depth > 0).all())
-        with self._precision(device):
-            made = model.generate(
-                batch,
+        # Where the fill has depth everywhere, the model's own scale is of no use.
+        complete_fill = filled is not None and bool((filled.depth > 0).all())
+        cascade = options.cascade_steps
+        with self._precision():
+            made = self.model.generate(
+                batch.to(self._device),
                 seed=seed,
                 names=[names],
-                bounds=bounds,
-                cascade_bounds=self._cascade_bounds(model),
-                guidance=self.guidance,
-                temperature=self.temperature,
-                prior=prior,
-                targets_alone=told,
-                near_holes=bool(self.near_holes),
+                bounds=effort.bounds,
+                cascade_bounds=interval_bounds(cascade) if cascade else self.config.flow.cascade,
+                guidance=options.cfg_scale,
+                temperature=options.temperature,
+                prior=effort.prior,
+                targets_alone=complete_fill,
             )
 
-        def brought(color_alignment: str) -> Completed:
+        def scaled(color_alignment: str) -> Completed:
             known = context_depth(context, part, size)
-            alignment = self.alignment or model.config.alignment
-            return brought_back(
+            alignment = options.alignment or self.config.alignment
+            return to_scene_scale(
                 made, part, cameras, known, alignment=alignment, color_alignment=color_alignment
             )
 
         if filled is None:
-            return brought(self.color_alignment or model.config.color_alignment)
-        made = seamless(made, model.config.patch)
-        return corrected(made, part, filled, back=None if told else brought("none"))
+            return scaled(options.color_alignment or self.config.color_alignment)
+        made = seamless(made, self.config.patch)
+        return corrected(made, part, filled, back=None if complete_fill else scaled("none"))
 
-    def _size(self, model: GeoVerse, part: Guidance, reach: float) -> tuple[int, int]:
-        """(H, W) of the pictures in a pass whose holes reach so far."""
-        longest = min(self.image_size or model.config.image_size, model.config.image_size)
-        if reach <= (self.half_size_holes or 0):
-            longest = longest // 2
-        return model_size(*part.depth.shape[1:], longest=longest, patch=model.config.patch)
-
-    def _bounds(self, model: GeoVerse, reach: float) -> tuple[float, ...]:
-        """Of level 1, in a pass whose holes reach so far."""
-        if self.steps == 0:
-            return ()
-        if self.steps is None:
-            one = reach <= (self.one_step_holes or 0)
-            return interval_bounds(1) if one else model.config.flow.level1
-        return interval_bounds(self.steps)
-
-    def _cascade_bounds(self, model: GeoVerse) -> tuple[float, ...]:
-        flow = model.config.flow
-        if self.cascade_steps is None:
-            return flow.cascade
-        return interval_bounds(self.cascade_steps)
-
-    def _times(self) -> tuple[float, ...]:
-        """When the weights' files were written: a changed file is read again."""
-        return tuple(path.stat().st_mtime for path in self.files)
-
+    @property
     def _device(self) -> torch.device:
-        if self.device == "auto":
+        if self.settings.device == "auto":
             return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        return torch.device(self.device)
+        return torch.device(self.settings.device)
 
-    def _precision(self, device: torch.device):  # type: ignore[no-untyped-def]
-        half = self.precision == "bfloat16" or (self.precision == "auto" and device.type == "cuda")
-        return torch.autocast(device.type, dtype=torch.bfloat16) if half else nullcontext()
+    def _precision(self) -> AbstractContextManager[Any]:
+        """Computes in bfloat16 where that is asked for."""
+        kind, precision = self._device.type, self.settings.precision
+        half = precision == "bfloat16" or (precision == "auto" and kind == "cuda")
+        return torch.autocast(kind, dtype=torch.bfloat16) if half else nullcontext()
 
 
 class _Canvas:
@@ -313,7 +255,8 @@ class _Canvas:
         for index in range(len(guidance)):
             self.rays[index] = guidance.cameras.plucker(index)
         self.spent = {"holes": float((~valid).sum()), "unfilled": 0.0, "views_without_scale": 0.0}
-        self.support = ["nothing to complete"] * len(guidance)
+        nothing = ScaleAlignment(ScaleStatus.NOTHING_TO_COMPLETE)
+        self.alignment = [nothing] * len(guidance)
 
     def put(self, rows: Sequence[int], made: Completed, part: Guidance) -> None:
         """Fill the holes of some views."""
@@ -324,7 +267,7 @@ class _Canvas:
             self.confidence[row][hole] = made.confidence[position][hole]
             if made.rays is not None and np.isfinite(made.scales[position]):
                 self.rays[row][hole] = made.rays[position][hole]
-            self.support[row] = made.support[position]
+            self.alignment[row] = made.alignment[position]
             self.spent["unfilled"] += float((made.depth[position][hole] <= 0).sum())
             placed = np.isfinite(made.scales[position]) or bool((made.depth[position] > 0).any())
             self.spent["views_without_scale"] += float(not placed)
@@ -337,17 +280,5 @@ class _Canvas:
             self.confidence,
             self.rays,
             spent={**self.spent, **spent},
-            support=tuple(self.support),
+            scale_alignment=tuple(self.alignment),
         )
-
-
-@lru_cache(maxsize=8)
-def _checked(folder: str, times: tuple[float, ...]) -> GeoVerseConfig:
-    """A folder's configuration, once it is known that it can be loaded; each round asks for it."""
-    return check_headers(folder)
-
-
-@lru_cache(maxsize=2)
-def _loaded(folder: str, device: str, times: tuple[float, ...]) -> GeoVerse:
-    """The model of a folder; kept, since every round asks for it. A student and its teacher fit."""
-    return from_pretrained(folder, device=device)

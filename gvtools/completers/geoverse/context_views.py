@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras, Float64
 from gvtools.completers.base import ContextView
 
-CHOICES = ("seen", "near")
 # Pixels of a target that stand for all of it.
 SAMPLES = 300
 # Radians between two rays to a point at which what one shows counts 37 % for the other.
@@ -19,24 +18,10 @@ PARALLAX = 0.5
 SAME_DEPTH = 0.1
 
 
-def chosen_views(
-    context: Sequence[ContextView],
-    targets: Cameras,
-    depth: NDArray[np.float32],
-    count: int,
-    *,
-    by: str,
-) -> list[ContextView]:
-    """``seeing_views`` or ``nearest_views``, as ``by`` of CHOICES says."""
-    if by == "seen":
-        return seeing_views(context, targets, depth, count)
-    return nearest_views(context, targets, count)
-
-
-def seeing_views(
+def covisible_views(
     context: Sequence[ContextView], targets: Cameras, depth: NDArray[np.float32], count: int
 ) -> list[ContextView]:
-    """The context views that together see most of what the targets show, the very best first.
+    """The context views that together see most of what the targets show, the best one first.
 
     A point counts by the best of the chosen views alone: as far as that looks at it along the same
     ray and no closer surface of its own depth stands before it. So a second view of the same part
@@ -52,17 +37,17 @@ def seeing_views(
     if len(context) <= 1:
         return list(context)
     points, directions = _samples(targets, depth)
-    seen = np.stack([_seen(view, points, directions) for view in context])
-    best = np.zeros(seen.shape[1])
+    visibility = np.stack([_visibility(view, points, directions) for view in context])
+    best = np.zeros(visibility.shape[1])
     chosen: list[int] = []
     while len(chosen) < min(count, len(context)):
-        gain = np.maximum(seen - best, 0).sum(1)
+        gain = np.maximum(visibility - best, 0).sum(1)
         gain[chosen] = 0
         first = int(gain.argmax())
         if gain[first] <= 0:
             break
         chosen.append(first)
-        best = np.maximum(best, seen[first])
+        best = np.maximum(best, visibility[first])
     rest = [view for index, view in enumerate(context) if index not in chosen]
     more = nearest_views(rest, targets, count - len(chosen)) if len(chosen) < count else []
     return [context[index] for index in chosen] + more
@@ -81,7 +66,7 @@ def _samples(targets: Cameras, depth: NDArray[np.float32]) -> tuple[Float64, Flo
     return np.concatenate(points), np.concatenate(directions)
 
 
-def _seen(view: ContextView, points: Float64, directions: Float64) -> Float64:
+def _visibility(view: ContextView, points: Float64, directions: Float64) -> Float64:
     """(N,) in [0, 1]: how well the view shows the points as they are seen along directions."""
     (xy,), (z,) = view.camera.project(points)
     width, height = int(view.camera.width[0]), int(view.camera.height[0])
@@ -100,7 +85,7 @@ def _seen(view: ContextView, points: Float64, directions: Float64) -> Float64:
 def nearest_views(
     context: Sequence[ContextView], targets: Cameras, count: int
 ) -> list[ContextView]:
-    """The context views that stand and look most like the targets, the very best first.
+    """The context views that stand and look most like the targets, the best one first.
 
     Distances are in units of the scene's extent between cameras; a right angle between viewing
     directions weighs as much as that extent.

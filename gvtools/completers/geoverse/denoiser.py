@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.active_tokens import NearTokens
 from gvtools.completers.geoverse.attention import attend
 from gvtools.completers.geoverse.plucker import CameraCondition
 from gvtools.completers.geoverse.projective import HEAD_MULTIPLE, Projective
@@ -174,22 +173,10 @@ class CameraAttention(nn.Module):
         x: Tensor,
         positions: Projective,
         video: VideoKeys | None = None,
-        near: NearTokens | None = None,
-        place: int = 0,
     ) -> Tensor:
-        """(B, T, width) to the same; ``video`` holds further keys and values (MoT variant).
-
-        With ``near``, the first step keeps its keys and values there, and later ones, whose tokens
-        are the active ones alone, find them at ``place``.
-        """
+        """(B, T, width) to the same; ``video`` holds further keys and values (MoT variant)."""
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        if near is not None and near.begun:
-            q, k, v = near.attention(place, q, k, v, positions)
-            out = near.output(attend(q, k, v), positions)
-            return self.proj(out.transpose(1, 2).flatten(2))
         q, k, v = positions.query(q), positions.key(k), positions.value(v)
-        if near is not None:
-            near.keys.append((k, v))
         out = attend(q, k, v) if video is None else video.attend(q, k, v)
         return self.proj(positions.output(out).transpose(1, 2).flatten(2))
 
@@ -211,8 +198,6 @@ class DenoiserBlock(nn.Module):
         c: Tensor,
         positions: Projective,
         video: VideoKeys | None = None,
-        near: NearTokens | None = None,
-        place: int = 0,
     ) -> Tensor:
         """Tokens under their conditioning.
 
@@ -221,12 +206,10 @@ class DenoiserBlock(nn.Module):
             c: (B, V, 1 or N, width).
             positions: of the V * N tokens.
             video: see ``CameraAttention``.
-            near: likewise.
-            place: likewise.
         """
         shift1, scale1, gate1, shift2, scale2, gate2 = self.adaLN_modulation(c).chunk(6, dim=-1)
         inner = modulated(self.norm1(x), shift1, scale1).flatten(1, 2)
-        x = x + gate1 * self.attn(inner, positions, video, near, place).view_as(x)
+        x = x + gate1 * self.attn(inner, positions, video).view_as(x)
         return x + gate2 * self.mlp(modulated(self.norm2(x), shift2, scale2))
 
 
@@ -327,7 +310,6 @@ class Denoiser(nn.Module):
         residuals: Mapping[int, Tensor] | None = None,
         video: Mapping[int, VideoKeys] | None = None,
         positions: Positions | None = None,
-        near: NearTokens | None = None,
     ) -> Tensor:
         """The velocity of every view.
 
@@ -338,7 +320,6 @@ class Denoiser(nn.Module):
             residuals: what is added after an encoder block, (B, V, N, width), by its index.
             video: further keys and values of an encoder block, by its index.
             positions: of this grid and cameras, when the caller has them already.
-            near: the tokens that steps after the first one look at, without residuals and video.
 
         Returns:
             (B, V, C, h, w).
@@ -348,26 +329,16 @@ class Denoiser(nn.Module):
         positions = positions or Positions(self.config, conditions.camera, grid)
         s, x = self.embed(noisy, conditions)
         time = self.time(t, noisy.shape[1]).to(s.dtype)
-        again = near is not None and near.begun
-        if near is not None and again:
-            time = near.chosen(time.expand(*s.shape[:3], -1))
-            s, x = near.chosen(s), near.chosen(x)
         c = nn.functional.silu(time)
         for index in range(self.config.depth):
             extra = None if video is None else video.get(index)
-            s = self.blocks[index](s, c, positions.encoder, extra, near, index)
+            s = self.blocks[index](s, c, positions.encoder, extra)
             if residuals is not None and index in residuals:
                 s = s + residuals[index]
         s = self.s_projector(nn.functional.silu(time + s))
         for index in range(self.config.depth, len(self.blocks)):
-            x = self.blocks[index](x, s, positions.head, None, near, index)
-        tokens = self.final_layer(x, s)
-        if near is not None and again:
-            return near.placed(tokens, grid)
-        out = tokens.transpose(2, 3).unflatten(3, grid)
-        if near is not None:
-            near.out = out
-        return out
+            x = self.blocks[index](x, s, positions.head)
+        return self.final_layer(x, s).transpose(2, 3).unflatten(3, grid)
 
     def _split(self, stream: str, x: Tensor, context: int) -> Tensor:
         """Embeds (B, V, 2C, h, w), context views by their own layer where there is one."""

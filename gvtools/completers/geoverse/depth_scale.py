@@ -2,12 +2,12 @@
 
 Three ways, the first the paper's: one scale a pass from camera centres (Eq. "scale-aligned"), one
 robust scale a view from the projected memory, or a smooth field of log ratios to it. Each is
-refused where nothing supports it, and then the next one is asked.
+refused where nothing supports it, and then the next one is tried.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gvtools.completers.base import ScaleAlignment, ScaleStatus
 from gvtools.completers.geoverse.fill import push_pull
 from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.errors import DegenerateError, OptionError
@@ -44,13 +45,13 @@ class ScaledDepth:
     Attributes:
         depth: (T, H, W) z-depth; 0 where the model's is not finite, and for views without a
             supported scale.
-        scale: (T,) factor, the field's median; NaN where refused.
-        method: for each view, what was used: one of ``ALIGNMENTS`` or "none".
+        scale: (T,) scene units per unit of the model, the field's median; NaN where refused.
+        alignment: for each view, what its scale rests on.
     """
 
     depth: NDArray[np.float32]
     scale: NDArray[np.float64]
-    method: tuple[str, ...]
+    alignment: tuple[ScaleAlignment, ...]
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,15 @@ class PassScale:
 
     Attributes:
         scale: scene units per unit of the model; NaN where refused.
-        by: "centres", "context" (the known depth of the context views), or "refused: ...".
+        status: what it rests on: camera centres or the depth of the context, or why it is refused.
+        centres: camera centres that were compared; 0 where the predicted rays give none.
+        correlation: of predicted and given centres; NaN where they fit no similarity.
     """
 
     scale: float
-    by: str
+    status: ScaleStatus = ScaleStatus.CAMERA_CENTRES
+    centres: int = 0
+    correlation: float = float("nan")
 
 
 def pass_scale(
@@ -78,42 +83,41 @@ def pass_scale(
         world_from_cam: (V, 4, 4), scene units.
         known: (C, H, W) depth of the context views at the model's size, scene units; 0 = none.
     """
-    centres, said = centre_scale(geometry, world_from_cam)
-    made = geometry.depth[0, : len(known)].float().cpu().numpy().astype(np.float64)
-    fitted = _fitted(made, known, known > 0)
-    if fitted.support >= 20 and int((known > 0).sum()) >= MIN_SUPPORT:
-        if not fitted.ok:
-            return PassScale(np.nan, f"refused: the context's own depth is missed, {fitted.status}")
-        if np.isfinite(centres) and abs(np.log(centres / fitted.scale)) <= np.log(MAX_FACTOR):
-            return PassScale(centres, "centres")
-        return PassScale(fitted.scale, "context")
-    if np.isfinite(centres):
-        return PassScale(centres, "centres")
-    return PassScale(np.nan, f"refused: {said}")
+    centres = centre_scale(geometry, world_from_cam)
+    generated = geometry.depth[0, : len(known)].float().cpu().numpy().astype(np.float64)
+    fit = _fitted(generated, known, known > 0)
+    if fit.support < 20 or int((known > 0).sum()) < MIN_SUPPORT:
+        return centres
+    if not fit.ok:
+        return replace(centres, scale=np.nan, status=ScaleStatus.CONTRADICTED)
+    apart = abs(np.log(centres.scale / fit.scale))
+    if np.isfinite(apart) and apart <= np.log(MAX_FACTOR):
+        return centres
+    return replace(centres, scale=fit.scale, status=ScaleStatus.CONTEXT_DEPTH)
 
 
-def centre_scale(geometry: Geometry, world_from_cam: NDArray[np.float64]) -> tuple[float, str]:
-    """s* between the predicted centres of all views and the requested ones, or NaN with a reason.
+def centre_scale(geometry: Geometry, world_from_cam: NDArray[np.float64]) -> PassScale:
+    """s* between the predicted centres of all views and the requested ones, where they support it.
 
     Args:
         geometry: (1, V, ...) of a pass.
         world_from_cam: (V, 4, 4), scene units.
     """
+    refused = PassScale(float("nan"), ScaleStatus.UNSUPPORTED)
     try:
         predicted = camera_centres(geometry.ray.float(), geometry.ray_confidence.float()).cpu()
-    except DegenerateError as error:
-        return float("nan"), str(error)
+    except DegenerateError:
+        return refused
     reference = torch.from_numpy(np.ascontiguousarray(world_from_cam[None, :, :3, 3]))
-    fitted = center_similarity(predicted, reference)
-    if not bool(fitted.ok[0]):
-        return float("nan"), fitted.status[0]
-    used = int(fitted.used[0])
-    if used < MIN_CENTRES:
-        return float("nan"), f"{used} camera centres, at least {MIN_CENTRES} are needed"
-    correlation = float(fitted.correlation[0])
-    if correlation < MIN_CORRELATION:
-        return float("nan"), f"centres correlate by {correlation:.2f}, below {MIN_CORRELATION}"
-    return float(fitted.scale[0]), "aligned"
+    fit = center_similarity(predicted, reference)
+    if not bool(fit.ok[0]):
+        return refused
+    found = PassScale(
+        float(fit.scale[0]), centres=int(fit.used[0]), correlation=float(fit.correlation[0])
+    )
+    if found.centres < MIN_CENTRES or found.correlation < MIN_CORRELATION:
+        return replace(found, scale=float("nan"), status=ScaleStatus.UNSUPPORTED)
+    return found
 
 
 def scaled_depth(
@@ -121,7 +125,7 @@ def scaled_depth(
     hint: NDArray[np.float32],
     valid: NDArray[np.bool_],
     *,
-    centres: float,
+    whole: PassScale,
     alignment: str,
 ) -> ScaledDepth:
     """Depth of target views in scene units.
@@ -130,7 +134,7 @@ def scaled_depth(
         depth: (T, H, W) of the model, at the hint's resolution.
         hint: (T, H, W) the memory's depth, scene units.
         valid: (T, H, W) where it is known.
-        centres: scale from ``centre_scale``; NaN when refused.
+        whole: the scale of the pass.
         alignment: one of ``ALIGNMENTS``.
 
     Raises:
@@ -138,39 +142,64 @@ def scaled_depth(
     """
     if alignment not in ALIGNMENTS:
         raise OptionError(f"alignment {alignment!r}; expected one of {', '.join(ALIGNMENTS)}")
-    made = depth.float().cpu().numpy().astype(np.float32)
-    result = np.zeros_like(made)
-    scale = np.full(len(made), np.nan)
-    methods = []
+    unscaled = depth.float().cpu().numpy().astype(np.float32)
+    result = np.zeros_like(unscaled)
+    scale = np.full(len(unscaled), np.nan)
+    alignments = []
+    views = list(zip(unscaled, hint, valid, strict=True))
     # One scale a pass: a view that contradicts it refutes it for the others too.
-    if any(_contradicts(v * centres, h, k) for v, h, k in zip(made, hint, valid, strict=True)):
-        centres = float("nan")
-    for index, view in enumerate(made):
-        fitted = _fitted(view, hint[index], valid[index])
-        order = {
-            "centres": ("centres", "hint"),
-            "hint": ("hint", "centres"),
-            "field": ("field", "hint", "centres"),
-        }[alignment]
-        known = {"centres": centres, "hint": fitted.scale, "field": fitted.scale}
-        method = next(
-            (
-                name
-                for name in order
-                if np.isfinite(known[name])
-                and not _contradicts(view * known[name], hint[index], valid[index])
-            ),
-            "none",
-        )
-        methods.append(method)
-        if method == "none":
+    refuted = any(_contradicts(_deviation(view * whole.scale, h, v)) for view, h, v in views)
+    if refuted:
+        whole = replace(whole, scale=float("nan"), status=ScaleStatus.CONTRADICTED)
+    for index, (view, known, where) in enumerate(views):
+        scale[index], outcome = _view_scale(view, known, where, whole=whole, alignment=alignment)
+        alignments.append(outcome)
+        if not outcome.accepted:
             continue
-        scale[index] = known[method]
         result[index] = view * np.float32(scale[index])
-        if method == "field":
-            result[index] *= _field(result[index], hint[index], valid[index])
+        if outcome.status is ScaleStatus.MEMORY_FIELD:
+            result[index] *= _field(result[index], known, where)
     result[~np.isfinite(result)] = 0
-    return ScaledDepth(result, scale, tuple(methods))
+    return ScaledDepth(result, scale, tuple(alignments))
+
+
+def _view_scale(
+    depth: NDArray[np.float32],
+    hint: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    *,
+    whole: PassScale,
+    alignment: str,
+) -> tuple[float, ScaleAlignment]:
+    """Scene units per unit of the model for one view, NaN where refused, and what it rests on."""
+    fit = _fitted(depth, hint, valid)
+    candidates = {
+        "centres": (whole.scale, whole.status),
+        "hint": (fit.scale, ScaleStatus.MEMORY_DEPTH),
+        "field": (fit.scale, ScaleStatus.MEMORY_FIELD),
+    }
+    order = {
+        "centres": ("centres", "hint"),
+        "hint": ("hint", "centres"),
+        "field": ("field", "hint", "centres"),
+    }[alignment]
+    for scale, status in (candidates[name] for name in order):
+        deviation, overlap = _deviation(depth * scale, hint, valid)
+        if np.isfinite(scale) and not _contradicts((deviation, overlap)):
+            residual = float(np.expm1(deviation))
+            return scale, ScaleAlignment(
+                status, 1.0, residual, overlap, fit.inlier_share, whole.centres, whole.correlation
+            )
+    contradicted = np.isfinite(fit.residual) or whole.status is ScaleStatus.CONTRADICTED
+    return np.nan, ScaleAlignment(
+        ScaleStatus.CONTRADICTED if contradicted else ScaleStatus.UNSUPPORTED,
+        np.nan,
+        fit.residual,
+        fit.support,
+        fit.inlier_share,
+        whole.centres,
+        whole.correlation,
+    )
 
 
 def _fitted(
@@ -189,15 +218,24 @@ def _fitted(
     )
 
 
-def _contradicts(
-    depth: NDArray[np.float64], hint: NDArray[np.float32], valid: NDArray[np.bool_]
-) -> bool:
-    """Whether scaled depth is far from the memory's where both are known: no scale then helps."""
+def _deviation(
+    depth: NDArray[np.floating[Any]], hint: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> tuple[float, int]:
+    """Median |log ratio| of scaled depth to the memory's, and the pixels where both are known.
+
+    The median is NaN below ``MIN_SUPPORT`` pixels.
+    """
     with np.errstate(invalid="ignore"):
         both = valid & (hint > 0) & (depth > 0) & np.isfinite(hint) & np.isfinite(depth)
-    if both.sum() < MIN_SUPPORT:
-        return False
-    return float(np.median(np.abs(np.log(hint[both] / depth[both])))) > np.log(MAX_FACTOR)
+    overlap = int(both.sum())
+    if overlap < MIN_SUPPORT:
+        return float("nan"), overlap
+    return float(np.median(np.abs(np.log(hint[both] / depth[both])))), overlap
+
+
+def _contradicts(deviation: tuple[float, int]) -> bool:
+    """Whether scaled depth is far from the memory's where both are known: no scale then helps."""
+    return deviation[0] > np.log(MAX_FACTOR)
 
 
 def _field(

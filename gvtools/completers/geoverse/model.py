@@ -18,7 +18,6 @@ import torch
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse import stages
-from gvtools.completers.geoverse.active_tokens import NearTokens, near_tokens
 from gvtools.completers.geoverse.conditioning import (
     ViewBatch,
     depth_condition,
@@ -192,7 +191,6 @@ class GeoVerse(nn.Module):
         t: Tensor,
         *,
         least: float | None = None,
-        near: NearTokens | None = None,
     ) -> Tensor:
         """The level-1 velocity (Eq. 2).
 
@@ -201,7 +199,6 @@ class GeoVerse(nn.Module):
             state: (B, V, C, h, w).
             t: (B,) or (B, V).
             least: instead of the configuration's ``flow.least_time``.
-            near: see ``Denoiser.forward``.
         """
         residuals = None
         if self.control is not None and prepared.adapted is not None:
@@ -220,7 +217,6 @@ class GeoVerse(nn.Module):
             residuals=residuals,
             video=prepared.keys,
             positions=prepared.positions,
-            near=near,
         )
         flow = self.config.flow
         if flow.prediction == "velocity":
@@ -251,7 +247,6 @@ class GeoVerse(nn.Module):
         bounds: Sequence[float] | None = None,
         guidance: float | None = None,
         temperature: float | None = None,
-        near: NearTokens | None = None,
         clock: Clock = no_clock,
     ) -> Tensor:
         """Level-1 latents from (B, V, C, h, w) noise, one Euler step an interval.
@@ -262,8 +257,6 @@ class GeoVerse(nn.Module):
             bounds: see ``generate``, as the others.
             guidance: scale.
             temperature: of the noise.
-            near: the tokens that later steps look at; all do where there is a video prior or a
-                guidance scale.
             clock: receives the stages' names.
         """
         flow = self.config.flow
@@ -274,13 +267,10 @@ class GeoVerse(nn.Module):
         # The floor is for training. A step from t goes (t - next) / t of the way to the clean
         # latents, however small t is; with the floor, short last steps would leave noise behind.
         least = min(flow.least_time, tau[-2])
-        whole = scale != 1 or prepared.adapted is not None or prepared.keys is not None
-        if whole or len(tau) < 3:
-            near = None
 
         def velocity(state: Tensor, t: Tensor) -> Tensor:
             with clock(stages.LEVEL1):
-                return self.velocity1(prepared, state, t, least=least, near=near)
+                return self.velocity1(prepared, state, t, least=least)
 
         def unconditional(state: Tensor, t: Tensor) -> Tensor:
             with clock(stages.LEVEL1):
@@ -375,7 +365,6 @@ class GeoVerse(nn.Module):
         video: VideoFeatures | None = None,
         prior: bool = True,
         targets_alone: bool = False,
-        near_holes: bool = False,
         clock: Clock = no_clock,
     ) -> Generated:
         """One pass: prepare, sample level 1 and level 0, decode.
@@ -393,8 +382,6 @@ class GeoVerse(nn.Module):
             video: features computed before, for the same views.
             prior: see ``prepare``.
             targets_alone: without all views' geometry; the same pictures and depth, sooner.
-            near_holes: steps of level 1 after the first look at tokens near holes alone, see
-                ``near_tokens``; where there is a video prior or a guidance scale, all look at all.
             clock: receives the stages' names.
         """
         rows = names or [list(range(batch.images.shape[1]))] * len(batch.images)
@@ -410,15 +397,12 @@ class GeoVerse(nn.Module):
 
         level1 = prepared.hints.unmasked
         if bounds is None or len(bounds):
-            grid = (like.shape[-2], like.shape[-1])
-            near = near_tokens(batch.valid, batch.context, grid) if near_holes else None
             level1 = self.sample1(
                 prepared,
                 noise("level1"),
                 bounds=bounds,
                 guidance=guidance,
                 temperature=temperature,
-                near=near,
                 clock=clock,
             )
         level0 = self.sample0(prepared, level1, noise("level0"), bounds=cascade_bounds, clock=clock)

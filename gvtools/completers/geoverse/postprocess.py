@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gvtools.cameras import Cameras
+from gvtools.completers.base import ScaleAlignment, ScaleStatus
 from gvtools.completers.geoverse.color_field import aligned_color
 from gvtools.completers.geoverse.correction import corrected_color, corrected_depth
 from gvtools.completers.geoverse.depth_scale import MAX_FACTOR, pass_scale, scaled_depth
@@ -43,7 +44,7 @@ class Completed:
         rays: (T, H, W, 6) predicted Plücker rays, world frame; None without a scale, and where
             they were not asked for.
         scales: (T,) scene units per unit of the model; NaN where refused.
-        support: what each view's depth stands on.
+        alignment: for each view, what its scale rests on.
     """
 
     rgb: NDArray[np.float32]
@@ -51,10 +52,10 @@ class Completed:
     confidence: NDArray[np.float32]
     rays: NDArray[np.float32] | None
     scales: NDArray[np.float64]
-    support: tuple[str, ...]
+    alignment: tuple[ScaleAlignment, ...]
 
 
-def brought_back(
+def to_scene_scale(
     made: Generated,
     part: Guidance,
     cameras: Cameras,
@@ -84,22 +85,15 @@ def brought_back(
     whole = pass_scale(geometry, world_from_cam, known)
     # A pixel without a colour has no depth either: nothing of it enters the memory.
     depth = torch.where(rgb.isfinite().all(1), depth, torch.nan)
-    scaled = scaled_depth(depth, part.depth, part.valid, centres=whole.scale, alignment=alignment)
+    scaled = scaled_depth(depth, part.depth, part.valid, whole=whole, alignment=alignment)
     confidence = _certainty(made.decoded.depth_confidence[0], full)
     confidence[~((scaled.depth > 0) & np.isfinite(confidence))] = 0
-    support = []
-    for method in scaled.method:
-        if method == "none":
-            reason = whole.by if whole.by.startswith("refused") else "refused: it contradicts"
-            support.append(f"{reason}; the memory gives no scale either")
-        else:
-            support.append(whole.by if method == "centres" else method)
     found = scaled.scale[np.isfinite(scaled.scale)]
     rays = None
     if len(found):
         rays = _plucker(geometry.ray[0, context:], world_from_cam[0], float(np.median(found)), full)
     picture = rgb.nan_to_num().permute(0, 2, 3, 1).numpy()
-    return Completed(picture, scaled.depth, confidence, rays, scaled.scale, tuple(support))
+    return Completed(picture, scaled.depth, confidence, rays, scaled.scale, scaled.alignment)
 
 
 def corrected(
@@ -138,7 +132,7 @@ def corrected(
             nothing,
             None,
             scales,
-            ("none",) * len(part),
+            tuple(ScaleAlignment(ScaleStatus.UNSUPPORTED, np.nan) for _ in scales),
         )
     if fill.confidence is None:
         certain = _certainty(made.decoded.depth_confidence[0], full)
@@ -152,9 +146,11 @@ def corrected(
         rgb=np.where(known[..., None], rgb.numpy(), back.rgb),
         depth=np.where(known, depth.numpy(), back.depth),
         confidence=np.where(known, certain, back.confidence),
-        support=tuple(
-            "the memory's surfaces" if view.any() else said
-            for view, said in zip(known, back.support, strict=True)
+        alignment=tuple(
+            replace(alignment, status=ScaleStatus.MEMORY_SURFACES, scale=1.0)
+            if view.any()
+            else alignment
+            for view, alignment in zip(known, back.alignment, strict=True)
         ),
     )
 

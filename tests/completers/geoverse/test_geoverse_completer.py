@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from gvtools.cameras import Cameras
-from gvtools.completers import Completion, ContextView, create
+from gvtools.completers import Completion, ContextView, ScaleStatus, create
 from gvtools.completers.geoverse import completer as completer_module
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.completers.geoverse.conditioning import ViewBatch
@@ -44,6 +44,10 @@ def complete(
 ) -> Completion:
     options = {"alignment": "hint", "device": "cpu", **options}
     return create("geoverse", weights=str(weights), **options).complete(context, known, seed=seed)
+
+
+def statuses(result: Completion) -> list[ScaleStatus]:
+    return [alignment.status for alignment in result.scale_alignment or () if alignment]
 
 
 def watched(monkeypatch: pytest.MonkeyPatch) -> list[tuple[ViewBatch, Any, Generated]]:
@@ -242,14 +246,13 @@ def test_without_any_support_for_a_scale_there_is_no_depth(weights, monkeypatch)
     """The requested cameras' rays stand where the predicted ones have no unit."""
     monkeypatch.setattr(
         "gvtools.completers.geoverse.postprocess.pass_scale",
-        lambda *a: PassScale(float("nan"), "refused: nothing to go by"),
+        lambda *a: PassScale(float("nan"), ScaleStatus.UNSUPPORTED),
     )
     known = micro.guidance(2, share=-1.0)
     result = complete(weights, micro.context_views(2), known)
     assert not result.depth.any() and not result.confidence.any() and result.rgb.any()
     assert result.spent["views_without_scale"] == 2
-    assert result.support is not None
-    assert all((said or "").startswith("refused: nothing to go by") for said in result.support)
+    assert statuses(result) == [ScaleStatus.UNSUPPORTED] * 2
     assert result.spent["unfilled"] == result.spent["holes"] == known.valid.size
     assert result.rays is not None
     np.testing.assert_array_equal(result.rays[1], np.float32(known.cameras.plucker(1)))
@@ -282,7 +285,7 @@ def test_predicted_rays_come_back_to_the_world(weights, monkeypatch, world):
 
     monkeypatch.setattr(GeoVerse, "generate", perfect)
     result = complete(weights, context, known, alignment="centres")
-    assert result.support == ("centres", "centres")
+    assert statuses(result) == [ScaleStatus.CAMERA_CENTRES] * 2
     assert result.rays is not None
     for view in range(2):
         expected = known.cameras.plucker(view)[4:-4, 4:-4]
@@ -303,7 +306,7 @@ def test_generated_depth_is_never_averaged_between_two_surfaces(weights, monkeyp
 
     monkeypatch.setattr(GeoVerse, "generate", stepped)
     monkeypatch.setattr(
-        "gvtools.completers.geoverse.postprocess.pass_scale", lambda *a: PassScale(2.0, "centres")
+        "gvtools.completers.geoverse.postprocess.pass_scale", lambda *a: PassScale(2.0)
     )
     known = micro.guidance(1, size=size, share=-1.0)
     result = complete(weights, micro.context_views(1), known, alignment="centres")
@@ -323,7 +326,7 @@ def test_steps_and_guidance_are_the_options(weights, monkeypatch):
     for options, times in (
         ({}, [1, 2 / 3, 1 / 3]),
         ({"steps": 2}, [1, 0.5]),
-        ({"steps": 2, "guidance": 1.5}, [1, 1, 0.5, 0.5]),
+        ({"steps": 2, "cfg_scale": 1.5}, [1, 1, 0.5, 0.5]),
     ):
         calls.clear()
         result = complete(weights, context, known, **options)
@@ -403,11 +406,11 @@ def test_a_folder_that_is_no_model_is_refused_in_one_line_at_creation(what, tmp_
         ({"steps": -1}, "completer.steps -1; expected at least 0"),
         ({"views": 1}, "completer.views 1; expected at least 2"),
         ({"context_views": 0}, "expected at least 1"),
-        ({"guidance": -1.0}, "expected at least 0"),
-        ({"precision": "float64"}, "expected one of auto, float32, bfloat16"),
-        ({"device": "tpu"}, "expected one of auto, cpu, cuda"),
-        ({"alignment": "best"}, "expected one of centres, hint, field"),
-        ({"step": 3}, "did you mean 'steps'"),
+        ({"cfg_scale": -1.0}, "expected at least 0"),
+        ({"precision": "float64"}, "expected 'auto', 'float32' or 'bfloat16'"),
+        ({"device": "tpu"}, "expected 'auto', 'cpu' or 'cuda'"),
+        ({"alignment": "best"}, "expected 'centres', 'hint' or 'field'"),
+        ({"step": 3}, "did you mean 'completer.steps'"),
     ],
 )
 def test_options_out_of_range_are_refused(weights, options, said):

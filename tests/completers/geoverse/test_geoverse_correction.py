@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gvtools.completers import Completion, create
+from gvtools.completers import Completion, ScaleStatus, create
 from gvtools.completers.geoverse.color_field import aligned_color
 from gvtools.completers.geoverse.correction import (
     CERTAIN,
@@ -149,7 +149,7 @@ def test_without_denoising_the_completion_is_the_fill(weights, size):
     share = made.confidence[holes] / fill.confidence[holes]
     assert np.isin(share, (DOUBTED, 1)).all()
     assert made.spent["steps"] == 0
-    assert set(made.support or ()) == {"the memory's surfaces"}
+    assert {a and a.status for a in made.scale_alignment or ()} == {ScaleStatus.MEMORY_SURFACES}
 
 
 def test_denoising_changes_holes_alone(weights):
@@ -174,8 +174,9 @@ def test_a_view_that_memory_tells_nothing_of_leaves_the_others_as_they_are(weigh
     for values in (known.valid, known.rgb, known.depth):
         values[1] = 0
     one = completer.complete(micro.context_views(2), known, seed=1)
-    assert one.support is not None and one.support[0] == "the memory's surfaces"
-    assert one.support[1] != one.support[0]
+    known_view, empty_view = one.scale_alignment or ()
+    assert known_view and known_view.status is ScaleStatus.MEMORY_SURFACES
+    assert empty_view and empty_view.status is not ScaleStatus.MEMORY_SURFACES
     assert (one.confidence[0] > 0).all() and (one.depth[0] > 0).all()
     # The empty view is seen by the model too, so that only the form is the same.
     hole = ~known.valid[0]

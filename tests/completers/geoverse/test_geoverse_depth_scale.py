@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from gvtools.completers.base import ScaleStatus
 from gvtools.completers.geoverse.depth_scale import (
     ALIGNMENTS,
     MAX_FIELD,
     PassScale,
+    ScaledDepth,
     centre_scale,
     pass_scale,
     scaled_depth,
@@ -50,23 +52,25 @@ def model_centres(world_from_cam: np.ndarray, scale: float) -> np.ndarray:
 @pytest.mark.parametrize("scale", [1e-3, 0.4, 2500.0])
 def test_the_scale_between_centres_is_found(views, scale):
     known = poses(views)
-    found, said = centre_scale(geometry(model_centres(known, scale)), known)
-    assert said == "aligned" and found == pytest.approx(scale, rel=1e-5)
+    found = centre_scale(geometry(model_centres(known, scale)), known)
+    assert found.status is ScaleStatus.CAMERA_CENTRES and found.centres == views
+    assert found.scale == pytest.approx(scale, rel=1e-5)
+    assert found.correlation == pytest.approx(1)
     known[:, :3, 3] += [1e6, -2e6, 5e5]
-    far, _ = centre_scale(geometry(model_centres(poses(views), scale)), known)
-    assert far == pytest.approx(scale, rel=1e-5)
+    far = centre_scale(geometry(model_centres(poses(views), scale)), known)
+    assert far.scale == pytest.approx(scale, rel=1e-5)
 
 
 def test_a_centre_is_the_mean_of_its_rays_by_their_confidence():
     known = poses(4)
     made = geometry(model_centres(known, 2.0), noise=0.01)
-    found, _ = centre_scale(made, known)
-    assert found == pytest.approx(2.0, rel=0.02)
+    found = centre_scale(made, known)
+    assert found.scale == pytest.approx(2.0, rel=0.02)
     worse = made.ray.clone()
     worse[:, 1, 0, 0, 3:] = 100.0
     made.ray_confidence[:, 1, 0, 0] = 0.0
-    again, _ = centre_scale(Geometry(made.depth, made.depth, worse, made.ray_confidence), known)
-    assert again == pytest.approx(found, rel=0.02)
+    again = centre_scale(Geometry(made.depth, made.depth, worse, made.ray_confidence), known)
+    assert again.scale == pytest.approx(found.scale, rel=0.02)
 
 
 def refused() -> dict[str, tuple[Geometry, np.ndarray]]:
@@ -97,9 +101,21 @@ def refused() -> dict[str, tuple[Geometry, np.ndarray]]:
 
 
 @pytest.mark.parametrize("what", list(refused()))
-def test_centres_that_support_no_scale_are_refused_with_a_reason(what):
-    found, said = centre_scale(*refused()[what])
-    assert math.isnan(found) and said != "aligned" and "\n" not in said
+def test_centres_that_support_no_scale_are_refused(what):
+    found = centre_scale(*refused()[what])
+    assert math.isnan(found.scale) and found.status is ScaleStatus.UNSUPPORTED
+    assert found.centres == {"three views": 3}.get(what, found.centres)
+
+
+METHODS = {
+    "centres": ScaleStatus.CAMERA_CENTRES,
+    "hint": ScaleStatus.MEMORY_DEPTH,
+    "field": ScaleStatus.MEMORY_FIELD,
+}
+
+
+def statuses(found: ScaledDepth) -> list[ScaleStatus]:
+    return [alignment.status for alignment in found.alignment]
 
 
 def scene(
@@ -117,10 +133,13 @@ def scene(
 def test_all_alignments_agree_where_everything_fits(alignment, scale):
     made, truth, valid = scene(scale=scale)
     hint = np.where(valid, truth, 0)
-    found = scaled_depth(made, hint, valid, centres=scale, alignment=alignment)
+    found = scaled_depth(made, hint, valid, whole=PassScale(scale), alignment=alignment)
     np.testing.assert_allclose(found.depth, truth, rtol=1e-4)
     np.testing.assert_allclose(found.scale, scale, rtol=1e-4)
-    assert found.method == (alignment,) * 2
+    assert statuses(found) == [METHODS[alignment]] * 2
+    for outcome, where in zip(found.alignment, valid, strict=True):
+        assert outcome.overlap_px == where.sum() and outcome.scale == 1
+        assert outcome.residual < 1e-4 and outcome.inlier_share == pytest.approx(1)
     assert found.depth.dtype == np.float32
 
 
@@ -129,7 +148,8 @@ def test_each_alignment_uses_its_own_evidence():
     truth[1] *= 1.2
     hint = np.where(valid, truth, 0)
     found = {
-        name: scaled_depth(made, hint, valid, centres=3.3, alignment=name) for name in ALIGNMENTS
+        name: scaled_depth(made, hint, valid, whole=PassScale(3.3), alignment=name)
+        for name in ALIGNMENTS
     }
     np.testing.assert_allclose(found["centres"].scale, [3.3, 3.3])
     np.testing.assert_allclose(found["hint"].scale, [3, 3.6], rtol=1e-4)
@@ -144,7 +164,7 @@ def test_a_field_follows_the_memory_and_stays_within_its_limit():
     bent[0, 3, 3] *= 10  # another surface, no error of scale
     valid[0, 3, 3] = True
     hint = np.where(valid, bent, 0)
-    found = scaled_depth(made, hint, valid, centres=math.nan, alignment="field")
+    found = scaled_depth(made, hint, valid, whole=PassScale(math.nan), alignment="field")
     rest = valid.copy()
     rest[0, 3, 3] = False
     np.testing.assert_allclose(found.depth[rest], hint[rest], rtol=1e-4)
@@ -154,7 +174,7 @@ def test_a_field_follows_the_memory_and_stays_within_its_limit():
     calm = np.ones(SIZE, bool)
     calm[:12, :12] = False
     assert np.abs(found.depth / bent - 1)[0][calm].max() < 0.1
-    plain = scaled_depth(made, hint, valid, centres=math.nan, alignment="hint")
+    plain = scaled_depth(made, hint, valid, whole=PassScale(math.nan), alignment="hint")
     assert np.abs(plain.depth / bent - 1)[0][calm].max() > 0.12
 
 
@@ -171,8 +191,9 @@ def test_without_support_the_next_one_is_asked_and_at_last_none():
         ("hint", nan, ("hint", "none", "none")),
         ("field", nan, ("field", "none", "none")),
     ):
-        found = scaled_depth(made, hint, valid, centres=centres, alignment=alignment)
-        assert found.method == methods
+        found = scaled_depth(made, hint, valid, whole=PassScale(centres), alignment=alignment)
+        wanted = [METHODS.get(method, ScaleStatus.UNSUPPORTED) for method in methods]
+        assert statuses(found) == wanted
         for view, method in enumerate(methods):
             expected = {"none": nan, "centres": centres}.get(method, 3.0)
             assert found.scale[view] == pytest.approx(expected, rel=1e-4, nan_ok=True)
@@ -182,8 +203,11 @@ def test_without_support_the_next_one_is_asked_and_at_last_none():
 def test_depth_that_does_not_follow_the_memory_is_no_support():
     made, truth, valid = scene(views=1)
     truth = np.random.default_rng(3).uniform(0.1, 10, truth.shape).astype(np.float32)
-    found = scaled_depth(made, truth, valid, centres=math.nan, alignment="hint")
-    assert found.method == ("none",) and not found.depth.any()
+    found = scaled_depth(made, truth, valid, whole=PassScale(math.nan), alignment="hint")
+    (outcome,) = found.alignment
+    assert outcome.status is ScaleStatus.CONTRADICTED and not found.depth.any()
+    assert outcome.residual > 0.3 and outcome.overlap_px == valid.sum()
+    assert math.isnan(outcome.scale) and not outcome.accepted
 
 
 def test_a_scale_that_contradicts_the_memory_is_not_taken():
@@ -193,20 +217,20 @@ def test_a_scale_that_contradicts_the_memory_is_not_taken():
     # not given a scale that its sibling refutes.
     blind = valid.copy()
     blind[1] = False
-    found = scaled_depth(made, hint, blind, centres=90.0, alignment="centres")
-    assert found.method == ("hint", "none")
-    found = scaled_depth(made, hint, valid, centres=90.0, alignment="centres")
-    assert found.method == ("hint", "hint")
+    found = scaled_depth(made, hint, blind, whole=PassScale(90.0), alignment="centres")
+    assert statuses(found) == [ScaleStatus.MEMORY_DEPTH, ScaleStatus.CONTRADICTED]
+    found = scaled_depth(made, hint, valid, whole=PassScale(90.0), alignment="centres")
+    assert statuses(found) == [ScaleStatus.MEMORY_DEPTH] * 2
     np.testing.assert_allclose(found.scale, [3, 3], rtol=1e-4)
     # Depth without any relation to the memory is left out, whatever the centres say.
     noise = np.random.default_rng(3).uniform(0.01, 10, truth.shape).astype(np.float32)
     for centres in (3.0, 90.0):
-        found = scaled_depth(made, noise, valid, centres=centres, alignment="field")
-        assert found.method == ("none", "none") and not found.depth.any()
+        found = scaled_depth(made, noise, valid, whole=PassScale(centres), alignment="field")
+        assert statuses(found) == [ScaleStatus.CONTRADICTED] * 2 and not found.depth.any()
     # Where the memory knows too little to tell, the centres stand.
     valid[:] = False
-    found = scaled_depth(made, hint, valid, centres=90.0, alignment="centres")
-    assert found.method == ("centres", "centres")
+    found = scaled_depth(made, hint, valid, whole=PassScale(90.0), alignment="centres")
+    assert statuses(found) == [ScaleStatus.CAMERA_CENTRES] * 2
 
 
 @pytest.mark.parametrize("alignment", ALIGNMENTS)
@@ -218,7 +242,7 @@ def test_damaged_depth_does_no_harm_around_it(alignment):
     damaged = made.clone()
     damaged[0, :4, :4] = math.nan
     damaged[0, 5, 5] = math.inf
-    found = scaled_depth(damaged, hint, valid, centres=3.0, alignment=alignment)
+    found = scaled_depth(damaged, hint, valid, whole=PassScale(3.0), alignment=alignment)
     assert not found.depth[0, :4, :4].any() and found.depth[0, 5, 5] == 0
     intact = np.isfinite(damaged[0].numpy())
     intact[8:11, 8:11] = False
@@ -229,7 +253,7 @@ def test_damaged_depth_does_no_harm_around_it(alignment):
 def test_another_alignment_is_refused():
     made, truth, valid = scene(views=1)
     with pytest.raises(OptionError, match="expected one of centres, hint, field"):
-        scaled_depth(made, truth, valid, centres=1.0, alignment="best")
+        scaled_depth(made, truth, valid, whole=PassScale(1.0), alignment="best")
 
 
 @pytest.mark.parametrize("size", [(60, 80), (31, 47), (24, 33), (24, 90)])
@@ -278,16 +302,19 @@ def test_one_scale_a_pass_stands_on_centres_and_on_the_context():
         return pass_scale(Geometry(depth, depth + 1, ray, sure), cameras, context)
 
     agreed = of(fitting / 2.0, truth)
-    assert agreed.by == "centres" and agreed.scale == pytest.approx(2.0, rel=1e-4)
+    assert agreed.status is ScaleStatus.CAMERA_CENTRES
+    assert agreed.scale == pytest.approx(2.0, rel=1e-4)
     # The context's own depth is better evidence than the centres, and stands in for them.
     for cameras in (known, known[:2]):
         other = of(fitting / 50.0, truth, cameras)
-        assert other.by == "context" and other.scale == pytest.approx(50.0, rel=1e-4)
+        assert other.status is ScaleStatus.CONTEXT_DEPTH
+        assert other.scale == pytest.approx(50.0, rel=1e-4)
     # A model that misses the depth of its own context is not believed.
     noise = torch.from_numpy(np.random.default_rng(2).uniform(0.01, 9, fitting.shape)).float()
     missed = of(noise, truth)
-    assert missed.by.startswith("refused: the context") and math.isnan(missed.scale)
+    assert missed.status is ScaleStatus.CONTRADICTED and math.isnan(missed.scale)
     # Without known depth the centres decide, if there are enough of them.
     nothing = np.zeros_like(truth)
-    assert of(fitting, nothing).by == "centres"
-    assert "at least 4" in of(fitting, nothing, known[:3]).by
+    assert of(fitting, nothing).status is ScaleStatus.CAMERA_CENTRES
+    few = of(fitting, nothing, known[:3])
+    assert (few.status, few.centres) == (ScaleStatus.UNSUPPORTED, 3)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
-from gvtools.completers.base import Completion
+from gvtools.completers.base import Completer, Completion, ScaleAlignment, ScaleStatus
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, together
 from gvtools.memory.back_projection import back_project
@@ -26,14 +24,16 @@ def camera(name: str, size: tuple[int, int], x: float = 0.0) -> Cameras:
     return Cameras(K[None], pose[None], np.array([width]), np.array([height]), names=(name,))
 
 
-@dataclass
-class Recorder:
+class Recorder(Completer):
     """Fills holes with one grey and depth 2, or leaves them."""
 
-    joint: bool
-    fill: bool = True
-    name: str = "recorder"
-    batches: list[tuple[str, ...]] = field(default_factory=list)
+    name = "recorder"
+
+    def __init__(self, *, batches_targets: bool, fill: bool = True, factor: float | None = None):
+        super().__init__()
+        self.batches_targets, self.fill, self.factor = batches_targets, fill, factor
+        self.status = ScaleStatus.CAMERA_CENTRES
+        self.batches: list[tuple[str, ...]] = []
 
     def complete(self, context, guidance: Guidance, *, seed: int = 0) -> Completion:
         self.batches.append(guidance.cameras.names)
@@ -41,7 +41,11 @@ class Recorder:
         rgb = np.where(hole[..., None], np.float32(0.5), guidance.rgb)
         depth = np.where(hole, np.float32(2), guidance.depth)
         confidence = np.where(hole, np.float32(0.5), np.minimum(guidance.confidence, 1))
-        return Completion(rgb, depth, confidence.astype(np.float32), support=("own",) * len(rgb))
+        if self.factor is not None:
+            depth = (depth * self.factor).astype(np.float32)
+            return Completion(rgb, depth, confidence.astype(np.float32))
+        alignment = (ScaleAlignment(self.status),) * len(rgb)
+        return Completion(rgb, depth, confidence.astype(np.float32), scale_alignment=alignment)
 
 
 @pytest.fixture
@@ -81,7 +85,7 @@ def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras])
 def test_targets_of_different_sizes_are_completed_together_by_size(memory):
     sizes = [(24, 32), (32, 24), (24, 32), (32, 24)]
     targets = [camera(f"t{i}", size, x=0.3 * i) for i, size in enumerate(sizes)]
-    completer = Recorder(joint=True)
+    completer = Recorder(batches_targets=True)
     results, total, calls = complete(memory, completer, targets)
     assert completer.batches == [("t0", "t2"), ("t1", "t3")] and not calls
     assert [r.guidance.cameras.names[0] for r in results] == ["t0", "t1", "t2", "t3"]
@@ -93,14 +97,37 @@ def test_targets_of_different_sizes_are_completed_together_by_size(memory):
 
 def test_a_later_target_sees_what_an_earlier_one_added(memory):
     targets = [camera("t0", (24, 32), x=0.4), camera("t1", (24, 32), x=0.4)]
-    results, _, calls = complete(memory, Recorder(joint=False), targets)
+    results, _, calls = complete(memory, Recorder(batches_targets=False), targets)
     assert calls == ["t1"]
     assert results[1].guidance.generated.any() and not results[0].guidance.generated.any()
 
 
+@pytest.mark.parametrize("factor", [0.5, 3.0])
+def test_depth_of_another_unit_is_aligned_with_the_memory(memory, factor):
+    completer = Recorder(batches_targets=True, factor=factor)
+    ((result,), total, _) = complete(memory, completer, [camera("t0", (24, 32), x=0.3)])
+    scale = result.report["scale"]
+    assert scale["status"] == ScaleStatus.MEMORY_DEPTH and scale["accepted"]
+    assert scale["scale"] == pytest.approx(1 / factor, rel=1e-5)
+    assert scale["overlap_px"] == result.guidance.valid.sum()
+    assert total.added > 0
+    shown = memory.project(camera("t0", (24, 32), x=0.3))
+    assert shown.generated.any()
+    np.testing.assert_allclose(shown.depth[shown.generated], 2, rtol=1e-3)
+
+
+def test_a_scale_that_the_completer_refuses_gives_no_points(memory):
+    completer = Recorder(batches_targets=True)
+    completer.status = ScaleStatus.CONTRADICTED
+    ((result,), total, _) = complete(memory, completer, [camera("t0", (24, 32), x=0.3)])
+    assert not total.added and not result.fused.any()
+    assert not result.report["scale"]["accepted"]
+    assert result.report["scale"]["description"].startswith("refused: known depth contradicts")
+
+
 def test_nothing_is_projected_again_while_nothing_is_fused(memory):
     targets = [camera(f"t{i}", (24, 32), x=0.4) for i in range(3)]
-    _, total, calls = complete(memory, Recorder(joint=False, fill=False), targets)
+    _, total, calls = complete(memory, Recorder(batches_targets=False, fill=False), targets)
     assert not total.points and not calls
 
 

@@ -82,13 +82,13 @@ def test_a_profile_is_tried_as_reconstruct_runs_it(scan, swept, tmp_path):
 @pytest.mark.parametrize("own", [[], ["max_side=200"], ["voxel=0.03", "profile=accurate"]])
 def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
     file = tmp_path / "given.json"
-    file.write_text('{"profile": "accurate", "savings": {"minor_holes": 0.07}}')
+    file.write_text('{"profile": "accurate", "effort": {"inpaint_below": 0.07}}')
     arguments = ["tradeoff", "scan", "--out", "out", "--config", str(file)]
     args = build_parser().parse_args(arguments + [word for text in own for word in ("--set", text)])
     start = asked_for(args)
     assert start.profile == "accurate" and start.memory.same_direction == 0
     for name in RunSettings.profiles:
-        wanted = with_texts(with_profile(RunSettings(), name), ["savings.minor_holes=0.07"])
+        wanted = with_texts(with_profile(RunSettings(), name), ["effort.inpaint_below=0.07"])
         wanted = with_texts(wanted, [text for text in own if "profile" not in text])
         wanted = wanted.replaced(context=start.context, targets=start.targets)
         assert asked_for(args, name) == wanted, name

@@ -1,0 +1,48 @@
+"""The options of the generative core as a completer."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from gvtools.completers.settings import CompleterSettings
+
+
+class GeoVerseSettings(CompleterSettings):
+    """Options of ``geoverse``; none takes the model's own value."""
+
+    weights: str | None = None
+    """Folder of a GeoVerse model, see ``gvtools weights list``; none takes the small model that
+    ships."""
+    steps: int | None = Field(None, ge=0)
+    """Level-1 steps, equally spaced in time; 0 decodes the features of the filled projections."""
+    cascade_steps: int | None = Field(None, ge=1)
+    """Level-0 steps, equally spaced in time."""
+    cfg_scale: float | None = Field(None, ge=0)
+    """Scale of classifier-free guidance; 1 does without."""
+    temperature: float | None = Field(None, ge=0)
+    """Standard deviation of the noise that level 1 starts from."""
+    context_views: int | None = Field(None, ge=1)
+    """Most photographs in a pass."""
+    context_selection: Literal["covisible", "nearest"] = "covisible"
+    """The photographs of a pass: those that show most of what the targets show, or those that
+    stand and look most like them."""
+    views: int | None = Field(None, ge=2)
+    """Most views in a pass, photographs and targets."""
+    alignment: Literal["centres", "hint", "field"] | None = None
+    """How decoded depth gets the memory's scale: by camera centres, by one factor to the memory's
+    depth, or by a smooth field of factors."""
+    color_alignment: Literal["none", "field"] | None = None
+    """Whether decoded colours follow the memory's by a smooth field."""
+    composition: Literal["decoded", "correction"] | None = None
+    """``decoded`` shows the decoding itself where the model corrects filled projections."""
+    shared_fill: bool = True
+    """Whether targets of a call share what their holes are filled with."""
+    image_size: int | None = Field(None, ge=1)
+    """Longer side of the pictures in a pass, pixels, rounded to whole patches; the model's own is
+    also the most."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """``auto`` is bfloat16 on a GPU and float32 on a CPU."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """``auto`` takes a GPU where there is one."""
