@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from html import escape
 
 CELL_WIDTH, CELL_HEIGHT = 190, 100
-BOX_WIDTH, BOX_HEIGHT = 150, 56
+BOX_WIDTH, BOX_HEIGHT = 158, 56
 FILLS = {"data": "#e3edf7", "step": "#fdf0d5", "result": "#e2f0e2"}
 
 
@@ -16,7 +16,7 @@ class Diagram:
 
     Attributes:
         boxes: key -> (column, row, kind, text); a bar in the text starts a new line.
-        arrows: (from, to, label) by keys; boxes of one row or one column, or diagonal ones.
+        arrows: (from, to, label) by keys; they leave at the side that faces the other box.
     """
 
     boxes: dict[str, tuple[float, float, str, str]]
@@ -41,7 +41,7 @@ class Diagram:
 
     def _arrow(self, start: str, end: str, label: str) -> str:
         (x0, y0), (x1, y1) = (_center(*self.boxes[key][:2]) for key in (start, end))
-        if y0 == y1:
+        if abs(x1 - x0) / CELL_WIDTH >= abs(y1 - y0) / CELL_HEIGHT:
             side = 1 if x1 > x0 else -1
             x0, x1 = x0 + side * BOX_WIDTH / 2, x1 - side * BOX_WIDTH / 2
         else:
@@ -171,18 +171,19 @@ DIAGRAMS = {
     ),
     "architecture": Diagram(
         {
-            "pipelines": (0, 0, "step", "pipelines|composes, talks"),
-            "viz": (1, 0, "step", "viz|draws"),
-            "runs": (1, 1, "data", "gvtools.runs|the run folder"),
-            "completers": (2, 1, "data", "gvtools.completers"),
-            "evaluation": (3, 1, "data", "gvtools.evaluation"),
-            "memory": (2, 2, "data", "gvtools.memory"),
-            "depth": (3, 2, "data", "gvtools.depth"),
-            "scenes": (1, 2, "data", "gvtools.scenes"),
-            "cameras": (2, 3, "data", "cameras, settings,|errors"),
+            "pipelines": (0.5, 0, "step", "pipelines|composes, talks"),
+            "viz": (0, 1, "step", "viz|draws"),
+            "runs": (0, 2, "data", "runs|the run folder"),
+            "training": (1, 2, "data", "training"),
+            "middle": (0.5, 3, "data", "depth, completers,|evaluation"),
+            "memory": (0.5, 4, "data", "memory"),
+            "store": (0, 5, "data", "the memory's store"),
+            "scenes": (1, 5, "data", "scenes"),
+            "base": (0.5, 6, "data", "cameras, settings,|errors"),
         },
-        [("pipelines", "viz", ""), ("viz", "runs", ""), ("runs", "scenes", ""),
-         ("completers", "memory", ""), ("evaluation", "depth", ""), ("memory", "cameras", ""),
-         ("depth", "cameras", ""), ("scenes", "cameras", "")],
+        [("pipelines", "viz", ""), ("pipelines", "training", ""), ("viz", "runs", ""),
+         ("runs", "middle", ""), ("training", "middle", ""), ("middle", "memory", ""),
+         ("memory", "store", ""), ("memory", "scenes", ""), ("store", "base", ""),
+         ("scenes", "base", "")],
     ),
 }  # fmt: skip

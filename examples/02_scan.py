@@ -16,6 +16,8 @@ seen, hidden = scene.views[::2], scene.views[1::2]
 memory = gvtools.SpatialMemory(voxel=0.02)
 for view in seen:
     frame = view.load()
+    if frame.depth is None:
+        continue  # gvtools.reconstruct computes depth where there is none
     report = memory.observe(frame.rgb, frame.depth, view.camera, round=0, mask=frame.mask)
     print(f"{view.name}: {report.added:,} added, {report.merged:,} merged")
 print(memory)

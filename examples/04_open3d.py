@@ -14,7 +14,8 @@ import gvtools
 memory = gvtools.SpatialMemory(voxel=0.02)
 for view in gvtools.open_project(sample_project()):
     frame = view.load()
-    memory.observe(frame.rgb, frame.depth, view.camera, round=0, mask=frame.mask)
+    if frame.depth is not None:
+        memory.observe(frame.rgb, frame.depth, view.camera, round=0, mask=frame.mask)
 
 cloud = memory.cloud  # open3d.t.geometry.PointCloud; no copy
 print(cloud)

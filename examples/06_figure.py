@@ -7,9 +7,6 @@ from __future__ import annotations
 
 import shutil
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from sample import output_folder, sample_project
 

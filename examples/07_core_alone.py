@@ -17,6 +17,8 @@ from gvtools.completers.geoverse.completer import GeoVerseCompleter
 scene = open_project(sample_project())
 first, second = scene.views[0], scene.views[1]
 frame = first.load()
+if frame.depth is None:
+    raise SystemExit(f"{first.name} has no depth; expected a project with depth")
 color = (frame.rgb / 255).astype(np.float32)
 context = ContextView(first.name, first.camera, color, frame.depth)
 

@@ -17,12 +17,14 @@ target = scene.views[len(scene) // 2]
 memory = gvtools.SpatialMemory(voxel=0.02)
 for view in scene.views[:3]:
     frame = view.load()
+    assert frame.depth is not None  # as of RGB-D; gvtools.reconstruct computes it otherwise
     memory.observe(frame.rgb, frame.depth, view.camera, round=0, mask=frame.mask)
 print(memory)
 print(f"known of {target.name}: {memory.project(target.camera).coverage:.1%}")
 
 # %% Round 1: one more view
 frame = scene.views[3].load()
+assert frame.depth is not None
 report = memory.observe(frame.rgb, frame.depth, scene.views[3].camera, round=1, mask=frame.mask)
 print(f"{report.added:,} added, {report.merged:,} merged, {report.rejected:,} rejected")
 print(f"known of {target.name}: {memory.project(target.camera).coverage:.1%}")

@@ -7,7 +7,6 @@ import runpy
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from gvtools.scenes.synthetic import write_room
 
@@ -17,13 +16,13 @@ FOLDER = Path(gvtools.__file__).parent.parent / "examples"
 SCRIPTS = sorted(FOLDER.glob("0*.py"))
 # Of each script: a file that it leaves, and a figure that it prints with its bounds. Holes that
 # stay black give 10 to 15 dB, a projection through a wrong camera about as much.
-PROMISES: dict[str, tuple[str | None, str, float, float]] = {
+PROMISES = {
     "01_colmap_project": ("colmap/memory.ply", r"PSNR (\S+) dB", 20, 45),
     "02_scan": ("memory.npz", r"context_01.png: .* (\S+) dB", 22, 45),
     "03_own_completer": ("completer_nearest/run.json", r"nearest: PSNR (\S+) dB", 20, 45),
     "04_open3d": ("cloud.ply", r"largest plane .*: (\d+)%", 8, 80),
-    "05_trajectory_errors": (None, r"ATE: .* scale (\S+)", 2.45, 2.55),
-    "06_figure": ("figure/target.png", r"target(\.)png", np.nan, np.nan),
+    "05_trajectory_errors": ("", r"ATE: .* scale (\S+)", 2.45, 2.55),
+    "06_figure": ("figure/target.png", r"written: .*, .*target.png()", None, None),
     "07_core_alone": ("core.png", r"depth afterwards (\S+)%", 90, 100),
     "08_memory_notebook": ("notebook.npz", r"completed: (\S+)%", 90, 100),
 }
@@ -56,11 +55,12 @@ def test_an_example_runs(
             if not hasattr(gvtools.SpatialMemory, name):
                 pytest.skip(f"SpatialMemory has no {name} yet")
     arguments = [] if script.stem.startswith("05") else [str(room), str(tmp_path)]
+    monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.setattr(sys, "argv", [str(script), *arguments])
     monkeypatch.syspath_prepend(str(FOLDER))
     runpy.run_path(str(script), run_name="__main__")
     file, pattern, least, most = PROMISES[script.stem]
-    assert file is None or (tmp_path / file).stat().st_size > 0
+    assert (tmp_path / file).stat().st_size > 0
     found = re.search(pattern, capsys.readouterr().out)
     assert found
-    assert np.isnan(least) or least <= float(found[1]) <= most
+    assert least is None or most is None or least <= float(found[1]) <= most
