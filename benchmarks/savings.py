@@ -23,8 +23,8 @@ from gvtools.runs.folder import RunDirectory
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
 from gvtools.settings import with_texts, with_values
-from pipelines.commands.reconstruct import reconstruct
 from pipelines.console import Console
+from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
 # Each saving's settings when it is off.
@@ -61,7 +61,7 @@ class Row:
         """Once more."""
         out = folder / "run"
         start = time.perf_counter()
-        reconstruct(scene, self.config, out, console=Console(quiet=True), drawn=False)
+        reconstruct(scene, self.config, out, console=Console(quiet=True))
         self.whole.append(time.perf_counter() - start)
         reports = RunDirectory(out).reports()
         self.rounds.append(sum(report["seconds"]["total"] for report in reports))

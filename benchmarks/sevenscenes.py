@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.evaluation.images import psnr
+from gvtools.files import write_json
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.store.points import PointSet
@@ -34,7 +35,7 @@ from pipelines.bench.side_by_side import alternate
 from pipelines.commands.bench import fuse as bench_fuse
 from pipelines.commands.bench import open3d_peers, report
 from pipelines.commands.bench import splat as bench_splat
-from pipelines.console import Console, write_json
+from pipelines.console import Console
 
 VOXEL = 0.005  # metres
 TSDF_VOXEL = 0.01

@@ -19,7 +19,7 @@ for finding in scene.findings:
 
 shutil.rmtree(out, ignore_errors=True)
 run = gvtools.reconstruct(project, out, context="not:every:3", targets="every:3")
-for report in run.reports:
+for report in run.rounds:
     print(f"round {report['round']}: {report['points']:,} observations")
 
 figures = gvtools.evaluate(run)

@@ -18,10 +18,10 @@ shutil.rmtree(out, ignore_errors=True)
 run = gvtools.reconstruct(
     sample_project(), out, context="not:every:3", targets="every:3", settings={"views_per_round": 2}
 )
-draw_growth(run.reports, title="sample").savefig(out / "growth_again.png", dpi=120)
+draw_growth(run.rounds, title="sample").savefig(out / "growth_again.png", dpi=120)
 
-number, entry, target, truth = next(run.targets())
-before = plt.imread(out / f"round_{number:03d}" / f"guidance_{entry['stem']}.png")
+view, target, truth = next(run.targets())
+before = plt.imread(view.folder / f"guidance_{view.report['stem']}.png")
 pictures = {"known before": before, "completed": target.picture}
 if truth is not None:
     pictures["held-out photograph"] = truth.load().rgb

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from gvtools.guidance import Guidance
     from gvtools.memory.projection import project
     from gvtools.memory.spatial_memory import SpatialMemory
-    from gvtools.runs.finished import open_run as load_run
+    from gvtools.runs.run import load_run
     from gvtools.scenes.project import open_project
     from gvtools.trajectory_files import read_poses
     from pipelines.api import evaluate, reconstruct
@@ -53,7 +53,7 @@ _SOURCES = {
     "ate": "gvtools.evaluation.trajectories:absolute_errors",
     "complete": "gvtools.completers.complete:complete",
     "evaluate": "pipelines.api:evaluate",
-    "load_run": "gvtools.runs.finished:open_run",
+    "load_run": "gvtools.runs.run:load_run",
     "open_project": "gvtools.scenes.project:open_project",
     "project": "gvtools.memory.projection:project",
     "read_poses": "gvtools.trajectory_files:read_poses",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
-    from gvtools.runs.finished import FinishedRun
+    from gvtools.runs.run import Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ def reconstruct(
     settings: Mapping[str, Any] | None = None,
     resume: bool = False,
     quiet: bool = True,
-) -> FinishedRun:
+) -> Run:
     """Grow a memory from a posed project, round by round, as ``gvtools reconstruct`` does.
 
     Args:
@@ -66,12 +66,13 @@ def reconstruct(
     Raises:
         GvError: wrong input or settings; nothing of an earlier run is lost.
     """
-    from gvtools.runs.finished import open_run
+    from gvtools.runs.run import load_run
     from gvtools.scenes.project import open_project
     from gvtools.settings import with_profile, with_values
-    from pipelines.commands.reconstruct import reconstruct as run_reconstruct
     from pipelines.console import Console
+    from pipelines.reconstruction.run import reconstruct as run_reconstruct
     from pipelines.reconstruction.settings import RunSettings
+    from pipelines.report.write import draw_run
 
     config = with_profile(RunSettings(), profile)
     named = {"context": context, "targets": targets, "completer": completer}
@@ -83,12 +84,13 @@ def reconstruct(
         Path(out),
         console=Console(quiet=quiet),
         resume=resume,
+        draw=draw_run,
     )
-    return open_run(folder)
+    return load_run(folder)
 
 
 def evaluate(
-    run: FinishedRun | Path | str,
+    run: Run | Path | str,
     *,
     parts: Sequence[str] = ("images",),
     lpips: Lpips | None = None,
@@ -109,14 +111,14 @@ def evaluate(
         ProjectError: no run, or its project is gone.
     """
     from gvtools.errors import OptionError
-    from gvtools.runs.finished import open_run
+    from gvtools.runs.run import load_run
     from pipelines.console import Console
     from pipelines.evaluation.run_evaluation import PARTS, evaluate_run
 
     unknown = [part for part in parts if part not in PARTS]
     if unknown or not parts:
         raise OptionError(f"parts {tuple(parts)}; expected some of {', '.join(PARTS)}")
-    finished = open_run(Path(run)) if isinstance(run, (Path, str)) else run
+    finished = load_run(Path(run)) if isinstance(run, (Path, str)) else run
     found = evaluate_run(
         finished,
         parts=parts,

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
-
-from gvtools.files import write_text
 
 
 class Console:
@@ -54,18 +50,3 @@ def _cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return str(value)
-
-
-def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """One JSON object; NaN and infinity become null."""
-    write_text(path, json.dumps(_finite(data), indent=1) + "\n")
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float) and not (abs(value) < float("inf")):
-        return None
-    if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    return value

@@ -31,12 +31,13 @@ from gvtools.completers.geoverse.weights.folder import (
 from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
 from gvtools.errors import OptionError
 from gvtools.evaluation.tables import Table
+from gvtools.files import write_json
 from gvtools.networks.config_json import to_json
 from gvtools.settings import with_texts
 from gvtools.training.options import TrainingSettings, shipped_or_read
 from gvtools.training.processes import started
 from gvtools.training.run import StageRun
-from pipelines.console import Console, write_json
+from pipelines.console import Console
 
 READS = ("weights", "scenes", "size", "seed", "steps", "out", "training")
 

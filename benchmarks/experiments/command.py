@@ -65,8 +65,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """
     from benchmarks.experiments.options import ExperimentOptions
     from gvtools.evaluation.tables import markdown
-    from gvtools.files import check_parent, write_text
-    from pipelines.console import write_json
+    from gvtools.files import check_parent, write_json, write_text
 
     names = (
         "weights",

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from gvtools.files import ZIP_EPOCH
 
 LEVEL = 1
-# Bytes from the middle of an array that tell, and the share of them that must go.
-SAMPLE, LEAST = 65536, 0.4
+# Bytes from the middle of an array that are tried, and the share of them that must be saved.
+SAMPLE_BYTES, MIN_SAVED = 65536, 0.4
 
 
 def save_arrays(target: Path | IO[bytes], **arrays: NDArray[Any]) -> None:
@@ -41,7 +41,7 @@ def save_arrays(target: Path | IO[bytes], **arrays: NDArray[Any]) -> None:
 def _pays(array: NDArray[Any]) -> bool:
     """Whether compressing makes the array much smaller, by a part of it."""
     flat = array.reshape(-1)
-    half = SAMPLE // (2 * max(array.itemsize, 1))
+    half = SAMPLE_BYTES // (2 * max(array.itemsize, 1))
     middle = len(flat) // 2
     part = np.ascontiguousarray(flat[max(middle - half, 0) : middle + half]).tobytes()
-    return len(zlib.compress(part, LEVEL)) <= (1 - LEAST) * len(part)
+    return len(zlib.compress(part, LEVEL)) <= (1 - MIN_SAVED) * len(part)

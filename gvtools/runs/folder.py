@@ -1,47 +1,32 @@
-"""A run's folder: what is in it, when a round counts as done, and how a run is taken up again.
+"""A run's folder while it is written: its rounds, when a round is complete, and how to resume.
 
-A round is written under a temporary name and renamed when it is whole, its memory included, so a
-kill at any moment leaves whole rounds only. The next round drops the previous one's memory file.
-Of a round that was not finished, the depth that it had computed is kept for the next attempt, which
-takes it over where it is the same run.
+A round is written under a temporary name and renamed when it is complete, its memory included, so a
+kill at any moment leaves complete rounds only. The next round drops the previous one's memory file.
+The context depth that an unfinished round had computed is kept; the next attempt reads it if it is
+the same run.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-import gvtools
 from gvtools.errors import ProjectError
-from gvtools.files import write_text
-from pipelines.console import write_json
-from gvtools.runs.folder_lock import held_folder
+from gvtools.files import replaced_when_written, write_json, write_text
+from gvtools.runs.folder_lock import folder_lock
+from gvtools.runs.identity import versions
+from gvtools.runs.layout import MEMORY, METRICS, RECORD, REPORT, ROUNDS, round_folder
 
-
-def versions() -> dict[str, str]:
-    """Versions of what a run's bytes depend on."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    out = {"gvtools": gvtools.__version__, "python": platform.python_version()}
-    for name in ("numpy", "numba", "open3d", "pycolmap", "torch", "scipy"):
-        try:
-            out[name] = version(name)
-        except PackageNotFoundError:
-            out[name] = "absent"
-    return out
-
-
-# What is being written has such a name until it is whole.
-LEFTOVERS = ".*.part"
-# Files of an unfinished round that are whole, and worth more than starting again.
-LASTING = "context_depth_*"
+# Names of files and folders that are not complete yet.
+PARTIAL = ".*.part"
+# Complete files of an unfinished round that the next attempt reads.
+KEPT = "context_depth_*"
 
 
 class RunDirectory:
@@ -58,38 +43,38 @@ class RunDirectory:
         """
         if self.path.exists() and not self.path.is_dir():
             raise ProjectError(f"{self.path}: is a file; give another --out")
-        if self.path.exists() and not (self.path / "run.json").exists() and self._results():
+        if self.path.exists() and not (self.path / RECORD).exists() and self._results():
             raise ProjectError(
                 f"{self.path}: holds files but no run.json, so it is no run of gvtools; give "
                 "another --out"
             )
 
     @contextmanager
-    def taken_up(self, identity: dict[str, Any], *, resume: bool) -> Iterator[int]:
-        """Make or take up the folder; gives the number of rounds that are done.
+    def open_or_resume(self, identity: dict[str, Any], *, resume: bool) -> Iterator[int]:
+        """Make the folder or resume the run in it; gives the number of complete rounds.
 
         As long as the block lasts, other processes are kept out.
 
         Args:
             identity: what decides the result; kept in run.json and compared on resuming.
-            resume: continue after the last whole round.
+            resume: continue after the last complete round.
 
         Raises:
             ProjectError: the folder holds something else, another run, a run that is at work, or
                 a run and ``resume`` is off; nothing is touched then.
         """
         self.refuse_foreign()
-        with held_folder(self.path):
+        with folder_lock(self.path):
             yield self._start(identity, resume=resume)
 
     def check(self, identity: dict[str, Any], *, resume: bool) -> bool:
-        """Whether a run is there that ``taken_up`` would continue; touches nothing.
+        """Whether a run is there that ``open_or_resume`` would continue; touches nothing.
 
         Raises:
-            ProjectError: as of ``taken_up``.
+            ProjectError: as of ``open_or_resume``.
         """
         self.refuse_foreign()
-        record = self.path / "run.json"
+        record = self.path / RECORD
         if not record.exists():
             return False
         try:
@@ -118,16 +103,16 @@ class RunDirectory:
         return True
 
     def _start(self, identity: dict[str, Any], *, resume: bool) -> int:
-        there = self.check(identity, resume=resume)
+        resumes = self.check(identity, resume=resume)
         record = {**identity, "versions": versions()}
-        begun = self._is_recorded(record)
-        self._drop_leftovers(but=self._part(0) if begun else None)
-        if not there:
-            if not begun:
-                write_json(self.path / "run.json", record)
+        same = self._is_recorded(record)
+        self._drop_partial(but=self._part(0) if same else None)
+        if not resumes:
+            if not same:
+                write_json(self.path / RECORD, record)
             return 0
         done = len(self.reports())
-        # Rounds after a removed one stood on it; they are done anew.
+        # Rounds after a removed one were built on it; they are repeated.
         for later in sorted(self.path.glob("round_[0-9]*")):
             if later.name > self.round_path(done - 1).name:
                 shutil.rmtree(later)
@@ -138,7 +123,7 @@ class RunDirectory:
     def _is_recorded(self, record: dict[str, Any]) -> bool:
         """Whether a first attempt at the very same run, by the same versions, was begun here."""
         try:
-            before = json.loads((self.path / "run.json").read_text(encoding="utf-8"))
+            before = json.loads((self.path / RECORD).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return False
         return bool(before == json.loads(json.dumps(record)))
@@ -148,23 +133,23 @@ class RunDirectory:
         return [
             path
             for path in self.path.iterdir()
-            if path.name != "run.json" and not fnmatch(path.name, LEFTOVERS)
+            if path.name != RECORD and not fnmatch(path.name, PARTIAL)
         ]
 
-    def _drop_leftovers(self, *, but: Path | None) -> None:
-        for leftover in self.path.glob(LEFTOVERS):
-            if leftover == but:
+    def _drop_partial(self, *, but: Path | None) -> None:
+        for partial in self.path.glob(PARTIAL):
+            if partial == but:
                 continue
-            if leftover.is_dir():
-                shutil.rmtree(leftover)
+            if partial.is_dir():
+                shutil.rmtree(partial)
             else:
-                leftover.unlink()
+                partial.unlink()
 
     def reports(self) -> list[dict[str, Any]]:
-        """The reports of the whole rounds, in order."""
+        """The reports of the complete rounds, in order."""
         out: list[dict[str, Any]] = []
         while True:
-            path = self.round_path(len(out)) / "report.json"
+            path = self.round_path(len(out)) / REPORT
             if not path.exists():
                 return out
             try:
@@ -176,22 +161,51 @@ class RunDirectory:
                 ) from None
 
     def round_path(self, number: int) -> Path:
-        """Where round ``number`` stands."""
-        return self.path / f"round_{number:03d}"
+        """The folder of round ``number``."""
+        return round_folder(self.path, number)
 
     def _part(self, number: int) -> Path:
         """Where round ``number`` is written."""
         return self.path / f".round_{number:03d}.part"
 
     def round_memory(self, number: int) -> Path:
-        """The memory after round ``number``; kept for the last whole round only."""
-        return self.round_path(number) / "memory.npz"
+        """The memory after round ``number``; kept for the last complete round only."""
+        return self.round_path(number) / MEMORY
+
+    def last_memory(self, done: int) -> Path:
+        """The newest memory file of a run with ``done`` complete rounds.
+
+        Raises:
+            ProjectError: it is gone.
+        """
+        for path in (self.round_memory(done - 1), self.path / MEMORY):
+            if path.exists():
+                return path
+        raise ProjectError(
+            f"{self.path}: the memory after round {done - 1} is gone, as with a later round's "
+            "folder that was removed; start again with another --out"
+        )
+
+    def finish(self, number: int, metrics: Mapping[str, Any]) -> None:
+        """Write the run's figures, and make the memory after its last round the run's own.
+
+        Args:
+            number: of the last round.
+            metrics: JSON-ready.
+        """
+        write_json(self.path / METRICS, metrics)
+        last = self.round_memory(number)
+        if last.exists():
+            # Copied, not moved: whoever reads meanwhile finds one of the two.
+            with replaced_when_written(self.path / MEMORY) as temporary:
+                shutil.copyfile(last, temporary)
+            last.unlink()
 
     @contextmanager
     def writing_round(self, number: int) -> Iterator[Path]:
         """A folder to fill; it becomes the round when the block ends without an error.
 
-        What an earlier attempt at this round left that lasts (LASTING) is in it.
+        It holds the files that an earlier attempt at this round left (KEPT).
 
         Raises:
             ProjectError: the disk is full or the folder cannot be written; earlier rounds stand.
@@ -205,7 +219,7 @@ class RunDirectory:
         except BaseException as error:
             with suppress(OSError):
                 _clear(part)
-                part.rmdir()  # Fails where something lasts.
+                part.rmdir()  # Fails while it holds kept files.
             # A file that could not be written names itself; the user's concern is the round.
             cause = error.__cause__ if isinstance(error, ProjectError) else error
             if not isinstance(cause, OSError):
@@ -217,17 +231,17 @@ class RunDirectory:
         self._settle(number)
 
     def _settle(self, number: int) -> None:
-        """What follows from round ``number`` being whole; safe to repeat after a kill."""
+        """What follows from round ``number`` being complete; safe to repeat after a kill."""
         if number:
             self.round_memory(number - 1).unlink(missing_ok=True)
         lines = [json.dumps(report) for report in self.reports()]
-        write_text(self.path / "rounds.jsonl", "".join(f"{line}\n" for line in lines))
+        write_text(self.path / ROUNDS, "".join(f"{line}\n" for line in lines))
 
 
 def _clear(part: Path) -> None:
-    """Remove what does not last from the folder of an unfinished round."""
+    """Remove what is not kept from the folder of an unfinished round."""
     for path in part.iterdir():
         if path.is_dir():
             shutil.rmtree(path)
-        elif not fnmatch(path.name, LASTING):
+        elif not fnmatch(path.name, KEPT):
             path.unlink()

@@ -11,11 +11,11 @@ from gvtools.errors import ProjectError
 
 
 @contextmanager
-def held_folder(path: Path) -> Iterator[None]:
+def folder_lock(path: Path) -> Iterator[None]:
     """Make the folder if need be; as long as the block lasts, other processes are kept out.
 
     Raises:
-        ProjectError: it cannot be made, or another process holds it.
+        ProjectError: it cannot be made, or another process works in it.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)

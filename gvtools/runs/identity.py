@@ -1,45 +1,21 @@
-"""What decides a run's result, as digests and plain data; compared on resuming."""
+"""What decides a run's result, as digests; compared on resuming."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+import platform
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from pipelines.reconstruction.plan import Plan
-from pipelines.reconstruction.sampling import sampled
+from numpy.typing import NDArray
 
-
-def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
-    """The identity of a run.
-
-    Args:
-        plan: the run.
-        reading: how the user said the project is to be read, JSON-ready.
-    """
-    files = [file for name in plan.context for file in plan.scene[name].files]
-    files += [file for view in plan.targets.truth if view for file in view.files]
-    return {
-        "project": str(plan.scene.root.resolve()),
-        "reading": dict(reading),
-        "fingerprint": fingerprint([*files, *plan.targets.files]),
-        "cameras": _camera_digest(plan),
-        "points": _point_digest(plan),
-        "pixels": _pixel_digest(plan),
-        "weights": fingerprint(plan.weights),
-        "settings": plan.settings.to_dict(),
-        "derived": plan.derived,
-        "context": list(plan.context),
-        "targets": list(plan.targets.cameras.names),
-        "targets_kind": plan.targets.kind,
-        "targets_project": None if plan.targets.project is None else str(plan.targets.project),
-        "schedule": [list(rows) for rows in plan.schedule],
-    }
+import gvtools
 
 
 def fingerprint(files: Iterable[Path]) -> str:
-    """A digest of the names, sizes and modification times of what a run reads."""
+    """A digest of the names, sizes and modification times of files that a run reads."""
     digest = hashlib.sha256()
     for path in sorted(set(files)):
         try:
@@ -51,31 +27,20 @@ def fingerprint(files: Iterable[Path]) -> str:
     return digest.hexdigest()
 
 
-def _camera_digest(plan: Plan) -> str:
-    """Of the intrinsics, poses and sizes of context and targets."""
+def array_digest(arrays: Iterable[NDArray[Any] | None]) -> str:
+    """A digest of the bytes of arrays, in order; None stands for an absent array."""
     digest = hashlib.sha256()
-    for cameras in (plan.scene.subset(plan.context).cameras, plan.targets.cameras):
-        for array in (cameras.K, cameras.cam_from_world, cameras.width, cameras.height):
-            digest.update(array.tobytes())
+    for array in arrays:
+        digest.update(b"none" if array is None else array.tobytes())
     return digest.hexdigest()
 
 
-def _point_digest(plan: Plan) -> str | None:
-    """Of the sparse points and their tracks, by which depth is sought and checked."""
-    points = plan.scene.points
-    if points is None:
-        return None
-    digest = hashlib.sha256()
-    for array in (points.positions, points.point_index, points.view_index, points.xy):
-        digest.update(array.tobytes())
-    return digest.hexdigest()
-
-
-def _pixel_digest(plan: Plan) -> str:
-    """Of some context views as they are read: units, registration and masks show in the pixels."""
-    digest = hashlib.sha256()
-    for name in sampled(plan.context):
-        frame = plan.scene[name].load()
-        for array in (frame.rgb, frame.depth, frame.mask):
-            digest.update(b"none" if array is None else array.tobytes())
-    return digest.hexdigest()
+def versions() -> dict[str, str]:
+    """Versions of what a run's bytes depend on."""
+    out = {"gvtools": gvtools.__version__, "python": platform.python_version()}
+    for name in ("numpy", "numba", "open3d", "pycolmap", "torch", "scipy"):
+        try:
+            out[name] = version(name)
+        except PackageNotFoundError:
+            out[name] = "absent"
+    return out

@@ -144,7 +144,7 @@ def _run_complete(args: argparse.Namespace, given: set[str], console: Console) -
     if args.json is None:
         show(figures, console)
         return
-    from pipelines.console import write_json
+    from gvtools.files import write_json
 
     write_json(args.json, figures)
     console.line(f"{len(figures['results'])} rows written to {args.json}")
@@ -157,7 +157,7 @@ def report(
     if path is not None:
         import os
 
-        from pipelines.console import write_json
+        from gvtools.files import write_json
 
         data = {**conditions, "cpus": os.cpu_count(), "results": [row.to_dict() for row in rows]}
         write_json(path, data)

@@ -33,8 +33,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
         ProjectError: a run could not read it; the report is out by then.
         GvError: nothing could be opened; the JSON file, if asked for, says so.
     """
+    from gvtools.files import write_json
     from gvtools.scenes.inspection import inspect
-    from pipelines.console import write_json
 
     try:
         result = inspect(open_scene(args.project, args))

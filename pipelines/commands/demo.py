@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from gvtools.runs.folder import RunDirectory
-from pipelines.commands.reconstruct import add_run_arguments, config_from, copy_figures, reconstruct
+from pipelines.commands.reconstruct import add_run_arguments, config_from, copy_figures
 from pipelines.console import Console
 
 SUMMARY = "run the main job on a sample that needs no download"
@@ -37,6 +37,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     console.line(f"sample {args.sample}, seed {config.seed}: writing {sample}")
     context, targets = _write(args.sample, sample, config.seed)
     from gvtools.scenes.project import open_project
+    from pipelines.reconstruction.run import reconstruct
+    from pipelines.report.write import draw_run
 
     if args.context is None:
         config = config.replaced(context=",".join(context))
@@ -51,6 +53,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         console=console,
         resume=args.resume,
         dry_run=args.dry_run,
+        draw=draw_run,
     )
     copy_figures(args, out)
     if not args.dry_run and (out / "round_001").is_dir():

@@ -87,7 +87,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: the memory is unreadable, an option is wrong, or the target cannot be written.
     """
-    from pipelines.rendering.memory_source import open_memory
+    from gvtools.runs.memory_file import load_memory
 
     if args.max_points is not None and args.max_points < 1:
         raise OptionError(f"--max-points {args.max_points}; expected 1 or more")
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             "run's folder or its memory.npz"
         )
     _refuse_foreign(args.format, args.memory, args.out)
-    memory = open_memory(args.memory, up_to=args.round)
+    memory = load_memory(args.memory, up_to=args.round)
     if not len(memory):
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
     limit = args.max_points if args.max_points is not None else MAX_POINTS.get(args.format)

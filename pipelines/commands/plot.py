@@ -79,18 +79,18 @@ def _figure(what: str, folder: Path) -> Figure:
             sweep.trials, front=sweep.front, recommended=sweep.recommended, budget=sweep.budget,
             title=title,
         )  # fmt: skip
-    from gvtools.runs.finished import read_record, read_reports
+    from gvtools.runs.run import load_run
 
-    record = read_record(folder)
-    rounds = read_reports(folder)
+    run = load_run(folder)
+    rounds = run.rounds
     if what == "trajectories":
         from pipelines.report.data import open_sources
         from pipelines.report.measures import read_measures, report_poses
         from viz.plots.trajectories import draw_trajectories
 
-        sources = open_sources(record)
-        found = read_measures(folder, record, rounds).poses
-        poses = report_poses(rounds, sources.scene, record["context"], found).drawn
+        sources = open_sources(run)
+        found = read_measures(run).poses
+        poses = report_poses(rounds, sources.scene, run.context, found).drawn
         if poses is None:
             raise ProjectError(f"{folder}: no cameras to draw ({sources.problem or 'no rounds'})")
         return draw_trajectories(poses, title=title)

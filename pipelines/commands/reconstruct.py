@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import shutil
-from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipelines.commands.help_settings import HelpSettings
-from pipelines.console import Console, write_json
-from pipelines.reconstruction.plan import Plan, describe, make_plan
 
 if TYPE_CHECKING:
-    from gvtools.completers.base import ContextView
-    from gvtools.memory.spatial_memory import SpatialMemory
-    from gvtools.runs.folder import RunDirectory
-    from gvtools.scenes.scene import Scene
+    from pipelines.console import Console
     from pipelines.reconstruction.settings import RunSettings
 
 SUMMARY = "grow a memory from a posed project, round by round"
@@ -86,7 +79,9 @@ def _settings() -> RunSettings:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run ``gvtools reconstruct``."""
     from pipelines.commands.scene_arguments import open_scene, reading_of
-    from pipelines.commands.view import live_viewer
+    from pipelines.reconstruction.run import reconstruct
+    from pipelines.report.write import draw_run
+    from pipelines.viewing.live import live_viewer
 
     config = config_from(args)
     watched = args.live and not args.dry_run
@@ -99,6 +94,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             resume=args.resume,
             dry_run=args.dry_run,
             reading=reading_of(args),
+            draw=draw_run,
         )
         copy_figures(args, args.out)
 
@@ -127,144 +123,3 @@ def config_from(args: argparse.Namespace) -> RunSettings:
     if args.allow_overlap:
         given["allow_overlap"] = True
     return with_texts(with_values(config, given), args.set)
-
-
-def reconstruct(
-    scene: Scene,
-    config: RunSettings,
-    out: Path,
-    *,
-    console: Console,
-    resume: bool = False,
-    dry_run: bool = False,
-    reading: Mapping[str, Any] | None = None,
-    drawn: bool = True,
-) -> Path:
-    """The main job; returns the run's folder.
-
-    Args:
-        scene: the project.
-        config: what to compute.
-        out: the run's folder.
-        console: where progress and figures go.
-        resume: continue after the last whole round.
-        dry_run: say what would be done, and write nothing.
-        reading: how the user said the project is to be read, JSON-ready; part of what a resumed
-            run must share with its beginning.
-        drawn: False leaves growth.png and report.html out.
-
-    Raises:
-        GvError: wrong input or options; nothing of an earlier run is lost.
-    """
-    plan = make_plan(scene, config, say=console.line)
-    describe(plan, console)
-    from gvtools.runs.folder import RunDirectory
-    from gvtools.runs.identity import run_identity
-
-    directory = RunDirectory(out)
-    identity = run_identity(plan, reading or {})
-    if dry_run:
-        there = directory.check(identity, resume=resume)
-        state = "the run in it was left as it is" if there else "no run was started in it"
-        console.line(f"dry run: {out}: {state}")
-        return out
-    with directory.taken_up(identity, resume=resume) as done:
-        _run_rounds(plan, directory, done, console, drawn=drawn)
-    return out
-
-
-def _run_rounds(
-    plan: Plan, directory: RunDirectory, done: int, console: Console, *, drawn: bool
-) -> None:
-    """The rounds from number ``done`` on, then the end products."""
-    from pipelines.reconstruction.depth_cache import KeptDepth
-    from pipelines.reconstruction.round_targets import RoundTargets
-    from pipelines.reconstruction.rounds import load_context
-    from pipelines.reconstruction.run_round import run_round
-
-    memory = _start_memory(plan)
-    if done:
-        from gvtools.errors import ProjectError
-        from gvtools.memory.spatial_memory import SpatialMemory
-
-        console.line(f"resuming after round {done - 1}")
-        saved = directory.round_memory(done - 1)
-        last = saved if saved.exists() else directory.path / "memory.npz"
-        if not last.exists():
-            raise ProjectError(
-                f"{directory.path}: the memory after round {done - 1} is gone, as with a later "
-                "round's folder that was removed; start again with another --out"
-            )
-        memory = SpatialMemory.load(last)
-        # A finished run's memory holds every round, also one whose folder was removed since.
-        for later in [number for number in reversed(memory.rounds) if number >= done]:
-            memory.forget(round=later)
-    context: list[ContextView] | None = None
-    with RoundTargets(plan, memory) as targets:
-        for number in range(done, len(plan.schedule) + 1):
-            if number and context is None:
-                kept = KeptDepth(plan.scene, plan.context, plan.source, directory.round_path(0))
-                context = load_context(plan.scene, plan.context, kept)
-            with directory.writing_round(number) as folder:
-                report = run_round(plan, targets, number, context or [], folder, console)
-                memory.save(folder / "memory.npz")
-                write_json(folder / "report.json", report)
-            console.line(_round_line(report))
-    _finish(plan, memory, directory, console, drawn=drawn)
-
-
-def _start_memory(plan: Plan) -> SpatialMemory:
-    from gvtools.memory.spatial_memory import SpatialMemory
-    from pipelines.reconstruction.grid_frame import grid_frame
-
-    assert plan.config.voxel is not None
-    frame = grid_frame(plan.scene, plan.context)
-    return SpatialMemory(
-        plan.config.voxel, origin=frame.origin, axes=frame.axes, options=plan.config.memory
-    )
-
-
-def _round_line(report: dict[str, Any]) -> str:
-    text = (
-        f"round {report['round']}: {report['points']:,} observations in {report['voxels']:,} "
-        f"voxels (+{report['added']:,} added, {report['merged']:,} merged, "
-        f"{report['rejected']:,} rejected)"
-    )
-    if report["coverage_before"] is not None:
-        text += f", coverage {report['coverage_before']:.1%} -> {report['coverage_after']:.1%}"
-    return f"{text}, {report['seconds']['total']:.1f} s"
-
-
-def _finish(
-    plan: Plan, memory: SpatialMemory, directory: RunDirectory, console: Console, *, drawn: bool
-) -> None:
-    """The run's end products, all derived from the last round's memory."""
-    from gvtools.files import replaced_when_written
-    from gvtools.memory.io.ply import export_memory_ply
-    from pipelines.commands.report import write_report
-    from pipelines.reconstruction.depth_cache import off_scale
-    from pipelines.reconstruction.measure import measure_run
-    from viz.plots.growth import draw_growth, growth_text
-
-    out = directory.path
-    last = directory.round_memory(len(plan.schedule))
-    if last.exists():
-        with replaced_when_written(out / "memory.npz") as temporary:
-            shutil.copyfile(last, temporary)
-    export_memory_ply(memory, out / "memory.ply")
-    reports = directory.reports()
-    metrics = measure_run(plan, memory, directory, console)
-    write_json(out / "metrics.json", metrics)
-    if drawn:
-        figure = draw_growth(reports, title=plan.scene.root.name)
-        with replaced_when_written(out / "growth.png") as temporary:
-            figure.savefig(temporary, format="png", dpi=120)
-        write_report(plan, out)
-    last.unlink(missing_ok=True)
-    console.line(growth_text(reports))
-    flagged = off_scale(reports[0].get("depth", ()))
-    if flagged:
-        console.warn(f"{flagged}; figures in {directory.round_path(0) / 'report.json'}")
-    console.line(
-        f"results in {out}: memory.npz, memory.ply, report.html, growth.png, metrics.json, round_*/"
-    )

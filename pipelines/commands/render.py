@@ -70,18 +70,19 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: the memory, the cameras, the selection or the output folder is wrong.
     """
-    from gvtools.runs.pictures import file_stems, write_view
+    from gvtools.files import write_json
+    from gvtools.runs.layout import file_stems
+    from gvtools.runs.memory_file import load_memory
     from gvtools.scenes.selection import select
-    from pipelines.console import write_json
     from pipelines.rendering.figures import measure, render_view, summary
-    from pipelines.rendering.memory_source import open_memory
+    from pipelines.rendering.view_files import write_view
 
     if args.out is None and not args.against_images:
         raise OptionError("--out: nothing would be left; give a folder, or --against-images")
     short = {"backend": args.backend, "device": args.device}
     given = [f"splat.{key}={value}" for key, value in short.items() if value is not None]
     options = splat_options([*given, *args.set])
-    memory = open_memory(args.memory)
+    memory = load_memory(args.memory)
     if not len(memory.views):
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
     cameras, scene = _cameras(args, memory)

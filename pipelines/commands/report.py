@@ -11,20 +11,18 @@ from gvtools.options import check_range
 
 if TYPE_CHECKING:
     from pipelines.console import Console
-    from pipelines.reconstruction.plan import Plan
 
 SUMMARY = "write a run's report: one HTML page with plots, pictures, figures and settings"
 EXAMPLES = (
     "gvtools report runs/kitchen",
     "gvtools report runs/kitchen --pictures 30 --out kitchen.html",
 )
-FILE = "report.html"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder, finished or not")
-    parser.add_argument("--out", type=Path, metavar="FILE", help=f"default RUN/{FILE}")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="default RUN/report.html")
     parser.add_argument(
         "--pictures",
         type=int,
@@ -45,10 +43,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """
     from gvtools.files import write_text
     from pipelines.report.data import collect
+    from pipelines.report.write import PAGE
     from viz.report.page import report_html
 
     check_range("--pictures", args.pictures, least=1)
-    out = args.out or args.run / FILE
+    out = args.out or args.run / PAGE
     _refuse_foreign(out)
     report = collect(args.run, project=args.project, most=args.pictures)
     page = report_html(report)
@@ -56,25 +55,6 @@ def run(args: argparse.Namespace, console: Console) -> None:
     for warning in report.warnings:
         console.warn(warning)
     console.line(f"{out}: {len(page) / 2**20:.1f} MiB, {len(report.sheet)} targets with pictures")
-
-
-def write_report(plan: Plan, path: Path) -> None:
-    """The report of a run whose project is open, as ``reconstruct`` leaves it in the run's folder.
-
-    Args:
-        plan: of the run.
-        path: its folder, with ``metrics.json`` in it.
-
-    Raises:
-        GvError: the folder cannot be read or written.
-    """
-    from gvtools.files import write_text
-    from pipelines.report.data import Sources, collect
-    from viz.report.page import report_html
-
-    targets = plan.targets
-    truths = dict(zip(targets.cameras.names, targets.truth, strict=True))
-    write_text(path / FILE, report_html(collect(path, sources=Sources(plan.scene, truths))))
 
 
 def _refuse_foreign(out: Path) -> None:

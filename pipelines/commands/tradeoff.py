@@ -61,12 +61,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: a project or settings that cannot be run, or a budget that is none.
     """
-    from gvtools.runs.folder_lock import held_folder
-    from gvtools.runs.identity import run_identity
+    from gvtools.files import write_json
+    from gvtools.runs.folder_lock import folder_lock
     from gvtools.settings import changes
     from pipelines.commands.scene_arguments import open_scene, reading_of
-    from pipelines.console import write_json
-    from pipelines.reconstruction.plan import make_plan
+    from pipelines.reconstruction.plan import make_plan, run_identity
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.tradeoff.results import write_results
     from pipelines.tradeoff.search_axes import longest_side, search_axes
@@ -93,7 +92,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             "since a trial is measured against their pictures"
         )
     config = config.replaced(voxel=plan.config.voxel, memory=plan.config.memory)
-    with held_folder(args.out):
+    with folder_lock(args.out):
         identity = run_identity(plan, reading_of(args))
         trials = Trials(scene, config, plan.targets.cameras.names, args.out / "trials", identity)
         trials.folder.mkdir(exist_ok=True)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.trajectories import PoseAuc, PoseErrors, Statistics
+    from gvtools.evaluation.trajectories import PoseErrors
     from pipelines.console import Console
 
 SUMMARY = "measure the pose errors (ATE, RPE, AUC) of a trajectory against its reference"
@@ -20,7 +19,6 @@ EXAMPLES = (
 )
 # All pairs of longer trajectories are too many, and say no more.
 MOST_FOR_AUC = 2000
-FIGURES = ("rmse", "mean", "median", "std", "min", "max")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,7 +73,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
         GvError: a trajectory cannot be read, nothing belongs together, or an option is wrong.
     """
     from gvtools.evaluation.trajectories import absolute_errors, pose_auc, relative_errors
-    from pipelines.console import write_json
+    from gvtools.files import write_json
+    from pipelines.evaluation.pose_figures import pose_figures
     from pipelines.inputs.trajectory_source import LAYOUTS, associate, open_trajectory
 
     if args.layout not in LAYOUTS:
@@ -113,7 +112,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         "poses_estimate": len(estimate),
         "associated": len(first),
         **({"delta": args.delta, "all_pairs": args.all_pairs} if args.metric == "rpe" else {}),
-        **to_dict(errors, auc),
+        **pose_figures(errors, auc),
     }
     if args.metric == "ate" and auc is None:
         figures["notes"]["auc"] = f"not measured over more than {MOST_FOR_AUC} poses"
@@ -125,37 +124,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
         console.warn(f"no figures: {errors.status}")
 
 
-def to_dict(errors: PoseErrors, auc: PoseAuc | None = None) -> dict[str, Any]:
-    """The figures as JSON has them: those of the translation at the top, null where none is."""
-    notes: dict[str, str] = {}
-    if not errors.ok:
-        notes["rmse"] = errors.status
-    elif errors.translation_share is None:
-        notes["translation_share"] = "the reference's centres have no extent"
-    out: dict[str, Any] = {
-        "status": errors.status,
-        **_fields(errors.translation),
-        "scale": errors.scale,
-        "extent": errors.extent,
-        "translation_share": _fields(errors.translation_share),
-        "rotation_deg": _fields(errors.rotation_deg),
-    }
-    if auc is not None:
-        out["auc"] = {f"{threshold:g}": value for threshold, value in auc.auc.items()}
-        out["auc_pairs"] = auc.pairs
-        out["auc_pairs_without_motion"] = auc.still
-        if auc.status != "measured":
-            notes["auc"] = auc.status
-    return {**out, "notes": notes}
-
-
-def _fields(statistics: Statistics | None) -> dict[str, Any]:
-    if statistics is None:
-        return dict.fromkeys(FIGURES) | {"n": 0}
-    return asdict(statistics)
-
-
 def _print(figures: dict[str, Any], errors: PoseErrors, console: Console) -> None:
+    from pipelines.evaluation.pose_figures import FIGURES, statistics_figures
+
     console.line(
         f"{figures['metric'].upper()}: {figures['associated']} poses of "
         f"{figures['poses_reference']} and {figures['poses_estimate']}, associated by "
@@ -163,7 +134,11 @@ def _print(figures: dict[str, Any], errors: PoseErrors, console: Console) -> Non
         + (f", scale {errors.scale:.6g}" if figures["align"] == "sim3" and errors.scale else "")
     )
     rows = [
-        [name, *(_fields(statistics)[key] for key in FIGURES), _fields(statistics)["n"]]
+        [
+            name,
+            *(statistics_figures(statistics)[key] for key in FIGURES),
+            statistics_figures(statistics)["n"],
+        ]
         for name, statistics in (
             ("translation, scene units", errors.translation),
             (f"translation / extent {errors.extent:.4g}", errors.translation_share),

@@ -120,7 +120,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 def _list(args: argparse.Namespace, console: Console) -> None:
     from gvtools.completers.geoverse.config import NAMES
-    from pipelines.console import write_json
+    from gvtools.files import write_json
     from pipelines.weights.report import needed_files, print_needed
 
     names = NAMES if args.config is None else (args.config,)
@@ -151,7 +151,7 @@ def _check(args: argparse.Namespace, console: Console) -> None:
         check_is_folder,
         config_of,
     )
-    from pipelines.console import write_json
+    from gvtools.files import write_json
     from pipelines.weights.report import print_parts
 
     folder = args.folder

@@ -2,22 +2,49 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gvtools.evaluation.ranking import Setting
-    from gvtools.runs.finished import FinishedRun
+    from gvtools.runs.run import Run
 
 
-def described(finished: FinishedRun, figures: dict[str, Any]) -> dict[str, Any]:
+@dataclass(frozen=True, kw_only=True)
+class EvaluationOptions:
+    """What is measured, and how.
+
+    Attributes:
+        name: of the measured row.
+        parts: of run_evaluation.PARTS.
+        matcher: of the pose probe, "sift" or "lightglue".
+        features: network of feature consistency as MODULE:NAME; None takes "dense-gradient".
+        control: measure the true pictures of the targets as well.
+        seed: of resampling, matching and robust estimates.
+        data_set: that the runs are scenes of; None ranks nothing.
+        lpips_net: backbone of LPIPS.
+        lpips_measured: whether its weights are there.
+    """
+
+    name: str
+    parts: tuple[str, ...]
+    matcher: str
+    features: str | None
+    control: bool
+    seed: int
+    data_set: str | None
+    lpips_net: str
+    lpips_measured: bool
+
+
+def described(finished: Run, figures: dict[str, Any]) -> dict[str, Any]:
     """The figures with what they were measured on."""
     record = finished.record
     schedule = [[record["targets"][row] for row in rows] for rows in record["schedule"]]
-    reports = finished.reports[1:]
+    reports = finished.rounds[1:]
     passes = [report["seconds"]["total"] for report in reports]
     return {
         "name": finished.path.resolve().name,
@@ -34,10 +61,7 @@ def described(finished: FinishedRun, figures: dict[str, Any]) -> dict[str, Any]:
 
 
 def setting_of(
-    args: argparse.Namespace,
-    runs: Sequence[FinishedRun],
-    evaluations: Sequence[Mapping[str, Any]],
-    lpips: bool,
+    options: EvaluationOptions, runs: Sequence[Run], evaluations: Sequence[Mapping[str, Any]]
 ) -> Setting:
     """How the figures were measured, as far as it decides what they may be ranked with."""
     from gvtools.evaluation.ranking import Setting
@@ -45,10 +69,10 @@ def setting_of(
     sizes = {
         (entry["camera"]["width"], entry["camera"]["height"])
         for finished in runs
-        for report in finished.reports[1:]
+        for report in finished.rounds[1:]
         for entry in report["views"]
     }
-    per_round = [len(report["views"]) for finished in runs for report in finished.reports[1:]]
+    per_round = [len(report["views"]) for finished in runs for report in finished.rounds[1:]]
     met3r = [e.get("consistency", {}).get("generated", {}).get("met3r") for e in evaluations]
     poses = [e["poses"] for e in evaluations if e.get("poses", {}).get("pictures")]
     located = sum(part["located"] for part in poses), sum(part["pictures"] for part in poses)
@@ -56,16 +80,16 @@ def setting_of(
         (e["images"]["settings"]["masked_share"] for e in evaluations if "images" in e), default=0
     )
     return Setting(
-        data_set=args.data_set,
+        data_set=options.data_set,
         # Mixed sizes and numbers are none of the published ones.
         resolution=sizes.pop() if len(sizes) == 1 else None,
         context=_common([len(finished.record["context"]) for finished in runs]),
         targets=_common(per_round),
-        rounds=_common([len(finished.reports) - 1 for finished in runs]),
+        rounds=_common([len(finished.rounds) - 1 for finished in runs]),
         scenes=len({finished.record["project"] for finished in runs}),
         pixels="inside masks" if masked > 0 else "all",
-        lpips_net=args.lpips_net if lpips else None,
-        poses_from=f"pose probe ({args.matcher}), {located[0]} of {located[1]} views located",
+        lpips_net=options.lpips_net if options.lpips_measured else None,
+        poses_from=f"pose probe ({options.matcher}), {located[0]} of {located[1]} views located",
         pose_unit="scene units",
         reprojection=None,
         met3r="original" if all(m and m["status"] == "measured" for m in met3r) else None,
@@ -89,8 +113,7 @@ def _common(numbers: Sequence[int]) -> int | None:
 def joined(
     evaluations: Sequence[Mapping[str, Any]],
     row: Mapping[str, float | None],
-    args: argparse.Namespace,
-    parts: Sequence[str],
+    options: EvaluationOptions,
 ) -> dict[str, Any]:
     """One JSON object: figures over all runs at the top, then each run's."""
     import time
@@ -98,13 +121,13 @@ def joined(
 
     from gvtools.evaluation.intervals import LEVEL, RESAMPLES, mean_interval
     from gvtools.evaluation.view_figures import FIGURES
-    from gvtools.runs.folder import versions
+    from gvtools.runs.identity import versions
 
     means = {
         name: [e.get("images", {}).get("mean", {}).get(name, {}).get("mean") for e in evaluations]
         for name in FIGURES
     }
-    over = {name: mean_interval(values, seed=args.seed) for name, values in means.items()}
+    over = {name: mean_interval(values, seed=options.seed) for name, values in means.items()}
     poses = [e["poses"] for e in evaluations if e.get("poses", {}).get("pictures")]
     notes = {key: text for e in evaluations for key, text in e.get("images", {})
              .get("notes", {}).items()}  # fmt: skip
@@ -121,12 +144,12 @@ def joined(
             "probed": sum(part["pictures"] for part in poses) if poses else None,
         },
         "evaluation": {
-            "seed": args.seed,
-            "parts": list(parts),
-            "matcher": args.matcher,
-            "features": args.features or "dense-gradient",
-            "lpips_net": args.lpips_net,
-            "control": not args.no_control,
+            "seed": options.seed,
+            "parts": list(options.parts),
+            "matcher": options.matcher,
+            "features": options.features or "dense-gradient",
+            "lpips_net": options.lpips_net,
+            "control": options.control,
             "bootstrap": {"level": LEVEL, "resamples": RESAMPLES},
             "versions": versions(),
             "date": time.strftime("%Y-%m-%d", time.gmtime()),

@@ -14,7 +14,8 @@ import numpy as np
 from gvtools.evaluation.intervals import mean_interval
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.view_figures import FIGURES, view_figures
-from gvtools.runs.finished import FinishedRun
+from gvtools.runs.memory_file import load_memory
+from gvtools.runs.run import Run
 
 if TYPE_CHECKING:
     from gvtools.evaluation.consistency.feature_consistency import FeatureNetwork
@@ -65,7 +66,7 @@ class Evaluation:
 
 
 def evaluate_run(
-    run: FinishedRun,
+    run: Run,
     *,
     parts: Sequence[str],
     lpips: Lpips | None,
@@ -93,16 +94,16 @@ def evaluate_run(
     with out.timed("reading"):
         targets = [
             _Target(
-                number,
-                dict(entry),
+                view.round,
+                dict(view.report),
                 PosedPicture(files.name, files.camera, files.picture, files.depth),
                 files.observed,
                 files.generated,
                 None if truth is None else truth.load(),
             )
-            for number, entry, files, truth in run.targets()
+            for view, files, truth in run.targets()
         ]
-    out.figures["rounds"] = len(run.reports) - 1
+    out.figures["rounds"] = len(run.rounds) - 1
     out.figures["views"] = len(targets)
     out.figures["coverage"] = _mean([target.entry["coverage"] for target in targets])
     out.figures["seconds_per_view"] = _seconds_per_view(run)
@@ -262,7 +263,7 @@ def _consistent(
 
 
 def _poses(
-    run: FinishedRun,
+    run: Run,
     targets: Sequence[_Target],
     matcher: FeatureMatcher | None,
     control: bool,
@@ -273,7 +274,7 @@ def _poses(
     from gvtools.evaluation.pose_probe.probe import PoseProbe
 
     try:
-        probe = PoseProbe(run.context(), matcher=matcher, seed=seed)
+        probe = PoseProbe(_context_pictures(run), matcher=matcher, seed=seed)
     except DegenerateError as error:
         return {"status": f"degenerate: {error}", "success_share": None}
     found = [probe.locate(target.picture) for target in console.track(targets, "pose probe")]
@@ -287,17 +288,29 @@ def _poses(
         if pictures:
             true = [probe.locate(p) for p in console.track(pictures, "pose probe, true pictures")]
             out["true_pictures"] = _pose_figures(true, pictures)
-        if len(run.record["context"]) > 2:
+        if len(run.context) > 2:
             left_out = probe.leave_one_out(CONTROLS)
             out["context_left_out"] = _pose_figures(left_out, None)
     return out
+
+
+def _context_pictures(run: Run) -> list[PosedPicture]:
+    """The context views, with the depth of the memory's observed points as each sees them."""
+    memory = load_memory(run.path, up_to=0)
+    pictures = []
+    for name in run.context:
+        view = run.scenes[0][name]
+        frame = view.load()
+        depth = memory.project(view.camera).depth[0]
+        pictures.append(PosedPicture(name, view.camera, frame.rgb, depth, frame.mask))
+    return pictures
 
 
 def _pose_figures(found: Sequence[Any], pictures: Sequence[PosedPicture] | None) -> dict[str, Any]:
     """The probe's summary, and ATE and RPE of the poses that it found."""
     from gvtools.evaluation.pose_probe.located import summarise
     from gvtools.evaluation.trajectories import absolute_errors, relative_errors
-    from pipelines.commands.trajectory import to_dict
+    from pipelines.evaluation.pose_figures import pose_figures
 
     summary = asdict(summarise(found))
     summary["rotation_auc"] = {f"{k:g}": v for k, v in summary["rotation_auc"].items()}
@@ -326,8 +339,8 @@ def _pose_figures(found: Sequence[Any], pictures: Sequence[PosedPicture] | None)
     out["rpe_pairs"] = "consecutive located views"
     out["auc"] = _auc(found, pictures)
     for align in ("none", "sim3"):
-        out[f"ate_{align}"] = to_dict(absolute_errors(requested, estimated, align=align))
-        out[f"rpe_{align}"] = to_dict(relative_errors(requested, estimated, align=align))
+        out[f"ate_{align}"] = pose_figures(absolute_errors(requested, estimated, align=align))
+        out[f"rpe_{align}"] = pose_figures(relative_errors(requested, estimated, align=align))
     return out
 
 
@@ -362,7 +375,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return mean_interval(values).mean
 
 
-def _seconds_per_view(run: FinishedRun) -> float | None:
-    reports = run.reports[1:]
+def _seconds_per_view(run: Run) -> float | None:
+    reports = run.rounds[1:]
     views = sum(len(report["views"]) for report in reports)
     return sum(report["seconds"]["total"] for report in reports) / views if views else None

@@ -7,7 +7,6 @@ tells which exports of the folder it is for, so that nothing else is ever writte
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
@@ -21,10 +20,10 @@ from gvtools.errors import ProjectError
 from gvtools.files import write_text
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.thinning import thinned
+from gvtools.runs.target_files import completed_picture
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.transforms_json import FILE as TRANSFORMS
 from gvtools.scenes.transforms_json import write_transforms
-from viz.run_view.view import inside
 
 GENERATED = "generated.txt"
 HEADER = "# views that a completer made: name, and its picture where the run kept it; exports:"
@@ -262,20 +261,7 @@ def _tracks(
 def _picture(memory: SpatialMemory, view: int, run: Path) -> Path | None:
     """The picture that a run kept of a generated view, absolute."""
     source = memory.views[view]
-    folder = run / f"round_{source.round:03d}"
-    picture = folder / f"generated_{_stem(folder, source.camera.names[0])}.png"
-    return inside(run, picture).resolve() if picture.is_file() else None
-
-
-def _stem(folder: Path, name: str) -> str:
-    """By what a round's files call a target."""
-    from gvtools.runs.round_files import target_stems
-
-    try:
-        views = json.loads((folder / "report.json").read_text(encoding="utf-8"))["views"]
-        return str(next(view["stem"] for view in views if view["name"] == name))
-    except (OSError, ValueError, KeyError, TypeError, StopIteration):
-        return target_stems((name,))[0]
+    return completed_picture(run, source.round, source.camera.names[0])
 
 
 def _exports(listing: Path) -> list[str] | None:

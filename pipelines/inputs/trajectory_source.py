@@ -38,9 +38,9 @@ def open_trajectory(path: Path, *, layout: str = "auto") -> Trajectory:
     if path.is_file() and path.suffix.lower() not in (".json", ".npz"):
         return read_poses(path, layout=layout)
     if path.suffix.lower() == ".npz" or (path / "run.json").is_file():
-        from pipelines.rendering.memory_source import open_memory
+        from gvtools.runs.memory_file import load_memory
 
-        cameras = open_memory(path).views.cameras
+        cameras = load_memory(path).views.cameras
         if cameras is None:
             raise ProjectError(f"{path}: a memory without views; expected at least one")
         # A view that was fused twice is one pose.

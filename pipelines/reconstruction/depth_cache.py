@@ -1,18 +1,10 @@
-"""Depth of the context that was computed rather than recorded: kept in round 0, and looked at.
-
-``context_depth_NAME.npz`` has the keys depth (float32 z-depth, scene units, 0 = none), confidence,
-source, and failed (why there is no depth, or empty); ``context_depth_NAME.png`` shows the depth,
-near red, far blue, none black. A file that stands under its name is whole, so that a run that is
-killed in round 0 goes on with the next view.
-"""
+"""Depth of the context: recorded, read from round 0, or computed and kept there."""
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +12,18 @@ from numpy.typing import NDArray
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap, DepthSource, RecordedDepth, is_recorded
 from gvtools.errors import DegenerateError, ProjectError
-from gvtools.files import replaced_when_written
-from gvtools.runs.arrays import save_arrays
-from gvtools.runs.round_files import target_stems, write_png
+from gvtools.runs.context_depth import (
+    UNREADABLE,
+    context_depth_files,
+    disagreeing,
+    read_context_depth,
+    write_context_depth,
+)
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.console import Console
 
-# Views that a line names at most.
-NAMED = 10
 
-
-class KeptDepth:
+class DepthCache:
     """The depth of a run's context: recorded, kept by round 0, or asked of the source.
 
     Args:
@@ -39,10 +32,10 @@ class KeptDepth:
         source: where depth comes from.
         folder: of round 0; what is not recorded is written there, and read again later.
         unfinished: round 0 is being written; a damaged file in its folder is then replaced.
-        known: gives the depth of a view that needs none computed, or None.
+        fallback: gives depth of a view that takes the place of computed depth, or None.
 
     Attributes:
-        failed: views that no depth was found for, with the reason.
+        failed: views that no depth was computed for, with the reason.
     """
 
     def __init__(
@@ -53,14 +46,12 @@ class KeptDepth:
         folder: Path,
         *,
         unfinished: bool = False,
-        known: Callable[[View, Frame], DepthMap | None] = lambda view, frame: None,
+        fallback: Callable[[View, Frame], DepthMap | None] = lambda view, frame: None,
     ) -> None:
-        self._known = known
-        self.scene, self.source, self.folder = scene, source, folder
+        self.scene, self.source = scene, source
         self.failed: dict[str, str] = {}
-        self._unfinished = unfinished
-        stems = dict(zip(names, target_stems(names), strict=True))
-        self._file = {name: folder / f"context_depth_{stem}.npz" for name, stem in stems.items()}
+        self._fallback, self._unfinished = fallback, unfinished
+        self._file = context_depth_files(folder, names)
 
     def covers(self, view: View) -> bool:
         """Whether the source does."""
@@ -75,13 +66,13 @@ class KeptDepth:
         """The depth of a context view whose pixels are ``frame``.
 
         Raises:
-            ProjectError: what was kept is damaged, or cannot be written.
+            ProjectError: a kept file is damaged, or cannot be written.
         """
         path = self._file[view.name]
         if path.exists():
             try:
-                found, failed = _read(path, frame)
-            except (OSError, EOFError, ValueError, KeyError, BadZipFile, zlib.error) as error:
+                depth_map, failed = read_context_depth(path, frame.rgb.shape[:2])
+            except UNREADABLE as error:
                 if not self._unfinished:
                     raise ProjectError(
                         f"{path}: unreadable ({error!r}); expected depth of the context; start the "
@@ -90,51 +81,29 @@ class KeptDepth:
             else:
                 if failed:
                     self.failed[view.name] = failed
-                return found
+                return depth_map
         try:
-            spared = None if is_recorded(self.source, view) else self._known(view, frame)
-            found = spared or self.source.depth(self.scene, view, frame)
+            substitute = None if is_recorded(self.source, view) else self._fallback(view, frame)
+            depth_map = substitute or self.source.depth(self.scene, view, frame)
         except DegenerateError as error:
             # The view stays without depth; the others carry the run.
             self.failed[view.name] = str(error)
             empty = np.zeros(frame.rgb.shape[:2], np.float32)
-            found = DepthMap(empty, np.ones_like(empty), self.source.name)
-        if found.source != RecordedDepth.name:
-            _write(path, found, self.failed.get(view.name, ""))
-        return found
+            depth_map = DepthMap(empty, np.ones_like(empty), self.source.name)
+        if depth_map.source != RecordedDepth.name:
+            failed = self.failed.get(view.name, "")
+            picture = colored(depth_map.depth)
+            write_context_depth(path, depth_map, failed=failed, picture=picture)
+        return depth_map
 
 
-def _read(path: Path, frame: Frame) -> tuple[DepthMap, str]:
-    """What was kept, and why it is empty, where it is."""
-    with np.load(path, allow_pickle=False) as stored:
-        kept = DepthMap(stored["depth"], stored["confidence"], str(stored["source"]))
-        failed = str(stored["failed"])
-    if kept.depth.shape != frame.rgb.shape[:2]:
-        raise ValueError(f"depth of {kept.depth.shape}, picture of {frame.rgb.shape[:2]}")
-    return kept, failed
-
-
-def _write(path: Path, found: DepthMap, failed: str) -> None:
-    # The picture first: where the arrays stand, nothing is missing.
-    with replaced_when_written(path.with_suffix(".png")) as temporary:
-        write_png(temporary, colored(found.depth))
-    with replaced_when_written(path) as temporary, temporary.open("wb") as file:
-        save_arrays(
-            file,
-            depth=found.depth,
-            confidence=found.confidence,
-            source=np.array(found.source),
-            failed=np.array(failed),
-        )
-
-
-def depth_report(scene: Scene, name: str, found: DepthMap) -> dict[str, Any]:
+def depth_report(scene: Scene, name: str, depth_map: DepthMap) -> dict[str, Any]:
     """What a view's depth covers, and whether it has the scale of the sparse points."""
-    fit = scale_to_points(scene, name, found.depth)
+    fit = scale_to_points(scene, name, depth_map.depth)
     report: dict[str, Any] = {
         "view": name,
-        "source": found.source,
-        "known": float((found.depth > 0).mean()),
+        "source": depth_map.source,
+        "known": float((depth_map.depth > 0).mean()),
         "scale": None,
     }
     if fit is not None:
@@ -163,7 +132,7 @@ def warn_of_depth(reports: Sequence[Mapping[str, Any]], console: Console) -> Non
             f"{len(failed)} of {len(reports)} views have no depth and give no points, first: "
             f"{failed[0]['failed']}"
         )
-    odd = _disagreeing(reports)
+    odd = disagreeing(reports)
     if odd:
         first = odd[0]["scale"]
         console.warn(
@@ -171,22 +140,6 @@ def warn_of_depth(reports: Sequence[Mapping[str, Any]], console: Console) -> Non
             f"first {odd[0]['view']}: {first['status']}, scale {first['scale']:.3g}; look at its "
             "unit and at the poses"
         )
-
-
-def off_scale(reports: Sequence[Mapping[str, Any]]) -> str | None:
-    """One line with the names of the views whose depth disagrees with the sparse points."""
-    names = [report["view"] for report in _disagreeing(reports)]
-    if not names:
-        return None
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return (
-        f"depth of {len(names)} of {len(reports)} views is off the sparse points' scale: "
-        f"{', '.join(names[:NAMED])}{more}"
-    )
-
-
-def _disagreeing(reports: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    return [report for report in reports if report["scale"] and report["scale"]["disagrees"]]
 
 
 def colored(depth: NDArray[np.float32]) -> NDArray[np.uint8]:

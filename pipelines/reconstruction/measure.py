@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvtools.evaluation.view_figures import FIGURES, view_figures
-from gvtools.runs.round_files import TargetFiles, read_target
-from pipelines.reconstruction.prefetch import ahead
+from gvtools.runs.target_files import TargetFiles, read_target
+from pipelines.reconstruction.prefetch import prefetch
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -31,6 +31,35 @@ def measure_run(
     one. ``coverage`` is the share that memory supports before the round, ``coverage_after`` after
     it.
     """
+    views = _figures_of_targets(plan, directory)
+    notes = [NO_LPIPS]
+    if not any("psnr" in view for view in views):
+        notes.append("no target has a true picture, so there are no image figures")
+    summary: dict[str, Any] = {name: mean_of(views, name) for name in FIGURES}
+    summary |= {
+        "coverage": mean_of(views, "coverage"),
+        "coverage_after": mean_of(views, "coverage_after"),
+        "targets": len(views),
+        "observations": len(memory),
+        "voxels": memory.voxels,
+        "views": views,
+        "notes": notes,
+    }
+    if views:
+        _print(views, summary, console)
+    return summary
+
+
+def _print(views: list[dict[str, Any]], summary: dict[str, Any], console: Console) -> None:
+    columns = ["target", "round", "coverage", "after", *TABLE]
+    keys = ["name", "round", "coverage", "coverage_after", *TABLE]
+    body = [[view.get(key) for key in keys] for view in views]
+    mean = ["mean", None, *(summary[key] for key in keys[2:])]
+    console.table(columns, [*body, mean])
+
+
+def _figures_of_targets(plan: Plan, directory: RunDirectory) -> list[dict[str, Any]]:
+    """Name, round, coverage and, where there is a true picture, figures of each target."""
     views: list[dict[str, Any]] = []
     reports = directory.reports()
     # Reports stand in the order of the rows, one entry a target.
@@ -48,7 +77,7 @@ def measure_run(
             return None
         return read_target(directory.round_path(number), entry), truth.load()
 
-    for (number, entry, _), files in zip(shown, ahead(read, shown), strict=True):
+    for (number, entry, _), files in zip(shown, prefetch(read, shown), strict=True):
         figures = {
             "name": entry["name"],
             "round": number,
@@ -65,26 +94,7 @@ def measure_run(
                 depth=target.depth,
             )
         views.append(figures)
-    notes = [NO_LPIPS]
-    if not any("psnr" in view for view in views):
-        notes.append("no target has a true picture, so there are no image figures")
-    summary: dict[str, Any] = {name: mean_of(views, name) for name in FIGURES}
-    summary |= {
-        "coverage": mean_of(views, "coverage"),
-        "coverage_after": mean_of(views, "coverage_after"),
-        "targets": len(views),
-        "observations": len(memory),
-        "voxels": memory.voxels,
-        "views": views,
-        "notes": notes,
-    }
-    if views:
-        columns = ["target", "round", "coverage", "after", *TABLE]
-        keys = ["name", "round", "coverage", "coverage_after", *TABLE]
-        body = [[view.get(key) for key in keys] for view in views]
-        mean = ["mean", None, *(summary[key] for key in keys[2:])]
-        console.table(columns, [*body, mean])
-    return summary
+    return views
 
 
 def mean_of(views: list[dict[str, Any]], name: str) -> float | None:

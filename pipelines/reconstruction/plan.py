@@ -1,18 +1,23 @@
-"""A run before its first round: what is given, what is completed when, and from which depth."""
+"""A run before its first round: its context, targets, schedule, depth source and identity."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gvtools.runs.identity import array_digest, fingerprint
 from gvtools.settings import changes, with_values
+from gvtools.view_selection import evenly_spread
 from pipelines.console import Console
 from pipelines.reconstruction.voxel_edge import automatic_voxel
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from gvtools.completers.base import Completer
     from gvtools.depth.source import DepthSource
     from gvtools.scenes.scene import Scene
@@ -28,7 +33,7 @@ class Plan:
         scene: the project.
         settings: as the user gave them.
         config: with everything derived in its place; see ``derived``.
-        context: names of the given views.
+        context: names of the context views.
         targets: the cameras to complete.
         schedule: per round (from 1) the rows of the targets.
         source: where depth comes from.
@@ -71,12 +76,10 @@ def make_plan(
     """
     from gvtools.completers.base import create
     from gvtools.depth.choice import choose_source
-    from gvtools.depth.source import is_recorded
     from gvtools.errors import ProjectError
     from gvtools.scenes.reduced import reduced
     from gvtools.scenes.selection import select
     from pipelines.reconstruction.targets import resolve_targets
-    from pipelines.reconstruction.voxel_probe import at_scale, sufficient_scale
 
     errors = [finding.message for finding in scene.findings if finding.level == "error"]
     if errors:
@@ -100,17 +103,7 @@ def make_plan(
         scene, context, config.depth, stereo=config.stereo, foundation=config.da3
     )
     if config.voxel is None:
-        edge = automatic_voxel(
-            scene, context, chosen.source, percentile=config.fusion.voxel_percentile, say=say
-        )
-        # Not rounded: it has to follow the world's scale.
-        config = at_scale(config.replaced(voxel=edge), config.fusion.voxel_scale)
-        if config.fusion.max_psnr_drop_db is not None:
-            recorded = [name for name in context if is_recorded(chosen.source, scene[name])]
-            scale = sufficient_scale(
-                scene, recorded, config=config, loss=config.fusion.max_psnr_drop_db, say=say
-            )
-            config = at_scale(config, scale)
+        config = _with_voxel(config, scene, context, source=chosen.source, say=say)
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = config.replaced(rounds=len(schedule))
     weights = [*getattr(chosen.source, "files", ()), *completer.files]
@@ -129,6 +122,29 @@ def make_plan(
     )
 
 
+def _with_voxel(
+    config: RunSettings,
+    scene: Scene,
+    context: tuple[str, ...],
+    *,
+    source: DepthSource,
+    say: Callable[[str], None] | None,
+) -> RunSettings:
+    """The settings with the automatic voxel edge."""
+    from gvtools.depth.source import is_recorded
+    from pipelines.reconstruction.voxel_probe import at_scale, sufficient_scale
+
+    fusion = config.fusion
+    edge = automatic_voxel(scene, context, source, percentile=fusion.voxel_percentile, say=say)
+    # Not rounded: it has to follow the world's scale.
+    config = at_scale(config.replaced(voxel=edge), fusion.voxel_scale)
+    if fusion.max_psnr_drop_db is None:
+        return config
+    recorded = [name for name in context if is_recorded(source, scene[name])]
+    loss = fusion.max_psnr_drop_db
+    return at_scale(config, sufficient_scale(scene, recorded, config=config, loss=loss, say=say))
+
+
 def _on_device(config: RunSettings) -> RunSettings:
     """The device of the projection: "cuda" takes the torch back end there, "cpu" no other.
 
@@ -136,7 +152,8 @@ def _on_device(config: RunSettings) -> RunSettings:
     """
     from gvtools.errors import OptionError
 
-    splat, device = config.splat, config.device
+    splat = config.splat
+    device: str = config.device
     if device == "cuda" and splat.backend in ("nearest", "open3d"):
         raise OptionError(
             f"device cuda with splat.backend {splat.backend}, which computes on the CPU; expected "
@@ -181,6 +198,48 @@ def make_schedule(
     used = min(targets, rounds * views_per_round)
     cuts = [i * used // rounds for i in range(rounds + 1)]
     return tuple(tuple(range(a, b)) for a, b in pairwise(cuts))
+
+
+def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides a run's result, JSON-ready; a resumed run must have the same.
+
+    Args:
+        plan: the run.
+        reading: how the user said the project is to be read, JSON-ready.
+    """
+    scene, targets = plan.scene, plan.targets
+    files = [file for name in plan.context for file in scene[name].files]
+    files += [file for view in targets.truth if view for file in view.files]
+    cameras = (scene.subset(plan.context).cameras, targets.cameras)
+    points = scene.points
+    return {
+        "project": str(scene.root.resolve()),
+        "reading": dict(reading),
+        "fingerprint": fingerprint([*files, *targets.files]),
+        "cameras": array_digest(
+            array for c in cameras for array in (c.K, c.cam_from_world, c.width, c.height)
+        ),
+        # Depth is sought and checked by the sparse points and their tracks.
+        "points": None
+        if points is None
+        else array_digest((points.positions, points.point_index, points.view_index, points.xy)),
+        "pixels": array_digest(_sample_pixels(plan)),
+        "weights": fingerprint(plan.weights),
+        "settings": plan.settings.to_dict(),
+        "derived": plan.derived,
+        "context": list(plan.context),
+        "targets": list(targets.cameras.names),
+        "targets_kind": targets.kind,
+        "targets_project": None if targets.project is None else str(targets.project),
+        "schedule": [list(rows) for rows in plan.schedule],
+    }
+
+
+def _sample_pixels(plan: Plan) -> Iterator[NDArray[np.generic] | None]:
+    """Some context views as they are read: units, registration and masks show in the pixels."""
+    for name in evenly_spread(plan.context):
+        frame = plan.scene[name].load()
+        yield from (frame.rgb, frame.depth, frame.mask)
 
 
 def describe(plan: Plan, console: Console) -> None:

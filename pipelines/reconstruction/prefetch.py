@@ -10,7 +10,7 @@ Item = TypeVar("Item")
 Loaded = TypeVar("Loaded")
 
 
-def ahead(load: Callable[[Item], Loaded], items: Iterable[Item]) -> Iterator[Loaded]:
+def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item]) -> Iterator[Loaded]:
     """``load`` of each item, in order, the next one always begun in another thread.
 
     An error of ``load`` is raised where its item would have come.

@@ -19,8 +19,8 @@ from gvtools.memory.projection_cache import FollowedCamera
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.similarity import align_depth_scale
-from pipelines.reconstruction.depth_cache import KeptDepth, depth_report
-from pipelines.reconstruction.prefetch import ahead
+from pipelines.reconstruction.depth_cache import DepthCache, depth_report
+from pipelines.reconstruction.prefetch import prefetch
 from pipelines.reconstruction.settings import RunSettings
 
 STAGES = ("depth", "fuse", "project", "complete", "align")
@@ -64,7 +64,7 @@ def observe_context(
     scene: Scene,
     names: Sequence[str],
     *,
-    source: KeptDepth,
+    source: DepthCache,
     memory: SpatialMemory,
     config: RunSettings,
     clock: Clock,
@@ -78,7 +78,8 @@ def observe_context(
     total = FuseReport()
     dropped: dict[str, int] = {}
     reports = []
-    frames = ahead(_load, [view for view in map(scene.__getitem__, names) if source.covers(view)])
+    covered = [view for view in map(scene.__getitem__, names) if source.covers(view)]
+    frames = prefetch(_load, covered)
     for name in progress(names, "context views"):
         view = scene[name]
         if not source.covers(view):
@@ -125,11 +126,11 @@ def _load(view: View) -> Frame:
     return view.load()
 
 
-def load_context(scene: Scene, names: Sequence[str], source: KeptDepth) -> list[ContextView]:
+def load_context(scene: Scene, names: Sequence[str], source: DepthCache) -> list[ContextView]:
     """The context as completers see it."""
     out = []
     views = [scene[name] for name in names]
-    for name, view, frame in zip(names, views, ahead(_load, views), strict=True):
+    for name, view, frame in zip(names, views, prefetch(_load, views), strict=True):
         depth = source.depth(view, frame) if source.covers(view) else None
         out.append(
             ContextView(

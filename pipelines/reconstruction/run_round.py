@@ -14,11 +14,12 @@ from gvtools.depth.from_memory import MEMORY, explained_depth
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
-from gvtools.runs.round_files import camera_entry, target_stems, write_after, write_target
+from gvtools.runs.layout import target_stems
+from gvtools.runs.target_files import camera_entry, write_after, write_target
 from gvtools.scenes.scene import Frame, View
 from pipelines.console import Console
 from pipelines.reconstruction import rounds
-from pipelines.reconstruction.depth_cache import KeptDepth, warn_of_depth
+from pipelines.reconstruction.depth_cache import DepthCache, warn_of_depth
 from pipelines.reconstruction.plan import Plan
 from pipelines.reconstruction.round_targets import RoundTargets
 
@@ -41,10 +42,10 @@ def run_round(
     about: dict[str, Any] = {"dropped": {}, "depth": [], "views": []}
     about |= {"coverage_before": None, "coverage_after": None}
     if number == 0:
-        total, said = _lift_context(plan, memory, folder, clock, console)
+        total, entries = _lift_context(plan, memory, folder, clock, console)
     else:
-        total, said = _complete(plan, targets, number, context, folder, clock, console)
-    about |= said
+        total, entries = _complete(plan, targets, number, context, folder, clock, console)
+    about |= entries
     generated = int(memory.generated.sum())
     return {
         "round": number,
@@ -76,16 +77,18 @@ def _lift_context(
 ) -> tuple[FuseReport, dict[str, Any]]:
     least = plan.config.savings.depth_from_memory
 
-    def known(view: View, frame: Frame) -> DepthMap | None:
+    def from_memory(view: View, frame: Frame) -> DepthMap | None:
         if least is None:
             return None
         splat = plan.config.splat
-        found = explained_depth(memory, view.camera, frame.rgb, least=least, options=splat)
+        depth_map = explained_depth(memory, view.camera, frame.rgb, least=least, options=splat)
         # What a view before it got wrong must not spread.
-        fit = found and scale_to_points(plan.scene, view.name, found.depth)
-        return None if fit and disagrees(fit) else found
+        fit = depth_map and scale_to_points(plan.scene, view.name, depth_map.depth)
+        return None if fit and disagrees(fit) else depth_map
 
-    source = KeptDepth(plan.scene, plan.context, plan.source, folder, unfinished=True, known=known)
+    source = DepthCache(
+        plan.scene, plan.context, plan.source, folder, unfinished=True, fallback=from_memory
+    )
     if source.kept:
         console.line(
             f"taking over the depth of {source.kept} of {len(plan.context)} context views, "
@@ -96,10 +99,10 @@ def _lift_context(
         memory=memory, config=plan.config, clock=clock, progress=console.track,
     )  # fmt: skip
     warn_of_depth(depth, console)
-    spared = sum(report["source"] == MEMORY for report in depth)
-    if spared:
+    skipped = sum(report["source"] == MEMORY for report in depth)
+    if skipped:
         console.line(
-            f"memory explains {spared} of {len(depth)} context views: their depth was not computed"
+            f"memory explains {skipped} of {len(depth)} context views: their depth was not computed"
         )
     return total, {"dropped": dropped, "depth": depth}
 
@@ -119,7 +122,7 @@ def _complete(
     stems = [all_stems[row] for row in rows]
     with clock.stage("project"):
         targets = followed.of(number)
-        known = [target.guidance() for target in targets]
+        before = [target.guidance() for target in targets]
     followed.look_ahead(number + 1)
     # Files are compressed beside the work on the next targets.
     with ThreadPoolExecutor(WRITERS) as pool:
@@ -129,12 +132,19 @@ def _complete(
             completer=plan.completer,
             context=context, config=config, clock=clock, progress=console.track,
             done=lambda at, result: writing.append(
-                pool.submit(write_target, folder, stems[at], result)
+                pool.submit(
+                    write_target,
+                    folder,
+                    stems[at],
+                    guidance=result.guidance,
+                    completion=result.completion,
+                    fused=result.fused,
+                )
             ),
         )  # fmt: skip
         with clock.stage("project"):
-            grown = [target.guidance() for target in targets]
-        for stem, guidance in zip(stems, grown, strict=True):
+            after = [target.guidance() for target in targets]
+        for stem, guidance in zip(stems, after, strict=True):
             writing.append(pool.submit(write_after, folder, stem, guidance))
         for written in writing:
             written.result()
@@ -143,24 +153,28 @@ def _complete(
             **result.report,
             "stem": stem,
             "camera": camera_entry(camera),
-            "coverage": before.coverage,
-            "coverage_after": after.coverage,
+            "coverage": first.coverage,
+            "coverage_after": last.coverage,
         }
-        for stem, camera, result, before, after in zip(
-            stems, cameras, results, known, grown, strict=True
+        for stem, camera, result, first, last in zip(
+            stems, cameras, results, before, after, strict=True
         )
     ]
+    _warn_of_refused(number, views, console)
+    return total, {
+        "coverage_before": _mean([guidance.coverage for guidance in before]),
+        "coverage_after": _mean([guidance.coverage for guidance in after]),
+        "views": views,
+    }
+
+
+def _warn_of_refused(number: int, views: Sequence[dict[str, Any]], console: Console) -> None:
     refused = [view for view in views if not view["scale"]["accepted"]]
     if refused:
         console.warn(
-            f"round {number}: {len(refused)} of {len(results)} completions give no points, first "
+            f"round {number}: {len(refused)} of {len(views)} completions give no points, first "
             f"{refused[0]['name']}: {refused[0]['scale']['description']}"
         )
-    return total, {
-        "coverage_before": _mean([guidance.coverage for guidance in known]),
-        "coverage_after": _mean([guidance.coverage for guidance in grown]),
-        "views": views,
-    }
 
 
 def _mean(values: list[float]) -> float | None:

@@ -63,7 +63,7 @@ def resolve_targets(
     Raises:
         OptionError: an unknown form, an empty selection, or hold-outs that overlap the context.
     """
-    known = scene.subset(context).cameras
+    context_cameras = scene.subset(context).cameras
     name, _, count = spec.partition(":")
     if name in PATHS and spec not in scene.names:
         if not count.isdecimal() or int(count) < 1:
@@ -76,7 +76,7 @@ def resolve_targets(
             if not allow_overlap:
                 _check_pictures(scene, context, targets)
             return targets
-        return _file(Path(path), known)
+        return _file(Path(path), context_cameras)
     try:
         # By name, as the context: what one target adds, the next ones are completed on.
         chosen = tuple(sorted(select(scene.names, spec)))
@@ -99,10 +99,10 @@ def _path(scene: Scene, context: tuple[str, ...], name: str, count: int) -> Targ
     from gvtools import trajectories
     from gvtools.errors import DegenerateError
 
-    known = scene.subset(context).cameras
+    context_cameras = scene.subset(context).cameras
     make = getattr(trajectories, name)
     try:
-        cameras = make(known, count)
+        cameras = make(context_cameras, count)
     except DegenerateError:
         # Parallel views have no common focus; what they look at lies at their median depth.
         if name != "orbit":
@@ -112,7 +112,7 @@ def _path(scene: Scene, context: tuple[str, ...], name: str, count: int) -> Targ
         if depth is None or not (depth > 0).any():
             raise
         ahead = view.camera.world_from_cam[0, :3, 2] * float(np.median(depth[depth > 0]))
-        cameras = make(known, count, center=known.centers.mean(axis=0) + ahead)
+        cameras = make(context_cameras, count, center=context_cameras.centers.mean(axis=0) + ahead)
     named = Cameras(
         cameras.K,
         cameras.cam_from_world,
@@ -123,10 +123,10 @@ def _path(scene: Scene, context: tuple[str, ...], name: str, count: int) -> Targ
     return Targets(named, (None,) * count, name)
 
 
-def _file(path: Path, known: Cameras) -> Targets:
+def _file(path: Path, context_cameras: Cameras) -> Targets:
     from gvtools.trajectory_files import read_trajectory
 
-    cameras = read_trajectory(path, known[0])
+    cameras = read_trajectory(path, context_cameras[0])
     return Targets(cameras, (None,) * len(cameras), "trajectory", (path,))
 
 
@@ -149,14 +149,14 @@ def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) ->
     """
     given = [scene[name] for name in context]
     files = {view.files[0].resolve() for view in given if view.files}
-    known = scene.subset(context).cameras
-    near = SAME_PLACE * max(float(np.ptp(known.centers, axis=0).max()), 1e-9)
+    context_cameras = scene.subset(context).cameras
+    near = SAME_PLACE * max(float(np.ptp(context_cameras.centers, axis=0).max()), 1e-9)
     both = []
     for view in targets.truth:
         if view is None:
             continue
         same = bool(view.files) and view.files[0].resolve() in files
-        if same or _at_one_place(view.camera, known, near).any():
+        if same or _at_one_place(view.camera, context_cameras, near).any():
             both.append(view.name)
     if both:
         raise OptionError(
@@ -166,9 +166,9 @@ def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) ->
         )
 
 
-def _at_one_place(camera: Cameras, known: Cameras, near: float) -> NDArray[np.bool_]:
-    """Which of the known cameras stand where ``camera`` does and look where it looks."""
-    apart = np.linalg.norm(known.centers - camera.centers[0], axis=1)
-    rotations = known.cam_from_world[:, :3, :3] @ camera.cam_from_world[0, :3, :3].T
+def _at_one_place(camera: Cameras, context_cameras: Cameras, near: float) -> NDArray[np.bool_]:
+    """Which of the context cameras stand where ``camera`` does and look where it looks."""
+    apart = np.linalg.norm(context_cameras.centers - camera.centers[0], axis=1)
+    rotations = context_cameras.cam_from_world[:, :3, :3] @ camera.cam_from_world[0, :3, :3].T
     cosine = (np.trace(rotations, axis1=1, axis2=2) - 1) / 2
     return (apart <= near) & (cosine >= np.cos(np.radians(SAME_DIRECTION)))

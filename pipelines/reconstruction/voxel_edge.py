@@ -1,4 +1,4 @@
-"""The automatic voxel edge: as wide as a pixel of the context sees at its typical distance."""
+"""The voxel grid of a run: its frame, and its edge by what a pixel of the context sees."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from gvtools.errors import DegenerateError, ProjectError
-from pipelines.reconstruction.sampling import sampled
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.view_selection import evenly_spread
 
 if TYPE_CHECKING:
     import numpy as np
@@ -14,6 +15,14 @@ if TYPE_CHECKING:
 
     from gvtools.depth.source import DepthSource
     from gvtools.scenes.scene import Scene, View
+
+
+def grid_frame(scene: Scene, names: Sequence[str]) -> LocalFrame:
+    """The frame of the first of the context cameras, by name, not by the project's order.
+
+    A world that is scaled, turned, shifted or listed otherwise gives the same memory in it.
+    """
+    return LocalFrame.of_camera(scene[min(names)].camera)
 
 
 def automatic_voxel(
@@ -34,10 +43,10 @@ def automatic_voxel(
         context: names of the views that may be looked at.
         source: the run's source of depth.
         percentile: of each view's footprints, 0 to 100.
-        say: is told, before depth is computed, of what and how.
+        say: receives a line before depth is computed.
 
     Raises:
-        ProjectError: no depth is known or found.
+        ProjectError: there is no depth, and none can be computed.
     """
     import numpy as np
 
@@ -45,14 +54,14 @@ def automatic_voxel(
 
     rows = {name: row for row, name in enumerate(scene.names)}
     tracked = set() if scene.points is None else set(scene.points.view_index.tolist())
-    telling = [
+    with_depth = [
         name for name in context if is_recorded(source, scene[name]) or rows[name] in tracked
     ]
     footprints: list[float] = []
-    for name in sampled(telling):
+    for name in evenly_spread(with_depth):
         view = scene[name]
-        known = _recorded(view) if is_recorded(source, view) else _of_points(scene, rows[name])
-        footprints += _footprint(view, known, percentile)
+        depths = _recorded(view) if is_recorded(source, view) else _of_points(scene, rows[name])
+        footprints += _footprint(view, depths, percentile)
     if not footprints:
         footprints = _computed(scene, context, source, percentile, say)
     return float(np.median(footprints))
@@ -73,7 +82,7 @@ def _computed(
     views = [n for n in context if rough.covers(scene[n]) and not is_recorded(source, scene[n])]
     if not views:
         raise ProjectError(f"{scene.root}: the context's depth maps are empty; see 'gvtools check'")
-    names = sampled(views)
+    names = evenly_spread(views)
     if say is not None:
         kind, then = "depth", "and kept for the run"
         if rough is not source:

@@ -21,8 +21,8 @@ from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.settings import with_values
-from pipelines.reconstruction.grid_frame import grid_frame
-from pipelines.reconstruction.sampling import sampled
+from gvtools.view_selection import evenly_spread, nearest_views
+from pipelines.reconstruction.voxel_edge import grid_frame
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Frame, Scene
@@ -61,7 +61,7 @@ def sufficient_scale(
         names: context views with recorded depth.
         config: of the run: the edge to start from, and how points are lifted, kept and projected.
         loss: dB that the mean PSNR of the predicted views may fall behind.
-        say: is told what was found.
+        say: receives a line with the result.
 
     Returns:
         A share of ``config.voxel``; 1 where there are too few views to tell.
@@ -71,7 +71,8 @@ def sufficient_scale(
         return 1.0
     frames: dict[str, Frame] = {}
     probes = [
-        _probe(scene, name, _nearest(scene, names, name), frames) for name in sampled(names, PROBES)
+        _probe(scene, name, _nearest(scene, names, name), frames)
+        for name in evenly_spread(names, PROBES)
     ]
     shown: dict[float, list[tuple[NDArray[np.float32], NDArray[np.bool_]]]] = {}
 
@@ -84,33 +85,45 @@ def sufficient_scale(
                 _predicted(probe, memory, scaled)
                 for probe, memory in zip(probes, memories, strict=True)
             ]
-        # What the finest of these memories knows; coarser ones know more.
+        # Pixels that the finest of these memories covers; coarser ones cover more.
         masks = [mask for _, mask in shown[min(shown)]]
         return {at: _psnr(pairs, masks) for at, pairs in shown.items()} if _enough(masks) else {}
 
-    # Of finer edges the PSNR rises, then falls: no more are looked at than it takes to see that.
-    found = look(START)
+    psnrs = _search(look, loss)
+    if not psnrs:
+        return 1.0
+    best = max(psnrs.values())
+    chosen = max(scale for scale, psnr in psnrs.items() if psnr >= best - loss)
+    if say is not None:
+        text = ", ".join(
+            f"{scale * voxel:.3g}: {psnr:.2f} dB" for scale, psnr in sorted(psnrs.items())
+        )
+        say(f"voxel edge by {len(probes)} context views predicted from their neighbours ({text})")
+    return chosen
+
+
+def _search(look: Callable[[float], dict[float, float]], loss: float) -> dict[float, float]:
+    """PSNR by scale, of as few scales as tell which is best; empty where too little compares.
+
+    Of finer edges the PSNR rises, then falls: no more are looked at than it takes to see that.
+
+    Args:
+        look: adds a scale; gives the PSNR of all scales so far, empty where too little compares.
+        loss: dB that may be lost.
+    """
+    psnrs = look(START)
     for scale in [scale for scale in reversed(SCALES) if scale < START]:
-        found = look(scale)
-        if not found:
-            return 1.0
+        psnrs = look(scale)
+        if not psnrs:
+            return {}
         # A gain of less than what may be lost decides nothing.
-        if found[scale] < max(psnr for at, psnr in found.items() if at > scale) + loss:
+        if psnrs[scale] < max(psnr for at, psnr in psnrs.items() if at > scale) + loss:
             break
     for scale in [scale for scale in SCALES if scale > START]:
-        if not found or found[max(found)] < max(found.values()) - loss:
+        if not psnrs or psnrs[max(psnrs)] < max(psnrs.values()) - loss:
             break
-        found = look(scale)
-    if not found:
-        return 1.0
-    best = max(found.values())
-    chosen = max(scale for scale, psnr in found.items() if psnr >= best - loss)
-    if say is not None:
-        said = ", ".join(
-            f"{scale * voxel:.3g}: {psnr:.2f} dB" for scale, psnr in sorted(found.items())
-        )
-        say(f"voxel edge by {len(probes)} context views predicted from their neighbours ({said})")
-    return chosen
+        psnrs = look(scale)
+    return psnrs
 
 
 def at_scale(config: RunSettings, scale: float) -> RunSettings:
@@ -148,11 +161,9 @@ def _nearest(scene: Scene, names: Sequence[str], name: str) -> list[str]:
     camera = scene[name].camera
     others = [other for other in names if other != name]
     cameras = scene.subset(others).cameras
-    apart = np.linalg.norm(cameras.centers - camera.centers, axis=1)
-    forward = cameras.world_from_cam[:, :3, 2] @ camera.world_from_cam[0, :3, 2]
-    spread = max(float(np.median(apart)), 1e-12)
-    order = np.argsort(apart / spread + (1 - forward), kind="stable")
-    return [others[i] for i in order[:NEIGHBOURS]]
+    spread = float(np.median(np.linalg.norm(cameras.centers - camera.centers, axis=1)))
+    rows = nearest_views(cameras, camera, NEIGHBOURS, unit=max(spread, 1e-12))
+    return [others[row] for row in rows]
 
 
 @dataclass(frozen=True, eq=False)

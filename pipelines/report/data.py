@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import GvError, ProjectError
-from gvtools.runs.finished import open_scenes, read_record, read_reports, resolved
+from gvtools.runs.context_depth import off_scale
+from gvtools.runs.run import Run, load_run
 from gvtools.settings import dotted
-from pipelines.reconstruction.depth_cache import off_scale
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.report.measures import read_measures, report_poses
 from pipelines.report.sheets import contact_sheets
@@ -41,25 +41,20 @@ class Sources:
     problem: str | None = None
 
 
-def open_sources(record: Mapping[str, Any], *, project: Path | None = None) -> Sources:
-    """The project of a run read again; what cannot be read is said, not raised.
-
-    Args:
-        record: of its run.json.
-        project: where the project lies now; None: where it lay.
-    """
+def open_sources(run: Run) -> Sources:
+    """The project of a run read again; an error becomes the ``problem``."""
     try:
-        scene, truths = open_scenes(record, project=project)
+        scene, truths = run.scenes
     except GvError as error:
         return Sources(None, {}, str(error))
-    found = {} if truths is None else {view.name: view for view in truths}
-    return Sources(scene, {name: found.get(name) for name in record["targets"]})
+    by_name = {} if truths is None else {view.name: view for view in truths}
+    return Sources(scene, {name: by_name.get(name) for name in run.record["targets"]})
 
 
 def collect(
     path: Path, *, sources: Sources | None = None, project: Path | None = None, most: int = PICTURES
 ) -> RunReport:
-    """What the report of a run tells, of its whole rounds.
+    """What the report of a run shows, of its complete rounds.
 
     Args:
         path: the run's folder.
@@ -68,30 +63,28 @@ def collect(
         most: targets whose pictures are shown.
 
     Raises:
-        ProjectError: no run, a damaged one, or one without a whole round.
+        ProjectError: no run, a damaged one, or one without a complete round.
     """
-    record = read_record(path)
-    reports = read_reports(path)
+    run = load_run(path, project=project)
+    record, reports = run.record, run.rounds
     if not reports:
         raise ProjectError(f"{path}: no round is done yet; expected one; wait, or add --resume")
-    sources = sources or open_sources(record, project=project)
-    measures = read_measures(path, record, reports)
+    sources = sources or open_sources(run)
+    measures = read_measures(run)
     psnr = {view["name"]: view.get("psnr") for view in measures.views}
     sheets = contact_sheets(
-        path,
-        reports,
+        run,
         psnr=psnr,
         most=most,
         scene=sources.scene,
-        context=record["context"],
         truths=sources.truths,
     )
     poses = report_poses(reports, sources.scene, record["context"], measures.poses)
     trade_off, unread = _trade_off(path, record)
-    settings = dotted(resolved(record))
+    settings = dotted(run.settings)
     return RunReport(
         title=f"{path.resolve().name}: a run of gvtools",
-        facts=_facts(record, reports),
+        facts=_facts(run),
         rounds=reports,
         changed=_changed(settings),
         settings={key: _said(value) for key, value in settings.items()},
@@ -156,10 +149,9 @@ def _trade_off(path: Path, record: Mapping[str, Any]) -> tuple[TradeOff | None, 
         return None, [str(error)]
 
 
-def _facts(
-    record: Mapping[str, Any], reports: Sequence[Mapping[str, Any]]
-) -> list[tuple[str, str]]:
-    config, done = resolved(record), len(reports) - 1
+def _facts(run: Run) -> list[tuple[str, str]]:
+    record, config, reports = run.record, run.settings, run.rounds
+    done = len(reports) - 1
     planned = len(record["schedule"])
     return [
         ("project", str(record["project"])),

@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvtools.evaluation.view_figures import FIGURES
+from gvtools.runs.layout import METRICS
 from viz.plots.trajectories import Trajectories
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from gvtools.runs.run import Run
     from gvtools.scenes.scene import Scene
 
-METRICS = "metrics.json"
 EVALUATION = "evaluation/evaluation.json"
 # What reading a file of another version, or one that was changed by hand, comes upon.
 MALFORMED = (KeyError, TypeError, ValueError, AttributeError)
@@ -48,17 +49,10 @@ class Measures:
     warnings: Sequence[str] = ()
 
 
-def read_measures(
-    path: Path, record: Mapping[str, Any], reports: Sequence[Mapping[str, Any]]
-) -> Measures:
-    """Of evaluation/evaluation.json where it is of this run as it stands, else of metrics.json.
-
-    Args:
-        path: the run's folder.
-        record: of its run.json.
-        reports: of its rounds.
-    """
-    names = [str(view["name"]) for report in reports for view in report["views"]]
+def read_measures(run: Run) -> Measures:
+    """Of evaluation/evaluation.json where it is of this run as it stands, else of metrics.json."""
+    path, record = run.path, run.record
+    names = [view.name for view in run.views]
     warnings: list[str] = []
     evaluation = _read(path / EVALUATION, warnings)
     found: Measures | None = None

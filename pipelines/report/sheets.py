@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvtools.errors import GvError
-from gvtools.runs.folder import RunDirectory
-from gvtools.runs.round_files import SUPPORT_OBSERVED, read_png
+from gvtools.runs.layout import COMPLETION, GUIDANCE, VALID, round_folder
+from gvtools.runs.target_files import SUPPORT_OBSERVED, entry_camera, read_picture
+from gvtools.view_selection import nearest_views
 from viz.report.contact_sheet import TargetPictures, contact_row
 from viz.report.content import SheetRow
-from viz.run_view.view import inside
 
 if TYPE_CHECKING:
-    from gvtools.cameras import Cameras
+    from gvtools.runs.run import Run
     from gvtools.scenes.scene import Scene, View
 
 # Decoding and compressing leave the interpreter alone.
@@ -77,29 +77,26 @@ def chosen_targets(
 
 
 def contact_sheets(
-    path: Path,
-    reports: Reports,
+    run: Run,
     *,
     psnr: Mapping[str, float | None],
     most: int,
     scene: Scene | None,
-    context: Sequence[str],
     truths: Mapping[str, View | None],
 ) -> Sheets:
     """The pictures of some of a run's targets.
 
     Args:
-        path: the run's folder.
-        reports: of its rounds.
+        run: as its folder holds it.
         psnr: by the target's name, dB, where it was measured.
         most: targets to show.
         scene: the project; None where it cannot be read.
-        context: names of the given views.
         truths: by the target's name the view that shows the truth.
     """
+    path, reports = run.path, run.rounds
     places = chosen_targets(reports, psnr, most)
     total = sum(len(report["views"]) for report in reports)
-    nearest = _nearest_context(scene, context)
+    nearest = _nearest_context(scene, run.context)
 
     def row(place: tuple[int, int]) -> SheetRow | str:
         number, at = place
@@ -142,10 +139,9 @@ def _pictures(
     truth: View | None,
     nearest: Callable[[Mapping[str, Any]], tuple[str, Any] | None],
 ) -> TargetPictures:
-    folder = RunDirectory(path).round_path(number)
+    folder = round_folder(path, number)
     hint, support, completion = (
-        read_png(inside(path, folder / f"{kind}_{entry['stem']}.png"))
-        for kind in ("guidance", "valid", "generated")
+        read_picture(folder, kind, entry["stem"]) for kind in (GUIDANCE, VALID, COMPLETION)
     )
     size = completion.shape[:2]
     if hint.shape != (*size, 3) or completion.shape != (*size, 3) or support.shape != size:
@@ -159,7 +155,7 @@ def _pictures(
             f"its photograph is {frame.rgb.shape[1]}x{frame.rgb.shape[0]} now, the completion "
             f"{completion.shape[1]}x{completion.shape[0]}"
         )
-    given = nearest(entry["camera"])
+    given = nearest(entry)
     return TargetPictures(
         name=str(entry["name"]),
         hint=hint,
@@ -176,9 +172,9 @@ def _pictures(
 def _nearest_context(
     scene: Scene | None, context: Sequence[str]
 ) -> Callable[[Mapping[str, Any]], tuple[str, Any] | None]:
-    """Finds name and picture of the context view that stands and looks most like a camera."""
+    """Finds name and picture of the context view that stands and looks most like a target."""
     if scene is None or not context:
-        return lambda camera: None
+        return lambda entry: None
     given = scene.subset(context)
     cameras = given.cameras
 
@@ -186,23 +182,8 @@ def _nearest_context(
     def load(place: int) -> Any:
         return given.views[place].load().rgb
 
-    def nearest(camera: Mapping[str, Any]) -> tuple[str, Any]:
-        place = nearest_camera(cameras, np.array(camera["cam_from_world"], np.float64))
+    def nearest(entry: Mapping[str, Any]) -> tuple[str, Any]:
+        (place,) = nearest_views(cameras, entry_camera(entry), 1)
         return given.views[place].name, load(place)
 
     return nearest
-
-
-def nearest_camera(cameras: Cameras, cam_from_world: np.ndarray) -> int:
-    """The row of the camera nearest to a pose: in centre, by the cameras' extent, and in angle.
-
-    Args:
-        cameras: at least one.
-        cam_from_world: (4, 4).
-    """
-    centre = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
-    extent = float(np.ptp(np.vstack([cameras.centers, centre]), axis=0).max()) or 1.0
-    apart = np.linalg.norm(cameras.centers - centre, axis=1) / extent
-    cosine = cameras.cam_from_world[:, 2, :3] @ cam_from_world[2, :3]
-    angle = np.arccos(np.clip(cosine, -1, 1)) / (np.pi / 2)
-    return int(np.argmin(apart + angle))

@@ -66,8 +66,7 @@ def write_results(
     Returns:
         The recommended trial; None where none is within the budget.
     """
-    from gvtools.files import replaced_when_written, write_text
-    from pipelines.console import write_json
+    from gvtools.files import replaced_when_written, write_json, write_text
 
     def fits(outcome: Outcome) -> bool:
         return budget is None or getattr(outcome, budget_of) <= budget

@@ -16,13 +16,14 @@ from PIL import Image
 
 from gvtools.errors import GvError
 from gvtools.evaluation.view_figures import view_figures
+from gvtools.files import write_json
 from gvtools.runs.folder import RunDirectory
-from gvtools.runs.round_files import TargetFiles, read_target
+from gvtools.runs.target_files import TargetFiles, read_target
 from gvtools.scenes.scene import Scene, View
 from gvtools.settings import with_values
-from pipelines.commands.reconstruct import reconstruct
-from pipelines.console import Console, write_json
+from pipelines.console import Console
 from pipelines.reconstruction.measure import mean_of
+from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
 
@@ -142,7 +143,7 @@ class Trials:
         shutil.rmtree(out, ignore_errors=True)
         start = time.perf_counter()
         try:
-            reconstruct(self.scene, config, out, console=_Silent(), drawn=False)
+            reconstruct(self.scene, config, out, console=_Silent())
             seconds = time.perf_counter() - start
             directory = RunDirectory(out)
             reports = directory.reports()

@@ -24,7 +24,7 @@ from gvtools.completers.settings import CompleterSettings
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 from gvtools.runs.folder import RunDirectory
-from gvtools.runs.round_files import read_target
+from gvtools.runs.target_files import read_target
 from gvtools.similarity import align_depth_scale
 from pipelines.cli import main
 

@@ -12,7 +12,7 @@ from tiny_scan import write_scan
 
 from gvtools.evaluation.images import psnr
 from gvtools.evaluation.view_figures import FIGURES
-from gvtools.runs.finished import open_run
+from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
 
@@ -57,18 +57,18 @@ def test_the_figures_that_scripts_read_stand_at_the_top(measured):
 def test_figures_are_of_the_runs_pictures_by_region(measured, finished):
     _, figures = measured
     views = {view["name"]: view for view in figures["runs"][0]["images"]["views"]}
-    for number, entry, target, truth in open_run(finished).targets():
+    for completed, target, truth in load_run(finished).targets():
         assert truth is not None
         reference = truth.load().rgb
         view = views[target.name]
-        assert view["round"] == number
+        assert view["round"] == completed.round
         assert view["psnr"] == pytest.approx(psnr(target.picture, reference))
         expected = psnr(target.picture, reference, mask=target.observed)
         assert view["psnr_valid"] == pytest.approx(expected)
         expected = psnr(target.picture, reference, mask=target.generated)
         assert view["psnr_generated"] == (None if expected is None else pytest.approx(expected))
         assert not (target.observed & target.generated).any()
-        assert view["observed"] == pytest.approx(entry["observed"])
+        assert view["observed"] == pytest.approx(completed.report["observed"])
 
 
 def test_means_are_over_views_and_rounds_with_intervals(measured):

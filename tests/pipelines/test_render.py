@@ -15,7 +15,7 @@ from gvtools.cameras import concatenate
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.io.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.runs.pictures import file_stems
+from gvtools.runs.layout import file_stems
 from gvtools.trajectory_files import write_trajectory
 from pipelines.bench.procedural_cloud import inside_camera, photograph
 from pipelines.commands import render

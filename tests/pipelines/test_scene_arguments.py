@@ -7,8 +7,9 @@ import pytest
 from scenes_workspace import sevenscenes, workspace
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.reading import rgbd_options
 from gvtools.scenes.scene import Scene
-from pipelines.commands.scene_arguments import add_scene_arguments, open_scene, rgbd_options
+from pipelines.commands.scene_arguments import add_scene_arguments, open_scene, reading_of
 
 
 def parsed(*words: object) -> argparse.Namespace:
@@ -24,7 +25,7 @@ def depth_of(scene: Scene) -> np.ndarray:
 
 
 def test_nothing_given_is_no_rgbd_option(tmp_path):
-    assert rgbd_options(parsed()) is None
+    assert rgbd_options(reading_of(parsed())) is None
     workspace(tmp_path)
     assert open_scene(tmp_path, parsed()).kind == "colmap"
 
@@ -73,7 +74,7 @@ def test_a_file_without_a_matrix(tmp_path, text):
     file = tmp_path / "moved.txt"
     file.write_text(text)
     with pytest.raises(OptionError, match=r"moved\.txt.*4x4|four rows of four"):
-        rgbd_options(parsed("--color-from-depth", file))
+        rgbd_options(reading_of(parsed("--color-from-depth", file)))
 
 
 @pytest.mark.parametrize(

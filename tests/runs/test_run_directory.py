@@ -11,10 +11,10 @@ from PIL import Image
 from tiny_scan import write_colmap_scan, write_scan
 
 from gvtools.errors import ProjectError
+from gvtools.files import write_json
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.folder import RunDirectory
 from pipelines.cli import main
-from pipelines.console import write_json
 
 RUN = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2", "--quiet")
 
@@ -45,7 +45,7 @@ def test_the_settings_of_a_run_with_rounds_bind(scan, tmp_path, capsys):
     assert reconstruct(scan, out) == 0
     shutil.rmtree(out / "round_002")
     assert reconstruct(scan, out, "--resume", "--voxel", "0.3") == 2
-    assert "config differ" in capsys.readouterr().err
+    assert "settings, derived differ" in capsys.readouterr().err
 
 
 def test_a_changed_reading_of_the_project_is_another_run(scan, tmp_path, capsys):
@@ -95,7 +95,7 @@ def test_removing_a_round_forgets_it_and_what_came_after(scan, tmp_path):
     directory = RunDirectory(again)
     record = json.loads((again / "run.json").read_text())
     record.pop("versions")
-    with directory.taken_up(record, resume=True) as done:
+    with directory.open_or_resume(record, resume=True) as done:
         assert done == 1
     assert reconstruct(scan, again, "--resume") == 0
     assert SpatialMemory.load(again / "memory.npz").rounds == (0, 1, 2)
@@ -104,14 +104,14 @@ def test_removing_a_round_forgets_it_and_what_came_after(scan, tmp_path):
 
 def test_a_folder_in_use_is_refused(tmp_path):
     first = RunDirectory(tmp_path / "run")
-    with first.taken_up({"a": 1}, resume=False):
+    with first.open_or_resume({"a": 1}, resume=False):
         second = RunDirectory(tmp_path / "run")
         with (
             pytest.raises(ProjectError, match="another process"),
-            second.taken_up({"a": 1}, resume=True),
+            second.open_or_resume({"a": 1}, resume=True),
         ):
             pass
-    with second.taken_up({"a": 1}, resume=True) as done:
+    with second.open_or_resume({"a": 1}, resume=True) as done:
         assert done == 0
 
 
@@ -119,7 +119,7 @@ def test_a_file_in_the_folders_place_is_refused_untouched(tmp_path):
     (tmp_path / "run").write_text("mine")
     with (
         pytest.raises(ProjectError, match="is a file"),
-        RunDirectory(tmp_path / "run").taken_up({}, resume=False),
+        RunDirectory(tmp_path / "run").open_or_resume({}, resume=False),
     ):
         pass
     assert (tmp_path / "run").read_text() == "mine"

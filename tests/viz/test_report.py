@@ -15,14 +15,13 @@ from PIL import Image
 from test_cli import refused
 from tiny_scan import write_scan
 
-from gvtools.cameras import Cameras
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
-from pipelines.commands.report import write_report
 from pipelines.reconstruction.plan import make_plan
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.report.data import collect, read_sweep
-from pipelines.report.sheets import chosen_targets, nearest_camera
+from pipelines.report.sheets import chosen_targets
+from pipelines.report.write import write_report
 from viz.report.contact_sheet import TargetPictures, contact_row
 from viz.report.content import SheetRow
 from viz.report.page import report_html
@@ -137,7 +136,8 @@ def test_settings_that_differ_come_first_and_all_are_there(page):
     heads = [index for index, row in enumerate(rows) if row[:2] == ["setting", "value"]]
     changed = [row[0] for row in rows[heads[0] + 1 : heads[1]]]
     everything = [row[0] for row in rows[heads[1] + 1 :]]
-    assert set(changed) == {"context", "targets", "views_per_round", "rounds", "voxel"}
+    given, derived = {"context", "targets", "views_per_round"}, {"rounds", "voxel", "device"}
+    assert set(changed) == {*given, *derived, "splat.device"}
     assert len(everything) > 40
     assert "splat.band" in everything
 
@@ -339,21 +339,6 @@ def test_every_round_is_shown_by_its_worst_target_first():
     assert len(chosen_targets(reports, psnr, 100)) == 9
     assert chosen_targets(reports, psnr, 2) == [(1, 1), (3, 0)]
     assert chosen_targets(reports[:1], psnr, 5) == []
-
-
-def test_the_context_view_beside_a_target_stands_and_looks_alike():
-    """Of equal places the one that looks alike, of equal directions the one that stands near."""
-    turned = np.diag([-1.0, 1, -1, 1])
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    poses[1] = turned
-    poses[2, 0, 3], poses[3, 0, 3] = -4, -9  # centres at x = 4 and 9
-    size = np.full(4, 64)
-    cameras = Cameras(np.tile(np.eye(3), (4, 1, 1)), poses, size, size, tuple("abcd"))
-    asked = np.eye(4)
-    assert nearest_camera(cameras, turned) == 1
-    for x, row in ((0.5, 0), (3.0, 2), (8.0, 3)):
-        asked[0, 3] = -x
-        assert nearest_camera(cameras, asked) == row
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,8 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.cli import main
 from pipelines.commands import view
 from pipelines.console import Console
-from pipelines.inputs.view_source import ViewSource
+from pipelines.viewing import live, serve
+from pipelines.viewing.source import ViewSource
 from viz.run_view.point_colors import MODES
 from viz.run_view.render import picture_of
 from viz.web.viewer import BUDGET, LOCAL, PORT
@@ -110,7 +111,7 @@ def test_the_open3d_window_shows_the_run_and_steps_through_it(folder, tmp_path):
     code = f"""
 from pathlib import Path
 import numpy as np
-from pipelines.inputs.view_source import ViewSource
+from pipelines.viewing.source import ViewSource
 from viz.open3d.window import Open3dViewer
 
 said = []
@@ -180,7 +181,7 @@ def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(folder, tmp_path
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", port)) == 0
 
-    with view.live_viewer(later, Console(), "--port", str(port)):
+    with live.live_viewer(later, Console(), "--port", str(port)):
         end = time.monotonic() + 60
         while not reached():
             assert time.monotonic() < end
@@ -195,7 +196,7 @@ def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(folder, tmp_path
 
 
 def test_a_run_that_fails_at_once_says_no_more_than_why(tmp_path, capfd):
-    with pytest.raises(OptionError), view.live_viewer(tmp_path / "run", Console()):
+    with pytest.raises(OptionError), live.live_viewer(tmp_path / "run", Console()):
         # While the viewer is still starting.
         time.sleep(0.3)
         raise OptionError("no such project")
@@ -217,7 +218,7 @@ def test_a_round_that_came_while_the_viewer_started_is_shown(folder, tmp_path, c
     shown = source.read()
     later.rename(growing / "round_002")
     rounds: list[int] = []
-    following = view.Following(source, shown, lambda r: rounds.append(r.last_round), Console())
+    following = serve.Following(source, shown, lambda r: rounds.append(r.last_round), Console())
     following.look()
     following.look()
     assert rounds == [2]
@@ -230,7 +231,7 @@ def test_a_report_that_cannot_be_read_does_not_end_the_viewer(folder, tmp_path, 
     shutil.copytree(folder, growing)
     (growing / "round_002").rename(kept)
     source, rounds = ViewSource(growing), list[int]()
-    following = view.Following(
+    following = serve.Following(
         source, source.read(), lambda run: rounds.append(run.last_round), Console()
     )
     (growing / "round_002").mkdir()

@@ -14,7 +14,8 @@ from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
-from pipelines.inputs.view_source import ViewSource
+from gvtools.runs.layout import inside
+from pipelines.viewing.source import ViewSource
 from viz.plots.palette import COLORS, GREY
 from viz.run_view.detail import detail
 from viz.run_view.point_colors import (
@@ -26,7 +27,7 @@ from viz.run_view.point_colors import (
     viridis,
 )
 from viz.run_view.render import RunRenderer, picture_of
-from viz.run_view.view import CONTEXT, TARGET, inside
+from viz.run_view.view import CONTEXT, TARGET
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +231,7 @@ def test_starting_a_viewer_imports_neither_torch_nor_open3d(folder):
     code = (
         "import sys; from pathlib import Path\n"
         "import pipelines.cli; pipelines.cli.build_parser()\n"
-        "from pipelines.inputs.view_source import ViewSource\n"
+        "from pipelines.viewing.source import ViewSource\n"
         "from viz.web.viewer import WebViewer\n"
         f"source = ViewSource(Path({str(folder)!r}))\n"
         "viewer = WebViewer(source.read(), port=18230)\n"

@@ -23,7 +23,7 @@ from memory_scenes import camera
 from PIL import Image
 
 from gvtools.memory.io.ply import write_ply
-from pipelines.inputs.view_source import ViewSource
+from pipelines.viewing.source import ViewSource
 from viz.run_view.render import RunRenderer, picture_of
 from viz.run_view.view import TARGET
 

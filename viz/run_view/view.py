@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
+from gvtools.runs.layout import AFTER, COMPLETION, GUIDANCE, round_folder
+from gvtools.runs.target_files import entry_camera, read_picture
 from viz.run_view.point_colors import PointColors, point_colors, view_counts
 from viz.run_view.upright import STRAY, guessed_up
 
@@ -24,8 +26,8 @@ if TYPE_CHECKING:
     from gvtools.scenes.scene import Frame
 
 CONTEXT, TARGET = "context", "target"
-# What a round leaves of a target, by the title that a viewer gives it.
-PICTURES = {"guidance": "guidance", "completion": "generated", "memory after": "after"}
+# The pictures that a round leaves of a target, by the title that a viewer gives them.
+PICTURES = {"guidance": GUIDANCE, "completion": COMPLETION, "memory after": AFTER}
 TRUTH = "truth"
 
 
@@ -131,11 +133,16 @@ class RunView:
         """
         out = {}
         if shown.stem is not None:
-            folder = self.path / f"round_{shown.round:03d}"
-            for title, prefix in PICTURES.items():
-                path = inside(self.path, folder / f"{prefix}_{shown.stem}.png")
-                if path.is_file():
-                    out[title] = _read_picture(path)
+            folder = round_folder(self.path, shown.round)
+            for title, kind in PICTURES.items():
+                try:
+                    out[title] = read_picture(folder, kind, shown.stem)
+                except FileNotFoundError:
+                    continue
+                except (OSError, SyntaxError) as error:
+                    raise ProjectError(
+                        f"{folder}: the {title} of {shown.name} is no readable picture ({error})"
+                    ) from error
         frame = self.frame_of(shown.name)
         if frame is not None:
             out[TRUTH] = frame.rgb
@@ -211,37 +218,7 @@ def cameras_of(
     ]
     for report in reports[1:]:
         for entry in report["views"]:
-            stored = entry["camera"]
-            camera = Cameras(
-                np.array(stored["K"])[None],
-                np.array(stored["cam_from_world"])[None],
-                np.array([stored["width"]]),
-                np.array([stored["height"]]),
-                (entry["name"],),
-            )
             coverage = (float(entry["coverage"]), float(entry["coverage_after"]))
-            out.append(
-                ShownCamera(entry["name"], TARGET, report["round"], camera, entry["stem"], coverage)
-            )
+            camera, number = entry_camera(entry), report["round"]
+            out.append(ShownCamera(entry["name"], TARGET, number, camera, entry["stem"], coverage))
     return tuple(out)
-
-
-def inside(folder: Path, path: Path) -> Path:
-    """``path``, if it lies in ``folder`` once every link and ".." is followed.
-
-    Raises:
-        ProjectError: it does not.
-    """
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise ProjectError(f"{path}: lies outside {folder}; only a run's own files are read")
-    return path
-
-
-def _read_picture(path: Path) -> NDArray[np.uint8]:
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            return np.array(image.convert("RGB"))
-    except (OSError, SyntaxError) as error:
-        raise ProjectError(f"{path}: no readable picture ({error})") from error

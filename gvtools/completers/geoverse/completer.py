@@ -24,7 +24,7 @@ from gvtools.completers.base import (
     check_views,
 )
 from gvtools.completers.geoverse.completer_settings import GeoVerseSettings
-from gvtools.completers.geoverse.context_views import covisible_views, nearest_views
+from gvtools.completers.geoverse.context_views import chosen_views
 from gvtools.completers.geoverse.correction import seamless
 from gvtools.completers.geoverse.fill import Filled
 from gvtools.completers.geoverse.flow import interval_bounds
@@ -139,10 +139,8 @@ class GeoVerseCompleter(Completer):
             part = guidance.rows(rows)
             fill = None if filled is None else filled.rows(range(first, first + len(rows)))
             depth = part.depth if fill is None else fill.depth
-            if self.settings.context_selection == "covisible":
-                chosen = covisible_views(context, part.cameras, depth, photographs)
-            else:
-                chosen = nearest_views(context, part.cameras, photographs)
+            selection = self.settings.context_selection
+            chosen = chosen_views(context, part.cameras, depth, photographs, selection=selection)
             effort = self._effort(part)
             canvas.put(rows, self._pass(chosen, part, fill, effort=effort, seed=seed), part)
             passes += 1

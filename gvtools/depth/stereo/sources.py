@@ -11,6 +11,7 @@ from gvtools.cameras import Cameras
 from gvtools.depth.stereo.depth_range import DepthRange, baselines, seen_points
 from gvtools.depth.stereo.warps import pixel_grid
 from gvtools.scenes.scene import Scene
+from gvtools.view_selection import in_view
 
 Float64 = NDArray[np.float64]
 
@@ -67,7 +68,7 @@ def choose_sources(
     reference, sources = cameras[views[name]], cameras[rows]
     tracks = seen_points(scene, name)
     points = _frustum_points(reference, depths) if tracks is None else tracks.positions
-    shared = _inside(sources, points)
+    shared = in_view(sources, points)
     if tracks is not None:
         tracked = tracks.seen_by(rows)
         # A track that misses a view may just be short; enough tracks are taken at their word.
@@ -121,11 +122,3 @@ def _frustum_points(camera: Cameras, depths: DepthRange) -> Float64:
     local = (rays[None] / inverse[:, None, None]).reshape(-1, 3)
     pose = camera.world_from_cam[0]
     return local @ pose[:3, :3].T + pose[:3, 3]
-
-
-def _inside(cameras: Cameras, points: Float64) -> NDArray[np.bool_]:
-    """(S, N) whether each point projects into each camera's image."""
-    xy, z = cameras.project(points)
-    size = np.stack([cameras.width, cameras.height], axis=-1)[:, None]
-    with np.errstate(invalid="ignore"):
-        return (z > 0) & (xy > 0).all(-1) & (xy < size).all(-1)

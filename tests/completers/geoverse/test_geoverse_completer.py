@@ -16,7 +16,7 @@ from gvtools.completers import Completion, ContextView, ScaleStatus, create
 from gvtools.completers.geoverse import completer as completer_module
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.context_views import nearest_views
+from gvtools.completers.geoverse.context_views import chosen_views
 from gvtools.completers.geoverse.depth_scale import PassScale
 from gvtools.completers.geoverse.model import Generated, GeoVerse
 from gvtools.completers.geoverse.postprocess import GENERATED
@@ -275,7 +275,7 @@ def test_predicted_rays_come_back_to_the_world(weights, monkeypatch, world):
     context, known = micro.moved(micro.context_views(2), micro.guidance(2, share=-1.0), **world)
     # Without any known depth, the centres alone give the scale.
     context = [replace(view, depth=None) for view in context]
-    order = nearest_views(context, known.cameras, 2)
+    order = chosen_views(context, known.cameras, known.depth, 2, selection="nearest")
 
     def perfect(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
         made = generate(self, batch, **options)

@@ -13,9 +13,10 @@ from tiny_scan import render, world_from_cam, write_colmap_scan, write_scan
 from gvtools.depth import choice
 from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError
+from gvtools.runs.context_depth import off_scale
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.cli import main
-from pipelines.reconstruction.depth_cache import colored, off_scale
+from pipelines.reconstruction.depth_cache import colored
 
 RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3", "--quiet")
 ALL = ("--set", "savings.depth_from_memory=none")

@@ -18,8 +18,8 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.settings import with_texts
-from pipelines.commands.reconstruct import reconstruct
 from pipelines.console import Console
+from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
 CONTEXT = [f"frame-{i:06d}.color.png" for i in (0, 2, 4, 6)]

@@ -18,8 +18,8 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
-from pipelines.commands.reconstruct import reconstruct
 from pipelines.console import Console
+from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
 SETTINGS = ("context=first:2", "targets=range:2-5", "views_per_round=2", "completer=inpaint")

@@ -5,7 +5,7 @@ import pytest
 from tiny_scan import write_scan
 
 from gvtools.errors import OptionError
-from gvtools.runs.round_files import target_stems
+from gvtools.runs.layout import target_stems
 from gvtools.scenes.project import open_project
 from gvtools.trajectory_files import write_trajectory
 from pipelines.reconstruction.plan import make_schedule

@@ -11,7 +11,7 @@ import pytest
 from tiny_scan import write_scan
 
 from gvtools.errors import OptionError
-from gvtools.runs.folder_lock import held_folder
+from gvtools.runs.folder_lock import folder_lock
 from gvtools.settings import changes, with_profile, with_texts
 from pipelines.cli import build_parser, main
 from pipelines.commands.tradeoff import asked_for
@@ -154,7 +154,7 @@ def test_a_damaged_trial_is_made_anew(scan, swept, tmp_path):
 
 
 def test_a_folder_takes_one_sweep_at_a_time(scan, tmp_path, capsys):
-    with held_folder(tmp_path / "out"):
+    with folder_lock(tmp_path / "out"):
         assert main(["tradeoff", str(scan), "--out", str(tmp_path / "out"), "--quiet"]) == 2
     assert "another process is at work" in capsys.readouterr().err
     file = tmp_path / "file"

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from pipelines.reconstruction.prefetch import ahead
+from pipelines.reconstruction.prefetch import prefetch
 
 
 def test_items_come_in_order_with_the_next_one_begun():
@@ -19,12 +19,12 @@ def test_items_come_in_order_with_the_next_one_begun():
             second.set()
         return 10 * item
 
-    items = ahead(load, range(4))
+    items = prefetch(load, range(4))
     assert next(items) == 0
     # Nobody has asked for it yet.
     assert second.wait(5) and 3 not in begun
     assert list(items) == [10, 20, 30]
-    assert list(ahead(load, [])) == []
+    assert list(prefetch(load, [])) == []
 
 
 def test_an_error_comes_where_its_item_would_have():
@@ -33,7 +33,7 @@ def test_an_error_comes_where_its_item_would_have():
             raise ValueError("broken")
         return item
 
-    items = ahead(load, range(3))
+    items = prefetch(load, range(3))
     assert next(items) == 0
     with pytest.raises(ValueError, match="broken"):
         next(items)

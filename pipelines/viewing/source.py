@@ -5,19 +5,17 @@ from __future__ import annotations
 import threading
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from gvtools.errors import GvError, MemoryFileError, ProjectError
-from gvtools.runs.finished import open_scenes, read_record, read_reports
-from gvtools.runs.folder import RunDirectory
-from pipelines.rendering.memory_source import open_memory
+from gvtools.errors import GvError, ProjectError
+from gvtools.runs.layout import RECORD
+from gvtools.runs.memory_file import load_memory
+from gvtools.runs.run import Run, count_rounds, load_growing_run
 from viz.run_view.view import RunView, cameras_of
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Frame, Scene
 
-# How often a memory is looked for that the run is just putting elsewhere.
-ATTEMPTS = 5
 KEPT_FRAMES = 8
 
 
@@ -32,11 +30,11 @@ class ViewSource:
     def __init__(self, path: Path, *, project: Path | None = None) -> None:
         self.path = path
         self.project = project
-        self._frames = ProjectFrames({}, None)
+        self._frames = ProjectFrames(None)
 
     def rounds(self) -> int:
-        """How many whole rounds the folder has; 0 also where there is no folder."""
-        return len(RunDirectory(self.path).reports())
+        """How many complete rounds the folder has; 0 also where there is no folder."""
+        return count_rounds(self.path)
 
     def read(self) -> RunView:
         """The run as it is now.
@@ -44,32 +42,20 @@ class ViewSource:
         Raises:
             GvError: no run or memory, a damaged file.
         """
-        if not self.path.is_dir():
-            memory = open_memory(self.path)
+        if not (self.path / RECORD).is_file():
+            memory = load_memory(self.path)
             return RunView(self.path, memory, (), cameras_of(memory, ()), self._frames)
-        record = read_record(self.path) if (self.path / "run.json").is_file() else {}
-        for attempt in range(ATTEMPTS):
-            reports = read_reports(self.path)
-            try:
-                memory = open_memory(self.path)
-            except MemoryFileError:
-                # The next round is done, and this one's memory gone.
-                if attempt == ATTEMPTS - 1 or len(reports) == self.rounds():
-                    raise
-                continue
-            if len(reports) == self.rounds():
-                break
-        if not self._frames.record:
-            self._frames = ProjectFrames(record, self.project)
-        planned = len(record["schedule"]) + 1 if "schedule" in record else None
+        run = load_growing_run(self.path, project=self.project)
+        if self._frames.run is None:
+            self._frames = ProjectFrames(run)
         try:
-            cameras = cameras_of(memory, reports)
+            cameras = cameras_of(run.memory, run.rounds)
         except GvError as error:
             raise ProjectError(
                 f"{self.path}: its rounds' reports hold a camera that is none ({error}); run "
                 "reconstruct again"
             ) from None
-        return RunView(self.path, memory, reports, cameras, self._frames, planned)
+        return RunView(self.path, run.memory, run.rounds, cameras, self._frames, run.planned)
 
     def lacking(self) -> str | None:
         """Why the project's own pictures cannot be shown; None when they can."""
@@ -80,13 +66,11 @@ class ProjectFrames:
     """The project's pixels by a view's name. The project is opened when it is first asked for.
 
     Args:
-        record: what run.json holds; empty where there is none.
-        project: where the project lies now; None: where it lay.
+        run: whose project it is; None where there is none.
     """
 
-    def __init__(self, record: dict[str, Any], project: Path | None) -> None:
-        self.record = record
-        self._project = project
+    def __init__(self, run: Run | None) -> None:
+        self.run = run
         self._lock = threading.Lock()
         self._opened = False
         self._scene: Scene | None = None
@@ -110,16 +94,17 @@ class ProjectFrames:
             if self._opened:
                 return
             self._opened = True
-            if not self.record:
+            if self.run is None:
                 self._lacking = "a memory without a run: no pictures of its cameras"
                 return
             try:
-                self._scene, self._truths = open_scenes(self.record, project=self._project)
+                self._scene, self._truths = self.run.scenes
             except (GvError, KeyError, TypeError) as error:
                 self._lacking = f"no pictures of the project: {error}"
 
     def _load_frame(self, name: str) -> Frame | None:
-        scene = self._scene if name in self.record.get("context", ()) else self._truths
+        given = self.run is not None and name in self.run.context
+        scene = self._scene if given else self._truths
         if scene is None or name not in scene.names:
             return None
         try:

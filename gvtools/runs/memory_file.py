@@ -1,4 +1,4 @@
-"""The memory that a command is given: a file, or a run's folder."""
+"""The memory in a file or in a run's folder."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.runs.layout import MEMORY
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
 
-FILE = "memory.npz"
 
-
-def open_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
+def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
     """The memory in a file or of a run.
 
     Args:
         path: a memory file, a coloured PLY, or a run's folder; an unfinished run gives that of its
-            last whole round.
+            last complete round.
         up_to: forget the rounds after this one; None keeps all.
 
     Raises:
@@ -33,7 +32,7 @@ def open_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
 
         memory = memory_from_ply(path)
     else:
-        memory = SpatialMemory.load(memory_file(path))
+        memory = SpatialMemory.load(memory_path(path))
     if up_to is not None:
         if up_to not in memory.rounds:
             raise OptionError(
@@ -46,20 +45,20 @@ def open_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
     return memory
 
 
-def memory_file(path: Path) -> Path:
-    """Where the memory lies that ``path`` means.
+def memory_path(path: Path) -> Path:
+    """The memory file that ``path``, a file or a run's folder, stands for.
 
     Raises:
-        ProjectError: nowhere.
+        ProjectError: there is none.
     """
     if path.is_file():
         return path
     if not path.is_dir():
         raise ProjectError(f"{path}: no such file or folder; expected a memory or a run's folder")
-    rounds = sorted(path.glob(f"round_*/{FILE}"))
-    for candidate in (path / FILE, *reversed(rounds)):
+    rounds = sorted(path.glob(f"round_*/{MEMORY}"))
+    for candidate in (path / MEMORY, *reversed(rounds)):
         if candidate.is_file():
             return candidate
     raise ProjectError(
-        f"{path}: holds no {FILE} and no round with one; expected a run's folder or a memory file"
+        f"{path}: holds no {MEMORY} and no round with one; expected a run's folder or a memory file"
     )

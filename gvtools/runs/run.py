@@ -1,0 +1,200 @@
+"""A run read back: its settings, its rounds and targets, its memory and its project."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gvtools.cameras import Cameras
+from gvtools.errors import MemoryFileError, ProjectError
+from gvtools.runs.folder import RunDirectory
+from gvtools.runs.layout import round_folder
+from gvtools.runs.memory_file import load_memory
+from gvtools.runs.record import read_record, read_reports, resolved_settings
+from gvtools.runs.target_files import TargetFiles, entry_camera, read_target
+
+if TYPE_CHECKING:
+    from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.scenes.scene import Scene, View
+
+
+# How often a run is read anew whose memory was replaced meanwhile.
+ATTEMPTS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class RunTarget:
+    """A target of a run that a round completed.
+
+    Attributes:
+        folder: of its round.
+        round: number of its round, from 1.
+        report: its entry in the round's report.
+    """
+
+    folder: Path
+    round: int
+    report: Mapping[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Of the target."""
+        return str(self.report["name"])
+
+    @cached_property
+    def camera(self) -> Cameras:
+        """Of the target, a batch of one."""
+        return entry_camera(self.report)
+
+    def read(self) -> TargetFiles:
+        """Its picture, depth and support.
+
+        Raises:
+            ProjectError: files are absent, damaged or of another version.
+        """
+        return read_target(self.folder, self.report)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run as its folder holds it; memory and project are read when they are first used.
+
+    Attributes:
+        path: its folder.
+        record: what run.json holds.
+        rounds: reports of the complete rounds, the context's (round 0) first; perhaps none.
+        project: where its project lies now; None: where it lay.
+    """
+
+    path: Path
+    record: Mapping[str, Any]
+    rounds: tuple[Mapping[str, Any], ...]
+    project: Path | None = None
+
+    @cached_property
+    def settings(self) -> Mapping[str, Any]:
+        """The resolved settings, nested, as JSON has them; derived values in their places."""
+        return resolved_settings(self.record)
+
+    @property
+    def context(self) -> tuple[str, ...]:
+        """Names of the context views."""
+        return tuple(self.record["context"])
+
+    @property
+    def planned(self) -> int:
+        """How many rounds the run is to have, the context's included."""
+        return len(self.record["schedule"]) + 1
+
+    @property
+    def complete(self) -> bool:
+        """Whether every planned round is there."""
+        return len(self.rounds) == self.planned
+
+    @cached_property
+    def views(self) -> tuple[RunTarget, ...]:
+        """The completed targets, in the order of the rounds."""
+        return tuple(
+            RunTarget(round_folder(self.path, number), number, entry)
+            for number, report in enumerate(self.rounds)
+            for entry in report["views"]
+        )
+
+    @cached_property
+    def memory(self) -> SpatialMemory:
+        """The memory after the last complete round.
+
+        Raises:
+            ProjectError: there is none.
+        """
+        return load_memory(self.path)
+
+    @cached_property
+    def scenes(self) -> tuple[Scene, Scene | None]:
+        """The project, and the scene with the true pictures of the targets, if there is one.
+
+        Raises:
+            GvError: it cannot be read any more.
+        """
+        from gvtools.scenes.project import open_project
+        from gvtools.scenes.reading import open_as
+        from gvtools.scenes.reduced import reduced
+
+        max_side = self.settings.get("max_side")
+        root = self.project or Path(self.record["project"])
+        scene = reduced(open_as(root, self.record["reading"]), max_side)
+        other = self.record["targets_project"]
+        if other is not None:
+            return scene, reduced(open_project(Path(other)), max_side)
+        return scene, scene if self.record["targets_kind"] == "hold-out" else None
+
+    def targets(self) -> Iterator[tuple[RunTarget, TargetFiles, View | None]]:
+        """Each completed target, its files, and the view with its true picture, if any.
+
+        Raises:
+            ProjectError: files are absent or damaged, or the project's camera has changed.
+        """
+        truths = self.scenes[1]
+        for view in self.views:
+            files = view.read()
+            truth = None if truths is None else truths[view.name]
+            if truth is not None and not _same_camera(truth, files):
+                raise ProjectError(
+                    f"{self.path}: the camera of {view.name} is another one now than when the run "
+                    "was made; expected the project as it was; run reconstruct again"
+                )
+            yield view, files, truth
+
+
+def load_run(path: Path, *, project: Path | None = None) -> Run:
+    """The run in a folder, finished or not.
+
+    Args:
+        path: the folder.
+        project: where its project lies now; None: where it lay.
+
+    Raises:
+        ProjectError: no run, a damaged one, or one of another version.
+    """
+    return Run(path, read_record(path), read_reports(path), project)
+
+
+def load_growing_run(path: Path, *, project: Path | None = None) -> Run:
+    """The run in a folder that another process may add rounds to; its memory is loaded.
+
+    Args:
+        path: the folder.
+        project: where its project lies now; None: where it lay.
+
+    Raises:
+        GvError: no run, no memory, or a damaged file.
+    """
+    for attempt in range(ATTEMPTS):
+        run = load_run(path, project=project)
+        try:
+            run.memory  # noqa: B018, loaded while it belongs to the rounds
+        except MemoryFileError:
+            # The next round is complete, and this one's memory gone.
+            if attempt == ATTEMPTS - 1 or len(run.rounds) == count_rounds(path):
+                raise
+            continue
+        if len(run.rounds) == count_rounds(path):
+            break
+    return run
+
+
+def count_rounds(path: Path) -> int:
+    """How many complete rounds a run's folder has; 0 also where there is no folder."""
+    return len(RunDirectory(path).reports())
+
+
+def _same_camera(view: View, target: TargetFiles) -> bool:
+    return all(
+        np.allclose(getattr(view.camera, name), getattr(target.camera, name), rtol=1e-9, atol=1e-9)
+        for name in ("K", "cam_from_world", "width", "height")
+    )

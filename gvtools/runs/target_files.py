@@ -1,0 +1,200 @@
+"""The pictures and arrays that a round leaves of each target: written and read."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.errors import ProjectError
+from gvtools.guidance import Guidance
+from gvtools.runs.arrays import save_arrays
+from gvtools.runs.layout import (
+    AFTER,
+    COMPLETION,
+    GUIDANCE,
+    REPORT,
+    VALID,
+    inside,
+    round_folder,
+    target_depth,
+    target_picture,
+    target_stems,
+)
+
+if TYPE_CHECKING:
+    from gvtools.completers.base import Completion
+
+# Grey levels of valid_NAME.png.
+SUPPORT_OBSERVED = 255
+SUPPORT_GENERATED = 128
+
+
+def write_target(
+    folder: Path,
+    stem: str,
+    *,
+    guidance: Guidance,
+    completion: Completion,
+    fused: NDArray[np.bool_],
+) -> None:
+    """Write the guidance of a target and its completion.
+
+    ``guidance_STEM.png`` (holes black), ``valid_STEM.png`` (guidance from observations 255, from
+    generated points 128, holes 0), ``generated_STEM.png`` (the completed picture), and
+    ``depth_STEM.npz`` with the keys guidance and completion (float32 z-depth, scene units, 0 =
+    none) and fused (bool).
+
+    Args:
+        folder: of the round.
+        stem: of the target's file names, see ``layout.target_stems``.
+        guidance: a batch of one.
+        completion: a batch of one.
+        fused: (H, W), the pixels that were fused.
+    """
+    support = np.where(guidance.generated[0], SUPPORT_GENERATED, SUPPORT_OBSERVED)
+    support = np.where(guidance.valid[0], support, 0).astype(np.uint8)
+    write_png(target_picture(folder, GUIDANCE, stem), to_bytes(guidance.rgb[0]))
+    write_png(target_picture(folder, VALID, stem), support)
+    write_png(target_picture(folder, COMPLETION, stem), to_bytes(completion.rgb[0]))
+    save_arrays(
+        target_depth(folder, stem),
+        guidance=guidance.depth[0],
+        completion=completion.depth[0],
+        fused=fused,
+    )
+
+
+def write_after(folder: Path, stem: str, after: Guidance) -> None:
+    """Write what memory shows of a target after the round, ``after_STEM.png``; holes black."""
+    write_png(target_picture(folder, AFTER, stem), to_bytes(after.rgb[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class TargetFiles:
+    """What a round left of one target.
+
+    Attributes:
+        name: of the target.
+        camera: a batch of one.
+        picture: (H, W, 3) uint8, completed; holes are black.
+        depth: (H, W) float32 z-depth of the picture, brought to the memory's scale, scene units,
+            0 = none.
+        observed: (H, W) bool, pixels that stand on observations.
+        generated: (H, W) bool, pixels that a completer made, in this round or an earlier one.
+    """
+
+    name: str
+    camera: Cameras
+    picture: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    observed: NDArray[np.bool_]
+    generated: NDArray[np.bool_]
+
+
+def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
+    """One target of a round.
+
+    Args:
+        folder: the round's, in the run's.
+        entry: the target's, of the round's report.
+
+    Raises:
+        ProjectError: files of the round are absent, damaged, of an older version or outside the
+            run's folder.
+    """
+    try:
+        stem, camera = entry["stem"], entry_camera(entry)
+        picture = read_picture(folder, COMPLETION, stem)
+        support = read_picture(folder, VALID, stem)
+        file = inside(folder.parent, target_depth(folder, stem))
+        with np.load(file, allow_pickle=False) as stored:
+            depth = stored["completion"]
+        scale = entry["scale"]["scale"]
+    except (OSError, EOFError, BadZipFile, ValueError, KeyError, TypeError) as error:
+        raise ProjectError(
+            f"{folder}: the target {entry.get('name', '?')} cannot be read ({error!r}); expected a "
+            "round of this version; run reconstruct again"
+        ) from error
+    observed = support == SUPPORT_OBSERVED
+    aligned = depth * np.float32(scale) if scale is not None and scale == scale else depth
+    return TargetFiles(
+        str(entry["name"]), camera, picture, aligned, observed, ~observed & (depth > 0)
+    )
+
+
+def read_picture(folder: Path, kind: str, stem: str) -> NDArray[np.uint8]:
+    """The pixels of a target's picture, see ``layout.target_picture``.
+
+    Raises:
+        ProjectError: it lies outside the run's folder.
+        OSError: it is absent or damaged.
+    """
+    from PIL import Image
+
+    with Image.open(inside(folder.parent, target_picture(folder, kind, stem))) as image:
+        return np.asarray(image)
+
+
+def entry_camera(entry: Mapping[str, Any]) -> Cameras:
+    """The camera, a batch of one, of a target's entry in a report."""
+    stored = entry["camera"]
+    return Cameras(
+        np.array(stored["K"])[None],
+        np.array(stored["cam_from_world"])[None],
+        np.array([stored["width"]]),
+        np.array([stored["height"]]),
+        (entry["name"],),
+    )
+
+
+def completed_picture(run: Path, number: int, name: str) -> Path | None:
+    """The file, absolute, with the completed picture of a target; None where there is none.
+
+    Args:
+        run: the run's folder.
+        number: of the round.
+        name: of the target.
+
+    Raises:
+        ProjectError: it lies outside the run's folder.
+    """
+    folder = round_folder(run, number)
+    try:
+        views = json.loads((folder / REPORT).read_text(encoding="utf-8"))["views"]
+        stem = str(next(view["stem"] for view in views if view["name"] == name))
+    except (OSError, ValueError, KeyError, TypeError, StopIteration):
+        (stem,) = target_stems((name,))
+    path = target_picture(folder, COMPLETION, stem)
+    return inside(run, path).resolve() if path.is_file() else None
+
+
+def camera_entry(camera: Cameras) -> dict[str, Any]:
+    """A camera, a batch of one, as a report holds it."""
+    return {
+        "K": camera.K[0].tolist(),
+        "cam_from_world": camera.cam_from_world[0].tolist(),
+        "width": int(camera.width[0]),
+        "height": int(camera.height[0]),
+    }
+
+
+def to_bytes(rgb: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    """Colours in [0, 1] as uint8."""
+    return np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write a picture as PNG."""
+    from PIL import Image
+
+    # Run lengths alone are faster than a search for repeats, and smaller on these pictures.
+    Image.fromarray(image).save(path, format="PNG", compress_level=1, compress_type=zlib.Z_RLE)

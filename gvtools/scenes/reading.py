@@ -1,0 +1,80 @@
+"""A project opened with what the user said of it, as plain data that a run records."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gvtools.errors import OptionError
+from gvtools.scenes.project import open_project
+
+if TYPE_CHECKING:
+    from gvtools.scenes.rgbd_recording import RgbdOptions
+    from gvtools.scenes.scene import Scene
+
+# Options of a project by name, with the name that RgbdOptions has for those of RGB-D folders.
+READING = {
+    "images": None,
+    "masks": None,
+    "depth_unit": "depth_unit",
+    "depth_max": "depth_max",
+    "color_intrinsics": "color_K",
+    "depth_intrinsics": "depth_K",
+    "color_from_depth": "color_from_depth",
+    "max_time_difference": "max_time_difference",
+}
+
+
+def open_as(path: Path, reading: Mapping[str, Any]) -> Scene:
+    """The project at ``path``, read with options.
+
+    Args:
+        path: see ``gvtools.scenes.project.open_project``.
+        reading: options by the names of READING, JSON-ready; absent and None leave the default.
+
+    Raises:
+        GvError: as of ``open_project``; OptionError also for a matrix file that is none.
+    """
+    folders = {
+        name: None if reading.get(name) is None else Path(reading[name])
+        for name in ("images", "masks")
+    }
+    return open_project(path, **folders, rgbd=rgbd_options(reading))
+
+
+def rgbd_options(reading: Mapping[str, Any]) -> RgbdOptions | None:
+    """The options of RGB-D folders; None where there are none.
+
+    Raises:
+        OptionError: a matrix file that is none.
+    """
+    options = {
+        option: reading[name]
+        for name, option in READING.items()
+        if option is not None and reading.get(name) is not None
+    }
+    if not options:
+        return None
+    if "color_from_depth" in options:
+        options["color_from_depth"] = _matrix(Path(options["color_from_depth"]))
+    from gvtools.scenes.rgbd_recording import RgbdOptions
+
+    return RgbdOptions(**options)
+
+
+def _matrix(path: Path) -> list[list[float]]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        rows = [[float(word) for word in line.replace(",", " ").split()] for line in lines]
+    except (OSError, ValueError) as error:
+        raise OptionError(
+            f"--color-from-depth {path}: unreadable ({error}); expected a text file of 4x4 numbers"
+        ) from None
+    rows = [row for row in rows if row]
+    if [len(row) for row in rows] != [4, 4, 4, 4]:
+        raise OptionError(
+            f"--color-from-depth {path}: rows of {[len(row) for row in rows]} numbers; expected "
+            "four rows of four"
+        )
+    return rows

@@ -1,0 +1,150 @@
+"""A run: plan, rounds of fuse, project and complete, and what is left of them in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gvtools.files import write_json
+from gvtools.runs.folder import RunDirectory
+from gvtools.runs.layout import MEMORY, REPORT
+from pipelines.console import Console
+from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
+
+if TYPE_CHECKING:
+    from gvtools.completers.base import ContextView
+    from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.scenes.scene import Scene
+    from pipelines.reconstruction.settings import RunSettings
+
+# Draws what a finished run shows, given its plan and its folder; returns the names of the files.
+Draw = Callable[[Plan, RunDirectory], Sequence[str]]
+
+
+def reconstruct(
+    scene: Scene,
+    config: RunSettings,
+    out: Path,
+    *,
+    console: Console,
+    resume: bool = False,
+    dry_run: bool = False,
+    reading: Mapping[str, Any] | None = None,
+    draw: Draw | None = None,
+) -> Path:
+    """Fuse the context, then project, complete and fuse the targets round by round.
+
+    Args:
+        scene: the project.
+        config: what to compute.
+        out: the run's folder.
+        console: where progress and figures go.
+        resume: continue after the last complete round.
+        dry_run: say what would be done, and write nothing.
+        reading: how the user said the project is to be read, JSON-ready; part of what a resumed
+            run must share with its beginning.
+        draw: writes pictures and pages of the finished run; None writes none.
+
+    Returns:
+        The run's folder.
+
+    Raises:
+        GvError: wrong input or options; nothing of an earlier run is lost.
+    """
+    plan = make_plan(scene, config, say=console.line)
+    describe(plan, console)
+    directory = RunDirectory(out)
+    identity = run_identity(plan, reading or {})
+    if dry_run:
+        exists = directory.check(identity, resume=resume)
+        state = "the run in it was left as it is" if exists else "no run was started in it"
+        console.line(f"dry run: {out}: {state}")
+        return out
+    with directory.open_or_resume(identity, resume=resume) as done:
+        memory = _last_memory(plan, directory, done, console) if done else _empty_memory(plan)
+        _run_rounds(plan, memory, directory, done, console)
+        _finish(plan, memory, directory, console, draw)
+    return out
+
+
+def _empty_memory(plan: Plan) -> SpatialMemory:
+    from gvtools.memory.spatial_memory import SpatialMemory
+    from pipelines.reconstruction.voxel_edge import grid_frame
+
+    assert plan.config.voxel is not None
+    frame = grid_frame(plan.scene, plan.context)
+    return SpatialMemory(
+        plan.config.voxel, origin=frame.origin, axes=frame.axes, options=plan.config.memory
+    )
+
+
+def _last_memory(plan: Plan, directory: RunDirectory, done: int, console: Console) -> SpatialMemory:
+    """The memory after the last of ``done`` complete rounds."""
+    from gvtools.memory.spatial_memory import SpatialMemory
+
+    console.line(f"resuming after round {done - 1}")
+    memory = SpatialMemory.load(directory.last_memory(done))
+    # A finished run's memory holds every round, also one whose folder was removed since.
+    for later in [number for number in reversed(memory.rounds) if number >= done]:
+        memory.forget(round=later)
+    return memory
+
+
+def _run_rounds(
+    plan: Plan, memory: SpatialMemory, directory: RunDirectory, done: int, console: Console
+) -> None:
+    """The rounds from number ``done`` on."""
+    from pipelines.reconstruction.depth_cache import DepthCache
+    from pipelines.reconstruction.round_targets import RoundTargets
+    from pipelines.reconstruction.rounds import load_context
+    from pipelines.reconstruction.run_round import run_round
+
+    context: list[ContextView] | None = None
+    with RoundTargets(plan, memory) as targets:
+        for number in range(done, len(plan.schedule) + 1):
+            if number and context is None:
+                cache = DepthCache(plan.scene, plan.context, plan.source, directory.round_path(0))
+                context = load_context(plan.scene, plan.context, cache)
+            with directory.writing_round(number) as folder:
+                report = run_round(plan, targets, number, context or [], folder, console)
+                memory.save(folder / MEMORY)
+                write_json(folder / REPORT, report)
+            console.line(_round_line(report))
+
+
+def _round_line(report: dict[str, Any]) -> str:
+    text = (
+        f"round {report['round']}: {report['points']:,} observations in {report['voxels']:,} "
+        f"voxels (+{report['added']:,} added, {report['merged']:,} merged, "
+        f"{report['rejected']:,} rejected)"
+    )
+    if report["coverage_before"] is not None:
+        text += f", coverage {report['coverage_before']:.1%} -> {report['coverage_after']:.1%}"
+    return f"{text}, {report['seconds']['total']:.1f} s"
+
+
+def _finish(
+    plan: Plan,
+    memory: SpatialMemory,
+    directory: RunDirectory,
+    console: Console,
+    draw: Draw | None,
+) -> None:
+    """The run's end products, all derived from the last round's memory."""
+    from gvtools.memory.io.ply import export_memory_ply
+    from gvtools.runs.context_depth import off_scale
+    from pipelines.reconstruction.measure import measure_run
+    from viz.plots.growth import growth_text
+
+    export_memory_ply(memory, directory.path / "memory.ply")
+    metrics = measure_run(plan, memory, directory, console)
+    directory.finish(len(plan.schedule), metrics)
+    drawn = draw(plan, directory) if draw else ()
+    reports = directory.reports()
+    console.line(growth_text(reports))
+    flagged = off_scale(reports[0].get("depth", ()))
+    if flagged:
+        console.warn(f"{flagged}; figures in {directory.round_path(0) / REPORT}")
+    files = ", ".join(["memory.npz", "memory.ply", *drawn, "metrics.json", "round_*/"])
+    console.line(f"results in {directory.path}: {files}")

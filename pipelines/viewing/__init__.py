@@ -1,0 +1,1 @@
+"""The viewers of runs: what they read, the web page that follows a run, pictures."""
