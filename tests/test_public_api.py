@@ -21,7 +21,7 @@ DOCTESTED = (
     "gvtools.cameras",
     "gvtools.completers.complete",
     "gvtools.evaluation.trajectories",
-    "gvtools.settings",
+    "gvtools.settings.base",
     "gvtools.trajectory_files",
 )
 
