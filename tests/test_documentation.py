@@ -58,7 +58,9 @@ def test_the_completer_of_the_page_on_completers_works() -> None:
     known = np.zeros((1, 4, 6), bool)
     zeros = known.astype(np.float32)
     camera = gvtools.Cameras.pinhole(6, 4, focal=5.0)
-    guidance = gvtools.Guidance(camera, np.zeros((1, 4, 6, 3)), zeros, known, zeros, known)
+    guidance = gvtools.Guidance(
+        camera, np.zeros((1, 4, 6, 3), np.float32), zeros, known, zeros, known
+    )
     completion = create("grey", level="0.25").complete([], guidance)
     assert np.all(completion.rgb == 0.25)
 
