@@ -98,7 +98,8 @@ def python_page() -> str:
         value = getattr(gvtools, name)
         text += [f"## {name}", "", "```text"]
         try:
-            text.append(f"gvtools.{name}{inspect.signature(value)}")
+            signature = re.sub(r"(: |-> )'([^']*)'", r"\1\2", str(inspect.signature(value)))
+            text.append(f"gvtools.{name}{signature}")
         except (TypeError, ValueError):
             text.append(f"gvtools.{name}")
         text += ["", inspect.getdoc(value) or "", ""]
@@ -109,9 +110,10 @@ def python_page() -> str:
 
 
 def _members(kind: type) -> Iterator[str]:
-    """The public methods and properties that a class itself defines, a line each."""
-    for name, member in vars(kind).items():
-        member = member.__func__ if isinstance(member, staticmethod) else member
+    """The public methods and properties of a class and its bases, a line each."""
+    members = {name: entry for base in reversed(kind.__mro__) for name, entry in vars(base).items()}
+    for name, member in members.items():
+        member = getattr(member, "__func__", member)  # of static and class methods
         documented = inspect.getdoc(member)
         if name.startswith("_") or not documented:
             continue
