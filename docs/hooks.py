@@ -8,7 +8,6 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -25,7 +24,6 @@ RENAMED_LINKS = {"generative.md": "measurements-generative.md"} | {
     "complete.md": "measurements-complete.md",
     "README.md": "measurements.md",
 }
-BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -68,56 +66,27 @@ def commands_page() -> str:
 
 
 def settings_page() -> str:
-    """Every setting of a run: its name, type, default, range and meaning."""
-    from pipelines.config import PROFILES, RunConfig
+    """Every setting of a run, by section, and what the profiles change."""
+    from gvtools.settings import markdown
+    from pipelines.reconstruction.settings import RunSettings
 
+    settings = RunSettings()
     text = [
         "# Settings",
         "",
         "Settings come from the defaults, then `--profile`, then a JSON file (`--config`), then "
         "the options, then `--set NAME=VALUE`. The resolved ones are written to `run.json`. A name "
-        "that does not exist is an error which names the nearest one.",
+        "that does not exist is an error which names the nearest one. `gvtools reconstruct "
+        "--help-settings` prints this list.",
         "",
-        "| setting | default | range | meaning |",
-        "|---|---|---|---|",
+        markdown(settings),
+        "## Profiles",
+        "",
     ]
-    text += [f"| `{n}` | `{d}` | {r} | {_cell(doc)} |" for n, d, r, doc in _settings(RunConfig())]
-    text += ["", "## Profiles", ""]
-    for name, changes in PROFILES.items():
+    for name, changes in settings.profiles.items():
         changed = ", ".join(f"`{key}={value}`" for key, value in changes.items())
         text.append(f"- `{name}`: {changed or 'the defaults'}")
     return "\n".join(text) + "\n"
-
-
-def _settings(model: Any, prefix: str = "") -> Iterator[tuple[str, Any, str, str]]:
-    """Name, default, range and meaning of every field of a settings model, nested ones included."""
-    documented = _attributes(model)
-    fields = getattr(type(model), "model_fields", None) or type(model).__dataclass_fields__
-    for name, entry in fields.items():
-        value = getattr(model, name)
-        if hasattr(type(value), "model_fields") or hasattr(type(value), "__dataclass_fields__"):
-            yield from _settings(value, f"{prefix}{name}.")
-            continue
-        ends = [
-            f"{word} {getattr(item, end):g}"
-            for item in getattr(entry, "metadata", ())
-            for end, word in BOUNDS.items()
-            if getattr(item, end, None) is not None
-        ]
-        meaning = getattr(entry, "description", None) or documented.get(name, "")
-        yield f"{prefix}{name}", value, ", ".join(ends), meaning
-
-
-def _attributes(model: Any) -> dict[str, str]:
-    """The entries of a docstring's section "Attributes"."""
-    _, _, section = (inspect.getdoc(type(model)) or "").partition("Attributes:\n")
-    entries = re.split(r"^    (?=\w+: )", section, flags=re.MULTILINE)[1:]
-    return {name: text for name, _, text in (entry.partition(": ") for entry in entries)}
-
-
-def _cell(text: str) -> str:
-    """Text of a docstring as one cell of a table."""
-    return " ".join(text.replace("``", "`").replace("|", "\\|").split())
 
 
 def python_page() -> str:
@@ -129,7 +98,8 @@ def python_page() -> str:
         value = getattr(gvtools, name)
         text += [f"## {name}", "", "```text"]
         try:
-            text.append(f"gvtools.{name}{inspect.signature(value)}")
+            signature = re.sub(r"(: |-> )'([^']*)'", r"\1\2", str(inspect.signature(value)))
+            text.append(f"gvtools.{name}{signature}")
         except (TypeError, ValueError):
             text.append(f"gvtools.{name}")
         text += ["", inspect.getdoc(value) or "", ""]
@@ -140,9 +110,10 @@ def python_page() -> str:
 
 
 def _members(kind: type) -> Iterator[str]:
-    """The public methods and properties that a class itself defines, a line each."""
-    for name, member in vars(kind).items():
-        member = member.__func__ if isinstance(member, staticmethod) else member
+    """The public methods and properties of a class and its bases, a line each."""
+    members = {name: entry for base in reversed(kind.__mro__) for name, entry in vars(base).items()}
+    for name, member in members.items():
+        member = getattr(member, "__func__", member)  # of static and class methods
         documented = inspect.getdoc(member)
         if name.startswith("_") or not documented:
             continue

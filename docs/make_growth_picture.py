@@ -28,7 +28,7 @@ Picture = NDArray[np.uint8]
 def from_above(memory: gvtools.SpatialMemory, low: NDArray, high: NDArray) -> Picture:
     """The cloud seen along -z, without the ceiling; ``low`` and ``high`` bound it."""
     cloud = memory.cloud
-    points = cloud.point.positions.numpy() + memory.origin
+    points = memory.positions
     colors = tinted(cloud.point.colors.numpy(), cloud.point.generated.numpy()[:, 0] > 0)
     scale = min((WIDTH - 1) / (high[0] - low[0]), (HEIGHT - 1) / (high[1] - low[1]))
     keep = (points >= low).all(1) & (points <= high).all(1)
@@ -64,8 +64,7 @@ def main(folder: Path) -> None:
     wide = gvtools.Cameras.pinhole(
         WIDTH, HEIGHT, focal=0.5 * WIDTH, cam_from_world=camera.cam_from_world[0]
     )
-    positions = memory.cloud.point.positions.numpy() + memory.origin
-    low, high = np.quantile(positions, [0.0005, 0.9995], axis=0)
+    low, high = np.quantile(memory.positions, [0.0005, 0.9995], axis=0)
     columns = []
     for number in reversed(memory.rounds):
         count = len(memory)

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from tempfile import gettempdir
 
-from gvtools.scenes.synthetic import write_room
+from gvtools.procedural.room_sample import write_room
 
 
 def sample_project() -> Path:

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 # This package's front stands on top of all layers: it only re-exports, and no module of the
-# project imports these names from it. The type checker, editors and import-linter see the same
-# imports as the table below; the one that points upwards, to what composes the library into runs
-# (pipelines.api), is the one exception that the import contract lists.
+# project imports these names from it. One entry points upwards, to pipelines.api, which composes
+# the library into runs. import-linter sees neither imports by name nor those for type checkers, so
+# tests/test_public_api.py holds that this is the only one, and that nothing goes through it.
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras
     from gvtools.completers.base import Completer, Completion, ContextView
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from gvtools.trajectory_files import read_poses
     from pipelines.api import evaluate, reconstruct
 
-# Where each public name is defined. tests/test_public_api.py holds it equal to the imports above.
+# Where each public name is defined; the same as the imports above.
 _SOURCES = {
     "Cameras": "gvtools.cameras:Cameras",
     "Completer": "gvtools.completers.base:Completer",

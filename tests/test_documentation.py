@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from tiny_scan import write_scan
 
@@ -47,6 +48,21 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
     exec(compile(code, "README.md", "exec"), names)
     assert names["completion"].depth.shape == names["guidance"].depth.shape  # type: ignore[attr-defined]
     assert len(names["cloud"].point.positions) == len(names["memory"]) > 0  # type: ignore[attr-defined, arg-type]
+
+
+def test_the_completer_of_the_page_on_completers_works() -> None:
+    from gvtools.completers.base import create
+
+    page = (ROOT / "docs/concepts/completers.md").read_text(encoding="utf-8")
+    exec(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)[0], {})
+    known = np.zeros((1, 4, 6), bool)
+    zeros = known.astype(np.float32)
+    camera = gvtools.Cameras.pinhole(6, 4, focal=5.0)
+    guidance = gvtools.Guidance(
+        camera, np.zeros((1, 4, 6, 3), np.float32), zeros, known, zeros, known
+    )
+    completion = create("grey", level="0.25").complete([], guidance)
+    assert np.all(completion.rgb == 0.25)
 
 
 def test_the_generated_pages_hold_every_command_and_public_name(hooks: ModuleType) -> None:

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from gvtools.scenes.synthetic import write_room
 
 import gvtools
+from gvtools.procedural.room_sample import write_room
 
 FOLDER = Path(gvtools.__file__).parent.parent / "examples"
 SCRIPTS = sorted(FOLDER.glob("0*.py"))
