@@ -30,6 +30,7 @@ def run_round(
     plan: Plan,
     targets: RoundTargets,
     number: int,
+    *,
     context: Sequence[ContextView],
     folder: Path,
     console: Console,
