@@ -199,9 +199,7 @@ def _run_rounds(
                 kept = KeptDepth(plan.scene, plan.context, plan.source, directory.round_path(0))
                 context = load_context(plan.scene, plan.context, kept)
             with directory.writing_round(number) as folder:
-                report = run_round(
-                    plan, targets, number, context=context or [], folder=folder, console=console
-                )
+                report = run_round(plan, targets, number, context or [], folder, console)
                 memory.save(folder / "memory.npz")
                 write_json(folder / "report.json", report)
             console.line(_round_line(report))

@@ -30,7 +30,6 @@ def run_round(
     plan: Plan,
     targets: RoundTargets,
     number: int,
-    *,
     context: Sequence[ContextView],
     folder: Path,
     console: Console,

@@ -140,7 +140,7 @@ class GeoVerseCompleter(Completer):
             fill = None if filled is None else filled.rows(range(first, first + len(rows)))
             depth = part.depth if fill is None else fill.depth
             if self.settings.context_selection == "covisible":
-                chosen = covisible_views(context, part.cameras, depth, count=photographs)
+                chosen = covisible_views(context, part.cameras, depth, photographs)
             else:
                 chosen = nearest_views(context, part.cameras, photographs)
             effort = self._effort(part)

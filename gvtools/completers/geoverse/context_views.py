@@ -19,7 +19,7 @@ SAME_DEPTH = 0.1
 
 
 def covisible_views(
-    context: Sequence[ContextView], targets: Cameras, depth: NDArray[np.float32], *, count: int
+    context: Sequence[ContextView], targets: Cameras, depth: NDArray[np.float32], count: int
 ) -> list[ContextView]:
     """The context views that together see most of what the targets show, the best one first.
 
@@ -31,7 +31,7 @@ def covisible_views(
         context: to choose from.
         targets: V cameras of one picture size.
         depth: (V, H, W) z-depth, scene units, filled where that is possible; 0 and what is not
-            finite does not count.
+            finite count not.
         count: how many to choose.
     """
     if len(context) <= 1:

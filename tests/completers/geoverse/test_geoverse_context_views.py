@@ -79,7 +79,7 @@ def test_a_view_that_sees_the_target_comes_before_one_that_stands_nearer():
         looking((0.1, 0, 0), 1.2, "turned away"), looking((0, 0, -2), 0.0, "behind it")
     )
     assert names(nearest_views(context, target, 1)) == ["turned away"]
-    assert names(covisible_views(context, target, wall(2.0)[None], count=1)) == ["behind it"]
+    assert names(covisible_views(context, target, wall(2.0)[None], 1)) == ["behind it"]
 
 
 def test_the_second_view_shows_what_the_first_does_not():
@@ -89,8 +89,8 @@ def test_the_second_view_shows_what_the_first_does_not():
         looking((-1.05, 0, 0), 0.0, "left again"),
         looking((1.2, 0, 0), 0.0, "right"),
     )
-    assert names(covisible_views(context, target, wall(2.0)[None], count=2)) == ["left", "right"]
-    everything = covisible_views(context, target, wall(2.0)[None], count=9)
+    assert names(covisible_views(context, target, wall(2.0)[None], 2)) == ["left", "right"]
+    everything = covisible_views(context, target, wall(2.0)[None], 9)
     assert sorted(names(everything)) == ["left", "left again", "right"]
 
 
@@ -101,7 +101,7 @@ def test_what_hides_behind_a_photographs_own_surface_is_not_seen_by_it():
 
     def chosen(depth: np.ndarray | None) -> str:
         context = [ContextView("near", near, picture, depth), ContextView("far", far, picture)]
-        return covisible_views(context, target, wall(2.0)[None], count=1)[0].name
+        return covisible_views(context, target, wall(2.0)[None], 1)[0].name
 
     assert chosen(None) == chosen(wall(2.0)) == chosen(0 * wall(1.0)) == "near"
     # A board before the camera.
@@ -114,7 +114,7 @@ def test_the_choice_hangs_on_no_unit(scale):
     context = photographs(
         looking((0.1 * scale, 0, 0), 1.2, "turned"), looking((0, 0, -2 * scale), 0.0, "behind")
     )
-    assert names(covisible_views(context, target, wall(2.0 * scale)[None], count=1)) == ["behind"]
+    assert names(covisible_views(context, target, wall(2.0 * scale)[None], 1)) == ["behind"]
 
 
 def test_without_depth_the_nearest_stand_in():
@@ -122,4 +122,4 @@ def test_without_depth_the_nearest_stand_in():
     context = photographs(looking((3, 0, 0), 0.0, "far"), looking((0.1, 0, 0), 0.0, "near"))
     for nothing in (0.0, np.nan, np.inf):
         depth = np.full((1, 30, 40), nothing, np.float32)
-        assert names(covisible_views(context, target, depth, count=1)) == ["near"]
+        assert names(covisible_views(context, target, depth, 1)) == ["near"]
