@@ -1,6 +1,7 @@
 # make demo    the main job on a sample that needs no download; ARGS="--sample motorcycle"
 # make test    the tests, side by side; ARGS="--runslow" for all of them
 # make lint    what continuous integration asks of the code's form
+# make docs    the documentation, in build/site
 # make wheel   dist/*.whl
 # make clean   removes what the above made, .venv included
 #
@@ -10,7 +11,7 @@
 BIN := .venv/bin
 ARGS ?=
 
-.PHONY: demo test lint wheel clean environment
+.PHONY: demo test lint docs wheel clean environment
 
 demo: environment
 	$(BIN)/gvtools demo $(ARGS)
@@ -22,6 +23,10 @@ lint: environment
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
+
+docs: environment
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "open build/site/index.html"
 
 wheel: environment
 	rm -rf build dist

@@ -22,13 +22,14 @@ from typing import Any
 from gvtools.runs.folder import RunDirectory
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
+from gvtools.settings import with_texts, with_values
 from pipelines.commands.reconstruct import reconstruct
-from pipelines.config import RunConfig, with_setting, with_settings
 from pipelines.console import Console
+from pipelines.reconstruction.settings import RunSettings
 
 # Each saving's settings when it is off.
 OFF: dict[str, dict[str, Any]] = {
-    "voxel edge measured": {"fusion.voxel_loss": None},
+    "voxel edge measured": {"fusion.max_psnr_drop_db": None},
     # With one edge throughout, the typical footprint's is the sensible one.
     "voxels as wide as footprints": {
         "memory.footprints": 0.0,
@@ -38,11 +39,11 @@ OFF: dict[str, dict[str, Any]] = {
         "memory.same_direction": 0.0,
         "memory.observations_per_voxel": 64,
     },
-    "four pixels a point where voxels are coarser": {"savings.joined": 0.0},
+    "four pixels a point where voxels are coarser": {"savings.pixel_binning": 0.0},
     "observed content projected once": {"savings.reuse": False},
     "small holes left to inpaint": {"effort.inpaint_below": 0.0},
     "reduced effort for middle holes": {"effort.reduced_below": 0.0},
-    "explained views without computed depth": {"savings.explained": None},
+    "explained views without computed depth": {"savings.depth_from_memory": None},
 }
 
 
@@ -50,7 +51,7 @@ OFF: dict[str, dict[str, Any]] = {
 class Row:
     """One configuration's runs."""
 
-    config: RunConfig
+    config: RunSettings
     whole: list[float] = field(default_factory=list)
     rounds: list[float] = field(default_factory=list)
     psnr: float = 0.0
@@ -70,7 +71,7 @@ class Row:
         shutil.rmtree(out)
 
 
-def rows_of(config: RunConfig, *, computed: bool) -> dict[str, Row]:
+def rows_of(config: RunSettings, *, computed: bool) -> dict[str, Row]:
     """All savings off, each alone, all on; those that this run does not have are left out."""
     idle = set()
     if config.completer != "geoverse":
@@ -81,8 +82,7 @@ def rows_of(config: RunConfig, *, computed: bool) -> dict[str, Row]:
     def without(names: set[str]) -> Row:
         changed = config
         for name in names:
-            for key, value in OFF[name].items():
-                changed = with_setting(changed, key, value)
+            changed = with_values(changed, OFF[name])
         return Row(changed)
 
     used = set(OFF) - idle
@@ -101,15 +101,15 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=1)
     args = parser.parse_args()
     scene = open_project(args.project)
-    config = RunConfig(
+    config = RunSettings(
         context="every:2", targets="every:2+1", completer=args.completer, depth=args.depth
     )
-    config = with_settings(config, args.set)
+    config = with_texts(config, args.set)
     computed = args.depth not in ("sensor", "colmap")
     computed &= args.depth != "auto" or not all(view.has_depth for view in scene.views)
     with tempfile.TemporaryDirectory() as folder:
         # Compiled kernels load, and files come into the cache, untimed.
-        warm = Row(with_setting(config, "targets", scene.views[1].name))
+        warm = Row(config.replaced(targets=scene.views[1].name))
         warm.run(scene, Path(folder))
         rows = rows_of(config, computed=computed)
         for _ in range(args.repeats):

@@ -88,7 +88,7 @@ def main() -> None:
         ]
         target = shots(scene, "first:2")[1].camera
         side = int(min(target.height[0], 504))
-        window = target.cropped(0, 0, side, side)
+        window = target.cropped(0, 0, width=side, height=side)
         points = built(context, VOXEL).records.position
         rows += bench_splat.compare_one_pixel(points, window, repeat=args.repeat)
         report(rows, console, None)

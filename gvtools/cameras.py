@@ -32,7 +32,17 @@ class Cameras:
         cam_from_world: (V, 4, 4) float64, rigid, scene units.
         width: (V,) int64, pixels.
         height: (V,) int64, pixels.
-        names: V view names.
+        names: V view names; running numbers where none are given.
+
+    Raises:
+        ShapeError: arrays that do not fit each other.
+
+    >>> camera = Cameras.pinhole(640, 480, focal=500.0)
+    >>> xy, z = camera.project([[0.0, 0.0, 2.0]])  # a point 2 units ahead
+    >>> xy[0, 0], z[0]
+    (array([320., 240.]), array([2.]))
+    >>> camera.resized(320, 240).K[0].diagonal()
+    array([250., 250.,   1.])
     """
 
     K: Float64
@@ -60,6 +70,29 @@ class Cameras:
             object.__setattr__(self, name, value)
         if len(self.names) != count:
             raise ShapeError(f"cameras: {len(self.names)} names for {count} cameras")
+
+    @staticmethod
+    def pinhole(
+        width: int,
+        height: int,
+        *,
+        focal: float,
+        cam_from_world: ArrayLike | None = None,
+        name: str = "",
+    ) -> Cameras:
+        """One camera with square pixels and its principal point in the middle of the picture.
+
+        Args:
+            width: pixels.
+            height: pixels.
+            focal: focal length, pixels.
+            cam_from_world: (4, 4) rigid, scene units; None is the identity.
+            name: the view's name.
+        """
+        K = np.array([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], np.float64)
+        pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world, np.float64)
+        sizes = np.array([width]), np.array([height])
+        return Cameras(K, pose[None], *sizes, (name,) if name else ())
 
     def __len__(self) -> int:
         return len(self.K)
@@ -96,7 +129,7 @@ class Cameras:
         count = len(self)
         return replace(self, K=K, width=np.full(count, width), height=np.full(count, height))
 
-    def cropped(self, left: int, top: int, width: int, height: int) -> Cameras:
+    def cropped(self, left: int, top: int, *, width: int, height: int) -> Cameras:
         """The same cameras for the window of the images that starts at (left, top), pixels."""
         K = self.K.copy()
         K[:, 0, 2] -= left

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.errors import DegenerateError, OptionError
-from gvtools.options import check_range
 
 Float64 = NDArray[np.float64]
 
@@ -19,8 +18,8 @@ Float64 = NDArray[np.float64]
 ROUNDING = 1e-13
 # A step below this share of the others is none.
 STEP = 1e-9
-# Squares of coordinates beyond it leave float64.
-FARTHEST = 1e150
+# Largest coordinate, scene units: far beyond any scene.
+FARTHEST = 1e30
 
 
 def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Cameras:
@@ -65,9 +64,6 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
     keep = np.concatenate([[True], steps > 0])
     if keep.sum() < 2:
         raise DegenerateError("interpolate: all key cameras are the same; give cameras that differ")
-    # A power of two is divided out, so that no cube of a length leaves float64.
-    power = np.frexp(steps.sum())[1]
-    steps = np.ldexp(steps, -power)
     index = np.array(rows)[keep]
     length = np.concatenate([[0.0], np.cumsum(steps)])
     first, last = (length[1], length[-2]) if closed else (0.0, length[-1])
@@ -76,8 +72,8 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
     # PCHIP has no cross-talk between coordinates: centred first for large offsets.
     origin = world[0, :3, 3]
     pose = np.tile(np.eye(4), (count, 1, 1))
-    centers = np.ldexp(world[keep, :3, 3] - origin, -power)
-    pose[:, :3, 3] = np.ldexp(PchipInterpolator(length, centers)(at), power) + origin
+    centers = world[keep, :3, 3] - origin
+    pose[:, :3, 3] = PchipInterpolator(length, centers)(at) + origin
     pose[:, :3, :3] = Slerp(length, rotation[keep])(at).as_matrix()
     segment = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(length) - 2)
     share = (at - length[segment]) / (length[segment + 1] - length[segment])
@@ -202,8 +198,7 @@ def orbit(
             f"orbit: {len(cameras)} camera(s) given, {count} asked for, radius {radius}; "
             "expected 1 or more, and a positive radius"
         )
-    for name, value in (("radius", radius), ("height", height), ("degrees", degrees)):
-        check_range(f"orbit: {name}", value, above=-FARTHEST, below=FARTHEST)
+    _check_numbers("orbit", radius=radius, height=height, degrees=degrees)
     _check_poses("orbit", cameras)
     middle = focus_point(cameras) if center is None else np.asarray(center, np.float64)
     axis = _direction(mean_up(cameras) if up is None else up)
@@ -254,8 +249,7 @@ def spiral(
         raise OptionError(
             f"spiral: {len(cameras)} camera(s) given, {count} asked for; expected 2 and 1 or more"
         )
-    for name, value in (("turns", turns), ("spread", spread), ("focus_distance", focus_distance)):
-        check_range(f"spiral: {name}", value, above=-FARTHEST, below=FARTHEST)
+    _check_numbers("spiral", turns=turns, spread=spread, focus_distance=focus_distance)
     _check_poses("spiral", cameras)
     middle = cameras.centers.mean(axis=0)
     forward = cameras.world_from_cam[:, :3, 2].mean(axis=0)
@@ -284,6 +278,12 @@ def spiral(
     return _like_first(cameras, pose, "spiral")
 
 
+def _check_numbers(what: str, **numbers: float | None) -> None:
+    for name, value in numbers.items():
+        if value is not None and not abs(value) < FARTHEST:
+            raise OptionError(f"{what}: {name} {value}; expected less than {FARTHEST:g} either way")
+
+
 def _check_poses(what: str, cameras: Cameras) -> None:
     largest = np.abs(cameras.world_from_cam).max(axis=(1, 2), initial=0)
     wrong = np.flatnonzero(~(largest < FARTHEST))
@@ -297,11 +297,10 @@ def _check_poses(what: str, cameras: Cameras) -> None:
 def _direction(vector: ArrayLike) -> Float64:
     """(3,) of length 1."""
     values = np.asarray(vector, np.float64)
-    largest = float(np.abs(values).max(initial=0))
-    if values.shape != (3,) or not 0 < largest < np.inf:
+    length = float(np.linalg.norm(values))
+    if values.shape != (3,) or not 0 < length < np.inf:
         raise OptionError(f"up {values.tolist()}; expected three finite numbers, not all 0")
-    values = values / largest
-    return np.asarray(values / np.linalg.norm(values))
+    return np.asarray(values / length)
 
 
 def _like_first(cameras: Cameras, world_from_cam: Float64, prefix: str) -> Cameras:

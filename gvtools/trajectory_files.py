@@ -44,7 +44,7 @@ class Trajectory:
 
 
 def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
-    """The poses of a trajectory file.
+    r"""The poses of a trajectory file.
 
     Args:
         path: a text file; blank lines and lines that start with # are passed over.
@@ -59,6 +59,15 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
     Raises:
         ProjectError: unreadable or empty; a line with another count of numbers, something that is
             no number, or a rotation that is none. The message names the line.
+
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "path.txt"
+    ...     _ = file.write_text("0.0 1 2 3 0 0 0 1\n0.1 1 2 4 0 0 0 1\n")
+    ...     track = read_poses(file)
+    >>> track.poses[1, :3, 3], track.stamps
+    (array([1., 2., 4.]), array([0. , 0.1]))
     """
     path = Path(path)
     rows = _rows(path)

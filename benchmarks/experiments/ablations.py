@@ -19,7 +19,6 @@ from benchmarks.experiments.judging import COLUMNS, Judged, judge, perceptual, r
 from benchmarks.experiments.options import ExperimentOptions
 from benchmarks.experiments.rows import geoverse
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.control import ControlConfig
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
@@ -32,7 +31,9 @@ from gvtools.completers.geoverse.weights.folder import (
 from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
 from gvtools.errors import OptionError
 from gvtools.evaluation.tables import Table
-from gvtools.training.options import TrainingConfig, shipped_or_read, with_settings
+from gvtools.networks.config_json import to_json
+from gvtools.settings import with_texts
+from gvtools.training.options import TrainingSettings, shipped_or_read
 from gvtools.training.processes import started
 from gvtools.training.run import StageRun
 from pipelines.console import Console, write_json
@@ -118,7 +119,7 @@ def _trained(variant: Variant, options: ExperimentOptions) -> Path:
     assert options.weights is not None
     out = options.out / variant.folder
     config, folder = shipped_or_read(options.training)
-    model_config = _with_injection(config.model_config(folder), variant.injection)
+    model_config = _with_injection(config.network(folder), variant.injection)
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "model.json", to_json(model_config))
     settings = [
@@ -130,11 +131,11 @@ def _trained(variant: Variant, options: ExperimentOptions) -> Path:
     start = options.weights
     if variant.injection != "none":
         start = _start(options.weights, model_config, out / "start")
-    _train(with_settings(config, settings), out, start)
+    _train(with_texts(config, settings), out, start)
     return out / "denoiser" / "weights"
 
 
-def _train(config: TrainingConfig, out: Path, start: Path) -> None:
+def _train(config: TrainingSettings, out: Path, start: Path) -> None:
     with started("auto") as processes:
         stage = StageRun(config, "denoiser", out, processes=processes, model_folder=out, init=start)
         stage.train(resume=True, say=Console().line)

@@ -11,15 +11,15 @@ import numpy as np
 from torch import Tensor
 
 from benchmarks.experiments.cases import Case
-from gvtools.completers.base import Completer, Completion
-from gvtools.errors import CheckpointError
-from gvtools.evaluation.generated_pixels import (
+from benchmarks.experiments.generated_pixels import (
     GeneratedScore,
     figures,
     paired_interval,
     score,
 )
-from gvtools.evaluation.perceptual_distance import NAME, SqueezeNetDistance
+from benchmarks.experiments.perceptual_distance import NAME, SqueezeNetDistance
+from gvtools.completers.base import Completer, Completion
+from gvtools.errors import CheckpointError
 from gvtools.evaluation.tables import Column, Table
 
 # Figures whose smaller values are better.

@@ -28,8 +28,8 @@ from gvtools.memory.back_projection import back_project
 from gvtools.memory.projection_cache import FollowedCamera
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.training.hints import Clip
-from pipelines.config import RunConfig
 from pipelines.reconstruction.rounds import Clock, complete_targets
+from pipelines.reconstruction.settings import RunSettings
 
 READS = ("weights", "scenes", "size", "seed")
 
@@ -114,7 +114,7 @@ def _follow(
     arm: _Arm, truth: Clip, context: Sequence[ContextView], probe: PoseProbe, seed: int
 ) -> None:
     """All rounds of a scene."""
-    config = RunConfig(seed=seed)
+    config = RunSettings(seed=seed)
     footprint = float(np.median(truth.depth[:CONTEXT])) / float(truth.cameras.K[0, 0, 0])
     memory = SpatialMemory(footprint, origin=truth.cameras.centers[0], options=config.memory)
     for i in range(CONTEXT):

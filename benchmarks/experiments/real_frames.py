@@ -25,8 +25,9 @@ from gvtools.errors import OptionError
 from gvtools.evaluation.tables import Table
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import select
+from gvtools.settings import with_texts
 from gvtools.training.hints import Observation, projected
-from gvtools.training.options import shipped_or_read, with_settings
+from gvtools.training.options import shipped_or_read
 from gvtools.training.processes import started
 from gvtools.training.run import StageRun
 from pipelines.console import Console
@@ -110,7 +111,7 @@ def _tuned(options: ExperimentOptions) -> Path:
     assert options.out is not None
     assert options.project is not None
     config, folder = shipped_or_read(options.training)
-    config = with_settings(
+    config = with_texts(
         config,
         [
             f"seed={options.seed + 1}",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 from gvtools.depth.colmap_patch_match import ColmapPatchMatch, has_patch_match
 from gvtools.depth.foundation.options import FoundationOptions
@@ -11,6 +11,7 @@ from gvtools.depth.source import DepthSource, MixedDepth, RecordedDepth
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.scene import Scene
+from gvtools.settings import changes
 
 CHOICES = ("auto", "sensor", "colmap", "plane-sweep", "da3")
 # Of a rough estimate: longer side of the pictures that are compared, pixels, and their levels.
@@ -87,7 +88,7 @@ def rough_source(scene: Scene, source: DepthSource) -> DepthSource:
         return source
     options = source.options if isinstance(source, PlaneSweepStereo) else StereoOptions()
     side, levels = min(options.max_side, ROUGH_SIDE), min(options.levels, ROUGH_LEVELS)
-    options = replace(options, max_side=side, levels=levels, align=False)
+    options = options.replaced(max_side=side, levels=levels, align=False)
     return PlaneSweepStereo(scene, options=options, views=source.views)
 
 
@@ -194,5 +195,5 @@ def _ignored(source: DepthSource, options: StereoOptions | None) -> tuple[str, .
     computing = source.computed if isinstance(source, MixedDepth) else source
     if isinstance(computing, PlaneSweepStereo):
         return ()
-    given = ((entry.name, getattr(options, entry.name), entry.default) for entry in fields(options))
-    return tuple(f"stereo.{name}={value}" for name, value, default in given if value != default)
+    given = changes(StereoOptions(), options)
+    return tuple(f"stereo.{name}={value}" for name, value in given.items())

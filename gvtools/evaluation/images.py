@@ -1,8 +1,9 @@
 """Image and depth metrics of one view: PSNR, SSIM and relative depth error, whole or masked.
 
-Colours are compared in [0, 1] and in float64; the data range is 1. SSIM has the settings of Wang et
-al. 2004, as scikit-image documents them: a Gaussian window of sigma 1.5 (11 x 11 pixels) and
-population covariances. A figure that has no pixels to stand on is None, never a number.
+Colours are compared in [0, 1] and in float64; the data range is 1. SSIM is that of Z. Wang et al.,
+"Image quality assessment: from error visibility to structural similarity", IEEE TIP 13(4), 2004: a
+Gaussian window of sigma 1.5 (11 x 11 pixels), population covariances, constants 0.01 and 0.03. A
+figure without a pixel to compare is None, never a number.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.errors import ShapeError
-from gvtools.evaluation.ssim_map import RADIUS, SIDE, ssim_map
 
+SIGMA, SIDE = 1.5, 11
+K1, K2 = 0.01, 0.03
 # Nearer to the border, windows would see pixels that are not there.
-SSIM_BORDER = RADIUS
+SSIM_BORDER = SIDE // 2
 # Colours may lie outside [0, 1], as noise does, but not by more than the data range.
 LOWEST, HIGHEST = -1.0, 2.0
 
@@ -110,6 +112,35 @@ def image_figures(
             "ssim": None if similarity is None else _mean(similarity, where),
         }
     return out
+
+
+def ssim_map(
+    image: NDArray[np.float64], truth: NDArray[np.float64], *, sample_covariance: bool = False
+) -> NDArray[np.float64]:
+    """SSIM of every whole window, averaged over the channels.
+
+    Args:
+        image: (H, W, C) in [0, 1], at least 11 x 11 pixels.
+        truth: (H, W, C), likewise.
+        sample_covariance: see ``ssim``.
+
+    Returns:
+        (H - 10, W - 10): entry (i, j) is centred on pixel (i + 5, j + 5).
+    """
+    import cv2
+
+    inner = (slice(SSIM_BORDER, -SSIM_BORDER),) * 2
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        blurred = cv2.GaussianBlur(values, (SIDE, SIDE), SIGMA).reshape(values.shape)
+        return np.asarray(blurred[inner])
+
+    norm = SIDE**2 / (SIDE**2 - 1) if sample_covariance else 1.0
+    x, y = mean(image), mean(truth)
+    squares = norm * (mean(image**2 + truth**2) - x**2 - y**2)
+    product = norm * (mean(image * truth) - x * y)
+    top = (2 * x * y + K1**2) * (2 * product + K2**2)
+    return np.asarray((top / ((x**2 + y**2 + K1**2) * (squares + K2**2))).mean(axis=-1))
 
 
 def _mean(similarity: NDArray[np.float64], where: NDArray[np.bool_] | None) -> float | None:

@@ -20,7 +20,6 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.options import check_range
 
 LAYOUTS = ("ends", "first")
 
@@ -85,10 +84,10 @@ def protocol_split(
     Raises:
         OptionError: numbers below 1, an unknown layout, a name twice, or too few views.
     """
-    for what, number in (("context", context), ("targets", targets), ("rounds", rounds)):
-        check_range(what, number, least=1)
-    check_range("stride", stride, least=1)
-    check_range("seed", seed, least=0)
+    numbers = {"context": context, "targets": targets, "rounds": rounds, "stride": stride}
+    for what, number, least in (*((k, v, 1) for k, v in numbers.items()), ("seed", seed, 0)):
+        if number is not None and not number >= least:
+            raise OptionError(f"{what} {number}; expected at least {least}")
     if layout is None:
         layout = "ends" if rounds == 1 else "first"
     if layout not in LAYOUTS:

@@ -7,11 +7,11 @@ and the rows as published.
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from importlib import resources
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from gvtools.errors import OptionError, ProjectError
 
@@ -27,8 +27,16 @@ ASPECTS = {
 }
 
 
-@dataclass(frozen=True)
-class Figure:
+class _Record(BaseModel):
+    """Part of a specification: exactly these keys, of exactly these types."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+Texts = Annotated[tuple[str, ...], Field(strict=False)]
+
+
+class Figure(_Record):
     """A measure as the source has it.
 
     Attributes:
@@ -45,24 +53,46 @@ class Figure:
 
     name: str
     label: str
-    better: str
+    better: Literal["higher", "lower"]
     digits: int
-    definition: Mapping[str, str | None]
+    definition: dict[str, str | None]
     stated: str
-    not_stated: tuple[str, ...]
+    not_stated: Texts
     unit: str = ""
 
+    @field_validator("definition")
+    @classmethod
+    def _known(cls, definition: dict[str, str | None]) -> dict[str, str | None]:
+        for aspect in definition:
+            if aspect not in ASPECTS:
+                raise ValueError(unknown("aspect", aspect, ASPECTS))
+        return definition
 
-@dataclass(frozen=True)
-class PublishedRow:
+
+class PublishedRow(_Record):
     """What the source reports of one system: every figure, by name."""
 
     system: str
-    figures: Mapping[str, float]
+    figures: dict[str, float]
 
 
-@dataclass(frozen=True)
-class Benchmark:
+class Source(_Record):
+    """Title of the publication, and its table."""
+
+    title: str
+    table: str
+
+
+class DataSet(_Record):
+    """Citation, role, licence and where to get it, in words."""
+
+    cited_as: str
+    role: str
+    licence: str
+    obtain: str
+
+
+class Benchmark(_Record):
     """A published table with its protocol.
 
     Attributes:
@@ -73,25 +103,25 @@ class Benchmark:
         rounds: how many rounds.
         figures: by name, in the table's order.
         rows: one a system, in the table's order.
-        source: title of the publication, and its table.
-        data_set: citation, role, licence, where to get it; in words.
+        source: where it is published.
+        data_set: what was measured on.
         stated: what the source says of the protocol.
         not_stated: what it leaves open there.
         notes: what does not fit together in the source.
     """
 
     name: str
-    resolution: tuple[int, int]
+    resolution: Annotated[tuple[int, int], Field(strict=False)]
     context: int
     targets: int
     rounds: int
-    figures: Mapping[str, Figure]
-    rows: tuple[PublishedRow, ...]
-    source: Mapping[str, str]
-    data_set: Mapping[str, str]
-    stated: tuple[str, ...]
-    not_stated: tuple[str, ...]
-    notes: tuple[str, ...]
+    figures: dict[str, Figure]
+    rows: Annotated[tuple[PublishedRow, ...], Field(strict=False)]
+    source: Source
+    data_set: DataSet
+    stated: Texts
+    not_stated: Texts
+    notes: Texts
 
 
 def benchmark_names() -> tuple[str, ...]:
@@ -124,19 +154,6 @@ def _specs() -> dict[str, str]:
     return dict(sorted(texts.items()))
 
 
-_Kinds = dict[str, type]
-_SECTIONS = ("data_set", "source", "protocol", "figures", "published")
-_SPEC: _Kinds = {"name": str, "notes": list, **dict.fromkeys(_SECTIONS, dict)}
-_DATA_SET: _Kinds = dict.fromkeys(("cited_as", "role", "licence", "obtain"), str)
-_SOURCE: _Kinds = {"title": str, "table": str}
-_PROTOCOL: _Kinds = dict.fromkeys(("context", "targets", "rounds"), int)
-_PROTOCOL |= dict.fromkeys(("resolution", "stated", "not_stated"), list)
-_FIGURE: _Kinds = dict.fromkeys(("label", "unit", "better", "stated"), str)
-_FIGURE |= {"digits": int, "definition": dict, "not_stated": list}
-_PUBLISHED: _Kinds = {"columns": list, "rows": list}
-_TEXTS = ("stated", "not_stated", "notes")
-
-
 def parse_benchmark(text: str, origin: str) -> Benchmark:
     """A benchmark from its YAML; ``origin`` is the file's name, for messages.
 
@@ -146,67 +163,31 @@ def parse_benchmark(text: str, origin: str) -> Benchmark:
     import yaml
 
     try:
-        spec = _checked(yaml.safe_load(text), _SPEC, origin)
+        data = dict(yaml.safe_load(text))
+        protocol, published = dict(data.pop("protocol")), dict(data.pop("published"))
+        figures = {name: {"name": name, **dict(f)} for name, f in dict(data["figures"]).items()}
+        data["figures"] = figures
+        return Benchmark(**data, **protocol, rows=_rows(published, list(figures)))
     except yaml.YAMLError as error:
-        raise ProjectError(f"{origin}: no readable YAML ({' '.join(str(error).split())})") from None
-    protocol = _checked(spec["protocol"], _PROTOCOL, f"{origin}: protocol")
-    size = protocol["resolution"]
-    if [type(side) for side in size] != [int, int]:
-        raise ProjectError(f"{origin}: resolution {list(size)}; expected [width, height] in pixels")
-    figures = {n: _figure(n, data, f"{origin}: {n}") for n, data in spec["figures"].items()}
-    return Benchmark(
-        name=spec["name"],
-        **protocol,
-        figures=figures,
-        rows=_rows(spec["published"], tuple(figures), f"{origin}: published"),
-        source=_checked(spec["source"], _SOURCE, f"{origin}: source"),
-        data_set=_checked(spec["data_set"], _DATA_SET, f"{origin}: data_set"),
-        notes=spec["notes"],
-    )
+        reason = f"no readable YAML ({' '.join(str(error).split())})"
+    except ValidationError as error:
+        first = error.errors()[0]
+        reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    except KeyError as error:
+        reason = f"no {error}"
+    except (TypeError, ValueError) as error:
+        reason = str(error)
+    raise ProjectError(f"{origin}: {reason}; expected a specification like those beside it")
 
 
-def _figure(name: str, data: Any, where: str) -> Figure:
-    entry = _checked({"unit": "", **data} if isinstance(data, dict) else data, _FIGURE, where)
-    if entry["better"] not in ("higher", "lower"):
-        raise ProjectError(f"{where}: better {entry['better']!r}; expected higher or lower")
-    for aspect, value in entry["definition"].items():
-        if aspect not in ASPECTS:
-            raise ProjectError(unknown(f"{where}: definition", aspect, ASPECTS))
-        if not isinstance(value, str | None):
-            raise ProjectError(f"{where}: {aspect} {value!r}; expected a text, or null")
-    return Figure(name=name, **entry)
-
-
-def _rows(data: Any, figures: tuple[str, ...], where: str) -> tuple[PublishedRow, ...]:
-    table = _checked(data, _PUBLISHED, where)
-    columns = ("system", *figures)
-    if table["columns"] != columns:
-        raise ProjectError(f"{where}: columns {table['columns']}; expected {columns}")
-    out: dict[str, PublishedRow] = {}
-    for row in table["rows"]:
-        types = [type(value) for value in row] if isinstance(row, list) else []
-        right = types[:1] == [str] and len(row) == len(columns) and {int, float} >= {*types[1:]}
-        if not right or row[0] in out or not all(map(math.isfinite, row[1:])):
-            raise ProjectError(f"{where}: row {row}; expected one a system, {len(figures)} numbers")
-        out[row[0]] = PublishedRow(row[0], dict(zip(figures, map(float, row[1:]), strict=True)))
-    return tuple(out.values())
-
-
-def _checked(data: Any, kinds: _Kinds, where: str) -> dict[str, Any]:
-    """A mapping with exactly these keys, of these types; lists become tuples."""
-    expected = f"expected the keys {', '.join(kinds)}"
-    if not isinstance(data, dict):
-        raise ProjectError(f"{where}: {type(data).__name__}; {expected}")
-    for key in data:
-        if key not in kinds:
-            raise ProjectError(unknown(f"{where}: key", key, kinds))
-    for key, kind in kinds.items():
-        if key not in data:
-            raise ProjectError(f"{where}: no {key!r}; {expected}")
-        texts = data[key] if key in _TEXTS and kind is list else ()
-        if type(data[key]) is not kind or not all(isinstance(text, str) for text in texts):
-            raise ProjectError(f"{where}: {key} {data[key]!r}; expected {kind.__name__}")
-    return {key: tuple(value) if kinds[key] is list else value for key, value in data.items()}
+def _rows(published: Mapping[str, Any], figures: list[str]) -> list[dict[str, Any]]:
+    columns = ["system", *figures]
+    if published["columns"] != columns:
+        raise ValueError(f"published.columns: {published['columns']}, not {columns}")
+    rows = published["rows"]
+    if len({row[0] for row in rows}) < len(rows) or {len(row) for row in rows} != {len(columns)}:
+        raise ValueError(f"published.rows: not one a system with {len(figures)} numbers")
+    return [{"system": row[0], "figures": dict(zip(figures, row[1:], strict=True))} for row in rows]
 
 
 def unknown(what: str, given: object, known: Iterable[str]) -> str:

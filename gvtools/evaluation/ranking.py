@@ -163,7 +163,7 @@ def comparison_table(rows: Sequence[SideBySideRow], benchmark: Benchmark) -> Tab
         for row in rows
     ]
     notes = [
-        f"Published: {benchmark.source['title']}, {benchmark.source['table']}.",
+        f"Published: {benchmark.source.title}, {benchmark.source.table}.",
         f"Not stated there: {'; '.join(benchmark.not_stated)}.",
         *(f"In the source, {note}." for note in benchmark.notes),
         "Ranks count the published rows, and the comparable ones that were measured here.",

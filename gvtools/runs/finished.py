@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 # What records and reports hold at least, and of what type, as JSON has them.
 _RECORDED: dict[str, type | tuple[type, ...]] = {
     "project": str, "reading": dict, "targets_project": (str, NoneType), "targets_kind": str,
-    "schedule": list, "context": list, "targets": list, "config": dict, "versions": dict,
+    "schedule": list, "context": list, "targets": list, "settings": dict,
+    "derived": dict, "versions": dict,
 }  # fmt: skip
 _CONFIGURED: dict[str, type | tuple[type, ...]] = {
     "completer": str, "voxel": (int, float), "seed": int
@@ -129,10 +130,8 @@ def read_record(path: Path) -> dict[str, Any]:
         lacking = [key for key in _RECORDED if key not in record]
         if lacking:
             raise KeyError(", ".join(lacking))
-        for part, kinds in ((record, _RECORDED), (record["config"], _CONFIGURED)):
-            for key, kind in kinds.items():
-                if not isinstance(part[key], kind):
-                    raise TypeError(f"{key} is {part[key]!r}")
+        _check_types(record, _RECORDED)
+        _check_types(resolved(record), _CONFIGURED)
         if not all(isinstance(rows, list) for rows in record["schedule"]):
             raise TypeError("schedule holds more than lists")
         for key in ("context", "targets"):
@@ -143,6 +142,24 @@ def read_record(path: Path) -> dict[str, Any]:
             f"{file}: no record of a run of this version ({error!r}); run reconstruct again"
         ) from None
     return record
+
+
+def _check_types(data: Mapping[str, Any], kinds: Mapping[str, type | tuple[type, ...]]) -> None:
+    for key, kind in kinds.items():
+        if not isinstance(data[key], kind):
+            raise TypeError(f"{key} is {data[key]!r}")
+
+
+def resolved(record: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a run's record, nested, with what was derived in its place."""
+    out: dict[str, Any] = json.loads(json.dumps(record["settings"]))
+    for key, value in record["derived"].items():
+        *sections, name = key.split(".")
+        place = out
+        for section in sections:
+            place = place[section]
+        place[name] = value
+    return out
 
 
 def open_scenes(
@@ -157,7 +174,7 @@ def open_scenes(
     Raises:
         GvError: it cannot be read any more.
     """
-    max_side = record["config"].get("max_side")
+    max_side = record["settings"].get("max_side")
     root = project or Path(record["project"])
     scene = reduced(reopen_scene(root, record["reading"]), max_side)
     other = record["targets_project"]

@@ -2,37 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.colmap_files import find_model
 from gvtools.scenes.photographs import named
-from gvtools.scenes.redwood import is_redwood, read_redwood
-from gvtools.scenes.rgbd import RgbdOptions
-from gvtools.scenes.scannet import is_scannet, read_scannet
+from gvtools.scenes.redwood import REDWOOD
+from gvtools.scenes.rgbd_recording import RgbdOptions
+from gvtools.scenes.scannet import SCANNET
 from gvtools.scenes.scene import Finding, Scene
-from gvtools.scenes.sevenscenes import is_sevenscenes, read_sevenscenes
+from gvtools.scenes.sevenscenes import SEVENSCENES
 from gvtools.scenes.transforms_json import FILE as TRANSFORMS
 from gvtools.scenes.transforms_json import read_transforms
-from gvtools.scenes.tum import is_tum, read_tum
+from gvtools.scenes.tum import TUM
 
+# ScanNet before Redwood: both have colour and depth folders.
+LAYOUTS = (SEVENSCENES, TUM, SCANNET, REDWOOD)
 LOOKED_FOR = (
     "a COLMAP model (cameras.bin or .txt in sparse/0, sparse or the folder itself)",
     "transforms.json",
-    "7-Scenes (*.color.*, *.depth.png, *.pose.txt)",
-    "TUM (rgb.txt, depth.txt, groundtruth.txt)",
-    "ScanNet (color, depth, pose, intrinsic)",
-    "Redwood (color, depth, a .log trajectory)",
-)
-
-# ScanNet before Redwood: both have colour and depth folders.
-_LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[..., Scene]], ...] = (
-    (is_sevenscenes, read_sevenscenes),
-    (is_tum, read_tum),
-    (is_scannet, read_scannet),
-    (is_redwood, read_redwood),
+    *(layout.looks_like for layout in LAYOUTS),
 )
 
 
@@ -72,14 +62,14 @@ def open_project(
             return scene
         note = f"the COLMAP model is read, {TRANSFORMS} is not: give that file to read it instead"
         return replace(scene, findings=(*scene.findings, Finding("info", note)))
-    for is_layout, read in _LAYOUTS:
-        if is_layout(path):
+    for layout in LAYOUTS:
+        if layout.matches(path):
             if images is not None or masks is not None:
                 raise OptionError(
                     f"{path}: a posed RGB-D folder holds its own pictures; expected neither images "
                     "nor masks"
                 )
-            return read(path, options=rgbd)
+            return layout.read(path, options=rgbd)
     raise ProjectError(_unknown(path))
 
 
@@ -98,7 +88,7 @@ def _unknown(path: Path) -> str:
     inside = [
         str(folder)
         for folder in sorted([*path.glob("*/"), *path.glob("dense/*/")])
-        if find_model(folder) or any(is_layout(folder) for is_layout, _ in _LAYOUTS)
+        if find_model(folder) or any(layout.matches(folder) for layout in LAYOUTS)
     ]
     advice = f"did you mean {named(inside)}?" if inside else "give the project's folder"
     return f"{path}: {held}; expected one of: {'; '.join(LOOKED_FOR)}; {advice}"

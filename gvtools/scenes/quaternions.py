@@ -20,11 +20,9 @@ def rotation_from_quaternion(quaternion: Float64) -> Float64:
     Returns:
         (3, 3) float64.
     """
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [w * w + x * x - y * y - z * z, 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), w * w - x * x + y * y - z * z, 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), w * w - x * x - y * y + z * z],
-        ]
-    )
+    from scipy.spatial.transform import Rotation
+
+    square = float(quaternion @ quaternion)
+    if not 0 < square < np.inf:
+        return np.full((3, 3), square)
+    return np.asarray(square * Rotation.from_quat(quaternion).as_matrix())

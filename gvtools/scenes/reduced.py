@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.options import check_range
+from gvtools.errors import OptionError
 from gvtools.scenes.scene import Finding, Frame, Scene, View
 
 # Below this, nothing of a picture is left to work with.
@@ -27,7 +27,8 @@ def reduced(scene: Scene, max_side: int | None) -> Scene:
     Raises:
         OptionError: below 64 pixels.
     """
-    check_range("max_side", max_side, least=SMALLEST)
+    if max_side is not None and not max_side >= SMALLEST:
+        raise OptionError(f"max_side {max_side}; expected at least {SMALLEST}")
     sizes = np.array([(view.camera.width[0], view.camera.height[0]) for view in scene.views])
     if max_side is None or not len(sizes) or sizes.max() <= max_side:
         return scene

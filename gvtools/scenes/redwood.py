@@ -1,4 +1,10 @@
-"""The Redwood and Open3D layout: ``color/``, ``depth/`` and a ``.log`` trajectory."""
+"""The Redwood and Open3D layout: ``color/``, ``depth/`` and a ``.log`` trajectory.
+
+Each pose of the ``.log`` trajectory is camera-to-world; its first integer is the number of its
+picture in natural order. Of several ``.log`` files ``trajectory.log`` is read. Intrinsics come from
+a JSON file in Open3D's form (column by column), which counts pixel centres as integers, or are the
+PrimeSense default.
+"""
 
 from __future__ import annotations
 
@@ -10,46 +16,32 @@ from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.photographs import named
-from gvtools.scenes.rgbd import Recording, RgbdFrame, RgbdOptions, resolve_options, rgbd_scene
-from gvtools.scenes.scene import Finding, Scene, natural_key
-from gvtools.scenes.tum import open3d_intrinsics
+from gvtools.scenes.rgbd import RgbdLayout
+from gvtools.scenes.rgbd_recording import (
+    Recording,
+    RgbdFrame,
+    RgbdOptions,
+    open3d_intrinsics,
+    pictures_in,
+    pinhole,
+)
+from gvtools.scenes.scene import Finding
 
 Float64 = NDArray[np.float64]
 
 COLOR_FOLDERS = ("color", "image", "rgb")
-PICTURES = (".jpg", ".jpeg", ".png")
 PREFERRED_LOG = "trajectory.log"
 # The sensor of these recordings, as Open3D's own "PrimeSense default".
-PRIMESENSE = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
+PRIMESENSE = pinhole(525.0, 525.0, 319.5, 239.5)
 
 
-def is_redwood(root: Path) -> bool:
-    """Whether ``root`` holds colour and depth folders and a ``.log`` file."""
+def _matches(root: Path) -> bool:
     folders = (root / "depth").is_dir() and _color_folder(root) is not None
     return folders and any(root.glob("*.log"))
 
 
-def read_redwood(root: Path, *, options: RgbdOptions | None = None) -> Scene:
-    """A folder in the Redwood or Open3D layout.
-
-    Each pose of the ``.log`` trajectory is camera-to-world; its first integer is the number of its
-    picture in natural order. Of several ``.log`` files ``trajectory.log`` is read. Intrinsics come
-    from a JSON file in Open3D's form (column by column), which counts pixel centres as integers,
-    or are the PrimeSense default; the cameras read here lie half a pixel further.
-
-    Args:
-        root: the folder.
-        options: units, intrinsics, and the depth camera where depth is not of the colour camera.
-
-    Returns:
-        The scene, metric.
-
-    Raises:
-        ProjectError: a malformed file, or poses that do not fit the pictures.
-        ShapeError: a pose with NaN, a scale or a mirror.
-    """
-    root = Path(root)
-    resolved, findings = resolve_options(root, options)
+def _record(root: Path, options: RgbdOptions) -> Recording:
+    findings = []
     folder = _color_folder(root)
     logs = sorted(root.glob("*.log"), key=lambda path: (path.name != PREFERRED_LOG, path.name))
     if folder is None or not logs:
@@ -57,7 +49,7 @@ def read_redwood(root: Path, *, options: RgbdOptions | None = None) -> Scene:
     if len(logs) > 1:
         others = named([path.name for path in logs[1:]])
         findings.append(Finding("warning", f"poses are read from {logs[0].name}, not {others}"))
-    colors, depths = _pictures(folder), _pictures(root / "depth")
+    colors, depths = pictures_in(folder), pictures_in(root / "depth")
     depth_of = pair_by_name(colors, depths)
     unpaired = len(depths) - len(depth_of)
     if unpaired:
@@ -84,10 +76,10 @@ def read_redwood(root: Path, *, options: RgbdOptions | None = None) -> Scene:
     if cameras:
         K = open3d_intrinsics(cameras[0])
         findings.append(Finding("info", f"intrinsics: {cameras[0].name}"))
-    elif resolved.color_K is None:
+    elif options.color_K is None:
         message = "no intrinsics file: the PrimeSense default 525, 525, 319.5, 239.5 is taken"
         findings.append(Finding("warning", message))
-    return rgbd_scene(Recording(root, frames, K, findings=findings), resolved)
+    return Recording(root, frames, K, findings=findings)
 
 
 def read_log(path: Path) -> tuple[list[int], list[Float64]]:
@@ -153,6 +145,5 @@ def _color_folder(root: Path) -> Path | None:
     return next((root / name for name in COLOR_FOLDERS if (root / name).is_dir()), None)
 
 
-def _pictures(folder: Path) -> list[Path]:
-    paths = (path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-    return sorted(paths, key=lambda path: natural_key(path.name))
+REDWOOD = RgbdLayout("Redwood (color, depth, a .log trajectory)", _matches, _record)
+read_redwood = REDWOOD.read

@@ -1,23 +1,22 @@
 """Posed RGB-D folders: what their layouts have in common.
 
-A layout's reader finds frames, poses and intrinsics and describes them as a ``Recording``; here
-they become a scene. Every supported layout publishes intrinsics whose first pixel centre is
-(0, 0), as Kinect drivers and Open3D count; they are moved by half a pixel to the project's
-(0.5, 0.5) in this file, once.
+A layout is one file that defines an ``RgbdLayout``, and a line in ``project.LAYOUTS``. Its
+``record`` finds frames, poses and intrinsics and describes them as a ``Recording``; here they
+become a scene. Every supported layout publishes intrinsics whose first pixel centre is (0, 0), as
+Kinect drivers and Open3D count; they are moved by half a pixel to the project's (0.5, 0.5) in this
+file, once.
 """
 
 from __future__ import annotations
 
-import difflib
-import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gvtools.cameras import invert_rigid, rigid_transform
 from gvtools.errors import GvError, OptionError, ProjectError
@@ -30,120 +29,60 @@ from gvtools.scenes.photographs import (
     named,
     rotation_findings,
 )
+from gvtools.scenes.rgbd_recording import Float64, Recording, RgbdFrame, RgbdOptions
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.undistort import undistortion
-
-Float64 = NDArray[np.float64]
+from gvtools.settings import changes, with_file
 
 SIDECAR = "rgbd.json"
-MILLIMETRES = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class RgbdOptions:
-    """What a posed RGB-D folder does not tell by itself; None means the layout's own value.
-
-    The same names may stand in a file ``rgbd.json`` in the folder; values given here win.
-    Intrinsics are as published with such recordings: the first pixel's centre is (0, 0).
+@dataclass(frozen=True)
+class RgbdLayout:
+    """A way to lay out a posed RGB-D recording in a folder.
 
     Attributes:
-        depth_unit: metres per stored unit (TUM 1/5000, others 1/1000).
-        color_K: (3, 3) intrinsics of the colour camera, pixels.
-        depth_K: (3, 3) intrinsics of the depth camera, pixels; None: depth is of the colour
-            camera.
-        color_from_depth: (4, 4) rigid, metres; None with ``depth_K`` given: the same place.
-        depth_max: metres; greater readings are ignored.
-        max_time_difference: seconds between colour, depth and pose of one frame (TUM).
+        looks_like: its name and what its folder holds, for messages.
+        matches: whether a folder is of this layout.
+        record: finds frames, poses and intrinsics in a folder, with the options that were given.
     """
 
-    depth_unit: float | None = None
-    color_K: ArrayLike | None = None
-    depth_K: ArrayLike | None = None
-    color_from_depth: ArrayLike | None = None
-    depth_max: float | None = None
-    max_time_difference: float = 0.02
+    looks_like: str
+    matches: Callable[[Path], bool]
+    record: Callable[[Path, RgbdOptions], Recording]
 
-    def __post_init__(self) -> None:
-        for name in ("depth_unit", "depth_max", "max_time_difference"):
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, (int, float)) and 0 < value < np.inf):
-                raise OptionError(f"{name}: {value!r}; expected a positive number")
+    def read(self, root: Path, *, options: RgbdOptions | None = None) -> Scene:
+        """The folder ``root`` as a scene, metric, in the poses' own world frame.
 
+        Args:
+            root: the folder.
+            options: what the folder does not tell by itself.
 
-@dataclass(frozen=True, eq=False)
-class RgbdFrame:
-    """One frame of a recording.
-
-    Attributes:
-        name: the view's name.
-        color: the picture.
-        depth: the depth map, None when the frame has none.
-        world_from_cam: (4, 4) as read.
-        where: the pose's file, for messages.
-    """
-
-    name: str
-    color: Path
-    depth: Path | None
-    world_from_cam: Float64
-    where: str
-
-
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """What a layout's reader found.
-
-    Attributes:
-        root: the folder.
-        frames: with a pose each.
-        color_K: (3, 3) as published (integer pixel centres).
-        distortion: k1, k2, p1, p2, k3 of the colour camera as OpenCV has them; empty for none.
-        depth_K: (3, 3) as published, None where depth is of the colour camera.
-        color_from_depth: (4, 4), metres; None: the same place.
-        depth_unit: metres per stored unit.
-        findings: what was met.
-    """
-
-    root: Path
-    frames: Sequence[RgbdFrame]
-    color_K: Float64
-    distortion: tuple[float, ...] = ()
-    depth_K: Float64 | None = None
-    color_from_depth: Float64 | None = None
-    depth_unit: float = MILLIMETRES
-    findings: Sequence[Finding] = field(default_factory=tuple)
+        Raises:
+            ProjectError: a file is absent or malformed, or no frame is complete.
+            ShapeError: a pose with NaN, a scale or a mirror.
+            OptionError: a wrong option in the folder's ``rgbd.json``.
+        """
+        root = Path(root)
+        resolved, findings = resolve_options(root, options)
+        recording = self.record(root, resolved)
+        return rgbd_scene(replace(recording, findings=[*findings, *recording.findings]), resolved)
 
 
 def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOptions, list[Finding]]:
     """``options`` over those of the folder's ``rgbd.json``, and a finding when that was read.
 
     Raises:
-        OptionError: the file has an unknown key or a wrong value.
-        ProjectError: the file is no JSON object.
+        OptionError: the file is no JSON object, or has an unknown key or a wrong value.
     """
     options = options or RgbdOptions()
     path = root / SIDECAR
     if not path.is_file():
         return options, []
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ProjectError(f"{path}: no JSON ({error}); expected an object of options") from None
-    known = {item.name: item.default for item in fields(RgbdOptions)}
-    if not isinstance(values, dict):
-        raise ProjectError(f"{path}: expected an object with keys out of {', '.join(known)}")
-    for key in values:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-            raise OptionError(f"{path}: unknown key {key!r}; {hint}")
-    given = {name: getattr(options, name) for name in known}
-    given = {name: value for name, value in given.items() if value is not known[name]}
-    try:
-        merged = RgbdOptions(**{**values, **given})
-    except OptionError as error:
-        raise OptionError(f"{path}: {error}") from None
-    return merged, [Finding("info", f"options read from {SIDECAR}: {', '.join(sorted(values))}")]
+    read = with_file(RgbdOptions(), path)
+    merged = read.replaced(**{name: getattr(options, name) for name in options.model_fields_set})
+    names = ", ".join(sorted(changes(RgbdOptions(), read)))
+    return merged, [Finding("info", f"options read from {SIDECAR}: {names}")]
 
 
 def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:
@@ -196,26 +135,6 @@ def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:
     ]
     views = tuple(item.view() for item in photographs)
     return Scene(root, "rgbd", views, None, tuple(findings), metric=True)
-
-
-def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
-    """A matrix in a text file.
-
-    Raises:
-        ProjectError: absent, no numbers, or of none of ``shapes``.
-    """
-    expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
-    try:
-        matrix = np.array(
-            [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        ).astype(np.float64)
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise ProjectError(f"{path}: unreadable ({reason}); expected {expected} numbers") from None
-    if matrix.shape not in shapes:
-        shape = "x".join(str(length) for length in matrix.shape)
-        raise ProjectError(f"{path}: {shape} numbers; expected {expected}")
-    return matrix
 
 
 def _corner_origin(K: ArrayLike, *, what: str) -> Float64:

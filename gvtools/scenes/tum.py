@@ -1,8 +1,14 @@
-"""The TUM RGB-D layout: ``rgb.txt``, ``depth.txt`` and ``groundtruth.txt`` with time stamps."""
+"""The TUM RGB-D layout: ``rgb.txt``, ``depth.txt`` and ``groundtruth.txt`` with time stamps.
+
+Pictures, depth maps and poses are joined by the nearest time stamp, each depth map used once. Poses
+are camera-to-world. Intrinsics come from ``camera-intrinsics.txt`` (3x3) or ``camera.json``
+(Open3D's form) in the folder; otherwise those published for freiburg1, 2 or 3 when the folder's
+name says so, with their distortion, and the driver's default when not. All of them count pixel
+centres as integers.
+"""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +16,16 @@ from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.quaternions import rotation_from_quaternion
-from gvtools.scenes.rgbd import (
+from gvtools.scenes.rgbd import RgbdLayout
+from gvtools.scenes.rgbd_recording import (
     Recording,
     RgbdFrame,
     RgbdOptions,
     load_matrix,
-    resolve_options,
-    rgbd_scene,
+    open3d_intrinsics,
+    pinhole,
 )
-from gvtools.scenes.scene import Finding, Scene
+from gvtools.scenes.scene import Finding
 
 Float64 = NDArray[np.float64]
 
@@ -40,36 +47,15 @@ PUBLISHED = {
 DRIVER_DEFAULT = (525.0, 525.0, 319.5, 239.5)
 
 
-def is_tum(root: Path) -> bool:
-    """Whether ``root`` holds the three lists of a TUM sequence."""
+def _matches(root: Path) -> bool:
     return all((root / name).is_file() for name in FILES)
 
 
-def read_tum(root: Path, *, options: RgbdOptions | None = None) -> Scene:
-    """A TUM RGB-D sequence.
-
-    Pictures, depth maps and poses are joined by the nearest time stamp, each depth map used once.
-    Poses are camera-to-world. Intrinsics come from ``camera-intrinsics.txt`` (3x3) or
-    ``camera.json`` (Open3D's form) in the folder; otherwise those published for freiburg1, 2 or 3
-    when the folder's name says so, with their distortion, and the driver's default when not. All
-    of them count pixel centres as integers; the cameras read here lie half a pixel further.
-
-    Args:
-        root: the sequence's folder.
-        options: unit, intrinsics, and the largest accepted difference of time stamps.
-
-    Returns:
-        The scene, metric.
-
-    Raises:
-        ProjectError: a malformed list, or no frame within the time difference.
-        ShapeError: a pose with NaN or a quaternion far from unit length.
-    """
-    root = Path(root)
-    resolved, findings = resolve_options(root, options)
+def _record(root: Path, options: RgbdOptions) -> Recording:
+    findings = []
     colors, depths = _read_list(root / "rgb.txt"), _read_list(root / "depth.txt")
     pose_times, poses = _read_poses(root / "groundtruth.txt")
-    limit = resolved.max_time_difference
+    limit = options.max_time_difference
     color_times = np.array([time for time, _ in colors])
     depth_of = associate(color_times, np.array([time for time, _ in depths]), limit)
     frames, absent, unposed = [], 0, 0
@@ -93,10 +79,9 @@ def read_tum(root: Path, *, options: RgbdOptions | None = None) -> Scene:
     if absent:
         findings.append(Finding("warning", f"{absent} files named in the lists are absent on disk"))
     K, distortion, source = _intrinsics(root)
-    if resolved.color_K is None:
+    if options.color_K is None:
         findings.append(Finding("info", f"intrinsics: {source}"))
-    recording = Recording(root, frames, K, distortion, depth_unit=DEPTH_UNIT, findings=findings)
-    return rgbd_scene(recording, resolved)
+    return Recording(root, frames, K, distortion, depth_unit=DEPTH_UNIT, findings=findings)
 
 
 def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:
@@ -180,26 +165,9 @@ def _intrinsics(root: Path) -> tuple[Float64, tuple[float, ...], str]:
         return open3d_intrinsics(root / "camera.json"), (), "camera.json"
     for name, (values, distortion) in PUBLISHED.items():
         if name in root.resolve().name:
-            return _matrix(values), distortion, f"published for {name}"
-    return _matrix(DRIVER_DEFAULT), (), "the driver's default 525, 525, 319.5, 239.5"
+            return pinhole(*values), distortion, f"published for {name}"
+    return pinhole(*DRIVER_DEFAULT), (), "the driver's default 525, 525, 319.5, 239.5"
 
 
-def _matrix(values: tuple[float, ...]) -> Float64:
-    fx, fy, cx, cy = values
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-
-
-def open3d_intrinsics(path: Path) -> Float64:
-    """(3, 3) intrinsics of Open3D's JSON form, which lists them column by column.
-
-    Raises:
-        ProjectError: no such JSON.
-    """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]
-        return np.array(values, np.float64).reshape(3, 3).T
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ProjectError(
-            f"{path}: {type(error).__name__} ({error}); expected Open3D's form with "
-            "'intrinsic_matrix' as nine numbers, column by column"
-        ) from None
+TUM = RgbdLayout("TUM (rgb.txt, depth.txt, groundtruth.txt)", _matches, _record)
+read_tum = TUM.read

@@ -2,41 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from pydantic import Field, model_validator
 
 from gvtools.errors import OptionError
-from gvtools.options import check_range
+from gvtools.settings import Settings
 
 RULES = ("every", "ends", "first")
 COUNTS = 101  # the stream of random numbers that counts are drawn from
 
 
-@dataclass(frozen=True, kw_only=True)
-class ContextOptions:
-    """How many views are given, and which.
+class ContextOptions(Settings):
+    """How many views are given, and which."""
 
-    Attributes:
-        least: context views.
-        most: context views.
-        group: so many samples in a row have the same number, so that a batch of them is possible.
-        extrapolation: chance that the first views are given, and not views all along the path.
-        ends: chance, of the other cases, that both ends are given and not every k-th view.
-    """
+    section = "context"
 
-    least: int = 1
+    least: int = Field(1, ge=1)
+    """Context views."""
     most: int = 4
-    group: int = 8
-    extrapolation: float = 0.5
-    ends: float = 0.4
+    """Context views, at least ``least``."""
+    group: int = Field(8, ge=1)
+    """So many samples in a row have the same number, so that a batch of them is possible."""
+    extrapolation: float = Field(0.5, ge=0, le=1)
+    """Chance that the first views are given, and not views all along the path."""
+    ends: float = Field(0.4, ge=0, le=1)
+    """Chance, of the other cases, that both ends are given and not every k-th view."""
 
-    def __post_init__(self) -> None:
-        check_range("context.least", self.least, least=1)
-        check_range("context.most", self.most, least=self.least)
-        check_range("context.group", self.group, least=1)
-        check_range("context.extrapolation", self.extrapolation, least=0, most=1)
-        check_range("context.ends", self.ends, least=0, most=1)
+    @model_validator(mode="after")
+    def _check(self) -> ContextOptions:
+        if self.most < self.least:
+            raise OptionError(f"context.most {self.most}; expected at least {self.least}")
+        return self
 
     def count(self, seed: list[int], index: int) -> int:
         """The number of context views of a sample; ``seed`` is the data set's."""

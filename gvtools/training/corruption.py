@@ -6,63 +6,61 @@ the fault itself for every context view. Targets and the truth stay clean.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from gvtools.cameras import Cameras
-from gvtools.options import check_range
+from gvtools.settings import Settings
 
 Float32 = NDArray[np.float32]
 
 
-@dataclass(frozen=True, kw_only=True)
-class CorruptionOptions:
-    """The largest strength of every fault; 0 switches it off.
+Share = Annotated[float, Field(ge=0, le=1)]
+Strength = Annotated[float, Field(ge=0)]
 
-    Attributes:
-        clean: share of samples without any fault.
-        absent: chance that a fault is absent from a sample that has faults.
-        depth_noise: standard deviation of depth, as a share of the depth, at the view's mean depth;
-            it grows in proportion to the depth. Half of its variance is smooth over the picture.
-        depth_scale: standard deviation of a factor on all depths of a view.
-        holes: share of the pixels that lose their depth, in patches.
-        flying: share of the pixels at depth edges that lie somewhere between front and back.
-        rotation: standard deviation of the rotation by which a view is lifted wrongly, degrees.
-        translation: the same of its centre, as a share of the mean depth.
-        dropped: chance that a context view has no depth at all; never the first.
-        exposure: standard deviation of the exposure, in natural logarithm; the first context view
-            keeps its own, which is the targets'.
-        color: standard deviation of a gain a channel, likewise.
-        projection: standard deviation of noise on the colours of valid projections. The paper adds
-            0.1 to what the video prior gets; the model's own input has none.
-    """
 
-    clean: float = 0.25
-    absent: float = 0.4
-    depth_noise: float = 0.02
-    depth_scale: float = 0.015
-    holes: float = 0.25
-    flying: float = 0.5
-    rotation: float = 0.4
-    translation: float = 0.006
-    dropped: float = 0.15
-    exposure: float = 0.12
-    color: float = 0.03
-    projection: float = 0.0
+class CorruptionOptions(Settings):
+    """The largest strength of every fault; 0 switches it off."""
 
-    def __post_init__(self) -> None:
-        for entry in fields(self):
-            check_range(f"corruption.{entry.name}", getattr(self, entry.name), least=0)
-        for name in ("clean", "absent", "holes", "flying", "dropped"):
-            check_range(f"corruption.{name}", getattr(self, name), most=1)
+    section = "corruption"
+
+    clean: Share = 0.25
+    """Share of samples without any fault."""
+    absent: Strength = 0.4
+    """Chance that a fault is absent from a sample that has faults."""
+    depth_noise: Strength = 0.02
+    """Standard deviation of depth, as a share of the depth, at the view's mean depth; it grows in
+    proportion to the depth. Half of its variance is smooth over the picture."""
+    depth_scale: Strength = 0.015
+    """Standard deviation of a factor on all depths of a view."""
+    holes: Share = 0.25
+    """Share of the pixels that lose their depth, in patches."""
+    flying: Share = 0.5
+    """Share of the pixels at depth edges that lie somewhere between front and back."""
+    rotation: Strength = 0.4
+    """Standard deviation of the rotation by which a view is lifted wrongly. [degrees]"""
+    translation: Strength = 0.006
+    """The same of its centre, as a share of the mean depth."""
+    dropped: Share = 0.15
+    """Chance that a context view has no depth at all; never the first."""
+    exposure: Strength = 0.12
+    """Standard deviation of the exposure, in natural logarithm; the first context view keeps its
+    own, which is the targets'."""
+    color: Strength = 0.03
+    """Standard deviation of a gain a channel, likewise."""
+    projection: Strength = 0.0
+    """Standard deviation of noise on the colours of valid projections. The paper adds 0.1 to what
+    the video prior gets; the model's own input has none."""
 
 
 # Of recorded views, whose depth has faults of its own.
 GENTLE = CorruptionOptions(depth_noise=0.01, holes=0.05, flying=0.0)
 NOTHING = CorruptionOptions(
-    **{entry.name: 0.0 for entry in fields(CorruptionOptions) if entry.name not in ("clean",)}
+    **{name: 0.0 for name in CorruptionOptions.model_fields if name != "clean"}
 )
 
 
@@ -75,16 +73,15 @@ def drawn(rng: np.random.Generator, options: CorruptionOptions) -> CorruptionOpt
     """
     perfect = rng.random() < options.clean
     strengths = {}
-    for entry in fields(options):
-        if entry.name in ("clean", "absent"):
+    for name in CorruptionOptions.model_fields:
+        if name in ("clean", "absent"):
             continue
         chance, share = rng.random(2)
-        largest = getattr(options, entry.name)
         off = perfect or chance < options.absent
-        strengths[entry.name] = 0.0 if off else largest * share
+        strengths[name] = 0.0 if off else getattr(options, name) * share
     # A view has depth or has none: what is drawn for it is the chance itself.
     strengths["dropped"] = options.dropped if strengths["dropped"] > 0 else 0.0
-    return replace(NOTHING, **strengths)
+    return NOTHING.replaced(**strengths)
 
 
 def corrupted_depth(

@@ -6,20 +6,21 @@ that is continued see what one process would have seen.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
 import numpy as np
 
 from gvtools.errors import OptionError
 from gvtools.options import check_range
+from gvtools.procedural.layouts import scene
+from gvtools.procedural.paths import PathOptions, camera_path
+from gvtools.procedural.photographs import check_split, photograph_names
+from gvtools.procedural.render import SUPERSAMPLE, developed, radiance
+from gvtools.settings import Settings
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.corruption import CorruptionOptions, drawn
 from gvtools.training.hints import Clip, HintOptions
-from gvtools.training.layouts import scene
-from gvtools.training.paths import PathOptions, camera_path
-from gvtools.training.photographs import check_split, photograph_names
-from gvtools.training.renderer import SUPERSAMPLE, developed, radiance
 from gvtools.training.view_sample import Sample, make_sample
 
 # Streams of random numbers of one sample.
@@ -144,7 +145,10 @@ class ProceduralViews:
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides the samples, as plain data."""
-        return {"source": "procedural", **asdict(self)}
+        return {
+            "source": "procedural",
+            **{f.name: plain(getattr(self, f.name)) for f in fields(self)},
+        }
 
     @property
     def _seed(self) -> list[int]:
@@ -154,6 +158,11 @@ class ProceduralViews:
         if index < 0:
             raise OptionError(f"sample {index}; expected a number of 0 or more")
         return np.random.default_rng([*self._seed, index, stream])
+
+
+def plain(value: Any) -> Any:
+    """A part of a data set's description as plain data."""
+    return value.to_dict() if isinstance(value, Settings) else value
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ model's size. A memory of four views at 96 x 96 costs milliseconds, so nothing f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import ContextView
@@ -19,6 +20,7 @@ from gvtools.guidance import Guidance
 from gvtools.memory.back_projection import BackProjectionOptions, back_project
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
+from gvtools.settings import Settings
 from gvtools.training.corruption import (
     CorruptionOptions,
     corrupted_camera,
@@ -29,21 +31,14 @@ from gvtools.training.corruption import (
 Float32 = NDArray[np.float32]
 
 
-@dataclass(frozen=True, kw_only=True)
-class HintOptions:
-    """How memory is made and projected; the defaults are those of a run.
+class HintOptions(Settings):
+    """How memory is made and projected; the defaults are those of a run."""
 
-    Attributes:
-        voxel_scale: voxel edge, in median pixel footprints of the context.
-        back_projection: see BackProjectionOptions.
-        memory: see MemoryOptions.
-        splat: see SplatOptions.
-    """
-
-    voxel_scale: float = 1.0
-    back_projection: BackProjectionOptions = field(default_factory=BackProjectionOptions)
-    memory: MemoryOptions = field(default_factory=MemoryOptions)
-    splat: SplatOptions = field(default_factory=SplatOptions)
+    voxel_scale: float = Field(1.0, gt=0)
+    """Voxel edge. [median pixel footprints of the context]"""
+    back_projection: BackProjectionOptions = BackProjectionOptions()
+    memory: MemoryOptions = MemoryOptions()
+    splat: SplatOptions = SplatOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +97,7 @@ def observed(
         camera = clip.cameras[index]
         rgb = clip.rgb[index]
         depth = corrupted_depth(rng, clip.depth[index], strength)
-        own = strength if number else replace(strength, exposure=0.0, color=0.0, dropped=0.0)
+        own = strength if number else strength.replaced(exposure=0.0, color=0.0, dropped=0.0)
         rgb = corrupted_color(rng, rgb, own)
         dropped = rng.random() < own.dropped
         lifted.append(corrupted_camera(rng, camera, unit, strength))

@@ -13,13 +13,14 @@ import torch
 from torch import nn
 
 from gvtools.completers.geoverse.config import FlowConfig, GeoVerseConfig
-from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior
-from gvtools.completers.geoverse.weights.folder_parts import config_of
+from gvtools.completers.geoverse.weights.checks import config_of
+from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pretrained
 from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER, WHOLE_FILE
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text
+from gvtools.networks.config_json import to_json
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.copies import Copies, models_of
 from gvtools.training.denoiser_stage import DenoiserStage
@@ -27,7 +28,7 @@ from gvtools.training.encoder_stage import EncoderStage, measure_statistics
 from gvtools.training.heads_stage import HeadsStage
 from gvtools.training.loop import Reporting, Trainer, check_parts
 from gvtools.training.names import STAGES
-from gvtools.training.options import ReflowStageOptions, TrainingConfig
+from gvtools.training.options import ReflowStageOptions, TrainingSettings
 from gvtools.training.processes import Processes
 from gvtools.training.records import TrainingLog, read_log
 from gvtools.training.reflow_stage import ReflowStage
@@ -62,7 +63,7 @@ class StageRun:
 
     def __init__(
         self,
-        config: TrainingConfig,
+        config: TrainingSettings,
         stage: str,
         out: Path,
         *,
@@ -73,7 +74,7 @@ class StageRun:
         self.config, self.stage, self.out = config, stage, out
         self.folder = out / stage
         self.processes = processes
-        self.model_config = config.model_config(model_folder)
+        self.model_config = config.network(model_folder)
         self.init = init
         self.options = getattr(config, stage)
         if self.options is None:
@@ -124,7 +125,7 @@ class StageRun:
             say(f"{self.stage}: goes on after step {trainer.progress.step}")
         if self.processes.first:
             self.folder.mkdir(parents=True, exist_ok=True)
-            text = json.dumps(to_json(self.config), indent=2) + "\n"
+            text = json.dumps(self.config.to_dict(), indent=2) + "\n"
             write_text(self.folder / SETTINGS, text)
         samples.start(trainer, self.processes)
         check_parts(self.options.optimizer, self.processes, samples.group)
@@ -163,8 +164,6 @@ class StageRun:
 
     def _start(self, say: Callable[[str], None]) -> GeoVerse:
         """The model that the stage begins with; every process makes the same."""
-        from gvtools.completers.geoverse.weights.folder import from_pretrained
-
         before = [name for name in STAGES[: STAGES.index(self.stage)]]
         if not self.init:
             self._refuse_unfinished(before)
@@ -230,7 +229,7 @@ class StageRun:
 
     def _identity(self, samples: TrainingSamples) -> dict[str, Any]:
         """What may not change between the parts of a stage."""
-        data = to_json(self.config.data)
+        data = self.config.data.to_dict()
         for name in ("workers", "cache"):
             data.pop(name)
         model = to_json(self.model_config)
@@ -243,7 +242,7 @@ class StageRun:
             "seed": self.config.seed,
             "model": model,
             "photographs": list(samples.photographs),
-            "options": to_json(self.options),
+            "options": self.options.to_dict(),
             "start": None if self._source is None else _fingerprint(self._source),
             "data": data,
         }
@@ -265,7 +264,7 @@ class StageRun:
                 if self.stage == "reflow":
                     config = _distilled(config, self.options)
                 whole.config = replace(config, trained=self.stage in GENERATIVE)
-                whole.save_pretrained(self.folder / WEIGHTS)
+                save_pretrained(whole, self.folder / WEIGHTS)
                 self._link_video()
         # The next stage starts from them, in every process.
         self.processes.wait()

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
+from gvtools.procedural.photographs import photograph_names
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.dataset import MixedViews, ProceduralViews
 from gvtools.training.dataset import Samples as DataSet
 from gvtools.training.loader import BatchLoader
 from gvtools.training.loop import Trainer
-from gvtools.training.options import TrainingConfig
-from gvtools.training.photographs import photograph_names
+from gvtools.training.options import TrainingSettings
 from gvtools.training.processes import Processes
 from gvtools.training.sample_pool import PooledViews
 from gvtools.training.view_sample import collated
@@ -29,7 +29,7 @@ class TrainingSamples:
         model: whose context views a sample may have.
     """
 
-    def __init__(self, config: TrainingConfig, model: GeoVerseConfig) -> None:
+    def __init__(self, config: TrainingSettings, model: GeoVerseConfig) -> None:
         self.config = config
         most = min(model.context, config.data.views - 1)
         self._context = ContextOptions(most=most)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import select
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.corruption import GENTLE, CorruptionOptions, drawn
-from gvtools.training.dataset import FAULTS, PATH, RECORDED
+from gvtools.training.dataset import FAULTS, PATH, RECORDED, plain
 from gvtools.training.hints import Clip, HintOptions
 from gvtools.training.view_sample import Sample, make_sample
 
@@ -148,16 +148,15 @@ class SceneViews:
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides the samples, as plain data; scenes by folder and view names."""
-        plain = ("seed", "views", "size", "detail", "stride", "overlap", "fill")
-        parts = ("context", "faults", "hints")
+        names = ("seed", "views", "size", "detail", "stride", "overlap", "fill", "context",
+                 "faults", "hints")  # fmt: skip
         return {
             "source": "recorded",
             "scenes": [
                 {"root": str(scene.root), "views": [view.name for view in views]}
                 for scene, views in zip(self.scenes, self._usable, strict=True)
             ],
-            **{name: getattr(self, name) for name in plain},
-            **{n: None if getattr(self, n) is None else asdict(getattr(self, n)) for n in parts},
+            **{name: plain(getattr(self, name)) for name in names},
         }
 
     def _frame(self, scene: int, row: int) -> _Reduced:
@@ -208,7 +207,7 @@ def _reduced(view: View, size: tuple[int, int], detail: int) -> _Reduced:
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
     if frame.mask is not None:
         depth = np.where(frame.mask, depth, np.float32(0))
-    camera = view.camera.cropped(left, top, columns, rows)
+    camera = view.camera.cropped(left, top, width=columns, height=rows)
     factor = max(1, min(detail, rows // size[0], columns // size[1]))
     parts = [
         _resized(frame.rgb[window], depth[window], camera, (size[0] * times, size[1] * times))

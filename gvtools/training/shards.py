@@ -20,10 +20,9 @@ from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
 from torch.distributed.fsdp import FSDPModule, fully_shard, register_fsdp_forward_method
 from torch.distributed.tensor import DTensor, distribute_tensor
 
-from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.model import GeoVerse, empty_model
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior
-from gvtools.completers.geoverse.weights.checkpoints import load
-from gvtools.completers.geoverse.weights.folder_parts import empty_model
+from gvtools.networks.tensors import load
 from gvtools.training.copies import Copies, models_of
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 from gvtools.runs.folder import RunDirectory
@@ -40,11 +39,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.scenes.project import open_project
 
     if args.context is None:
-        config = replace(config, context=",".join(context))
+        config = config.replaced(context=",".join(context))
     if args.targets is None:
-        config = replace(config, targets=",".join(targets))
+        config = config.replaced(targets=",".join(targets))
     if args.views_per_round is None and args.rounds is None:
-        config = replace(config, views_per_round=4)
+        config = config.replaced(views_per_round=4)
     reconstruct(
         open_project(sample),
         config,
@@ -80,7 +79,7 @@ def free_folder(path: Path, *, resume: bool) -> Path:
 def _write(name: str, folder: Path, seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Write the sample; returns the names of context and targets."""
     if name == "room":
-        from gvtools.scenes.synthetic import write_room
+        from gvtools.procedural.room_sample import write_room
 
         room = write_room(folder, seed=seed)
         return room.context, room.targets

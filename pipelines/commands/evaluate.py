@@ -222,10 +222,11 @@ def _run_protocol(args: argparse.Namespace, out: Path, console: Console) -> Path
     """Split the project, run it, and write the split beside the scores; the run's folder."""
     from gvtools.evaluation.protocol import protocol_split
     from gvtools.runs.folder import RunDirectory
-    from pipelines import config as settings
+    from gvtools.settings import with_profile, with_texts, with_values
     from pipelines.commands.reconstruct import reconstruct
     from pipelines.commands.scene_arguments import open_scene, reading_of
     from pipelines.console import write_json
+    from pipelines.reconstruction.settings import RunSettings
 
     context, targets, rounds = PROTOCOLS[args.protocol]
     scene = open_scene(args.runs[0], args)
@@ -233,9 +234,9 @@ def _run_protocol(args: argparse.Namespace, out: Path, console: Console) -> Path
         scene.names, context=context, targets=targets, rounds=rounds, stride=args.stride,
         seed=args.seed,
     )  # fmt: skip
-    config = settings.RunConfig()
+    config = RunSettings()
     if args.profile is not None:
-        config = settings.with_profile(config, args.profile)
+        config = with_profile(config, args.profile)
     chosen = {
         "context": ",".join(split.context),
         "targets": ",".join(split.targets),
@@ -244,13 +245,12 @@ def _run_protocol(args: argparse.Namespace, out: Path, console: Console) -> Path
         "seed": args.seed,
         "completer": args.completer or config.completer,
     }
-    for key, value in chosen.items():
-        config = settings.with_setting(config, key, value)
+    config = with_values(config, chosen)
     for text in args.set:
         key = text.partition("=")[0].strip()
         if key in chosen:
             raise OptionError(f"--set {key}: decided by --protocol; leave it out")
-    config = settings.with_settings(config, args.set)
+    config = with_texts(config, args.set)
     folder = out / "run"
     resume = (folder / "run.json").is_file()
     RunDirectory(folder).refuse_foreign()

@@ -6,10 +6,10 @@ import argparse
 import shutil
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipelines.commands.help_settings import HelpSettings
 from pipelines.console import Console, write_json
 from pipelines.reconstruction.plan import Plan, describe, make_plan
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.runs.folder import RunDirectory
     from gvtools.scenes.scene import Scene
-    from pipelines.config import RunConfig
+    from pipelines.reconstruction.settings import RunSettings
 
 SUMMARY = "grow a memory from a posed project, round by round"
 EXAMPLES = (
@@ -66,12 +66,21 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
         "--set", action="append", default=[], metavar="KEY=VALUE", help="one setting; repeatable"
     )
     parser.add_argument(
+        "--help-settings", action=HelpSettings, settings=_settings, help="list all settings"
+    )
+    parser.add_argument(
         "--allow-overlap", action="store_true", help="let views be context and target"
     )
     parser.add_argument("--resume", action="store_true", help="continue after the last whole round")
     parser.add_argument("--dry-run", action="store_true", help="say what would be done, and stop")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
     add_scene_arguments(parser)
+
+
+def _settings() -> RunSettings:
+    from pipelines.reconstruction.settings import RunSettings
+
+    return RunSettings()
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
@@ -102,29 +111,27 @@ def copy_figures(args: argparse.Namespace, out: Path) -> None:
         write_text(args.json, (out / "metrics.json").read_text(encoding="utf-8"))
 
 
-def config_from(args: argparse.Namespace) -> RunConfig:
+def config_from(args: argparse.Namespace) -> RunSettings:
     """Defaults, then the profile, then --config, then the options, then --set."""
-    from pipelines import config as settings
+    from gvtools.settings import with_file, with_profile, with_texts, with_values
+    from pipelines.reconstruction.settings import RunSettings
 
-    config = settings.RunConfig()
+    config = RunSettings()
     if args.config:
-        config = settings.with_file(config, args.config, profile=args.profile)
+        config = with_file(config, args.config, profile=args.profile)
     elif args.profile:
-        config = settings.with_profile(config, args.profile)
+        config = with_profile(config, args.profile)
     names = ("context", "targets", "views_per_round", "rounds", "max_side", "depth", "completer",
              "voxel", "device", "seed")  # fmt: skip
-    for name in names:
-        value = getattr(args, name)
-        if value is not None:
-            config = settings.with_setting(config, name, value)
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     if args.allow_overlap:
-        config = replace(config, allow_overlap=True)
-    return settings.with_settings(config, args.set)
+        given["allow_overlap"] = True
+    return with_texts(with_values(config, given), args.set)
 
 
 def reconstruct(
     scene: Scene,
-    config: RunConfig,
+    config: RunSettings,
     out: Path,
     *,
     console: Console,

@@ -123,12 +123,13 @@ def splat_options(texts: list[str]) -> SplatOptions:
     Raises:
         OptionError: another key or a wrong value.
     """
-    from pipelines.config import RunConfig, with_settings
+    from gvtools.settings import with_texts
+    from pipelines.reconstruction.settings import RunSettings
 
     for text in texts:
         if not text.strip().startswith("splat."):
             raise OptionError(f"--set {text!r}: render takes splat.KEY=VALUE alone")
-    return with_settings(RunConfig(), texts).splat
+    return with_texts(RunSettings(), texts).splat
 
 
 def _cameras(args: argparse.Namespace, memory: SpatialMemory) -> tuple[Cameras, Scene | None]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gvtools.errors import OptionError
 
 if TYPE_CHECKING:
-    from gvtools.scenes.rgbd import RgbdOptions
+    from gvtools.scenes.rgbd_recording import RgbdOptions
     from gvtools.scenes.scene import Scene
 
 
@@ -112,7 +112,7 @@ def rgbd_options(args: argparse.Namespace) -> RgbdOptions | None:
     given = {name: value for name, value in given.items() if value is not None}
     if not given:
         return None
-    from gvtools.scenes.rgbd import RgbdOptions
+    from gvtools.scenes.rgbd_recording import RgbdOptions
 
     return RgbdOptions(**given)
 

@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
+from pipelines.commands.help_settings import HelpSettings
 
 if TYPE_CHECKING:
+    from gvtools.training.options import TrainingSettings
     from pipelines.console import Console
 
 SUMMARY = "train the generative core: encoder, denoisers, distillation"
@@ -57,13 +59,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="a setting, such as denoiser.optimizer.steps=500 (JSON values)",
+        help="a setting, such as denoiser.optimizer.steps=500",
+    )
+    parser.add_argument(
+        "--help-settings", action=HelpSettings, settings=_settings, help="list all settings"
     )
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument(
         "--sheets", type=int, default=250, metavar="N", help="sample sheets every N steps; 0: none"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the last figures there")
+
+
+def _settings() -> TrainingSettings:
+    from gvtools.training.options import TrainingSettings
+
+    return TrainingSettings()
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
@@ -73,13 +84,14 @@ def run(args: argparse.Namespace, console: Console) -> None:
         GvError: a wrong setting, a state of another training, or weights that do not fit.
     """
     from gvtools.files import check_parent, make_folder, write_text
+    from gvtools.settings import with_texts
     from gvtools.training.names import STAGES
-    from gvtools.training.options import shipped_or_read, with_settings
+    from gvtools.training.options import shipped_or_read
     from gvtools.training.processes import started
     from gvtools.training.run import StageRun
 
     config, folder = shipped_or_read(args.config)
-    config = with_settings(config, args.set)
+    config = with_texts(config, args.set)
     if args.until is not None and args.until < 1:
         raise OptionError(f"--until {args.until}; expected at least step 1")
     init = _init_folder(args.init)

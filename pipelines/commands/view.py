@@ -53,8 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=MAX_POINTS,
         metavar="N",
-        help="draw at most so many points of the whole on the page, one a cell (%(default)s), and "
-        "of all those near the viewer's camera three tenths as many",
+        help="draw at most so many points on the page, spread evenly (%(default)s)",
     )
     parser.add_argument(
         "--screenshot",
@@ -129,7 +128,7 @@ def _screenshot(
 
 
 def _serve(source: ViewSource, args: argparse.Namespace, console: Console) -> None:
-    from viz.web.guard import is_loopback
+    from viz.web.server import is_loopback
     from viz.web.viewer import WebViewer
 
     if args.live:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import CheckpointError, GvError, OptionError, ProjectError
-from pipelines.weights.report import print_needed, print_parts, size_text
 
 if TYPE_CHECKING:
     from gvtools.completers.geoverse.config import GeoVerseConfig
@@ -121,8 +120,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 def _list(args: argparse.Namespace, console: Console) -> None:
     from gvtools.completers.geoverse.config import NAMES
-    from gvtools.completers.geoverse.weights.needed_files import needed_files
     from pipelines.console import write_json
+    from pipelines.weights.report import needed_files, print_needed
 
     names = NAMES if args.config is None else (args.config,)
     listed = [needed_files(_config(name)) for name in names]
@@ -140,15 +139,20 @@ def _list(args: argparse.Namespace, console: Console) -> None:
 
 def _pack(args: argparse.Namespace, console: Console) -> None:
     from pipelines.weights.pack import pack, packed_bytes
+    from pipelines.weights.report import size_text
 
     source = pack(args.source, args.folder)
     console.line(f"{args.folder}: {size_text(packed_bytes(args.folder))}, from {source}")
 
 
 def _check(args: argparse.Namespace, console: Console) -> None:
-    from gvtools.completers.geoverse.weights.folder_check import check_folder
-    from gvtools.completers.geoverse.weights.folder_parts import check_is_folder, config_of
+    from gvtools.completers.geoverse.weights.checks import (
+        check_folder,
+        check_is_folder,
+        config_of,
+    )
     from pipelines.console import write_json
+    from pipelines.weights.report import print_parts
 
     folder = args.folder
     report: dict[str, Any] = {"folder": str(folder), "config": None, "ok": False, "parts": []}
@@ -167,7 +171,7 @@ def _check(args: argparse.Namespace, console: Console) -> None:
         first = bad[0].name if bad[0].path is None else str(bad[0].path)
         problem = (
             f"{folder}: {len(bad)} of {len(parts)} parts cannot be loaded, first {first}: "
-            f"{bad[0].said}"
+            f"{bad[0].summary}"
         )
     if args.json is not None:
         found = [part.to_dict() for part in parts]
@@ -182,10 +186,10 @@ def _check(args: argparse.Namespace, console: Console) -> None:
 def _create(args: argparse.Namespace, console: Console) -> None:
     import torch
 
-    from gvtools.completers.geoverse.model import GeoVerse
+    from gvtools.completers.geoverse.model import GeoVerse, empty_model
     from gvtools.completers.geoverse.weights.folder import save_pretrained
-    from gvtools.completers.geoverse.weights.folder_parts import empty_model
     from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
+    from pipelines.weights.report import size_text
 
     config, folder = _config(args.config), args.folder
     if folder.is_file() or (
@@ -246,6 +250,8 @@ def _empty_prompt(args: argparse.Namespace, console: Console) -> None:
 
 def _progress(console: Console) -> Callable[[int, int], None]:
     """Bytes done of all: a line that is rewritten on a terminal, one now and then elsewhere."""
+    from pipelines.weights.report import size_text
+
     last = [time.monotonic()]
 
     def report(done: int, total: int) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from gvtools.settings import changes, with_values
 from pipelines.console import Console
 from pipelines.reconstruction.voxel_edge import automatic_voxel
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from gvtools.completers.base import Completer
     from gvtools.depth.source import DepthSource
     from gvtools.scenes.scene import Scene
-    from pipelines.config import RunConfig
+    from pipelines.reconstruction.settings import RunSettings
     from pipelines.reconstruction.targets import Targets
 
 
@@ -25,7 +26,8 @@ class Plan:
 
     Attributes:
         scene: the project.
-        config: with everything derived filled in.
+        settings: as the user gave them.
+        config: with everything derived in its place; see ``derived``.
         context: names of the given views.
         targets: the cameras to complete.
         schedule: per round (from 1) the rows of the targets.
@@ -37,7 +39,8 @@ class Plan:
     """
 
     scene: Scene
-    config: RunConfig
+    settings: RunSettings
+    config: RunSettings
     context: tuple[str, ...]
     targets: Targets
     schedule: tuple[tuple[int, ...], ...]
@@ -47,8 +50,15 @@ class Plan:
     ignored: tuple[str, ...] = ()
     weights: tuple[Path, ...] = ()
 
+    @property
+    def derived(self) -> dict[str, Any]:
+        """What the run's settings leave open, by dotted key: voxel edge, rounds, device, ..."""
+        return changes(self.settings, self.config)
 
-def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | None = None) -> Plan:
+
+def make_plan(
+    scene: Scene, config: RunSettings, *, say: Callable[[str], None] | None = None
+) -> Plan:
     """Resolve selections, depth source, voxel edge and schedule.
 
     Args:
@@ -74,7 +84,7 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
             f"{scene.root}: {errors[0]}"
             + (f" (and {len(errors) - 1} more; see 'gvtools check')" if len(errors) > 1 else "")
         )
-    config = _on_device(config)
+    settings, config = config, _on_device(config)
     scene = reduced(scene, config.max_side)
     completer = config.effort.applied(create(config.completer, **config.completer_options))
     # By name: a project may list its views in any order, and merging depends on theirs.
@@ -94,18 +104,19 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
             scene, context, chosen.source, percentile=config.fusion.voxel_percentile, say=say
         )
         # Not rounded: it has to follow the world's scale.
-        config = at_scale(replace(config, voxel=edge), config.fusion.voxel_scale)
-        if config.fusion.voxel_loss is not None:
+        config = at_scale(config.replaced(voxel=edge), config.fusion.voxel_scale)
+        if config.fusion.max_psnr_drop_db is not None:
             recorded = [name for name in context if is_recorded(chosen.source, scene[name])]
             scale = sufficient_scale(
-                scene, recorded, config=config, loss=config.fusion.voxel_loss, say=say
+                scene, recorded, config=config, loss=config.fusion.max_psnr_drop_db, say=say
             )
             config = at_scale(config, scale)
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
-    config = replace(config, rounds=len(schedule))
+    config = config.replaced(rounds=len(schedule))
     weights = [*getattr(chosen.source, "files", ()), *completer.files]
     return Plan(
         scene,
+        settings,
         config,
         context,
         targets,
@@ -118,28 +129,40 @@ def make_plan(scene: Scene, config: RunConfig, *, say: Callable[[str], None] | N
     )
 
 
-def _on_device(config: RunConfig) -> RunConfig:
-    """The projection on the run's device: "cuda" takes the torch back end there, "cpu" no other."""
+def _on_device(config: RunSettings) -> RunSettings:
+    """The device of the projection: "cuda" takes the torch back end there, "cpu" no other.
+
+    "auto" is CUDA where the torch back end was chosen, may choose, and finds such a device.
+    """
     from gvtools.errors import OptionError
 
-    splat = config.splat
-    if config.device == "cpu" and splat.device != "cpu":
-        return replace(config, splat=replace(splat, device="cpu"))
-    if config.device != "cuda":
-        return config
-    if splat.backend in ("nearest", "open3d"):
+    splat, device = config.splat, config.device
+    if device == "cuda" and splat.backend in ("nearest", "open3d"):
         raise OptionError(
             f"device cuda with splat.backend {splat.backend}, which computes on the CPU; expected "
             "torch; leave one of them out"
         )
-    import torch
+    if device == "auto":
+        device = splat.device if splat.backend == "torch" else "cpu"
+        if device == "auto":
+            device = "cuda" if _cuda() else "cpu"
+        return with_values(config, {"device": device, "splat.device": device})
+    if device == "cpu":
+        return with_values(config, {"splat.device": "cpu"})
+    if not _cuda():
+        import torch
 
-    if not torch.cuda.is_available():
         raise OptionError(
             f"device cuda: torch {torch.__version__} finds no CUDA device; expected one; use "
             "--device cpu, or install a CUDA build of torch"
         )
-    return replace(config, splat=replace(splat, backend="torch", device="cuda"))
+    return with_values(config, {"splat.backend": "torch", "splat.device": "cuda"})
+
+
+def _cuda() -> bool:
+    import torch
+
+    return torch.cuda.is_available()
 
 
 def make_schedule(

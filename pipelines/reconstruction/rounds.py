@@ -19,9 +19,9 @@ from gvtools.memory.projection_cache import FollowedCamera
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.similarity import align_depth_scale
-from pipelines.config import RunConfig
 from pipelines.reconstruction.depth_cache import KeptDepth, depth_report
 from pipelines.reconstruction.prefetch import ahead
+from pipelines.reconstruction.settings import RunSettings
 
 STAGES = ("depth", "fuse", "project", "complete", "align")
 
@@ -66,7 +66,7 @@ def observe_context(
     *,
     source: KeptDepth,
     memory: SpatialMemory,
-    config: RunConfig,
+    config: RunSettings,
     clock: Clock,
     progress: Any,
 ) -> tuple[FuseReport, dict[str, int], list[dict[str, Any]]]:
@@ -98,7 +98,7 @@ def observe_context(
                 mask=frame.mask,
                 options=config.back_projection,
                 levels=memory.levels,
-                joined=config.savings.joined,
+                joined=config.savings.pixel_binning,
             )
             total += memory.fuse(points, round=0)
         for reason, count in points.dropped.items():
@@ -150,7 +150,7 @@ def complete_targets(
     memory: SpatialMemory,
     completer: Completer,
     context: Sequence[ContextView],
-    config: RunConfig,
+    config: RunSettings,
     clock: Clock,
     progress: Any,
     done: Callable[[int, TargetResult], object] = lambda row, result: None,
@@ -236,7 +236,7 @@ def _align_and_fuse(
     completion: Completion,
     number: int,
     memory: SpatialMemory,
-    config: RunConfig,
+    config: RunSettings,
     clock: Clock,
 ) -> tuple[TargetResult, FuseReport]:
     valid, depth = guidance.valid[0], completion.depth[0]
@@ -260,7 +260,7 @@ def _align_and_fuse(
                 mask=fused,
                 options=config.back_projection,
                 levels=memory.levels,
-                joined=config.savings.joined,
+                joined=config.savings.pixel_binning,
             )
             report = memory.fuse(points, round=number, generated=True)
     figures = {
@@ -275,7 +275,7 @@ def _align_and_fuse(
 
 
 def _scale_alignment(
-    guidance: Guidance, completion: Completion, config: RunConfig
+    guidance: Guidance, completion: Completion, config: RunSettings
 ) -> ScaleAlignment:
     """How the depth of a completion, a batch of one, gets into scene units.
 

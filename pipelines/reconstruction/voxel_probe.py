@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
@@ -20,12 +20,13 @@ from gvtools.cameras import Cameras
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.settings import with_values
 from pipelines.reconstruction.grid_frame import grid_frame
 from pipelines.reconstruction.sampling import sampled
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Frame, Scene
-    from pipelines.config import RunConfig
+    from pipelines.reconstruction.settings import RunSettings
 
 # Edges that are tried, in shares of the one given.
 SCALES = (0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0)
@@ -47,7 +48,7 @@ def sufficient_scale(
     scene: Scene,
     names: Sequence[str],
     *,
-    config: RunConfig,
+    config: RunSettings,
     loss: float,
     say: Callable[[str], None] | None = None,
 ) -> float:
@@ -112,14 +113,17 @@ def sufficient_scale(
     return chosen
 
 
-def at_scale(config: RunConfig, scale: float) -> RunConfig:
+def at_scale(config: RunSettings, scale: float) -> RunSettings:
     """``config`` with all voxels so many times as wide.
 
     An edge of twice the typical footprint means voxels of twice the footprint everywhere.
     """
     assert config.voxel is not None
-    memory = replace(config.memory, footprints=scale * config.memory.footprints)
-    return replace(config, voxel=scale * config.voxel, memory=memory)
+    changes = {
+        "voxel": scale * config.voxel,
+        "memory.footprints": scale * config.memory.footprints,
+    }
+    return with_values(config, changes)
 
 
 def _enough(masks: Sequence[NDArray[np.bool_]]) -> bool:
@@ -215,7 +219,7 @@ def _falls_on(
     return whole if frame.mask is None else whole & frame.mask
 
 
-def _fused(probe: _Probe, config: RunConfig) -> SpatialMemory:
+def _fused(probe: _Probe, config: RunSettings) -> SpatialMemory:
     """The neighbours' memory."""
     assert config.voxel is not None
     memory = SpatialMemory(
@@ -231,14 +235,14 @@ def _fused(probe: _Probe, config: RunConfig) -> SpatialMemory:
             mask=mask,
             options=config.back_projection,
             levels=memory.levels,
-            joined=config.savings.joined,
+            joined=config.savings.pixel_binning,
         )
         memory.fuse(points, round=0)
     return memory
 
 
 def _predicted(
-    probe: _Probe, memory: SpatialMemory, config: RunConfig
+    probe: _Probe, memory: SpatialMemory, config: RunSettings
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """(H, W) squared colour error of a view, and where in its tiles the memory knows it."""
     guidance = memory.project(probe.camera, options=config.splat)

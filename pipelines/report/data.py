@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import GvError, ProjectError
-from gvtools.runs.finished import open_scenes, read_record, read_reports
-from pipelines.config import RunConfig, flat_settings
+from gvtools.runs.finished import open_scenes, read_record, read_reports, resolved
+from gvtools.settings import dotted
 from pipelines.reconstruction.depth_cache import off_scale
+from pipelines.reconstruction.settings import RunSettings
 from pipelines.report.measures import read_measures, report_poses
 from pipelines.report.sheets import contact_sheets
 from viz.report.content import RunReport
@@ -87,7 +88,7 @@ def collect(
     )
     poses = report_poses(reports, sources.scene, record["context"], measures.poses)
     trade_off, unread = _trade_off(path, record)
-    settings = dict(flat_settings(record["config"]))
+    settings = dotted(resolved(record))
     return RunReport(
         title=f"{path.resolve().name}: a run of gvtools",
         facts=_facts(record, reports),
@@ -128,7 +129,7 @@ def read_sweep(path: Path, *, of: Mapping[str, Any] | None = None) -> TradeOff |
     Raises:
         ProjectError: one in the folder or above cannot be read.
     """
-    from pipelines.tradeoff.points import FILE, read_trade_off
+    from pipelines.tradeoff.results import FILE, read_trade_off
 
     folder = path.resolve()
     for candidate in (folder, *folder.parents)[:ABOVE]:
@@ -158,7 +159,7 @@ def _trade_off(path: Path, record: Mapping[str, Any]) -> tuple[TradeOff | None, 
 def _facts(
     record: Mapping[str, Any], reports: Sequence[Mapping[str, Any]]
 ) -> list[tuple[str, str]]:
-    config, done = record["config"], len(reports) - 1
+    config, done = resolved(record), len(reports) - 1
     planned = len(record["schedule"])
     return [
         ("project", str(record["project"])),
@@ -206,7 +207,7 @@ def _few(names: Sequence[str], most: int = 4) -> str:
 
 def _changed(settings: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Settings that differ from the defaults, with both."""
-    usual = dict(flat_settings(RunConfig().to_dict()))
+    usual = dotted(RunSettings().to_dict())
     return [
         (key, _said(value), _said(usual[key]) if key in usual else "none")
         for key, value in settings.items()

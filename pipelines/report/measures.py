@@ -166,7 +166,7 @@ def _of_this_run(
 ) -> Mapping[str, Any] | None:
     """The entry of an evaluation that measured exactly these targets of exactly this run."""
     for entry in evaluation.get("runs", ()):
-        same = all(entry.get(key) == record[key] for key in ("config", "project"))
+        same = all(entry.get(key) == record[key] for key in ("settings", "derived", "project"))
         if same and _measured(entry.get("images", entry.get("poses", {})), names):
             return dict(entry)
     return None

@@ -1,9 +1,9 @@
-"""What a trade-off varies: each knob's levels, from cheap to dear, as settings of a run."""
+"""What a trade-off varies: settings of a run, each with a few values, cheapest first."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from gvtools.completers.base import create
@@ -12,242 +12,130 @@ from gvtools.errors import GvError
 from gvtools.scenes.reduced import SMALLEST
 
 if TYPE_CHECKING:
-    from gvtools.completers.geoverse.config import GeoVerseConfig
     from pipelines.reconstruction.plan import Plan
+    from pipelines.reconstruction.settings import RunSettings
 
-# Of the voxel edge that the run has.
-EDGES = (4.0, 2.0, 1.0, 0.5)
-# Level-1 steps of the generative core.
-STEPS = (1, 3, 6)
 Settings = Mapping[str, Any]
-Point = tuple[int, ...]
+# Of the voxel edge that the run has.
+EDGES = (2.0, 1.0, 0.5)
 
 
 @dataclass(frozen=True)
-class Level:
-    """One position of a knob.
+class SearchAxis:
+    """One part of a run that can be cheaper or costlier.
 
     Attributes:
-        name: as a table shows it.
-        settings: dotted keys of a run's settings, and their values.
+        name: as tables show it.
+        values: name and settings of each value, cheapest first; the start's settings are {}.
     """
 
     name: str
-    settings: Settings = field(default_factory=dict)
+    values: tuple[tuple[str, Settings], ...]
 
 
-@dataclass(frozen=True)
-class Knob:
-    """A part of a run that can be cheap or dear.
-
-    Attributes:
-        name: what it is.
-        levels: from cheap to dear.
-        usual: index of the level that the sweep starts from.
-        delivered: longer side of the start's pictures, pixels, where cheaper levels deliver smaller
-            ones rather than the same with less effort; 0 for any other knob.
-        completer: the one that it belongs to; with others it changes nothing.
-    """
-
-    name: str
-    levels: tuple[Level, ...]
-    usual: int
-    delivered: int = 0
-    completer: str | None = None
-
-
-def settings_of(knobs: Sequence[Knob], point: Point) -> dict[str, Any]:
-    """The settings of one level of each knob; of a knob whose completer is not there none."""
-    levels = [knob.levels[level] for knob, level in zip(knobs, point, strict=True)]
-    named = [level.settings["completer"] for level in levels if "completer" in level.settings]
-    out: dict[str, Any] = {}
-    for knob, level in zip(knobs, levels, strict=True):
-        if knob.completer is None or knob.completer in named:
-            out |= level.settings
-    return out
-
-
-def delivers_less(knobs: Sequence[Knob], settings: Settings) -> bool:
-    """Whether a run with these settings delivers less than the one that the sweep starts from."""
-    side = settings.get("max_side")
-    return side is not None and any(side < knob.delivered for knob in knobs)
-
-
-def usual(knobs: Sequence[Knob]) -> Point:
-    """Where a sweep starts."""
-    return tuple(knob.usual for knob in knobs)
-
-
-def neighbours(knobs: Sequence[Knob], point: Point) -> list[Point]:
-    """Every point that differs from ``point`` in one knob."""
-    return [
-        (*point[:at], level, *point[at + 1 :])
-        for at, knob in enumerate(knobs)
-        for level in range(len(knob.levels))
-        if level != point[at]
-    ]
-
-
-def knobs_of(plan: Plan) -> list[Knob]:
-    """The knobs that change something in this run.
+def search_axes(plan: Plan) -> list[SearchAxis]:
+    """The axes that change something in this run.
 
     Args:
-        plan: of a run with the settings that the sweep starts from.
+        plan: of a run with the settings that the sweep starts from and a voxel edge.
     """
     config = plan.config
-    assert config.voxel is not None
-    completers = _completers(plan)
-    knobs = [
-        Knob("voxel edge", tuple(_edge(config.voxel, share) for share in EDGES), EDGES.index(1.0)),
-        _far_voxels(config.memory.footprints),
-        _numbers("observations a voxel", "memory.observations_per_voxel",
-                 (2, 4, 12, 48), config.memory.observations_per_voxel),
-        _numbers("merging angle, degrees", "memory.same_direction",
-                 (15.0, 8.0, 2.0, 0.0), config.memory.same_direction),
-        Knob(
-            "projection",
-            (
-                Level("one pixel a point", {"splat.backend": "nearest"}),
-                Level("blended, first tiers alone", {"splat.occluders": False}),
-                Level("blended", {}),
-                Level("blended, 4 views first", {"splat.nearest_views": 4}),
-            ),
-            2,
-        ),
-        completers,
-        _numbers("views a round", "views_per_round", (3, 6, 12), config.views_per_round),
+    voxel, far = config.voxel, config.memory.footprints
+    assert voxel is not None
+    side = longest_side(plan)
+    sides = [size for size in (side // 2,) if size >= 2 * SMALLEST]
+    axes = [
+        _axis("voxel edge", "voxel", [float(f"{share * voxel:.4g}") for share in EDGES], voxel),
+        _axis("far voxels, footprints", "memory.footprints", (2 * far or 1.0, far, 0.0), far),
+        _axis("observations a voxel", "memory.observations_per_voxel", (4, 12, 48),
+              config.memory.observations_per_voxel),
+        _axis("merging angle, degrees", "memory.same_direction", (8.0, 2.0, 0.0),
+              config.memory.same_direction),
+        SearchAxis("projection", (
+            ("one pixel a point", {"splat.backend": "nearest"}),
+            ("as given", {}),
+            ("blended, 4 views first", {"splat.nearest_views": 4}),
+        )),
+        _completers(config),
+        _axis("views a round", "views_per_round", (3, 6, 12), config.views_per_round),
+        SearchAxis("picture size", (
+            *((f"{size} px", {"max_side": size}) for size in sides), (f"{side} px", {}))),
     ]  # fmt: skip
     if config.completer != "none":
-        knobs.append(
-            _numbers("least confidence that is fused", "fusion.min_confidence",
-                     (0.35, 0.2, 0.08), config.fusion.min_confidence)
-        )  # fmt: skip
-    side = max(int(plan.targets.cameras.width.max()), int(plan.targets.cameras.height.max()))
-    sides = [size for size in (side // 2, 3 * side // 4) if size >= 2 * SMALLEST]
-    knobs.append(
-        Knob(
-            "picture size",
-            (*(Level(f"{size} px", {"max_side": size}) for size in sides), Level(f"{side} px")),
-            len(sides),
-            delivered=side,
-        )
-    )
-    if "geoverse" in [level.settings["completer"] for level in completers.levels]:
-        given = config.completer_options if config.completer == "geoverse" else {}
-        core = _core(given)
-        knobs += [
-            replace(knob, completer="geoverse")
-            for knob in (
-                _numbers("holes left to inpaint, share of the diagonal", "effort.inpaint_below",
-                         (0.1, 0.05, 0.02, 0.0), config.effort.inpaint_below),
-                _values("cascade steps", "completer.cascade_steps", (1, 2, 4, None),
-                        given.get("cascade_steps")),
-                _values("model resolution, px", "completer.image_size",
-                        (core.image_size // 2, 3 * core.image_size // 4, None),
-                        given.get("image_size")),
-                _values("precision", "completer.precision", ("bfloat16", "float32"),
-                        given.get("precision", "auto")),
-                _numbers("holes of reduced effort, share of the diagonal", "effort.reduced_below",
-                         (1e6, 0.3, 0.1, 0.0), config.effort.reduced_below),
-            )
-        ]  # fmt: skip
+        axes.append(_axis("least confidence that is fused", "fusion.min_confidence",
+                          (0.35, 0.08), config.fusion.min_confidence))  # fmt: skip
+    if config.completer == "geoverse":
+        axes += _core_axes(config)
     if plan.source.name != RecordedDepth.name:
-        knobs.append(
-            _values("views explained, share of pixels", "savings.explained",
-                    (0.7, 0.8, 0.9, None), config.savings.explained)
-        )  # fmt: skip
+        axes.append(_axis("views explained, share of pixels", "savings.depth_from_memory",
+                          (0.8, 0.9, None), config.savings.depth_from_memory))  # fmt: skip
     if plan.source.name == "plane-sweep":
-        knobs += [
-            _values("stereo planes", "stereo.planes", (16, 32, 64, None), config.stereo.planes),
-            _numbers("stereo sources", "stereo.sources", (2, 4, 6), config.stereo.sources),
-            _numbers("stereo picture size", "stereo.max_side",
-                     (320, 480, 640, 960), config.stereo.max_side),
-            _numbers("stereo iterations", "stereo.iterations", (0, 1, 2), config.stereo.iterations),
-        ]  # fmt: skip
-    return [knob for knob in knobs if len(knob.levels) > 1]
+        axes += [
+            _axis("stereo planes", "stereo.planes", (32, None), config.stereo.planes),
+            _axis("stereo sources", "stereo.sources", (2, 4), config.stereo.sources),
+            _axis("stereo picture size", "stereo.max_side", (320, 640), config.stereo.max_side),
+            _axis("stereo iterations", "stereo.iterations", (0, 1), config.stereo.iterations),
+        ]
+    return [axis for axis in axes if len(axis.values) > 1]
 
 
-def _core(given: Mapping[str, Any]) -> GeoVerseConfig:
-    """The generative core's configuration, with a run's options of it."""
+def longest_side(plan: Plan) -> int:
+    """Of a run's pictures, pixels."""
+    cameras = plan.targets.cameras
+    return max(int(cameras.width.max()), int(cameras.height.max()))
+
+
+def _core_axes(config: RunSettings) -> list[SearchAxis]:
+    """Of a run that the generative core completes."""
     from gvtools.completers.geoverse.completer import GeoVerseCompleter
-    from gvtools.completers.geoverse.weights.folder_parts import config_of
+    from gvtools.completers.geoverse.weights.checks import config_of
 
-    core = create("geoverse", **given)
-    assert isinstance(core, GeoVerseCompleter)
-    return config_of(core.folder)
+    given = config.completer_options
+    completer = create("geoverse", **given)
+    assert isinstance(completer, GeoVerseCompleter)
+    core = config_of(completer.folder)
+    steps = int(given.get("steps") or len(core.flow.level1))
+    size = int(given["image_size"]) if given.get("image_size") else None
+    return [
+        _axis("generative steps", "completer.steps", (1, 3, 6), steps),
+        _axis("model resolution, px", "completer.image_size", (core.image_size // 2, size), size),
+        _axis("holes left to inpaint, share of the diagonal", "effort.inpaint_below",
+              (0.1, 0.02, 0.0), config.effort.inpaint_below),
+        _axis("holes of reduced effort, share of the diagonal", "effort.reduced_below",
+              (0.3, 0.1, 0.0), config.effort.reduced_below),
+    ]  # fmt: skip
 
 
-def _numbers(name: str, key: str, values: Sequence[float], start: float) -> Knob:
-    """Levels by number, in the order given; the run's own value is one of them."""
+def _axis(name: str, key: str, values: Sequence[Any], start: Any) -> SearchAxis:
+    """One setting; the start's own value takes its place among the numbers, or comes last."""
+    values = list(dict.fromkeys(values))
     if start not in values:
-        rising = values[0] < values[-1]
-        values = sorted({*values, start}, reverse=not rising)
-    levels = tuple(Level(f"{value:g}", {key: value}) for value in values)
-    return Knob(name, levels, list(values).index(start))
-
-
-def _values(name: str, key: str, values: Sequence[Any], start: Any) -> Knob:
-    """Levels in the order given, None among them; the run's own value is one, if need be the last.
-
-    None stands for what a run finds by itself, or for a saving that is off.
-    """
-    values = list(values) if start in values else [*values, start]
-    levels = tuple(Level("none" if v is None else str(v), {key: v}) for v in values)
-    return Knob(name, levels, values.index(start))
-
-
-def _edge(voxel: float, share: float) -> Level:
-    """As an edge, not as a share of the footprints: the sweep's runs need not find it again."""
-    return Level(f"{share:g} x {voxel:.3g}", {"voxel": float(f"{share * voxel:.4g}")})
-
-
-def _far_voxels(footprints: float) -> Knob:
-    """How wide voxels may be, beyond the edge, in footprints of what they hold."""
-    values = [float(f"{share * footprints:.4g}") for share in (2.0, 1.0, 0.5)]
-    values = [*values, 0.0] if footprints else [1.0, 0.0]
-    levels = tuple(
-        Level(
-            f"at most {value:g} footprints wide" if value else "as wide as near ones",
-            {"memory.footprints": value},
-        )
+        numbers = [value for value in values if value is not None]
+        falling = numbers[0] > numbers[-1]
+        if start is not None:
+            numbers = sorted([*numbers, start], reverse=falling)
+        values = [*numbers, None] if None in (*values, start) else numbers
+    return SearchAxis(name, tuple(
+        (f"{value:.4g}" if isinstance(value, float) else "as found" if value is None
+         else str(value), {} if value == start else {key: value})
         for value in values
-    )
-    return Knob("far voxels", levels, 1)
+    ))  # fmt: skip
 
 
-def _completers(plan: Plan) -> Knob:
-    """Completers that this installation has, cheap to dear; the run's own with its options."""
-    config = plan.config
-    options = {f"completer.{key}": value for key, value in config.completer_options.items()}
-    own = Level(f"{config.completer} as given", {"completer": config.completer, **options})
-    known: list[Level] = [Level(name, {"completer": name}) for name in ("none", "inpaint")]
-    at = len(known)
-    of_core = config.completer == "geoverse"
-    # As many bounds as it has steps, and one more.
-    bounds = len(_core(config.completer_options).flow.level1) if of_core else 0
-    for steps in STEPS:
-        settings: dict[str, Any] = {"completer": "geoverse", "completer.steps": steps}
-        if of_core:
-            settings = {**own.settings, **settings}
-            if steps < bounds:
-                at = len(known) + 1
-        known.append(Level(f"geoverse {steps}+1", settings))
-    if own.settings not in [level.settings for level in known]:
-        known.insert(at if of_core else len(known), own)
-    levels = [level for level in known if level is own or _available(level)]
-    return Knob(
-        "completer", tuple(levels), [level.settings for level in levels].index(own.settings)
-    )
+def _completers(config: RunSettings) -> SearchAxis:
+    """Completers that this installation has, the run's own with its options."""
+    names = [name for name in ("none", "inpaint", "geoverse") if name != config.completer]
+    values: list[tuple[str, Settings]] = [
+        (name, {"completer": name}) for name in names if _available(name)
+    ]
+    at = 0 if config.completer == "none" else 1 if config.completer == "inpaint" else len(values)
+    values.insert(at, (config.completer, {}))
+    return SearchAxis("completer", tuple(values))
 
 
-def _available(level: Level) -> bool:
-    options = {
-        key.partition(".")[2]: value
-        for key, value in level.settings.items()
-        if key.startswith("completer.")
-    }
+def _available(name: str) -> bool:
     try:
-        create(str(level.settings["completer"]), **options)
+        create(name)
     except GvError:
         return False
     return True

@@ -7,7 +7,7 @@ import json
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,24 +19,60 @@ from gvtools.evaluation.view_figures import view_figures
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.round_files import TargetFiles, read_target
 from gvtools.scenes.scene import Scene, View
+from gvtools.settings import with_values
 from pipelines.commands.reconstruct import reconstruct
-from pipelines.config import RunConfig, with_setting
 from pipelines.console import Console, write_json
 from pipelines.reconstruction.measure import mean_of
-from pipelines.tradeoff.outcome import Outcome
+from pipelines.reconstruction.settings import RunSettings
 
 
-def applied(config: RunConfig, settings: Mapping[str, Any]) -> RunConfig:
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a run with some settings takes and gives.
+
+    Attributes:
+        settings: by which it differs from the start.
+        seconds: of the run.
+        bytes: of the memory at the end.
+        observations: stored at the end.
+        psnr: mean over the targets, dB, whole pictures at their full size.
+        psnr_valid: of pixels that observations support, dB.
+        psnr_generated: of generated pixels, dB.
+        ssim: mean over the targets, whole pictures at their full size.
+        depth_rel: median relative depth error where the depth is known.
+        coverage: share of the pictures that observations support.
+    """
+
+    settings: dict[str, Any]
+    seconds: float
+    bytes: float
+    observations: int
+    psnr: float
+    psnr_valid: float | None
+    psnr_generated: float | None
+    ssim: float | None
+    depth_rel: float | None
+    coverage: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Outcome:
+        """From plain data, which may hold other keys besides."""
+        return cls(**{field.name: data[field.name] for field in fields(cls)})
+
+
+def applied(config: RunSettings, settings: Mapping[str, Any]) -> RunSettings:
     """A run's settings with a trial's; one that names a completer says all of its options."""
     if "completer" in settings:
-        config = replace(config, completer_options={})
-    for key, value in settings.items():
-        config = with_setting(config, key, value)
-    return config
+        config = config.replaced(completer_options={})
+    return with_values(config, settings)
 
 
 class _Silent(Console):
-    """Says nothing, warnings included: a sweep's runs are not the user's."""
+    """Prints nothing, warnings included: a sweep's runs are not the user's."""
 
     def __init__(self) -> None:
         super().__init__(quiet=True)
@@ -46,80 +82,68 @@ class _Silent(Console):
 
 
 class Trials:
-    """Runs with changed settings, each made once and kept by what decides it.
+    """Runs with changed settings, each made once and kept in a file.
 
     Args:
         scene: the project.
-        config: the run that was asked for; its voxel edge is set.
+        config: of the start; its voxel edge is set.
         names: of the target views, held out.
         folder: where outcomes are kept, one JSON file each.
-        identity: of that run, see ``run_identity``: other pictures, masks, weights or units are
+        identity: of the start, see ``run_identity``: other pictures, masks, weights or units are
             other trials.
     """
 
     def __init__(
         self,
         scene: Scene,
-        config: RunConfig,
+        config: RunSettings,
         names: Sequence[str],
         folder: Path,
         identity: Mapping[str, Any],
     ) -> None:
-        self.scene, self.config, self.names, self.folder = scene, config, tuple(names), folder
+        self.scene, self.config, self.names, self.folder = scene, config, list(names), folder
         self.identity = identity
         self._warm = False
 
-    def outcome(self, settings: Mapping[str, Any], share: float) -> Outcome:
-        """The run with these settings on an even share of the targets.
+    def outcome(self, settings: Mapping[str, Any]) -> Outcome:
+        """The run with these settings.
 
         Raises:
             GvError: the run is refused.
         """
-        names = self._names(share)
-        kept = self.kept(settings, share)
+        kept = self.kept(settings)
         if kept is not None:
             return kept
         if not self._warm:
-            # Compiled kernels load, and files come into the cache, once.
+            # Kernels are compiled and files are cached once.
             self._warm = True
-            self._run({}, names[:1])
-        found = self._run(settings, names)
-        write_json(self._file(settings, names), {"outcome": found.to_json(), "names": names})
-        return found
+            self._run({}, self.names[:1])
+        outcome = self._run(settings, self.names)
+        write_json(self._file(settings), outcome.to_json())
+        return outcome
 
-    def kept(self, settings: Mapping[str, Any], share: float) -> Outcome | None:
+    def kept(self, settings: Mapping[str, Any]) -> Outcome | None:
         """What this trial gave before; None if it was not made, or its file is damaged."""
-        file = self._file(settings, self._names(share))
         try:
-            return Outcome(**json.loads(file.read_text(encoding="utf-8"))["outcome"])
+            return Outcome.from_json(json.loads(self._file(settings).read_text(encoding="utf-8")))
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
-    def _names(self, share: float) -> list[str]:
-        """An even share of the targets."""
-        count = max(1, round(share * len(self.names)))
-        rows = sorted({round((i + 0.5) * len(self.names) / count - 0.5) for i in range(count)})
-        return [self.names[row] for row in rows]
-
-    def _file(self, settings: Mapping[str, Any], names: Sequence[str]) -> Path:
-        return self.folder / f"{self._key(settings, names)}.json"
-
-    def _key(self, settings: Mapping[str, Any], names: Sequence[str]) -> str:
+    def _file(self, settings: Mapping[str, Any]) -> Path:
         import gvtools
 
-        kept = [field.name for field in fields(Outcome)]
-        said = [self.identity, dict(settings), list(names), gvtools.__version__, kept]
-        text = json.dumps(said, sort_keys=True, default=str)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        parts = [self.identity, dict(settings), self.names, gvtools.__version__]
+        text = json.dumps(parts, sort_keys=True, default=str)
+        return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
 
     def _run(self, settings: Mapping[str, Any], names: Sequence[str]) -> Outcome:
-        config = with_setting(applied(self.config, settings), "targets", ",".join(names))
+        config = applied(self.config, settings).replaced(targets=",".join(names))
         out = self.folder / "running"
         shutil.rmtree(out, ignore_errors=True)
         start = time.perf_counter()
         try:
             reconstruct(self.scene, config, out, console=_Silent(), drawn=False)
-            whole = time.perf_counter() - start
+            seconds = time.perf_counter() - start
             directory = RunDirectory(out)
             reports = directory.reports()
             figures = [
@@ -129,16 +153,12 @@ class Trials:
             ]
         finally:
             shutil.rmtree(out, ignore_errors=True)
-        targets = len(figures)
-        rounds = sum(report["seconds"]["total"] for report in reports[1:])
         psnr = mean_of(figures, "psnr")
         if psnr is None:
             raise GvError("no target has a true picture to compare with; hold views out")
         return Outcome(
             settings=dict(settings),
-            targets=targets,
-            fixed=whole - rounds,
-            per_target=rounds / targets,
+            seconds=seconds,
             bytes=float(reports[-1]["bytes"]),
             observations=int(reports[-1]["points"]),
             psnr=psnr,

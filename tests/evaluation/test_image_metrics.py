@@ -5,8 +5,7 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from gvtools.errors import ShapeError
-from gvtools.evaluation.images import image_figures, psnr, relative_depth_error, ssim
-from gvtools.evaluation.ssim_map import ssim_map
+from gvtools.evaluation.images import image_figures, psnr, relative_depth_error, ssim, ssim_map
 
 SSIM = {
     "gaussian_weights": True,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -198,3 +199,36 @@ def test_lightglue_locates_without_an_offset(context: list[PosedPicture], take: 
     found = probe.locate(take(camera))
     assert found.ok and found.rotation_error_deg is not None, found.status
     assert found.rotation_error_deg < 0.2
+
+
+def test_lightglue_reads_weights_of_a_folder_and_refuses_others(
+    tmp_path: Path, context: list[PosedPicture]
+) -> None:
+    import torch
+
+    from gvtools.evaluation.pose_probe import lightglue
+
+    torch.manual_seed(0)
+    random = lightglue.networks(64)
+    for network, name in zip(random, lightglue.FILES, strict=True):
+        torch.save(network.state_dict(), tmp_path / name)
+    matcher = lightglue.LightGlueMatcher(max_features=64, weights=tmp_path)
+    for network, stored in zip((matcher._extractor, matcher._matcher), random, strict=True):
+        for name, tensor in stored.state_dict().items():
+            assert torch.equal(network.state_dict()[name], tensor), name
+    found = matcher.extract(context[0].rgb)
+    assert found.descriptors.shape == (len(found), 128)
+    pairs = matcher.match(found, found)
+    assert pairs.ndim == 2 and pairs.shape[1] == 2
+
+    weights = random[1].state_dict()
+    torch.save(weights | {"input_proj.weight": torch.zeros(2, 2)}, tmp_path / lightglue.FILES[1])
+    with pytest.raises(CheckpointError, match=r"input_proj\.weight.*another network"):
+        lightglue.LightGlueMatcher(weights=tmp_path)
+    del weights["input_proj.weight"]
+    torch.save(weights, tmp_path / lightglue.FILES[1])
+    with pytest.raises(CheckpointError, match=r"no input_proj\.weight"):
+        lightglue.LightGlueMatcher(weights=tmp_path)
+    (tmp_path / lightglue.FILES[1]).unlink()
+    with pytest.raises(CheckpointError, match="download it"):
+        lightglue.LightGlueMatcher(weights=tmp_path)

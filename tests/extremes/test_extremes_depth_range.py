@@ -11,7 +11,7 @@ from memory_scenes import camera, plane_view, points
 from reference_splat import reference_project
 
 from gvtools.memory.back_projection import BackProjectionOptions, back_project
-from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.store.voxel_index import MAX_VOXEL
 
@@ -76,14 +76,6 @@ def test_what_is_too_far_is_counted_and_wide_voxels_go_farther():
     seen = memory.project(source)
     assert finite(seen)
     np.testing.assert_allclose(seen.depth[0, 2:-2, -60:-4], 5e4, rtol=1e-5)
-
-
-def test_with_one_edge_nine_decades_are_too_many():
-    source = camera(**WIDE)
-    memory = SpatialMemory(1e-4, options=MemoryOptions(footprints=0.0))
-    report = memory.fuse(plane_view(source, _halves(1e-4, 1e5)), round=0)
-    # The column beside the step is a depth edge.
-    assert report.out_of_reach == (WIDE["width"] // 2 - 1) * WIDE["height"]
 
 
 @settings(max_examples=20, deadline=None)

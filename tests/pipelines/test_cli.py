@@ -79,7 +79,7 @@ def test_a_run_and_what_it_leaves(scan, tmp_path, capsys):
                      "metrics.json", "round_000", "round_001", "round_002"}  # fmt: skip
     assert (out / "growth.png").read_bytes().startswith(b"\x89PNG")
     record = json.loads((out / "run.json").read_text())
-    assert record["config"]["voxel"] > 0
+    assert record["derived"]["voxel"] > 0 and record["settings"]["voxel"] is None
     assert record["versions"]["numpy"] == np.__version__
     assert capsys.readouterr().out == ""
 

@@ -110,7 +110,7 @@ def test_what_was_measured_is_written_beside_the_scores(measured, scan):
     assert run["split"]["rounds"] == [list(names[3:5]), list(names[5:])]
     assert run["seed"] == 0
     assert run["versions"]["gvtools"]
-    assert run["config"]["completer"] == "inpaint"
+    assert run["settings"]["completer"] == "inpaint"
 
 
 def test_every_table_is_there_in_every_form(measured):

@@ -14,8 +14,9 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from gvtools.completers.geoverse import from_pretrained, named
-from gvtools.completers.geoverse.config_json import to_json
+from gvtools.completers.geoverse.weights.folder import save_pretrained
 from gvtools.completers.geoverse.weights.published import VIDEO_SIZES, WHOLE_FILE
+from gvtools.networks.config_json import to_json
 from pipelines.cli import build_parser, main
 from pipelines.commands.weights import _progress
 from pipelines.console import Console
@@ -45,7 +46,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
-    micro.model(PLAIN).save_pretrained(tmp_path / "own")
+    save_pretrained(micro.model(PLAIN), tmp_path / "own")
     return tmp_path / "own"
 
 
@@ -164,7 +165,7 @@ def test_a_folder_that_fits(capsys: pytest.CaptureFixture[str], own: Path, tmp_p
     assert found["problem"] is None
     (part,) = found["parts"]
     assert part["parameters"] == sum(t.numel() for t in load_file(own / WHOLE_FILE).values())
-    assert part["missing"] == part["unexpected"] == part["misshapen"] == []
+    assert part["missing"] == part["unexpected"] == part["shape_mismatch"] == []
 
 
 def test_what_does_not_fit_is_said_for_each_part(
@@ -190,7 +191,7 @@ def test_what_does_not_fit_is_said_for_each_part(
     assert parts["level1"]["unexpected"] == ["blocks.0.qkv"]
     assert parts["cascade"]["path"] is None
     assert not parts["cascade"]["ok"]
-    assert parts["rgb_head"]["passed_over"] == ["encoder.mask"]
+    assert parts["rgb_head"]["ignored"] == ["encoder.mask"]
     assert [name for name, part in parts.items() if part["ok"]] == [
         "geometry", "rgb_head", "statistics0", "statistics1", "geometry_head",
     ]  # fmt: skip
@@ -279,7 +280,7 @@ def test_the_video_prior_is_cut_and_completed(
     tiny_wan.transformer(6, (0, 2, 4)).save_pretrained(source / "transformer")
     tiny_wan.vae().save_pretrained(source / "vae")
     config = micro.config(injection="control", video=tiny_wan.CONFIG)
-    micro.model(config).save_pretrained(folder)
+    save_pretrained(micro.model(config), folder)
     video = folder / "video"
     assert weights("truncate-wan", source, video, "--blocks", 4) == 0
     text = capsys.readouterr().out

@@ -37,7 +37,7 @@ def test_a_first_attempt_that_failed_does_not_bind_the_next(scan, tmp_path):
     assert reconstruct(scan, out, "--voxel", "0.02") == 2
     broken.write_bytes(whole)
     assert reconstruct(scan, out, "--voxel", "0.03") == 0
-    assert json.loads((out / "run.json").read_text())["config"]["voxel"] == 0.03
+    assert json.loads((out / "run.json").read_text())["settings"]["voxel"] == 0.03
 
 
 def test_the_settings_of_a_run_with_rounds_bind(scan, tmp_path, capsys):
@@ -250,6 +250,6 @@ def test_a_completer_may_be_named_in_its_section(scan, tmp_path):
     file = tmp_path / "config.json"
     file.write_text(json.dumps({"completer": {"name": "inpaint", "sweeps": 3}}))
     assert reconstruct(scan, tmp_path / "run", "--config", file) == 0
-    config = json.loads((tmp_path / "run" / "run.json").read_text())["config"]
+    config = json.loads((tmp_path / "run" / "run.json").read_text())["settings"]
     assert config["completer"] == "inpaint"
     assert config["completer_options"] == {"sweeps": 3}

@@ -12,7 +12,7 @@ from test_scenes_transforms_json import PINHOLE, frame
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.project import open_project
-from gvtools.scenes.rgbd import RgbdOptions
+from gvtools.scenes.rgbd_recording import RgbdOptions
 
 
 def make_transforms(root):

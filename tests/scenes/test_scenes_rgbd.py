@@ -10,7 +10,7 @@ from scenes_workspace import HEIGHT, WIDTH, depth_picture, pose_matrix, ramp, sa
 from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
 from gvtools.scenes.quaternions import rotation_from_quaternion
 from gvtools.scenes.redwood import read_redwood
-from gvtools.scenes.rgbd import RgbdOptions
+from gvtools.scenes.rgbd_recording import RgbdOptions
 from gvtools.scenes.scannet import read_scannet
 from gvtools.scenes.sevenscenes import read_sevenscenes
 from gvtools.scenes.tum import PUBLISHED, associate, read_tum
@@ -47,7 +47,7 @@ def test_sevenscenes_incomplete_frames_are_dropped_and_counted(tmp_path):
     scene = read_sevenscenes(root)
     assert len(scene) == 3
     assert [view.has_depth for view in scene] == [True, False, True]
-    assert "1 pictures have no pose: dropped (frame-000001.color.png)" in messages(scene)
+    assert "1 of 4 frames have no pose: dropped (frame-000001.color.png)" in messages(scene)
     assert "1 poses have no picture: dropped" in messages(scene)
     assert "1 frames have no depth map" in messages(scene)
 
@@ -153,7 +153,7 @@ def test_registration_through_options_and_sidecar(tmp_path):
 
 def test_wrong_options(tmp_path):
     root = sevenscenes(tmp_path)
-    with pytest.raises(OptionError, match="depth_unit: -1"):
+    with pytest.raises(OptionError, match=r"rgbd\.depth_unit -1; expected more than 0"):
         RgbdOptions(depth_unit=-1)
     with pytest.raises(OptionError, match="without depth_K"):
         read_sevenscenes(root, options=RgbdOptions(color_from_depth=np.eye(4)))
@@ -162,10 +162,10 @@ def test_wrong_options(tmp_path):
             root, options=RgbdOptions(depth_K=np.eye(3), color_from_depth=np.diag([2, 2, 2, 1]))
         )
     (root / "rgbd.json").write_text('{"depth_units": 0.001}')
-    with pytest.raises(OptionError, match="did you mean 'depth_unit'"):
+    with pytest.raises(OptionError, match=r"did you mean 'rgbd\.depth_unit'"):
         read_sevenscenes(root)
     (root / "rgbd.json").write_text("{")
-    with pytest.raises(ProjectError, match="no JSON"):
+    with pytest.raises(OptionError, match=r"rgbd\.json: no readable JSON"):
         read_sevenscenes(root)
 
 

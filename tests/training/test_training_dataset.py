@@ -9,6 +9,7 @@ import torch
 from seen_surfaces import seen_by_context
 
 from gvtools.errors import OptionError, ShapeError
+from gvtools.procedural.photographs import photograph_names
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.corruption import (
     NOTHING,
@@ -20,7 +21,6 @@ from gvtools.training.corruption import (
 )
 from gvtools.training.dataset import MixedViews, ProceduralViews
 from gvtools.training.hints import Clip, observed, projected
-from gvtools.training.photographs import photograph_names
 from gvtools.training.view_sample import Sample, collated
 
 CLEAN = ProceduralViews(faults=None)
@@ -190,11 +190,11 @@ def _plane() -> Clip:
 
 
 @pytest.mark.parametrize(
-    "fault", [e.name for e in fields(CorruptionOptions) if e.name not in ("clean", "absent")]
+    "fault", [name for name in CorruptionOptions.model_fields if name not in ("clean", "absent")]
 )
 def test_every_fault_by_itself(fault: str) -> None:
     clip = _plane()
-    strength = replace(NOTHING, **{fault: 1.0 if fault in ("flying", "dropped") else 0.2})
+    strength = NOTHING.replaced(**{fault: 1.0 if fault in ("flying", "dropped") else 0.2})
     perfect = observed(clip, (0, 2), NOTHING, np.random.default_rng(0))
     harmed = observed(clip, (0, 2), strength, np.random.default_rng(0))
     first, second = harmed.views
@@ -218,7 +218,7 @@ def test_every_fault_by_itself(fault: str) -> None:
 def test_depth_noise_grows_with_depth() -> None:
     rng = np.random.default_rng(0)
     depth = np.repeat(np.linspace(1, 4, 128, dtype=np.float32)[None], 128, 0)
-    strength = replace(NOTHING, depth_noise=0.02)
+    strength = NOTHING.replaced(depth_noise=0.02)
     errors = np.array([corrupted_depth(rng, depth, strength) / depth - 1 for _ in range(40)])
     spread = errors.std((0, 1))
     expected = 0.02 * depth[0] / depth.mean()
@@ -228,7 +228,7 @@ def test_depth_noise_grows_with_depth() -> None:
 def test_holes_take_the_share_they_are_given() -> None:
     rng = np.random.default_rng(0)
     depth = np.ones((64, 64), np.float32)
-    strength = replace(NOTHING, holes=0.4)
+    strength = NOTHING.replaced(holes=0.4)
     shares = [(corrupted_depth(rng, depth, strength) == 0).mean() for _ in range(200)]
     assert max(shares) <= 0.4 + 1e-3 and np.mean(shares) == pytest.approx(0.2, abs=0.03)
 
@@ -236,7 +236,7 @@ def test_holes_take_the_share_they_are_given() -> None:
 def test_flying_pixels_lie_between_front_and_back() -> None:
     depth = np.ones((32, 32), np.float32)
     depth[:, 16:] = 3
-    out = corrupted_depth(np.random.default_rng(0), depth, replace(NOTHING, flying=1.0))
+    out = corrupted_depth(np.random.default_rng(0), depth, NOTHING.replaced(flying=1.0))
     changed = out != depth
     assert changed[:, 15:17].mean() > 0.95 and not changed[:, :15].any()
     assert out.min() >= 1 and out.max() <= 3
@@ -244,13 +244,13 @@ def test_flying_pixels_lie_between_front_and_back() -> None:
 
 def test_gains_are_gains() -> None:
     rgb = np.full((4, 4, 3), 100, np.uint8)
-    out = corrupted_color(np.random.default_rng(0), rgb, replace(NOTHING, exposure=0.3))
+    out = corrupted_color(np.random.default_rng(0), rgb, NOTHING.replaced(exposure=0.3))
     assert np.ptp(out) == 0 and out[0, 0, 0] != 100
 
 
 def test_wrong_cameras_are_rigid() -> None:
     camera = _plane().cameras[0]
-    strength = replace(NOTHING, rotation=1.0, translation=0.01)
+    strength = NOTHING.replaced(rotation=1.0, translation=0.01)
     moved = corrupted_camera(np.random.default_rng(0), camera, 2.0, strength)
     rotation = moved.cam_from_world[0, :3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
@@ -258,7 +258,7 @@ def test_wrong_cameras_are_rigid() -> None:
 
 
 def test_projection_noise_touches_valid_target_pixels_alone() -> None:
-    noisy = replace(CLEAN, faults=replace(NOTHING, projection=0.1)).sample(2)
+    noisy = replace(CLEAN, faults=NOTHING.replaced(projection=0.1)).sample(2)
     clean = replace(CLEAN, faults=NOTHING).sample(2)
     k = clean.context
     assert torch.equal(noisy.hint[:k], clean.hint[:k])
@@ -270,10 +270,10 @@ def test_projection_noise_touches_valid_target_pixels_alone() -> None:
 def test_strengths_are_drawn_within_their_ranges() -> None:
     options = CorruptionOptions()
     strengths = [drawn(np.random.default_rng(n), options) for n in range(400)]
-    for entry in fields(options):
-        if entry.name not in ("clean", "absent"):
-            values = np.array([getattr(strength, entry.name) for strength in strengths])
-            assert values.min() == 0 and values.max() <= getattr(options, entry.name)
+    for name in CorruptionOptions.model_fields:
+        if name not in ("clean", "absent"):
+            values = np.array([getattr(strength, name) for strength in strengths])
+            assert values.min() == 0 and values.max() <= getattr(options, name)
     untouched = np.mean([strength == NOTHING for strength in strengths])
     assert untouched == pytest.approx(options.clean, abs=0.08)
     assert drawn(np.random.default_rng(0), CorruptionOptions(clean=1.0)) == NOTHING

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def model() -> GeoVerse:
     torch.manual_seed(0)
     config, folder = shipped_or_read("micro")
-    chosen = config.model_config(folder)
+    chosen = config.network(folder)
     # The last interval lies within the floor.
     flow = replace(chosen.flow, prediction="clean", least_time=0.2, level1=(1.0, 0.4, 0.1, 0.0))
     return GeoVerse(replace(chosen, flow=flow))

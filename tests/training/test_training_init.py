@@ -15,9 +15,10 @@ from torch import Tensor
 from gvtools.completers.geoverse import GeoVerse, from_pretrained
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig, named, read
-from gvtools.completers.geoverse.config_json import to_json
 from gvtools.completers.geoverse.denoiser import Conditions
 from gvtools.completers.geoverse.plucker import camera_condition
+from gvtools.completers.geoverse.weights.folder import save_pretrained
+from gvtools.networks.config_json import to_json
 from gvtools.training.options import SHIPPED, shipped_or_read
 from gvtools.training.samples import TrainingSamples
 from pipelines.cli import main
@@ -92,7 +93,7 @@ def train(training: str, out: Path, stage: str, *more: str) -> int:
 def unseen_targets(training: str) -> ViewBatch:
     """Real cameras and context views; nothing is projected into the targets."""
     config, folder = shipped_or_read(training)
-    views = TrainingSamples(config, config.model_config(folder)).aside(0, 2).views
+    views = TrainingSamples(config, config.network(folder)).aside(0, 2).views
     shown = torch.zeros_like(views.valid)
     shown[:, : views.context] = views.valid[:, : views.context]
     images, depth = views.images * (shown > 0), views.depth * (shown > 0)
@@ -162,7 +163,7 @@ def test_a_training_goes_on_from_gld_without_the_encoders_stage(
 
 def test_ones_own_start_is_that_of_the_first_stage(published, training, tmp_path, capsys):
     own = tmp_path / "own"
-    from_pretrained(published, config=small_base()).save_pretrained(own)
+    save_pretrained(from_pretrained(published, config=small_base()), own)
     few = ["--set", "encoder.statistics=1"]
     assert train(training, tmp_path / "out", "all", "--init", str(own), *few) == 0
     said = capsys.readouterr().out
@@ -188,7 +189,7 @@ def test_a_training_goes_on_from_the_published_files_that_it_began_with(
 
 def test_other_starts_are_one_clear_line(published, training, tmp_path, capsys):
     own = tmp_path / "own"
-    from_pretrained(published, config=small_base()).save_pretrained(own)
+    save_pretrained(from_pretrained(published, config=small_base()), own)
     part = tmp_path / "part"
     (part / "checkpoints").mkdir(parents=True)
     (part / "checkpoints" / "da3_level1.pt").symlink_to(published / "checkpoints/da3_level1.pt")
@@ -212,7 +213,7 @@ def test_other_starts_are_one_clear_line(published, training, tmp_path, capsys):
 def test_the_training_of_base_is_the_papers():
     """Training details of the paper: 504 x 504, 8 views, 32 samples, 300k and 50k iterations."""
     config, folder = shipped_or_read("base")
-    assert config.model_config(folder) == named("base")
+    assert config.network(folder) == named("base")
     assert config.parallel == "sharded"
     assert (config.data.views, config.data.size) == (8, (504, 504))
     for stage, steps, rate in ((config.denoiser, 300_000, 3e-5), (config.reflow, 50_000, 1e-5)):
@@ -221,7 +222,7 @@ def test_the_training_of_base_is_the_papers():
         assert (options.betas, options.clip, options.ema) == ((0.9, 0.95), 1.0, 0.9995)
         assert options.precision == "bfloat16"
         assert stage.context_weight == 0.25
-    assert config.reflow.bounds is None and config.model_config().flow.level1[0::3] == (1.0, 0.0)
+    assert config.reflow.bounds is None and config.network().flow.level1[0::3] == (1.0, 0.0)
 
 
 def test_an_unknown_way_of_sharing_is_refused(tmp_path, capsys):

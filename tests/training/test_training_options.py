@@ -8,11 +8,11 @@ from itertools import pairwise
 import pytest
 
 from gvtools.errors import OptionError
+from gvtools.settings import with_texts
 from gvtools.training.options import (
     HeadsStageOptions,
     OptimizerOptions,
     shipped_or_read,
-    with_settings,
 )
 from gvtools.training.samples import TrainingSamples
 
@@ -44,7 +44,7 @@ def test_heads_of_which_none_learns_are_refused():
 def test_a_setting_reaches_a_stage_that_the_training_does_not_have():
     base, _ = shipped_or_read("base")
     assert base.heads is None
-    changed = with_settings(base, ["heads.optimizer.steps=3", "heads.origin=1.5"])
+    changed = with_texts(base, ["heads.optimizer.steps=3", "heads.origin=1.5"])
     assert changed.heads is not None
     assert changed.heads.optimizer.steps == 3 and changed.heads.origin == 1.5
 
@@ -53,8 +53,8 @@ def test_the_faults_of_observations_are_settings():
     text = ["data.faults.projection=0.1", "data.faults.clean=0", "data.faults.absent=0"]
     config, folder = shipped_or_read("tiny")
     noisy, plain = (
-        TrainingSamples(changed, config.model_config(folder))._data_set("train").describe()
-        for changed in (with_settings(config, text), config)
+        TrainingSamples(changed, config.network(folder))._data_set("train").describe()
+        for changed in (with_texts(config, text), config)
     )
     assert noisy["faults"]["projection"] == 0.1 and plain["faults"]["projection"] == 0
     assert {k: v for k, v in noisy.items() if k != "faults"} == {
@@ -65,7 +65,7 @@ def test_the_faults_of_observations_are_settings():
 @pytest.mark.parametrize("text", ["seed.deep=3", "heads.origin.deep=3", "model.name=tiny"])
 def test_a_setting_of_what_has_none_is_refused(text):
     with pytest.raises(OptionError, match="settings of its own"):
-        with_settings(shipped_or_read("tiny")[0], [text])
+        with_texts(shipped_or_read("tiny")[0], [text])
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_a_setting_of_what_has_none_is_refused(text):
 )
 def test_values_outside_their_range_are_refused_before_anything_is_trained(text):
     with pytest.raises(OptionError, match=text.partition("=")[0].replace(".", r"\.")):
-        with_settings(shipped_or_read("tiny")[0], [text])
+        with_texts(shipped_or_read("tiny")[0], [text])
 
 
 @pytest.mark.parametrize(
@@ -98,4 +98,4 @@ def test_values_outside_their_range_are_refused_before_anything_is_trained(text)
 )
 def test_what_would_leave_noise_or_never_learn_is_refused(text, said):
     with pytest.raises(OptionError, match=re.escape(said)):
-        with_settings(shipped_or_read("tiny")[0], [text])
+        with_texts(shipped_or_read("tiny")[0], [text])

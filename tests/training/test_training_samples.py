@@ -5,7 +5,8 @@ import torch
 
 from gvtools.completers.geoverse.config import named
 from gvtools.errors import OptionError
-from gvtools.training.options import shipped_or_read, with_settings
+from gvtools.settings import with_texts
+from gvtools.training.options import shipped_or_read
 from gvtools.training.samples import TrainingSamples
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -13,8 +14,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def samples(*settings: str) -> TrainingSamples:
     config, folder = shipped_or_read("micro")
-    config = with_settings(config, list(settings))
-    return TrainingSamples(config, config.model_config(folder))
+    config = with_texts(config, list(settings))
+    return TrainingSamples(config, config.network(folder))
 
 
 def test_holes_reach_the_model_filled_and_marked():

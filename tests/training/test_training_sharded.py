@@ -19,7 +19,8 @@ from PIL import Image
 
 from gvtools.completers.geoverse import GeoVerse, from_pretrained
 from gvtools.completers.geoverse.config import GeoVerseConfig, read
-from gvtools.completers.geoverse.config_json import to_json
+from gvtools.completers.geoverse.weights.folder import save_pretrained
+from gvtools.networks.config_json import to_json
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.draws import Draws
 from gvtools.training.options import SHIPPED, shipped_or_read
@@ -108,7 +109,7 @@ def model_of(config: GeoVerseConfig) -> GeoVerse:
 def start(tmp_path_factory) -> Path:
     """Weights that every training here starts from."""
     folder = tmp_path_factory.mktemp("start")
-    model_of(read(SHIPPED / "micro_model.json")).save_pretrained(folder)
+    save_pretrained(model_of(read(SHIPPED / "micro_model.json")), folder)
     return folder
 
 
@@ -131,7 +132,7 @@ def two(start, tmp_path_factory) -> tuple[Path, str]:
 
 def test_two_processes_that_share_parameters_out_see_what_one_would(one, two):
     config, folder = shipped_or_read("micro")
-    samples = TrainingSamples(config, config.model_config(folder))
+    samples = TrainingSamples(config, config.network(folder))
     contexts = [samples.batch(range(n, n + 1)).views.context for n in range(0, 16 * STEPS, 8)]
     assert any(a != b for a, b in zip(contexts[::2], contexts[1::2], strict=True))
     same_record(two[0], one)
@@ -176,7 +177,7 @@ def test_what_they_save_goes_on_exactly_and_in_one_process(start, one, two, tmp_
 def test_a_batch_that_is_bad_in_one_process_is_skipped_by_both(start, tmp_path):
     """Also where the one goes on to its backward pass, in which the processes meet."""
     config, folder = shipped_or_read("micro")
-    model = from_pretrained(start, config=config.model_config(folder))
+    model = from_pretrained(start, config=config.network(folder))
     stage, samples = DenoiserStage(model, config.denoiser), TrainingSamples(config, model.config)
     losses = [
         float(stage(samples.batch(part), Draws(0, "denoiser", 0, tuple(part)))[0].detach())

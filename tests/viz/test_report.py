@@ -19,8 +19,8 @@ from gvtools.cameras import Cameras
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
 from pipelines.commands.report import write_report
-from pipelines.config import RunConfig
 from pipelines.reconstruction.plan import make_plan
+from pipelines.reconstruction.settings import RunSettings
 from pipelines.report.data import collect, read_sweep
 from pipelines.report.sheets import chosen_targets, nearest_camera
 from viz.report.contact_sheet import TargetPictures, contact_row
@@ -156,7 +156,7 @@ def test_an_evaluation_gives_intervals_and_estimated_poses(own):
         assert np.abs(apart).max() < 0.2
     # An evaluation of other settings says nothing of this run.
     record = json.loads((own / "run.json").read_text())
-    record["config"]["seed"] = 7
+    record["settings"]["seed"] = 7
     (own / "run.json").write_text(json.dumps(record))
     report = collect(own)
     assert report.figures_from == "metrics.json"
@@ -193,7 +193,7 @@ def test_a_project_that_is_gone(own, scan, capsys):
 
 
 def test_a_run_that_has_its_project_open_writes_the_same_page(own, scan, page):
-    config = RunConfig(context="first:3", targets="range:3-6", views_per_round=2)
+    config = RunSettings(context="first:3", targets="range:3-6", views_per_round=2)
     before = (own / "report.html").read_bytes()
     (own / "report.html").unlink()
     write_report(make_plan(open_project(scan), config), own)
@@ -220,7 +220,7 @@ def test_a_damaged_report_is_one_line(own, capsys, change):
     assert "round_001/report.json: no report of this version" in refused(capsys, "report", own)
 
 
-@pytest.mark.parametrize("key", ["schedule", "context", "config", "project"])
+@pytest.mark.parametrize("key", ["schedule", "context", "settings", "derived", "project"])
 def test_a_damaged_record_is_one_line(own, capsys, key):
     record = json.loads((own / "run.json").read_text())
     (own / "run.json").write_text(json.dumps({**record, key: None}))
@@ -276,20 +276,15 @@ def test_what_is_no_run_is_refused(own, tmp_path, capsys):
 
 def test_a_sweep_beside_the_run_is_drawn(own):
     outcome = {
-        "settings": {}, "targets": 4, "fixed": 1.0, "per_target": 0.5, "bytes": 1e6,
-        "observations": 10, "psnr": 20.0, "psnr_valid": None, "psnr_generated": None,
-        "ssim": None, "depth_rel": None, "coverage": 1.0,
+        "label": "start", "settings": {}, "seconds": 3.0, "bytes": 1e6, "observations": 10,
+        "psnr": 20.0,
     }  # fmt: skip
-    better = {**outcome, "psnr": 25.0, "per_target": 2.0}
-    worse = {**outcome, "psnr": 19.0, "per_target": 3.0}
-    names = {"start": outcome, "profile fast": better, "voxel 2": worse}
-    trials = [{"label": label, "share": 1.0, **trial} for label, trial in names.items()]
-    # Trials on a share of the targets are no figures of whole runs.
-    trials.append({"label": "voxel 4", "share": 0.25, **outcome, "psnr": 99.0})
+    better = {**outcome, "label": "profile fast", "psnr": 25.0, "seconds": 9.0}
+    worse = {**outcome, "label": "voxel 2", "psnr": 19.0, "seconds": 13.0}
     record = json.loads((own / "run.json").read_text())
-    sweep = {"project": record["project"], "reading": record["reading"], "targets": 4,
-             "budget": 60, "budget_of": "seconds", "trials": trials,
-             "recommended": better}  # fmt: skip
+    sweep = {"project": record["project"], "reading": record["reading"],
+             "budget": 60, "budget_of": "seconds", "trials": [outcome, better, worse],
+             "front": [outcome, better], "recommended": better}  # fmt: skip
     # Beside the run, as README has it, and above it, as a trial has it.
     beside = own.parent / "sweep"
     beside.mkdir()

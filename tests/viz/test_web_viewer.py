@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import gzip
 import http.client
 import io
 import shutil
@@ -31,8 +30,8 @@ from viz.run_view.view import TARGET
 pytest.importorskip("viser", reason="viser is not installed (extra web)")
 
 from viz.web.frame import FIELD_OF_VIEW, PageFrame, home
-from viz.web.guard import address_of, is_loopback, is_own_page
 from viz.web.pictures import GAP, ROW_WIDTH
+from viz.web.server import address_of, is_loopback
 from viz.web.splats import LONGEST
 from viz.web.viewer import WebViewer
 
@@ -270,28 +269,19 @@ def test_nobody_else_is_served_and_nothing_is_shared(viewer):
 
 @pytest.mark.parametrize(
     ("origin", "status"),
-    [("http://127.0.0.1:{port}", None), (None, None), ("http://evil.example", 403), ("null", 403),
-     ("http://localhost:{port}", 403), ("http://127.0.0.1:1", 403)],
+    [("http://127.0.0.1:{port}", 101), (None, 101), ("http://evil.example", 403), ("null", 403),
+     ("http://localhost:9", 101), ("http://evil.example:{port}", 403),
+     ("http://localhost.evil.example", 403)],
 )  # fmt: skip
-def test_no_other_page_in_the_browser_can_read_the_run(viewer, origin, status):
-    assert handshake(viewer, origin, f"127.0.0.1:{viewer.server.get_port()}") == (status or 101)
+def test_no_page_from_elsewhere_can_read_the_run(viewer, origin, status):
+    assert handshake(viewer, origin) == status
 
 
-def test_a_name_that_a_foreign_page_gave_to_this_machine_is_refused(viewer):
-    port = viewer.server.get_port()
-    assert handshake(viewer, f"http://evil.example:{port}", f"evil.example:{port}") == 403
-    # A tunnel's end has a port of its own.
-    assert handshake(viewer, "http://localhost:9", "localhost:9") == 101
-    assert is_own_page("http://[::1]:8080", "[::1]:8080", "::1")
-    assert is_own_page("http://box:8080", "box:8080", "box")
-    assert not is_own_page("http://[::1", "[::1", "::1")
-
-
-def handshake(viewer, origin, host) -> int:
+def handshake(viewer, origin) -> int:
     """The status with which a request for a WebSocket is answered."""
     connection = http.client.HTTPConnection("127.0.0.1", viewer.server.get_port(), timeout=20)
     headers = {
-        "Host": host, "Upgrade": "websocket", "Connection": "Upgrade",
+        "Upgrade": "websocket", "Connection": "Upgrade",
         "Sec-WebSocket-Key": base64.b64encode(bytes(16)).decode(), "Sec-WebSocket-Version": "13",
     }  # fmt: skip
     if origin is not None:
@@ -300,17 +290,6 @@ def handshake(viewer, origin, host) -> int:
     status = connection.getresponse().status
     connection.close()
     return status
-
-
-def test_the_page_is_called_after_the_run(viewer):
-    for encoding in ("identity", "gzip"):
-        connection = http.client.HTTPConnection("127.0.0.1", viewer.server.get_port(), timeout=20)
-        connection.request("GET", "/?x=1", headers={"Accept-Encoding": encoding})
-        response = connection.getresponse()
-        assert response.headers.get_all("Content-Length") == [response.headers["Content-Length"]]
-        body = response.read()
-        page = gzip.decompress(body) if encoding == "gzip" else body
-        assert b"<title>run - gvtools</title>" in page
 
 
 def test_addresses_are_written_and_judged_as_they_are():

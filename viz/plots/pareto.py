@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError
 from viz.plots.canvas import chosen, figure_of
-from viz.plots.palette import BLACK, BLUE, GREY, ORANGE, RED, SKY
+from viz.plots.palette import BLACK, BLUE, GREY, ORANGE, RED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,7 +20,6 @@ Trial = Mapping[str, Any]
 # Marks differ, not colours alone.
 STYLES: dict[str, Any] = {
     "trial": {"color": GREY, "marker": "o"},
-    "combination": {"color": SKY, "marker": "s"},
     "profile": {"color": ORANGE, "marker": "^"},
     "start": {"color": BLACK, "marker": "D"},
 }

@@ -63,8 +63,6 @@ class Panel:
         # A slider of no length cannot be drawn; set_run gives it the run's.
         self._round = gui.add_slider("Round", 0, 1, 1, 0, disabled=True)
         self._counts = gui.add_html("")
-        # Of each client, as each has a camera of its own.
-        self._near: dict[int, viser.GuiHtmlHandle] = {}
         self._mode = gui.add_dropdown("Colour", tuple(MODES.values()), initial_value=MODES[mode])
         self._legend = gui.add_html("")
         self._look = gui.add_dropdown("Look", LOOKS)
@@ -145,16 +143,6 @@ class Panel:
         if not run.whole:
             lines.append(f"not finished: {run.last_round} of {(run.planned or 1) - 1} rounds done")
         self._counts.content = _small("<br>".join(lines))
-
-    def set_near(self, client: viser.ClientHandle, near: int, coarse: int) -> None:
-        """Say how many points near its camera a client is shown, in place of how many others."""
-        line = f"near you all {near:,} observations, in place of {coarse:,} points"
-        shown = self._near.get(client.client_id)
-        if shown is not None:
-            shown.content, shown.visible = _small(line), near > 0
-        elif near:
-            order = self._counts.order + 0.5
-            self._near[client.client_id] = client.gui.add_html(_small(line), order=order)
 
     def set_legend(self, legend: Legend) -> None:
         """How to read the colours."""

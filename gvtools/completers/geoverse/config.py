@@ -8,7 +8,6 @@ from importlib import resources
 from pathlib import Path
 
 from gvtools.completers.geoverse.conditioning import HintConfig
-from gvtools.completers.geoverse.config_json import from_json, to_json
 from gvtools.completers.geoverse.control import ControlConfig
 from gvtools.completers.geoverse.denoiser import DenoiserConfig
 from gvtools.completers.geoverse.flow import check_bounds
@@ -16,8 +15,8 @@ from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
 from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
 from gvtools.completers.geoverse.video_prior.prior import VideoPriorConfig
 from gvtools.errors import CheckpointError, OptionError
+from gvtools.networks.config_json import check_range, from_json, to_json
 from gvtools.networks.depth_anything.network import DepthAnythingConfig
-from gvtools.options import check_range
 
 NAMES = ("base", "tiny")
 
@@ -58,11 +57,11 @@ class FlowConfig:
             )
         if self.skip and self.prediction != "clean":
             raise OptionError("flow.skip needs flow.prediction = 'clean'")
-        check_range("flow.least_time", self.least_time, above=0, most=1)
-        check_range("flow.shift", self.shift, above=0)
-        check_range("flow.guidance", self.guidance, least=0)
-        check_range("flow.temperature", self.temperature, least=0)
-        check_range("flow.most_time", self.most_time, above=0, most=1)
+        check_range("flow.least_time", self.least_time, gt=0, le=1)
+        check_range("flow.shift", self.shift, gt=0)
+        check_range("flow.guidance", self.guidance, ge=0)
+        check_range("flow.temperature", self.temperature, ge=0)
+        check_range("flow.most_time", self.most_time, gt=0, le=1)
         check_bounds(self.level1, whole=True)
         check_bounds(self.cascade, whole=True)
 
@@ -166,14 +165,12 @@ class GeoVerseConfig:
             )
         if self.video is not None:
             self._check_layers(len(self.video.taps))
-        check_range("geometry.encoder.patch", encoder.patch, least=1)
-        check_range("image_size", self.image_size, least=encoder.patch)
-        check_range("views", self.views, least=2)
-        check_range("context", self.context, least=1)
-        check_range("decode_views", self.decode_views, least=1)
-        check_range(
-            "camera.reference", self.camera.reference, least=-self.views, most=self.views - 1
-        )
+        check_range("geometry.encoder.patch", encoder.patch, ge=1)
+        check_range("image_size", self.image_size, ge=encoder.patch)
+        check_range("views", self.views, ge=2)
+        check_range("context", self.context, ge=1)
+        check_range("decode_views", self.decode_views, ge=1)
+        check_range("camera.reference", self.camera.reference, ge=-self.views, le=self.views - 1)
         if self.image_size % encoder.patch:
             raise OptionError(
                 f"image_size = {self.image_size}; expected a multiple of the patch {encoder.patch}"

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gvtools.errors import OptionError, ShapeError
-from gvtools.options import check_range
+from gvtools.networks.config_json import check_range
 
 Time = TypeVar("Time", float, Tensor)
 Velocity = Callable[[Tensor, Tensor], Tensor]
@@ -33,20 +33,20 @@ def shift_time(t: Time, shift: float) -> Time:
     Raises:
         OptionError: a shift beyond MOST_SHIFT or below its inverse.
     """
-    check_range("time shift", shift, least=1 / MOST_SHIFT, most=MOST_SHIFT)
+    check_range("time shift", shift, ge=1 / MOST_SHIFT, le=MOST_SHIFT)
     # 1 + (s - 1) t, written so that nothing cancels and t = 1 gives s to the last digit.
     return shift * t / (1 if shift == 1 else (1 - t) + shift * t)
 
 
 def unshift_time(t: Time, shift: float) -> Time:
     """The inverse of ``shift_time``."""
-    check_range("time shift", shift, least=1 / MOST_SHIFT, most=MOST_SHIFT)
+    check_range("time shift", shift, ge=1 / MOST_SHIFT, le=MOST_SHIFT)
     return shift_time(t, 1 / shift)
 
 
 def latent_shift(values: int, *, base: int = 4096) -> float:
     """Geometric Latent Diffusion's shift sqrt(values / base), of values = C h w V a sample."""
-    check_range("latent values", values, least=1)
+    check_range("latent values", values, ge=1)
     return math.sqrt(values / base)
 
 
@@ -64,9 +64,9 @@ def time_grid(
     Raises:
         OptionError: a value out of its range, or more steps than float64 tells apart.
     """
-    check_range("steps", steps, least=1)
-    check_range("time grid's start", start, above=0, most=1)
-    check_range("time grid's end", end, least=0, below=start)
+    check_range("steps", steps, ge=1)
+    check_range("time grid's start", start, gt=0, le=1)
+    check_range("time grid's end", end, ge=0, lt=start)
     first, last = unshift_time(start, shift), unshift_time(end, shift)
     inner = (first + (last - first) * k / steps for k in range(1, steps))
     times = (start, *(shift_time(u, shift) for u in inner), end)
@@ -129,7 +129,7 @@ def training_times(uniform: Tensor, *, shift: float = 1.0, most: float = 1.0) ->
     The paper's t ~ U(0, 1) is ``most`` 1, ``shift`` 1; Geometric Latent Diffusion has 0.999 and
     ``latent_shift``.
     """
-    check_range("largest training time", most, above=0, most=1)
+    check_range("largest training time", most, gt=0, le=1)
     return shift_time(uniform * most, shift)
 
 
@@ -167,7 +167,7 @@ def velocity_from_clean(
 
     As t falls to 0, ``least`` keeps the prediction's errors from growing beyond 1 / least.
     """
-    check_range("least time", least, above=0, most=1)
+    check_range("least time", least, gt=0, le=1)
     time = over_state(t, state)
     time = time.clamp(min=least) if isinstance(time, Tensor) else max(time, least)
     return ((state - clean) / time).to(state.dtype)
@@ -181,7 +181,7 @@ def guided(velocity: Velocity, unconditional: Velocity | None, scale: float) -> 
     Raises:
         OptionError: a scale other than 1 without an unconditional branch.
     """
-    check_range("guidance scale", scale, least=0, below=math.inf)
+    check_range("guidance scale", scale, ge=0, lt=math.inf)
     if scale == 1:
         return velocity
     if unconditional is None:

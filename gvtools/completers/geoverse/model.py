@@ -12,8 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -44,8 +43,9 @@ from gvtools.completers.geoverse.shared_attention import SharedAttention
 from gvtools.completers.geoverse.stages import Clock, no_clock
 from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.completers.geoverse.video_prior.prior import VideoFeatures, VideoPrior
-from gvtools.errors import CheckpointError
+from gvtools.errors import CheckpointError, GvError
 from gvtools.networks.depth_anything.network import DepthAnything3
+from gvtools.networks.tensors import first_line
 
 __all__ = ["Decoded", "Generated", "GeoVerse", "Prepared"]
 
@@ -82,19 +82,6 @@ class GeoVerse(nn.Module):
         # Not a submodule: its weights live in a folder of their own and are never trained.
         self._video: list[VideoPrior] = []
         self.freeze()
-
-    @classmethod
-    def from_pretrained(cls, folder: Path | str, **options: Any) -> GeoVerse:
-        """The model of a weights folder; see ``weights.folder.from_pretrained``."""
-        from gvtools.completers.geoverse.weights.folder import from_pretrained
-
-        return from_pretrained(folder, **options)
-
-    def save_pretrained(self, folder: Path | str, **options: Any) -> Path:
-        """Write a weights folder; see ``weights.folder.save_pretrained``."""
-        from gvtools.completers.geoverse.weights.folder import save_pretrained
-
-        return save_pretrained(self, folder, **options)
 
     def freeze(self) -> None:
         """Turn off gradients of the encoder and both heads; they still pass gradients through."""
@@ -456,3 +443,22 @@ class GeoVerse(nn.Module):
             if video is None
             else video_keys(self.shared, self.config.level1, camera, video, grid),
         )
+
+
+def empty_model(config: GeoVerseConfig, *, where: object) -> GeoVerse:
+    """The model on the meta device: names and shapes, no numbers, no memory.
+
+    Raises:
+        CheckpointError: the numbers in the configuration make no network.
+    """
+    try:
+        with torch.device("meta"):
+            return GeoVerse(config)
+    except GvError:
+        raise
+    except Exception as error:
+        # Dimensions that do not divide, that are negative or zero: each module has its own way.
+        raise CheckpointError(
+            f"{where}: no network comes of configuration {config.name!r} ({first_line(error)}); "
+            "expected dimensions that fit each other, such as those of base or tiny"
+        ) from error

@@ -109,7 +109,7 @@ def _cropped(
     top, left = (height - rows) // 2, (width - columns) // 2
     window = np.s_[top : top + rows, left : left + columns]
     depth = np.zeros((height, width), np.float32) if view.depth is None else view.depth
-    camera = view.camera.cropped(left, top, columns, rows)
+    camera = view.camera.cropped(left, top, width=columns, height=rows)
     return view.rgb[window], depth[window], camera
 
 

@@ -23,7 +23,7 @@ from gvtools.completers.geoverse.flow import (
     unshift_time,
 )
 from gvtools.errors import OptionError
-from gvtools.options import check_range
+from gvtools.networks.config_json import check_range
 
 # Over a shorter interval, the displacement of float32 states is mostly rounding.
 SHORTEST = 1e-4
@@ -86,7 +86,7 @@ def straight_velocity(
 
 def teacher_times(upper: Tensor, lower: Tensor, *, steps: int, shift: float = 1.0) -> Tensor:
     """(steps + 1, B) times from ``upper`` to ``lower`` (B,), equally spaced before the shift."""
-    check_range("teacher steps", steps, least=1)
+    check_range("teacher steps", steps, ge=1)
     share = torch.linspace(0, 1, steps + 1, dtype=upper.dtype, device=upper.device)[:, None]
     times = shift_time(
         torch.lerp(unshift_time(upper, shift), unshift_time(lower, shift), share), shift
@@ -145,5 +145,5 @@ def reflow_pair(
 
 def fast_loss(reflow: Tensor, flow: Tensor, *, rho: float) -> Tensor:
     """L_fast = rho L_PRF + (1 - rho) L_FM, of any one shape."""
-    check_range("rho", rho, least=0, most=1)
+    check_range("rho", rho, ge=0, le=1)
     return rho * reflow + (1 - rho) * flow

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from kornia.geometry.liegroup import Se3, So3
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
@@ -201,9 +202,6 @@ def _eliminated(
 
 def _rigid(pose: Float64) -> Float64:
     """(S, 4, 4) rigid motions of rotation vectors and translations (S, 6)."""
-    from scipy.spatial.transform import Rotation
-
-    motion = np.tile(np.eye(4), (len(pose), 1, 1))
-    motion[:, :3, :3] = Rotation.from_rotvec(pose[:, :3]).as_matrix()
-    motion[:, :3, 3] = pose[:, 3:]
+    turn, shift = torch.from_numpy(pose).split(3, dim=-1)
+    motion: Float64 = Se3(So3.exp(turn), shift).matrix().detach().numpy()
     return motion

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
+from kornia.filters import box_blur
+from kornia.geometry.transform import remap
 
 UNSEEN = 1.0  # the cost of a pixel that a source does not show, and of one without any likeness
 
@@ -73,8 +77,8 @@ def sweep(
     """See gvtools.depth.stereo.matching.Matcher.sweep."""
     height, width = reference.shape
     v, u = pixel_centers(height, width, reference.device)
-    mean = _box(reference, window)
-    variance = (_box(reference**2, window) - mean**2).clamp(min=0) + noise**2
+    mean = window_mean(reference, window)
+    variance = (window_mean(reference**2, window) - mean**2).clamp(min=0) + noise**2
     planes = []
     for w in inverse_depths:
         costs = []
@@ -83,9 +87,9 @@ def sweep(
             inverse = 1 / z.clamp(min=1e-6)
             inside = _inside(x * inverse, y * inverse, z, size)
             image = bilinear(source, size, x * inverse, y * inverse) * inside
-            first = _box(image, window)
-            spread = (_box(image**2, window) - first**2).clamp(min=0) + noise**2
-            likeness = _box(image * reference, window) - first * mean
+            first = window_mean(image, window)
+            spread = (window_mean(image**2, window) - first**2).clamp(min=0) + noise**2
+            likeness = window_mean(image * reference, window) - first * mean
             likeness = likeness / (spread * variance).sqrt()
             costs.append(torch.where(inside, 1 - likeness.clamp(min=0), UNSEEN))
         planes.append(torch.stack(costs).sort(dim=0).values[:best].mean(0))
@@ -149,26 +153,29 @@ def pixel_centers(
 
 
 def bilinear(
-    image: torch.Tensor, size: list[int], x: torch.Tensor, y: torch.Tensor
+    image: torch.Tensor, size: Sequence[int], x: torch.Tensor, y: torch.Tensor
 ) -> torch.Tensor:
-    """The image's values at pixel coordinates (first centre 0.5), held at the border."""
-    qx = (x - 0.5).clamp(min=0, max=size[0] - 1.001)
-    qy = (y - 0.5).clamp(min=0, max=size[1] - 1.001)
-    column, line = qx.long(), qy.long()
-    fx, fy = qx - column, qy - line
-    flat, cell = image.reshape(-1), line * image.shape[1] + column
-    top = flat[cell] + fx * (flat[cell + 1] - flat[cell])
-    cell = cell + image.shape[1]
-    low = flat[cell] + fx * (flat[cell + 1] - flat[cell])
-    return top + fy * (low - top)
+    """The values of a picture at some places, held at its border.
+
+    Args:
+        image: (H', W'), of which the first ``size`` (width, height) pixels are the picture.
+        size: pixels.
+        x: (H, W) pixel coordinates; the first pixel's centre is 0.5, unlike kornia's 0.
+        y: (H, W).
+
+    Returns:
+        (H, W).
+    """
+    picture = image[None, None, : size[1], : size[0]]
+    places = ((x - 0.5)[None], (y - 0.5)[None])
+    return remap(picture, *places, padding_mode="border", align_corners=True)[0, 0]
 
 
 def _inside(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, size: list[int]) -> torch.Tensor:
     return (z > 1e-6) & (x > 0) & (y > 0) & (x < size[0]) & (y < size[1])
 
 
-def _box(image: torch.Tensor, window: int) -> torch.Tensor:
-    """Mean over a square window, the border repeated."""
-    radius = window // 2
-    padded = F.pad(image[None, None], (radius,) * 4, mode="replicate")
-    return F.avg_pool2d(padded, window, stride=1)[0, 0]
+def window_mean(images: torch.Tensor, window: int) -> torch.Tensor:
+    """Mean over a square window of (..., H, W) images, the border repeated."""
+    planes = images.reshape(1, -1, *images.shape[-2:])
+    return box_blur(planes, window, "replicate", separable=True).view_as(images)

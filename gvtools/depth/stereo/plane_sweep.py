@@ -250,7 +250,7 @@ class PlaneSweepStereo:
         small = [_halved(self._pyramid(self._scene[name])) for name in names]
         coarse = coarse_depth(
             _halved(reference), small, depths,
-            options=replace(self.options, window=5, planes=None),
+            options=self.options.replaced(window=5, planes=None),
             matcher=self._matcher, device=self._device,
         )  # fmt: skip
         return narrowed(depths, coarse)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
+from kornia.color import rgb_to_grayscale
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
@@ -49,7 +50,8 @@ def build_pyramid(
         max_side: see StereoOptions.
         levels: see StereoOptions; fewer where the picture would fall below 16 pixels.
     """
-    luminance = torch.from_numpy(rgb).float() @ torch.tensor([0.299, 0.587, 0.114]) / 255
+    colors = torch.from_numpy(rgb).permute(2, 0, 1).float() / 255
+    luminance = rgb_to_grayscale(colors)[0]  # (H, W), BT.601
     width, height = working_size(rgb.shape[1], rgb.shape[0], max_side)
     images: list[torch.Tensor] = []
     cameras: list[Cameras] = []

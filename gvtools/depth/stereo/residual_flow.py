@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from gvtools.depth.stereo.matching import Level
-from gvtools.depth.stereo.matching_torch import bilinear, pixel_centers
+from gvtools.depth.stereo.matching_torch import bilinear, pixel_centers, window_mean
 
 WINDOW = 11
 LARGEST = 4.0  # pixels; a longer motion is no residual
@@ -74,10 +74,10 @@ def _motion(
     across = F.pad((source[:, 2:] - source[:, :-2]) / 2, (1, 1))
     down = F.pad((source[2:] - source[:-2]) / 2, (0, 0, 1, 1))
     mask = inside.float()
-    share = _box(mask[None])[0].clamp(min=1e-3)
+    share = window_mean(mask, WINDOW).clamp(min=1e-3)
 
     def centred(image: torch.Tensor) -> torch.Tensor:
-        return (image - _box((image * mask)[None])[0] / share) * mask
+        return (image - window_mean(image * mask, WINDOW) / share) * mask
 
     target = centred(reference)
     dx, dy = torch.zeros_like(x), torch.zeros_like(y)
@@ -86,21 +86,17 @@ def _motion(
         gx = centred(bilinear(across, size, x + dx, y + dy))
         gy = centred(bilinear(down, size, x + dx, y + dy))
         r = target - image
-        a, b, c, p, q = _box(torch.stack([gx * gx, gx * gy, gy * gy, gx * r, gy * r]))
+        a, b, c, p, q = window_mean(
+            torch.stack([gx * gx, gx * gy, gy * gy, gx * r, gy * r]), WINDOW
+        )
         a, c = a + noise**2 / 10, c + noise**2 / 10
         determinant = a * c - b * b
         dx = (dx + ((c * p - b * q) / determinant).clamp(-1, 1)).clamp(-LARGEST, LARGEST)
         dy = (dy + ((a * q - b * p) / determinant).clamp(-1, 1)).clamp(-LARGEST, LARGEST)
     image = centred(bilinear(source, size, x + dx, y + dy))
-    rr, ss, rs = _box(torch.stack([target**2, image**2, target * image]))
+    rr, ss, rs = window_mean(torch.stack([target**2, image**2, target * image]), WINDOW)
     likeness = rs / ((rr + noise**2) * (ss + noise**2)).sqrt()
     weakest = (a + c) / 2 - (((a - c) / 2) ** 2 + b * b).sqrt()
     clear = (weakest > noise**2) & (share > 0.95) & inside
     clear &= (dx.abs() < 0.9 * LARGEST) & (dy.abs() < 0.9 * LARGEST)
     return x, y, dx, dy, clear * ((likeness - 0.6) / 0.4).clamp(0, 1)
-
-
-def _box(images: torch.Tensor) -> torch.Tensor:
-    """Mean over a square window of (C, H, W) images, the border repeated."""
-    padded = F.pad(images[None], (WINDOW // 2,) * 4, mode="replicate")
-    return F.avg_pool2d(F.avg_pool2d(padded, (WINDOW, 1), stride=1), (1, WINDOW), stride=1)[0]

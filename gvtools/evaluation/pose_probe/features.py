@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import ShapeError
-from gvtools.options import check_range
+from gvtools.networks.config_json import check_range
 
 # Lightness of BT.601, as grey pictures are commonly made for SIFT.
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
@@ -83,9 +83,9 @@ class SiftMatcher:
     _extractor: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        check_range("sift.max_features", self.max_features, least=1)
-        check_range("sift.ratio", self.ratio, above=0, most=1)
-        check_range("sift.max_distance", self.max_distance, above=0, most=2)
+        check_range("sift.max_features", self.max_features, ge=1)
+        check_range("sift.ratio", self.ratio, gt=0, le=1)
+        check_range("sift.max_distance", self.max_distance, gt=0, le=2)
 
     def extract(self, rgb: NDArray[np.uint8]) -> Features:
         """The keypoints of a picture, those of the largest scale first.

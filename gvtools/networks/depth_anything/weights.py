@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from gvtools.completers.geoverse.config import read
-from gvtools.completers.geoverse.weights.checkpoints import (
-    check_finite,
-    load,
-    read_part,
-    read_tensors,
-)
-from gvtools.completers.geoverse.weights.published import CONFIG_FILE, PARTS, WHOLE_FILE
-from gvtools.errors import CheckpointError
+from gvtools.errors import CheckpointError, OptionError
+from gvtools.networks.config_json import from_json
 from gvtools.networks.depth_anything.encoder import EncoderConfig
 from gvtools.networks.depth_anything.geometry_head import GeometryHeadConfig
 from gvtools.networks.depth_anything.network import DepthAnything3, DepthAnythingConfig
+from gvtools.networks.tensors import check_finite, load, read_tensors, share_tied
 
 # Released models by the width of their tokens.
 RELEASED = {
@@ -26,8 +22,26 @@ RELEASED = {
     ),
     768: DepthAnythingConfig(),
 }
+# Where the published file may lie in a folder, and the prefix of its keys.
 PUBLISHED_FILE = "model.safetensors"
-GEOMETRY = next(part for part in PARTS if part.name == "geometry")
+PUBLISHED_PLACES = ("pretrained_models/da3/model.safetensors", "da3/model.safetensors")
+PUBLISHED_PREFIX = "model."
+# A GeoVerse folder: its weights, its configuration, and the prefix of this network's keys.
+GEOVERSE_FILE = "geoverse.safetensors"
+GEOVERSE_CONFIG = "config.json"
+GEOVERSE_PREFIX = "geometry."
+
+
+def tied_norms(start: str) -> tuple[tuple[str, ...], ...]:
+    """Names of the one LayerNorm that the four ray outputs share; files hold it under one name.
+
+    Args:
+        start: prefix of the head's keys.
+    """
+    return tuple(
+        tuple(f"{start}scratch.output_conv2_aux.{level}.2.{kind}" for level in range(4))
+        for kind in ("weight", "bias")
+    )
 
 
 def find_weights(folder: Path | str) -> Path:
@@ -39,12 +53,12 @@ def find_weights(folder: Path | str) -> Path:
     folder = Path(folder)
     if folder.is_file():
         return folder
-    names = (WHOLE_FILE, PUBLISHED_FILE, *GEOMETRY.files)
+    names = (GEOVERSE_FILE, PUBLISHED_FILE, *PUBLISHED_PLACES)
     for name in names:
         if (folder / name).is_file():
             return folder / name
     raise CheckpointError(
-        f"{folder}: no {PUBLISHED_FILE} of DA3-SMALL or DA3-BASE and no {WHOLE_FILE} in it; "
+        f"{folder}: no {PUBLISHED_FILE} of DA3-SMALL or DA3-BASE and no {GEOVERSE_FILE} in it; "
         "download model.safetensors of depth-anything/DA3-BASE (Apache-2.0, 0.5 GB) into a folder "
         "and name that"
     )
@@ -63,16 +77,17 @@ def load_depth_anything(
         CheckpointError: nothing there, or a tensor that does not fit.
     """
     path = find_weights(folder)
-    if path.name == WHOLE_FILE:
-        config = read(path.with_name(CONFIG_FILE)).geometry
-        start = GEOMETRY.module
+    if path.name == GEOVERSE_FILE:
+        config = _geoverse_config(path.with_name(GEOVERSE_CONFIG))
         tensors = {
-            name.removeprefix(start): tensor
+            name.removeprefix(GEOVERSE_PREFIX): tensor
             for name, tensor in read_tensors(path).items()
-            if name.startswith(start)
+            if name.startswith(GEOVERSE_PREFIX)
         }
     else:
-        tensors = read_part(path, GEOMETRY)
+        stored = read_tensors(path)
+        tensors = {name.removeprefix(PUBLISHED_PREFIX): value for name, value in stored.items()}
+        share_tied(tensors, tied_norms("head."), where=path)
         token = tensors.get("backbone.pretrained.cls_token")
         width = 0 if token is None else token.shape[-1]
         if width not in RELEASED:
@@ -86,3 +101,15 @@ def load_depth_anything(
     check_finite(tensors, where=path)
     load(network, tensors, where=path)
     return network.requires_grad_(False).eval().to(device)
+
+
+def _geoverse_config(path: Path) -> DepthAnythingConfig:
+    try:
+        stored: Any = json.loads(path.read_text(encoding="utf-8"))
+        return from_json(DepthAnythingConfig, stored.get("geometry", {}), where="geometry")
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"no {path}; expected the config.json of a GeoVerse folder (gvtools weights list)"
+        ) from None
+    except (OSError, ValueError, AttributeError, OptionError) as error:
+        raise CheckpointError(f"{path}: {error}; expected a GeoVerse configuration") from None

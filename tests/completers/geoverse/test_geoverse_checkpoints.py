@@ -30,11 +30,11 @@ from safetensors.torch import load_file, save_file
 
 from gvtools.completers.geoverse import GeoVerse, named
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.weights.checkpoints import READABLE, expected_of
-from gvtools.completers.geoverse.weights.folder import save_extension
-from gvtools.completers.geoverse.weights.folder_parts import empty_model
-from gvtools.completers.geoverse.weights.published import PARTS
+from gvtools.completers.geoverse.model import empty_model
+from gvtools.completers.geoverse.weights.folder import save_extension, save_pretrained
+from gvtools.completers.geoverse.weights.published import PARTS, expected_of
 from gvtools.errors import CheckpointError
+from gvtools.networks.tensors import READABLE
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -63,7 +63,7 @@ def test_published_files_and_ones_own_are_the_same_model(
     for start in ("geometry.", "level1.", "cascade.", "rgb_head.", "statistics.1."):
         wanted = published.part_of(published.tie_ray_norms(micro.model(BARE)), start)
         assert all(torch.equal(model.state_dict()[start + n], t) for n, t in wanted.items())
-    model.save_pretrained(tmp_path)
+    save_pretrained(model, tmp_path)
     again = load(tmp_path)
     assert again.config == config
     assert equal(model, again)
@@ -83,7 +83,7 @@ def test_a_fresh_extension_changes_no_bit_and_is_the_same_each_time(
     said = report(source, "extension", config)
     assert said.ok
     assert not said.needed
-    assert "untrained" in said.said
+    assert "untrained" in said.summary
 
 
 @pytest.mark.parametrize("config", [CONTROL, SHARED], ids=lambda c: c.injection)
@@ -131,7 +131,7 @@ def test_the_wrappings_of_published_tensors(
             content |= {"model": {n: t + 1 for n, t in inner.items()}, "opt": {"state": {}}}
         torch.save(content, folder / file)
     assert equal(load(folder), load(source))
-    assert report(folder, "rgb_head").passed_over == (f"{start}encoder.mask",)
+    assert report(folder, "rgb_head").ignored == (f"{start}encoder.mask",)
 
 
 def test_a_shared_tensor_may_have_any_of_its_names(folder: Path, source: Path) -> None:
@@ -157,7 +157,7 @@ def test_the_publishers_other_geometry_head_takes_the_place_of_the_first(
     for name, tensor in before.items():
         own = head.get(name.removeprefix("geometry.head."), tensor)
         assert torch.equal(state[name], own), name
-    assert "1 others in the file passed over" in report(folder, "geometry_head").said
+    assert "1 others in the file ignored" in report(folder, "geometry_head").summary
     content = torch.load(folder / published.DPT_HEAD)["model"]
     torch.save({"model": {**content, "pred.colour": torch.zeros(2)}}, folder / published.DPT_HEAD)
     refused(folder, r"dpt_decoder\.pt: .*unexpected: colour")
@@ -173,7 +173,7 @@ def test_other_floating_point_types_are_loaded_as_float32(folder: Path, dtype: t
     state = load(folder).state_dict()
     for name, tensor in content.items():
         assert torch.equal(state[f"level1.{name}"], tensor.to(dtype).float())
-    assert str(dtype).removeprefix("torch.") in report(folder, "level1").said
+    assert str(dtype).removeprefix("torch.") in report(folder, "level1").summary
 
 
 def test_views_and_parameters_are_loaded_as_they_are(folder: Path, source: Path) -> None:

@@ -19,7 +19,7 @@ from published_folder import CASCADE, GEOMETRY, LEVEL1, RGB_HEAD, STATISTICS
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from gvtools.completers.geoverse.weights.folder import check_folder
+from gvtools.completers.geoverse.weights.checks import check_folder
 from gvtools.completers.geoverse.weights.published import WHOLE_FILE
 from gvtools.errors import CheckpointError
 
@@ -95,7 +95,9 @@ def test_what_does_not_fit_is_listed_in_full(folder: Path) -> None:
     found = report(folder, "level1").to_dict()
     assert found["missing"] == [LAYER, "blocks.1.attn.qkv.bias"]
     assert found["unexpected"] == ["a", "b"]
-    assert "missing: blocks.1.attn.qkv.weight and 1 more; unexpected: a and 1 more" in found["said"]
+    assert (
+        "missing: blocks.1.attn.qkv.weight and 1 more; unexpected: a and 1 more" in found["summary"]
+    )
     json.dumps(found)
 
 
@@ -108,9 +110,9 @@ def test_a_network_in_the_place_of_another_is_refused(folder: Path) -> None:
     shutil.copy(folder / CASCADE, folder / LEVEL1)
     refused(folder, r"da3_level1\.pt: .*missing: .*unexpected: ")
     shutil.copy(folder / LEVEL1, folder / RGB_HEAD)
-    said = report(folder, "rgb_head").said
+    said = report(folder, "rgb_head").summary
     assert "missing: trainable_cls_token and 23 more" in said
-    assert "others in the file passed over" in said
+    assert "others in the file ignored" in said
 
 
 def test_statistics_of_the_other_level_are_refused(folder: Path) -> None:
@@ -120,9 +122,9 @@ def test_statistics_of_the_other_level_are_refused(folder: Path) -> None:
     torch.save({**content, "level": -3}, folder / STATISTICS[1])
     assert report(folder, "statistics1").ok
     torch.save({**content, "var": -content["var"]}, folder / STATISTICS[1])
-    assert "negative" in report(folder, "statistics1").said
+    assert "negative" in report(folder, "statistics1").summary
     torch.save({"mean": content["mean"]}, folder / STATISTICS[1])
-    assert "missing: var" in report(folder, "statistics1").said
+    assert "missing: var" in report(folder, "statistics1").summary
 
 
 class Malicious:
@@ -202,7 +204,7 @@ def test_other_contents_of_a_pytorch_file_are_refused(folder: Path) -> None:
 @pytest.mark.parametrize("file", [STATISTICS[0], Path("a.safetensors")], ids=lambda f: f.suffix)
 def test_no_damage_ends_in_another_error(folder: Path, file: Path) -> None:
     """Every ending, and random bytes: either it is read, or the error is our own."""
-    from gvtools.completers.geoverse.weights.checkpoints import read_tensors
+    from gvtools.networks.tensors import read_tensors
 
     path = folder / file
     if file.suffix == ".safetensors":

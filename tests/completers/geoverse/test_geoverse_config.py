@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from gvtools.completers.geoverse.config import CameraConfig, FlowConfig, GeoVerseConfig, named
-from gvtools.completers.geoverse.config_json import from_json, to_json
 from gvtools.errors import OptionError
+from gvtools.networks.config_json import from_json, to_json
 
 
 @pytest.mark.parametrize("value", [0.0, -3.0, float("nan")])

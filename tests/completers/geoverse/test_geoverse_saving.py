@@ -13,10 +13,10 @@ import torch
 from geoverse_folders import PLAIN, equal, load
 from safetensors.torch import load_file
 
-from gvtools.completers.geoverse.weights import saved_tensors
 from gvtools.completers.geoverse.weights.folder import save_pretrained
 from gvtools.completers.geoverse.weights.published import WHOLE_FILE
 from gvtools.errors import CheckpointError, GvError, ProjectError
+from gvtools.networks.tensors import save_tensors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -36,7 +36,7 @@ def own(own_source: Path, tmp_path: Path) -> Path:
 @pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
 def test_what_must_not_be_rounded_keeps_float32(dtype: str, tmp_path: Path) -> None:
     model = micro.model(PLAIN)
-    model.save_pretrained(tmp_path, dtype=dtype)
+    save_pretrained(model, tmp_path, dtype=dtype)
     stored, state = load_file(tmp_path / WHOLE_FILE), model.state_dict()
     exact = {name for name, tensor in stored.items() if tensor.dtype == torch.float32}
     assert exact == {
@@ -58,7 +58,7 @@ def test_what_must_not_be_rounded_keeps_float32(dtype: str, tmp_path: Path) -> N
 
 def test_what_could_not_be_loaded_is_not_saved(tmp_path: Path) -> None:
     model = micro.model(PLAIN)
-    model.save_pretrained(tmp_path)
+    save_pretrained(model, tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     weight = model.level1.blocks[0].attn.qkv.weight
     for value, dtype, message in (
@@ -77,7 +77,7 @@ def test_a_write_that_fails_leaves_the_earlier_model_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = micro.model(PLAIN)
-    model.save_pretrained(tmp_path / "model")
+    save_pretrained(model, tmp_path / "model")
     other = micro.model(replace(PLAIN, views=4), seed=1)
 
     def full(tensors: Any, file: str, **_: Any) -> None:
@@ -103,7 +103,7 @@ def test_weights_are_never_beside_another_configuration(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Killed between the two names, the folder holds no model, rather than a wrong one."""
-    micro.model(PLAIN).save_pretrained(tmp_path)
+    save_pretrained(micro.model(PLAIN), tmp_path)
     other = micro.model(replace(PLAIN, views=4), seed=1)
     real = Path.replace
 
@@ -127,7 +127,7 @@ def test_a_model_is_saved_over_the_files_it_was_loaded_from(own: Path) -> None:
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     with torch.no_grad():
         model.level1.get_parameter("blocks.0.norm1.weight").add_(1)
-    model.save_pretrained(own)
+    save_pretrained(model, own)
     again = load(own)
     assert equal(model, again)
     changed = [n for n, t in again.state_dict().items() if not torch.equal(t, before[n])]
@@ -146,12 +146,12 @@ def test_training_does_not_write_into_the_loaded_files(own: Path) -> None:
 def test_two_names_of_one_tensor_are_both_saved(tmp_path: Path) -> None:
     shared = torch.randn(4, 4)
     tensors = {"a": shared, "b": shared, "c": shared.T, "d": shared[1:]}
-    saved_tensors.save_tensors(tensors, tmp_path / "t.safetensors", about="x")
+    save_tensors(tensors, tmp_path / "t.safetensors", about="x")
     found = load_file(tmp_path / "t.safetensors")
     assert all(torch.equal(found[name], tensor) for name, tensor in tensors.items())
 
 
 def test_saved_files_can_be_read_by_those_who_can_read_the_others(tmp_path: Path) -> None:
-    micro.model(PLAIN).save_pretrained(tmp_path)
+    save_pretrained(micro.model(PLAIN), tmp_path)
     modes = {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
     assert len(modes) == 1

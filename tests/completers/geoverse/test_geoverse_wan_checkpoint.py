@@ -145,7 +145,7 @@ def test_a_truncated_folder_gives_the_features_of_the_whole_network(
     report = check_folder(truncated)
     sizes = [p.stat().st_size for p in truncated.rglob(FILE)]
     assert (report.bytes, len(sizes)) == (sum(sizes), 2)
-    assert "empty prompt: (1, 20)" in report.said
+    assert "empty prompt: (1, 20)" in report.summary
     assert not list(truncated.parent.glob(".*"))
 
 

@@ -11,10 +11,11 @@ import geoverse_models as micro
 import pytest
 from geoverse_folders import CONTROL, PLAIN, load, refused, report
 
-from gvtools.completers.geoverse.config_json import to_json
-from gvtools.completers.geoverse.weights.folder import check_folder, from_pretrained
+from gvtools.completers.geoverse.weights.checks import check_folder
+from gvtools.completers.geoverse.weights.folder import from_pretrained
 from gvtools.completers.geoverse.weights.published import WHOLE_FILE
 from gvtools.errors import CheckpointError
+from gvtools.networks.config_json import to_json
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 pytest_plugins = ("geoverse_folder_fixtures",)
@@ -91,7 +92,7 @@ def test_an_absent_video_folder_is_named(folder: Path) -> None:
     found = report(folder, "video", CONTROL)
     assert not found.ok
     assert found.needed
-    assert "truncate-wan" in found.said
+    assert "truncate-wan" in found.summary
     assert load(folder, CONTROL).video is None
 
 
@@ -112,6 +113,6 @@ def test_the_video_folder_is_checked_as_it_is_loaded(folder: Path) -> None:
         (replace(tiny_wan.CONFIG, prompt="zeros", taps=(0, 1, 2, 4)), "4 blocks"),
     ):
         config = replace(CONTROL, video=video)
-        assert message in report(folder, "video", config).said
+        assert message in report(folder, "video", config).summary
         with pytest.raises(CheckpointError, match=message):
             from_pretrained(folder, config=config)

@@ -19,8 +19,8 @@ from gvtools.depth.stereo.pyramid import build_pyramid, level_of
 from gvtools.depth.stereo.residual_flow import residual_flow
 from gvtools.depth.stereo.sources import choose_sources, parallax
 from gvtools.errors import DegenerateError
+from gvtools.procedural.room_sample import look_at
 from gvtools.scenes.scene import Scene, SparsePoints
-from gvtools.scenes.synthetic import look_at
 
 
 def with_points(scene: Scene, depth: float = 2.0, count: int = 60) -> Scene:

@@ -17,9 +17,10 @@ from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
+from gvtools.settings import with_texts
 from pipelines.commands.reconstruct import reconstruct
-from pipelines.config import RunConfig, with_settings
 from pipelines.console import Console
+from pipelines.reconstruction.settings import RunSettings
 
 CONTEXT = [f"frame-{i:06d}.color.png" for i in (0, 2, 4, 6)]
 TARGETS = [f"frame-{i:06d}.color.png" for i in (1, 3, 5, 7)]
@@ -80,7 +81,7 @@ def plain(scene, tmp_path_factory) -> Run:
 
 def run(scene: Scene, out: Path, *more: str, targets: Sequence[str] = TARGETS) -> Run:
     texts = [f"context={','.join(CONTEXT)}", f"targets={','.join(targets)}", "views_per_round=2"]
-    config = with_settings(RunConfig(), [*texts, *more])
+    config = with_texts(RunSettings(), [*texts, *more])
     reconstruct(scene, config, out, console=Console(quiet=True))
     pictures = {
         path.name: np.asarray(Image.open(path))

@@ -17,9 +17,10 @@ from tiny_scan import write_scan
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scenes.project import open_project
+from gvtools.settings import with_texts
 from pipelines.commands.reconstruct import reconstruct
-from pipelines.config import RunConfig, with_settings
 from pipelines.console import Console
+from pipelines.reconstruction.settings import RunSettings
 
 SETTINGS = ("context=first:2", "targets=range:2-5", "views_per_round=2", "completer=inpaint")
 
@@ -36,7 +37,7 @@ def whole(scan, tmp_path_factory):
 
 
 def run(scan: Path, out: Path, *settings: str, resume: bool = False, dry_run: bool = False) -> Path:
-    config = with_settings(RunConfig(), (*SETTINGS, *settings))
+    config = with_texts(RunSettings(), (*SETTINGS, *settings))
     return reconstruct(
         open_project(scan), config, out, console=Console(quiet=True), resume=resume, dry_run=dry_run
     )

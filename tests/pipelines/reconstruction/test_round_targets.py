@@ -15,9 +15,9 @@ from gvtools.cameras import concatenate
 from gvtools.kernels import run_beside_each_other
 from gvtools.memory.projection_cache import FollowedCamera
 from gvtools.memory.spatial_memory import SpatialMemory
-from pipelines.config import RunConfig
 from pipelines.reconstruction.plan import Plan
 from pipelines.reconstruction.round_targets import RoundTargets
+from pipelines.reconstruction.settings import RunSettings
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def plan(*rounds: int) -> Plan:
     return cast(
         Plan,
         SimpleNamespace(
-            config=RunConfig(),
+            config=RunSettings(),
             schedule=tuple(tuple(range(a, b)) for a, b in pairwise(cuts)),
             targets=SimpleNamespace(cameras=concatenate(at)),
         ),

@@ -12,8 +12,8 @@ from gvtools.guidance import Guidance, together
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.projection_cache import FollowedCamera
 from gvtools.memory.spatial_memory import SpatialMemory
-from pipelines.config import RunConfig
 from pipelines.reconstruction.rounds import Clock, complete_targets
+from pipelines.reconstruction.settings import RunSettings
 
 
 def camera(name: str, size: tuple[int, int], x: float = 0.0) -> Cameras:
@@ -75,7 +75,7 @@ def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras])
         memory=memory,
         completer=completer,
         context=(),
-        config=RunConfig(),
+        config=RunSettings(),
         clock=Clock(),
         progress=lambda items, _: items,
     )

@@ -12,12 +12,13 @@ from tiny_scan import FOCAL, WALL, write_scan
 from gvtools.errors import OptionError
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
-from pipelines.config import RunConfig, with_settings
+from gvtools.settings import with_texts
 from pipelines.reconstruction.plan import make_plan
+from pipelines.reconstruction.settings import RunSettings
 from pipelines.reconstruction.voxel_probe import NEIGHBOURS, SCALES, sufficient_scale
 
 FOOTPRINT = WALL / FOCAL
-AT_FOOTPRINT = RunConfig(voxel=FOOTPRINT)
+AT_FOOTPRINT = RunSettings(voxel=FOOTPRINT)
 
 
 @pytest.fixture(scope="module")
@@ -85,18 +86,20 @@ def test_a_run_takes_the_measured_edge_unless_told_otherwise(scan):
     scene = open_project(scan)
     texts = ["context=not:first:1", "targets=first:1"]
     edges = {
-        name: make_plan(scene, with_settings(RunConfig(), [*texts, *more])).config.voxel or 0
+        name: make_plan(scene, with_texts(RunSettings(), [*texts, *more])).config.voxel or 0
         for name, more in {
-            "footprint": ["fusion.voxel_loss=none"],
+            "footprint": ["fusion.max_psnr_drop_db=none"],
             "balanced": [],
             "accurate": ["profile=accurate"],
-            "any": ["fusion.voxel_loss=100"],
-            "given": ["voxel=0.0123", "fusion.voxel_loss=100"],
+            "any": ["fusion.max_psnr_drop_db=100"],
+            "given": ["voxel=0.0123", "fusion.max_psnr_drop_db=100"],
         }.items()
     }
     assert edges["any"] == pytest.approx(SCALES[-1] * edges["footprint"], rel=0.01)
-    wide = make_plan(scene, with_settings(RunConfig(), [*texts, "fusion.voxel_loss=100"])).config
-    assert wide.memory.footprints == SCALES[-1] * RunConfig().memory.footprints
+    wide = make_plan(
+        scene, with_texts(RunSettings(), [*texts, "fusion.max_psnr_drop_db=100"])
+    ).config
+    assert wide.memory.footprints == SCALES[-1] * RunSettings().memory.footprints
     assert edges["accurate"] <= edges["balanced"] and edges["given"] == 0.0123
-    with pytest.raises(OptionError, match=r"fusion\.voxel_loss"):
-        with_settings(RunConfig(), ["fusion.voxel_loss=-1"])
+    with pytest.raises(OptionError, match=r"fusion\.max_psnr_drop_db"):
+        with_texts(RunSettings(), ["fusion.max_psnr_drop_db=-1"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,16 +12,16 @@ from tiny_scan import write_scan
 
 from gvtools.errors import OptionError
 from gvtools.runs.folder_lock import held_folder
+from gvtools.settings import changes, with_profile, with_texts
 from pipelines.cli import build_parser, main
 from pipelines.commands.tradeoff import asked_for
-from pipelines.config import PROFILES, RunConfig, difference, with_profile, with_settings
-from pipelines.tradeoff.search import EQUAL
+from pipelines.reconstruction.settings import RunSettings
+from pipelines.tradeoff.sweep import EQUAL
 from pipelines.tradeoff.trial import applied
 from viz.plots.pareto import draw_pareto
 
 # Another edge than the first guess, as if it had been measured.
 WIDER = ("--set", "fusion.voxel_scale=1.25")
-TIMES = ("fixed", "per_target")
 
 
 @pytest.fixture(scope="module")
@@ -47,17 +46,13 @@ def test_a_sweep_leaves_table_front_plot_and_profile(swept):
     assert front and [row["psnr"] for row in front] == sorted(row["psnr"] for row in front)
     best = found["recommended"]
     # Smaller pictures are another product.
-    whole = [
-        trial
-        for trial in found["trials"]
-        if trial["share"] == 1 and "max_side" not in trial["settings"]
-    ]
+    whole = [trial for trial in found["trials"] if "max_side" not in trial["settings"]]
     assert whole and best["psnr"] >= max(trial["psnr"] for trial in whole) - EQUAL
-    names = {row["knob"] for row in found["marginal"]}
+    names = {row["setting"] for row in found["marginal"]}
     assert {"voxel edge", "completer", "projection"} <= names
     for row in found["marginal"]:
         assert row["time"] > 0 and row["bytes"] > 0
-    coarse = next(row for row in found["marginal"] if row["knob"] == "voxel edge")
+    coarse = next(row for row in found["marginal"] if row["setting"] == "voxel edge")
     assert coarse["observations"] > 1.2 and coarse["bytes"] > 1
     # Runs leave nothing behind but their outcomes.
     assert all(path.suffix == ".json" for path in (swept / "trials").iterdir())
@@ -75,7 +70,7 @@ def test_the_profile_is_what_reconstruct_takes_and_gives_its_figures(scan, swept
 
 def test_a_profile_is_tried_as_reconstruct_runs_it(scan, swept, tmp_path):
     trials = json.loads((swept / "tradeoff.json").read_text())["trials"]
-    tried = next(t for t in trials if t["label"] == "profile accurate" and t["share"] == 1)
+    tried = next(t for t in trials if t["label"] == "profile accurate")
     arguments = ["reconstruct", str(scan), "--context", "every:2", "--targets", "every:2+1"]
     arguments += ["--profile", "accurate", "--out", str(tmp_path / "run"), "--quiet"]
     assert main([*arguments, *WIDER]) == 0
@@ -92,15 +87,15 @@ def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
     args = build_parser().parse_args(arguments + [word for text in own for word in ("--set", text)])
     start = asked_for(args)
     assert start.profile == "accurate" and start.memory.same_direction == 0
-    for name, changes in PROFILES.items():
-        wanted = with_settings(with_profile(RunConfig(), name), ["effort.inpaint_below=0.07"])
-        wanted = with_settings(wanted, [text for text in own if "profile" not in text])
-        wanted = replace(wanted, context=start.context, targets=start.targets)
-        assert asked_for(args, name) == wanted, changes
+    for name in RunSettings.profiles:
+        wanted = with_texts(with_profile(RunSettings(), name), ["effort.inpaint_below=0.07"])
+        wanted = with_texts(wanted, [text for text in own if "profile" not in text])
+        wanted = wanted.replaced(context=start.context, targets=start.targets)
+        assert asked_for(args, name) == wanted, name
         # As a trial reaches it, from the start with the edge that it has.
-        found = replace(start, voxel=start.voxel or 0.02)
-        tried = applied(found, difference(found, wanted))
-        assert replace(tried, profile=name) == wanted
+        found = start.replaced(voxel=start.voxel or 0.02)
+        tried = applied(found, changes(found, wanted))
+        assert tried.replaced(profile=name) == wanted
 
 
 def test_a_second_sweep_takes_over_what_is_there(scan, swept, capsys):
@@ -146,21 +141,16 @@ def test_a_plot_without_trials_is_refused():
 def test_a_damaged_trial_is_made_anew(scan, swept, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(swept, out)
-    start = json.loads((out / "tradeoff.json").read_text())["trials"][0]
-    files = {path: json.loads(path.read_text())["outcome"] for path in (out / "trials").iterdir()}
+    files = {path: json.loads(path.read_text()) for path in (out / "trials").iterdir()}
     # Sweeps of the same project that was read otherwise may lie there, too.
-    damaged = [
-        path
-        for path, outcome in files.items()
-        if (outcome["settings"], outcome["targets"]) == (start["settings"], start["targets"])
-    ]
+    damaged = [path for path, outcome in files.items() if not outcome["settings"]]
     for path in damaged:
         path.write_text("{")
     command = ["tradeoff", str(scan), "--out", str(out), "--budget", "1h", "--quiet"]
     assert main([*command, *WIDER]) == 0
     whole = [path for path in damaged if path.read_text() != "{"]
-    again = [json.loads(path.read_text())["outcome"] for path in whole]
-    assert again == [files[path] | {key: again[0][key] for key in TIMES} for path in whole] != []
+    again = [json.loads(path.read_text()) for path in whole]
+    assert again == [files[path] | {"seconds": again[0]["seconds"]} for path in whole] != []
 
 
 def test_a_folder_takes_one_sweep_at_a_time(scan, tmp_path, capsys):

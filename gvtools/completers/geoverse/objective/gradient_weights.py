@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gvtools.errors import ShapeError
-from gvtools.options import check_range
+from gvtools.networks.config_json import check_range
 
 DELTA = 1e-6
 # ITU-R BT.601; the paper says "grayscale" only.
@@ -86,7 +86,7 @@ def linear_quantiles(values: Tensor, shares: Sequence[float]) -> list[Tensor]:
     ordered = values.sort().values
     found = []
     for share in shares:
-        check_range("quantile", share, least=0, most=1)
+        check_range("quantile", share, ge=0, le=1)
         rank = share * (len(ordered) - 1)
         below = min(int(rank), len(ordered) - 1)
         above = min(below + 1, len(ordered) - 1)

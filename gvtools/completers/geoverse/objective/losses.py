@@ -16,7 +16,7 @@ from torch import Tensor
 from gvtools.completers.geoverse.objective.gradient_weights import DELTA, gradient_weights
 from gvtools.completers.geoverse.objective.similarity_scale import CenterSimilarity
 from gvtools.errors import OptionError, ShapeError
-from gvtools.options import check_range
+from gvtools.networks.config_json import check_range
 
 Reduction = Literal["mean", "sum"]
 WithoutScale = Literal["drop", "one"]
@@ -72,7 +72,7 @@ def flow_matching_loss(
         reduction: see above.
         views: (B, V) bool; the others do not count.
     """
-    check_range("context weight", context_weight, least=0)
+    check_range("context weight", context_weight, ge=0)
     errors = view_errors(predicted, target, reduction=reduction, views=views)
     count = errors.shape[1]
     if not 0 <= context <= count:

@@ -27,7 +27,7 @@ from gvtools.completers.geoverse.objective.losses import (
 )
 from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.errors import OptionError
-from gvtools.options import check_range
+from gvtools.networks.config_json import check_range
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,7 @@ class LossWeights:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            check_range(
-                f"loss weight {item.name}", getattr(self, item.name), least=0, below=math.inf
-            )
+            check_range(f"loss weight {item.name}", getattr(self, item.name), ge=0, lt=math.inf)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gvtools.completers.geoverse.video_prior.layouts import LAYOUTS
 from gvtools.errors import OptionError
-from gvtools.options import check_range
+from gvtools.networks.config_json import check_range
 
 _DTYPES = ("float32", "bfloat16", "float16")
 
@@ -58,10 +58,10 @@ class VideoPriorConfig:
             raise OptionError(f"video.taps = {self.taps}; expected ascending block numbers")
         if self.multiple < 1 or self.multiple % 16:
             raise OptionError(f"video.multiple = {self.multiple}; expected a multiple of 16")
-        check_range("video.timestep", self.timestep, least=0, most=1000)
-        check_range("video.sigma", self.sigma, least=0, most=1)
-        check_range("video.proxy_noise", self.proxy_noise, least=0)
-        check_range("video.prompt_rows", self.prompt_rows, least=1)
+        check_range("video.timestep", self.timestep, ge=0, le=1000)
+        check_range("video.sigma", self.sigma, ge=0, le=1)
+        check_range("video.proxy_noise", self.proxy_noise, ge=0)
+        check_range("video.prompt_rows", self.prompt_rows, ge=1)
 
     def size(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns in px that views of a size are resized to."""

@@ -7,6 +7,8 @@ trained extension. The video prior lies in ``video/`` of either.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -14,16 +16,15 @@ from torch import Tensor
 
 from gvtools.completers.geoverse import config as configs
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.control import ControlBranch
+from gvtools.completers.geoverse.denoiser import Denoiser
+from gvtools.completers.geoverse.model import GeoVerse, empty_model
+from gvtools.completers.geoverse.shared_attention import SharedAttention
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior
-from gvtools.completers.geoverse.weights.checkpoints import is_extension, load
-from gvtools.completers.geoverse.weights.extension import fresh_extension
-from gvtools.completers.geoverse.weights.folder_check import check_folder, check_video_folder
-from gvtools.completers.geoverse.weights.folder_parts import (
-    PartReport,
+from gvtools.completers.geoverse.weights.checks import (
     check_is_folder,
+    check_video_folder,
     config_of,
-    empty_model,
     examine,
     pieces_of,
 )
@@ -32,20 +33,14 @@ from gvtools.completers.geoverse.weights.published import (
     EXTENSION_FILE,
     VIDEO_FOLDER,
     WHOLE_FILE,
+    is_extension,
 )
-from gvtools.completers.geoverse.weights.saved_tensors import DTYPES, save_tensors
 from gvtools.errors import CheckpointError
 from gvtools.files import replaced_when_written
+from gvtools.networks.tensors import load, save_tensors
 
-__all__ = [
-    "DTYPES",
-    "PartReport",
-    "check_folder",
-    "config_of",
-    "from_pretrained",
-    "save_extension",
-    "save_pretrained",
-]
+# Of the random numbers of an untrained extension; none of them reaches the output.
+_SEED = 0
 
 
 def from_pretrained(
@@ -68,7 +63,7 @@ def from_pretrained(
         video: load the video prior, where the configuration has one.
 
     Raises:
-        CheckpointError: a file or a tensor is missing, unexpected, misshapen or not finite.
+        CheckpointError: a file or a tensor is missing, unexpected, of another shape or not finite.
     """
     folder = Path(folder)
     check_is_folder(folder)
@@ -96,7 +91,7 @@ def _tensors(folder: Path, model: GeoVerse) -> dict[str, Tensor]:
         if not report.ok:
             what = f"{folder}: {report.name}" if report.path is None else f"{report.path}"
             raise CheckpointError(
-                f"{what}: {report.said}; gvtools weights list names what is needed"
+                f"{what}: {report.summary}; gvtools weights list names what is needed"
             )
         loaded |= tensors
     absent = [name for name in model.state_dict() if name not in loaded]
@@ -171,5 +166,55 @@ def save_extension(model: GeoVerse, folder: Path | str, *, dtype: str = "float32
 def _save(model: GeoVerse, file: Path, tensors: dict[str, Tensor], dtype: str, about: str) -> None:
     exact = {name for name, _ in model.named_buffers()}
     exact |= {name for name in tensors if name.endswith(".t_embedder.W")}
-    said = ", ".join(filter(None, (f"GeoVerse {model.config.name}", about)))
-    save_tensors(tensors, file, dtype=dtype, exact=exact, about=said)
+    words = ", ".join(filter(None, (f"GeoVerse {model.config.name}", about)))
+    save_tensors(tensors, file, dtype=dtype, exact=exact, about=words)
+
+
+def fresh_extension(model: GeoVerse, loaded: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Untrained extensions, the same at every call.
+
+    The output is bit for bit that of the published networks, but for the ungated MoT variant.
+
+    Args:
+        model: may be on the meta device.
+        loaded: the published tensors by their names in ``model``; the control branch starts as a
+            copy of some.
+    """
+    config = model.config
+    fresh = {
+        name: torch.zeros(tuple(tensor.shape))
+        for name, tensor in model.state_dict().items()
+        if name.startswith("level1.depth_embedder.")
+    }
+    if config.video is None:
+        return fresh
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(_SEED)
+        if model.control is not None:
+            control = ControlBranch(
+                config.control,
+                _published_level1(model, loaded),
+                video_channels=config.video.channels,
+            )
+            fresh |= {f"control.{name}": value for name, value in control.state_dict().items()}
+        if model.shared is not None:
+            shared = SharedAttention(
+                config.shared,
+                width=config.level1.width,
+                heads=config.level1.heads,
+                video_channels=config.video.channels,
+            )
+            fresh |= {f"shared.{name}": value for name, value in shared.state_dict().items()}
+    return fresh
+
+
+def _published_level1(model: GeoVerse, loaded: Mapping[str, Tensor]) -> Denoiser:
+    with torch.device("meta"):
+        denoiser = Denoiser(replace(model.config.level1, depth_condition=False))
+    tensors = {
+        name.removeprefix("level1."): tensor
+        for name, tensor in loaded.items()
+        if name.startswith("level1.") and not is_extension(name)
+    }
+    load(denoiser, tensors, where="level1")
+    return denoiser

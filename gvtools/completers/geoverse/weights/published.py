@@ -6,16 +6,22 @@ and code in November 2026; the shapes come from our own modules, not from the fi
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor, nn
+
 from gvtools.completers.geoverse.config import GeoVerseConfig
+from gvtools.errors import CheckpointError
+from gvtools.networks.depth_anything import weights as da3
+from gvtools.networks.tensors import plain_tensors, read_pickled, read_tensors, share_tied
 
 # What GeoVerse adds to published networks; fresh where a folder has no trained extension.
 EXTENSION = ("level1.depth_embedder.", "control.", "shared.")
 EXTENSION_FILE = "geoverse_extension.safetensors"
-WHOLE_FILE = "geoverse.safetensors"
-CONFIG_FILE = "config.json"
+WHOLE_FILE = da3.GEOVERSE_FILE
+CONFIG_FILE = da3.GEOVERSE_CONFIG
 VIDEO_FOLDER = "video"
 
 
@@ -31,7 +37,7 @@ class Part:
         licence: its terms.
         nested: dictionaries in which the tensors may lie, the first that is there.
         strip: prefix that is taken off every key that has it.
-        only: keys with none of these prefixes belong to other networks and are passed over; the
+        only: keys with none of these prefixes belong to other networks and are ignored; the
             prefix is taken off as well.
         tied: names that are one tensor in the publisher's network; a file may hold any of them.
         optional: the model can do without it; where the file is there it has to fit all the same.
@@ -68,26 +74,15 @@ class Part:
 GLD = "SeonghuJeon/GLD (Geometric Latent Diffusion)"
 GLD_TERMS = "Apache-2.0 (model card); code MIT"
 
-# Depth Anything 3 has one LayerNorm in its four ray outputs; safetensors store it under one name.
-_RAY_NORMS = "scratch.output_conv2_aux.{}.2.{}"
-
-
-def _tied(start: str) -> tuple[tuple[str, ...], ...]:
-    return tuple(
-        tuple(start + _RAY_NORMS.format(level, kind) for level in range(4))
-        for kind in ("weight", "bias")
-    )
-
-
 PARTS = (
     Part(
         "geometry",
-        "geometry.",
-        ("pretrained_models/da3/model.safetensors", "da3/model.safetensors"),
+        da3.GEOVERSE_PREFIX,
+        da3.PUBLISHED_PLACES,
         "depth-anything/DA3-BASE, model.safetensors; also in SeonghuJeon/GLD",
         "Apache-2.0",
-        strip="model.",
-        tied=_tied("head."),
+        strip=da3.PUBLISHED_PREFIX,
+        tied=da3.tied_norms("head."),
         note="the frozen encoder, geometry head, camera encoder and decoder",
     ),
     Part(
@@ -148,7 +143,7 @@ GEOMETRY_HEAD = Part(
     nested=("model",),
     strip="module.",
     only=("decoder.", "pred."),
-    tied=_tied(""),
+    tied=da3.tied_norms(""),
     optional=True,
     stated_bytes=400_000_000,
     note="GLD's geometry head, in place of Depth Anything 3's own",
@@ -168,3 +163,74 @@ def parts_of(config: GeoVerseConfig) -> tuple[Part, ...]:
     """The published parts that a configuration has modules for, the optional one last."""
     parts = (*PARTS, GEOMETRY_HEAD)
     return tuple(part for part in parts if part.name != "cascade" or config.cascade is not None)
+
+
+def expected_of(module: nn.Module, part: Part) -> dict[str, tuple[int, ...]]:
+    """What a part's file has to hold for a (meta) ``GeoVerse``: its module without extensions."""
+    return {
+        name.removeprefix(part.module): tuple(tensor.shape)
+        for name, tensor in module.state_dict().items()
+        if name.startswith(part.module) and not is_extension(name)
+    }
+
+
+def is_extension(name: str) -> bool:
+    """Whether a key of ``GeoVerse`` is what GeoVerse adds to published networks."""
+    return name.startswith(EXTENSION)
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a file holds for a part.
+
+    Attributes:
+        tensors: by the names of our module, without its prefix.
+        ignored: names in the file that belong to other networks or are no weights.
+    """
+
+    tensors: dict[str, Tensor]
+    ignored: tuple[str, ...] = ()
+
+
+def read_stored(path: Path, part: Part) -> Stored:
+    """A part's tensors by the names of our module, and what else its file holds.
+
+    Raises:
+        CheckpointError: see ``read_tensors``; or two stored tensors claim one name.
+    """
+    if path.suffix == ".safetensors":
+        stored = read_tensors(path)
+    else:
+        content = read_pickled(path)
+        inner = next((k for k in part.nested if isinstance(content.get(k), Mapping)), None)
+        stored = plain_tensors(content if inner is None else content[inner], path)
+        if part.name.startswith("statistics"):
+            return _statistics(content, stored, path, part)
+    found: dict[str, Tensor] = {}
+    ignored = []
+    for key, tensor in stored.items():
+        name = part.own_name(key)
+        if name is None:
+            ignored.append(key)
+        elif name in found:
+            raise CheckpointError(f"{path}: holds {name} twice, also as {key}; expected it once")
+        else:
+            found[name] = tensor
+    share_tied(found, part.tied, where=path)
+    return Stored(found, tuple(ignored))
+
+
+def _statistics(
+    content: Mapping[str, object], stored: dict[str, Tensor], path: Path, part: Part
+) -> Stored:
+    """Mean and variance of a level, (C,); that level is checked where the file names one."""
+    expected = int(part.name.removeprefix("statistics"))
+    level = content.get("level")
+    # Of the four levels the last may be called -1.
+    if isinstance(level, int) and -4 <= level < 4 and level % 4 != expected:
+        raise CheckpointError(f"{path}: statistics of level {level}; expected level {expected}")
+    known: tuple[str, ...] = ("mean", "var")
+    found = {name: stored[name].reshape(-1) for name in known if name in stored}
+    if "var" in found and bool((found["var"] < 0).any()):
+        raise CheckpointError(f"{path}: var is negative in places; expected variances")
+    return Stored(found, tuple(name for name in stored if name not in found))

@@ -1,0 +1,26 @@
+"""Settings: pydantic models with one parser, and their documentation as text and Markdown."""
+
+from __future__ import annotations
+
+from gvtools.settings.base import Settings
+from gvtools.settings.documentation import listing, markdown
+from gvtools.settings.parser import (
+    changes,
+    dotted,
+    with_file,
+    with_profile,
+    with_texts,
+    with_values,
+)
+
+__all__ = [
+    "Settings",
+    "changes",
+    "dotted",
+    "listing",
+    "markdown",
+    "with_file",
+    "with_profile",
+    "with_texts",
+    "with_values",
+]

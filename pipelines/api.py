@@ -1,0 +1,130 @@
+"""The two jobs of the command line as functions: ``gvtools.reconstruct``, ``gvtools.evaluate``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gvtools.evaluation.lpips_distance import Lpips
+    from gvtools.runs.finished import FinishedRun
+
+
+@dataclass(frozen=True, eq=False)
+class RunFigures:
+    """What ``evaluate`` measured; a figure that could not be computed is None.
+
+    Attributes:
+        coverage: mean share of a target's pixels that memory knew before completion.
+        psnr: mean over the targets, dB, all pixels; ``details`` has it for observed and for
+            generated pixels alone, by view and by round, with intervals.
+        ssim: likewise, in [-1, 1].
+        lpips: likewise; None without the network's weights.
+        views: number of targets.
+        details: everything that ``gvtools evaluate`` writes to evaluation.json, by part.
+    """
+
+    coverage: float | None
+    psnr: float | None
+    ssim: float | None
+    lpips: float | None
+    views: int
+    details: Mapping[str, Any]
+
+
+def reconstruct(
+    project: Path | str,
+    out: Path | str,
+    *,
+    context: str | None = None,
+    targets: str | None = None,
+    completer: str | None = None,
+    profile: str = "balanced",
+    settings: Mapping[str, Any] | None = None,
+    resume: bool = False,
+    quiet: bool = True,
+) -> FinishedRun:
+    """Grow a memory from a posed project, round by round, as ``gvtools reconstruct`` does.
+
+    Args:
+        project: a COLMAP workspace, a posed RGB-D folder or a ``transforms.json``.
+        out: the run's folder; new, unless ``resume``.
+        context: which views are given, such as ``"every:2"``; None takes all.
+        targets: which cameras to complete, such as ``"every:2+1"`` or ``"orbit:24"``; None takes
+            twelve between the context views.
+        completer: by registered name; None takes ``inpaint``.
+        profile: fast, balanced or accurate.
+        settings: any setting by its dotted name, such as ``{"voxel": 0.01, "rounds": 2}``.
+        resume: continue after the last whole round.
+        quiet: False prints progress and figures.
+
+    Returns:
+        The finished run: its record, its rounds' reports and its targets' files.
+
+    Raises:
+        GvError: wrong input or settings; nothing of an earlier run is lost.
+    """
+    from gvtools.runs.finished import open_run
+    from gvtools.scenes.project import open_project
+    from gvtools.settings import with_profile, with_values
+    from pipelines.commands.reconstruct import reconstruct as run_reconstruct
+    from pipelines.console import Console
+    from pipelines.reconstruction.settings import RunSettings
+
+    config = with_profile(RunSettings(), profile)
+    named = {"context": context, "targets": targets, "completer": completer}
+    chosen = {key: value for key, value in named.items() if value is not None}
+    config = with_values(config, {**chosen, **(settings or {})})
+    folder = run_reconstruct(
+        open_project(Path(project)),
+        config,
+        Path(out),
+        console=Console(quiet=quiet),
+        resume=resume,
+    )
+    return open_run(folder)
+
+
+def evaluate(
+    run: FinishedRun | Path | str,
+    *,
+    parts: Sequence[str] = ("images",),
+    lpips: Lpips | None = None,
+    seed: int = 0,
+    quiet: bool = True,
+) -> RunFigures:
+    """Measure a finished run against the pictures that were held out.
+
+    Args:
+        run: as ``load_run`` or ``reconstruct`` returns it, or its folder.
+        parts: of "images", "consistency" and "poses".
+        lpips: a network for LPIPS.
+        seed: of resampling, matching and robust estimates.
+        quiet: False prints progress.
+
+    Raises:
+        OptionError: an unknown part.
+        ProjectError: no run, or its project is gone.
+    """
+    from gvtools.errors import OptionError
+    from gvtools.runs.finished import open_run
+    from pipelines.console import Console
+    from pipelines.evaluation.run_evaluation import PARTS, evaluate_run
+
+    unknown = [part for part in parts if part not in PARTS]
+    if unknown or not parts:
+        raise OptionError(f"parts {tuple(parts)}; expected some of {', '.join(PARTS)}")
+    finished = open_run(Path(run)) if isinstance(run, (Path, str)) else run
+    found = evaluate_run(
+        finished,
+        parts=parts,
+        lpips=lpips,
+        no_lpips=None if lpips else "no network was given",
+        seed=seed,
+        console=Console(quiet=quiet),
+    ).figures
+    mean = found["images"]["mean"] if "images" in found else {}
+    psnr, ssim, perceptual = (mean.get(key, {}).get("mean") for key in ("psnr", "ssim", "lpips"))
+    return RunFigures(found["coverage"], psnr, ssim, perceptual, found["views"], found)

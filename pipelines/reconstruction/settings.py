@@ -1,0 +1,119 @@
+"""The settings of a run and its profiles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from gvtools.completers.effort import EffortPolicy
+from gvtools.depth.foundation.options import FoundationOptions
+from gvtools.depth.stereo.options import StereoOptions
+from gvtools.memory.back_projection import BackProjectionOptions
+from gvtools.memory.spatial_memory import MemoryOptions
+from gvtools.memory.splat.api import SplatOptions
+from gvtools.scenes.reduced import SMALLEST
+from gvtools.settings import Settings
+
+
+class FusionOptions(Settings):
+    """What is taken of depth and of completions."""
+
+    section = "fusion"
+
+    min_confidence: float = Field(0.08, ge=0, le=1)
+    """Generated pixels below this are not fused."""
+    max_scale_residual: float = Field(0.1, gt=0)
+    """A completion whose depth fits the memory's worse than this relative residual is refused."""
+    voxel_percentile: float = Field(10.0, ge=0, le=100)
+    """The automatic edge of the finest voxels follows this percentile of the context's pixel
+    footprints; what is farther gets wider ones (``memory.footprints``). [%]"""
+    voxel_scale: float = Field(1.0, gt=0)
+    """How many such footprints the edge is."""
+    max_psnr_drop_db: float | None = Field(0.05, ge=0)
+    """Of edges from half to four times the footprints', how much worse context views, predicted
+    from their neighbours, may be than with the best edge for a coarser one to be taken; none keeps
+    the footprints'. Only views with recorded depth are tried. [dB]"""
+
+
+class SavingsOptions(Settings):
+    """What a run does not compute because the scene does not require it.
+
+    The voxel edge (``fusion.max_psnr_drop_db``), wider voxels for what is far
+    (``memory.footprints``) and what a voxel keeps (``memory.same_direction``,
+    ``memory.observations_per_voxel``) are savings, too.
+    """
+
+    section = "savings"
+
+    reuse: bool = True
+    """What observed views show of a target is not projected again after completions were fused;
+    the pictures are the same."""
+    pixel_binning: float = Field(1.0, ge=0)
+    """2 x 2 pixels become one point, their mean, where they are together at most this many voxel
+    edges wide, unless the surface is steep; 0 lifts each by itself. [voxel edges]"""
+    depth_from_memory: float | None = Field(0.9, gt=0, le=1)
+    """A context view whose depth would have to be computed takes memory's instead where the views
+    before it explain this share of its pixels; none computes all."""
+
+
+class RunSettings(Settings):
+    """Everything that decides what a run computes."""
+
+    profiles: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "fast": {
+            "max_side": 480,
+            "views_per_round": 12,
+            "effort.inpaint_below": 0.05,
+            "effort.reduced_below": 0.3,
+        },
+        # The defaults.
+        "balanced": {},
+        "accurate": {
+            "fusion.max_psnr_drop_db": 0.0,
+            "effort.inpaint_below": 0.0,
+            "effort.reduced_below": 0.0,
+            "savings.depth_from_memory": None,
+            "memory.same_direction": 0.0,
+            "memory.observations_per_voxel": 64,
+        },
+    }
+    options_of: ClassVar[Mapping[str, str]] = {"completer": "completer_options"}
+
+    context: str = "all"
+    """Which views are given (a selection)."""
+    targets: str = "interpolate:12"
+    """Which cameras to complete: a selection, a path such as ``orbit:24``, a trajectory file, or
+    another project."""
+    views_per_round: int = Field(6, ge=1)
+    """Targets that a round takes at most."""
+    rounds: int | None = Field(None, ge=0)
+    """How many rounds; none takes as many as the targets need."""
+    max_side: int | None = Field(1600, ge=SMALLEST)
+    """Longer side that larger pictures are reduced to; none keeps all. [px]"""
+    depth: str = "auto"
+    """Where the context's depth comes from: auto, sensor, colmap, plane-sweep or da3."""
+    completer: str = "inpaint"
+    """What fills the holes, by registered name; ``completer.KEY`` is an option of its own."""
+    profile: str = "balanced"
+    """Fast, balanced or accurate: sets several of the others."""
+    voxel: float | None = Field(None, gt=0)
+    """Voxel edge; none derives it from the pixel footprints. [scene units]"""
+    seed: int = Field(0, ge=0)
+    """Of everything random."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where memory is projected: "cuda" takes the torch back end there, "auto" leaves it to
+    ``splat.backend`` and ``splat.device``."""
+    allow_overlap: bool = False
+    """Whether a view may be context and target."""
+    completer_options: dict[str, Any] = Field(default_factory=dict)
+    """Options of the completer."""
+    back_projection: BackProjectionOptions = BackProjectionOptions()
+    memory: MemoryOptions = MemoryOptions()
+    stereo: StereoOptions = StereoOptions()
+    da3: FoundationOptions = FoundationOptions()
+    splat: SplatOptions = SplatOptions()
+    fusion: FusionOptions = FusionOptions()
+    savings: SavingsOptions = SavingsOptions()
+    effort: EffortPolicy = EffortPolicy()

@@ -1,0 +1,213 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from reference_rays import first_surface, is_free
+
+from gvtools.cameras import Cameras
+from gvtools.procedural.builder import ProceduralScene, SceneBuilder
+from gvtools.procedural.geometry import BALL, BOX, TUBE, clearance
+from gvtools.procedural.layouts import scene
+from gvtools.procedural.paths import camera_path
+from gvtools.procedural.ray_cast import cast
+from gvtools.procedural.render import developed, radiance
+from gvtools.procedural.shading import Look
+
+SEEDS = range(8)
+SIZE = (20, 20)
+
+
+def _drawn(seed: int, *, size: tuple[int, int] = SIZE, views: int = 3):
+    rng = np.random.default_rng([seed, 5])
+    place = scene(rng, ("train", "held-out")[seed % 2])
+    return place, camera_path(rng, place.geometry, views=views, size=size).cameras
+
+
+def _rays(cameras: Cameras, view: int) -> np.ndarray:
+    return (cameras.rays(view) @ cameras.cam_from_world[view, :3, :3]).reshape(-1, 3)
+
+
+def _white(look: Look, **changes) -> Look:
+    """Every surface white and dark but for the light that is given."""
+    black = {
+        "texels": np.ones_like(look.texels),
+        "gain": np.ones_like(look.gain),
+        "emission": np.zeros_like(look.emission),
+        "ambient": np.zeros((2, 3)),
+        "sun": np.array([[0, 0, 1.0], [0, 0, 0]]),
+        "lamp": np.zeros((2, 3)),
+        "shadows": False,
+    }
+    return look._replace(**{**black, **changes})
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_depth_is_where_rays_leave_free_space(seed: int) -> None:
+    place, cameras = _drawn(seed)
+    depth = cast(place.geometry, cameras).depth
+    for view in range(len(cameras)):
+        expected = first_surface(place.geometry, cameras.centers[view], _rays(cameras, view))
+        np.testing.assert_allclose(depth[view].ravel(), expected, rtol=1e-9)
+
+
+def test_the_picture_has_the_same_depth() -> None:
+    place, cameras = _drawn(3)
+    _, depth = radiance(place.geometry, place.look, cameras)
+    np.testing.assert_allclose(depth, cast(place.geometry, cameras).depth, rtol=1e-6)
+
+
+def test_solids_on_their_own_and_from_within_their_hull() -> None:
+    build = SceneBuilder(np.random.default_rng(0), ())
+    paint = build.material()
+    build.room([-5, -5, 0], [5, 5, 4], [paint] * 6)
+    build.solid(TUBE, [2, 0, 1], [0.5, 0.3, 1], material=paint, yaw=0.4)
+    build.solid(BALL, [2, 2, 2], [0.9, 0.5, 0.7], material=paint, yaw=1.0, tilt=0.5)
+    tunnel = ([-0.6, -2, -0.5], [0.6, 2, 0.6])
+    build.solid(BOX, [0, 0, 1.5], [1, 1, 1], material=paint, cuts=[tunnel])
+    cell = ([-0.3, -2.0, -0.2], [0.3, 0.4, 0.5])
+    build.solid(BALL, [2, -2, 2], [1, 1, 1], material=paint, yaw=0.7, cuts=[cell])
+    geometry = build.geometry()
+    rng = np.random.default_rng(1)
+    # One stands in the tunnel: within the hull, and free.
+    for eye in ([0.1, 0.2, 1.4], [-3.0, -3.0, 2.0], [2.0, -4.5, 2.2]):
+        assert is_free(geometry, np.array(eye))
+        camera = _towards(np.array(eye), rng.uniform([1, -1, 1], [3, 1, 3]))
+        depth = cast(geometry, camera).depth[0].ravel()
+        expected = first_surface(geometry, np.array(eye), _rays(camera, 0))
+        np.testing.assert_allclose(depth, expected, rtol=1e-9)
+
+
+def _towards(eye: np.ndarray, aim: np.ndarray) -> Cameras:
+    from gvtools.procedural.room_sample import look_at
+
+    K = np.array([[16.0, 0, 20], [0, 16, 20], [0, 0, 1]])
+    return Cameras(K[None], look_at(eye, aim)[None], np.array([40]), np.array([40]), ("a",))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 5])
+def test_normals_are_those_of_neighbouring_surface_points(seed: int) -> None:
+    place, cameras = _drawn(seed, views=1)
+    geometry = place.geometry
+    found = np.zeros((*SIZE, 3))
+    for axis in range(3):
+        for sign in (-1, 1):
+            towards = np.zeros(3)
+            towards[axis] = sign
+            look = _white(place.look, sun=np.stack([towards, np.ones(3)]))
+            found[..., axis] += (
+                sign * radiance(geometry, look, cameras, supersample=1)[0][0, ..., 0]
+            )
+    rays = _rays(cameras, 0)
+    eye = cameras.centers[0]
+    step = 1e-5
+    turn = cameras.cam_from_world[0, :3, :3]
+    points = [
+        eye + first_surface(geometry, eye, rays + offset)[:, None] * (rays + offset)
+        for offset in (0 * turn[0], step * turn[0], step * turn[1])
+    ]
+    normal = np.cross(points[1] - points[0], points[2] - points[0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal *= -np.sign((normal * rays).sum(1, keepdims=True))
+    smooth = np.linalg.norm(points[1] - points[0], axis=1) < 50 * step * points[0].max()
+    wrong = np.linalg.norm(found.reshape(-1, 3) - normal, axis=1) > 1e-2
+    # A ray that straddles an edge has no normal of this kind.
+    assert (wrong & smooth).mean() < 0.01
+    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3, 6])
+def test_the_lamp_lights_what_it_sees(seed: int) -> None:
+    place, cameras = _drawn(seed, views=1)
+    geometry = place.geometry
+    lamp = np.stack([place.look.lamp[0], np.ones(3)])
+    assert is_free(geometry, lamp[0])
+    lit = radiance(geometry, _white(place.look, lamp=lamp, shadows=True), cameras, supersample=1)[
+        0
+    ][0, ..., 0].ravel()
+    open_ = radiance(geometry, _white(place.look, lamp=lamp), cameras, supersample=1)[0]
+    facing = open_[0, ..., 0].ravel() > 1e-3
+    rays = _rays(cameras, 0)
+    depth = cast(geometry, cameras).depth[0].reshape(-1, 1)
+    start = cameras.centers[0] + depth * (1 - 1e-6) * rays
+    clear = first_surface(geometry, start, lamp[0] - start) >= 1
+    assert ((lit > 0) != clear)[facing].mean() < 0.005
+    np.testing.assert_allclose(
+        lit[facing & clear & (lit > 0)],
+        open_[0, ..., 0].ravel()[facing & clear & (lit > 0)],
+        rtol=1e-5,
+    )
+
+
+def test_a_point_has_one_colour_in_all_views() -> None:
+    errors, chance = [], []
+    for seed in range(6):
+        place, cameras = _drawn(seed, size=(64, 64), views=2)
+        light, depth = radiance(place.geometry, place.look, cameras)
+        image = developed(light, place.key / light.mean()).astype(float) / 255
+        points = cameras.centers[0] + depth[0].reshape(-1, 1) * _rays(cameras, 0)
+        xy, z = cameras[1].project(points)
+        with np.errstate(invalid="ignore"):
+            inside = ((xy[0] > 1) & (xy[0] < 63)).all(1)
+        column, row = np.floor(xy[0][inside]).astype(int).T
+        same = np.abs(depth[1][row, column] / z[0][inside] - 1) < 0.01
+        first = image[0].reshape(-1, 3)[inside][same]
+        errors.append((first - image[1][row, column][same]) ** 2)
+        chance.append((first - np.random.default_rng(0).permutation(first)) ** 2)
+    found, expected = np.concatenate(errors), np.concatenate(chance)
+    assert len(found) > 3000
+    # Half a pixel of misplacement at most, and textures that are finer than a pixel.
+    assert np.median(found.mean(1)) < 4e-4
+    assert found.mean() < 0.15 * expected.mean()
+
+
+def test_more_rays_a_pixel_converge() -> None:
+    place, cameras = _drawn(4, size=(32, 32))
+    light = [radiance(place.geometry, place.look, cameras, supersample=n)[0] for n in (1, 2, 6)]
+    coarse, fine = (np.abs(image - light[2]).mean() for image in light[:2])
+    assert fine < 0.7 * coarse
+
+
+def test_cameras_in_no_room_see_nothing() -> None:
+    place, cameras = _drawn(1)
+    away = cameras.cam_from_world.copy()
+    away[:, :3, 3] += 1e3
+    outside = Cameras(cameras.K, away, cameras.width, cameras.height, cameras.names)
+    assert (cast(place.geometry, outside).depth == 0).all()
+
+
+def test_clearance_is_the_distance_to_what_is_not_free() -> None:
+    place, _ = _drawn(2)
+    geometry = place.geometry
+    rng = np.random.default_rng(3)
+    low, high = geometry.rooms[0]
+    points = rng.uniform(low - 0.2, high + 0.2, (300, 3))
+    distance = clearance(geometry, points)
+    for point, reach in zip(points, distance, strict=True):
+        if reach <= 0:
+            continue
+        around = rng.standard_normal((200, 3))
+        around *= 0.999 * reach / np.linalg.norm(around, axis=1, keepdims=True)
+        assert is_free(geometry, point + around).all()
+    assert not is_free(geometry, points[distance < -0.05]).all()
+
+
+def test_pictures_do_not_depend_on_threads() -> None:
+    import numba
+
+    place, cameras = _drawn(0)
+    before = numba.get_num_threads()
+    several = radiance(place.geometry, place.look, cameras)
+    numba.set_num_threads(1)
+    single = radiance(place.geometry, place.look, cameras)
+    numba.set_num_threads(before)
+    for a, b in zip(several, single, strict=True):
+        assert np.array_equal(a, b)
+
+
+def test_scenes_are_those_of_their_seed() -> None:
+    def arrays(place: ProceduralScene) -> list[np.ndarray]:
+        return [*place.geometry, *(part for part in place.look if isinstance(part, np.ndarray))]
+
+    first, again, other = (scene(np.random.default_rng(n), "train") for n in (7, 7, 8))
+    assert all(np.array_equal(a, b) for a, b in zip(arrays(first), arrays(again), strict=True))
+    assert not np.array_equal(first.geometry.rooms[0], other.geometry.rooms[0])

@@ -1,0 +1,211 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from scipy.ndimage import map_coordinates
+
+from gvtools.cameras import Cameras
+from gvtools.errors import OptionError, ProjectError
+from gvtools.procedural.furnished_room import furnished_room
+from gvtools.procedural.room_sample import RoomSample, look_at, write_room
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.scene import Frame, Scene
+
+SIZE = {"views": 6, "width": 240, "height": 180}
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> RoomSample:
+    return write_room(tmp_path_factory.mktemp("room") / "seed0", seed=0, **SIZE)
+
+
+@pytest.fixture(scope="module")
+def scene(sample: RoomSample) -> Scene:
+    return read_colmap(sample.folder)
+
+
+@pytest.fixture(scope="module")
+def frames(scene: Scene) -> list[Frame]:
+    return [view.load() for view in scene]
+
+
+def _warp(
+    source: Frame, target: Frame, source_camera: Cameras, target_camera: Cameras, scale: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The source's colours seen at the target's pixels, and where both see the same surface."""
+    assert source.depth is not None and target.depth is not None
+    local = target_camera.rays() * target.depth[..., None] * scale
+    world_from_cam = target_camera.world_from_cam[0]
+    points = local @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+    xy, z = source_camera.project(points.reshape(-1, 3))
+    xy = np.nan_to_num(xy[0], nan=-9)
+    at = [xy[:, 1] - 0.5, xy[:, 0] - 0.5]
+    height, width = source.depth.shape
+    inside = (at[0] >= 0) & (at[0] <= height - 1) & (at[1] >= 0) & (at[1] <= width - 1)
+    seen = map_coordinates(source.depth.astype(float), at, order=1, mode="nearest")
+    same = inside & (np.abs(seen / z[0] - 1) < 0.005)
+    colors = np.stack(
+        [
+            map_coordinates(source.rgb[..., c].astype(float), at, order=1, mode="nearest")
+            for c in range(3)
+        ],
+        -1,
+    )
+    return colors.reshape(*target.depth.shape, 3), same.reshape(target.depth.shape)
+
+
+def test_depth_carries_one_views_colours_into_another(scene: Scene, frames: list[Frame]) -> None:
+    source, target = frames[0], frames[1]
+    cameras = scene.cameras
+    colors, same = _warp(source, target, cameras[0], cameras[1])
+    assert same.mean() > 0.3
+    error = np.abs(colors - target.rgb)[same].mean()
+    shifted, _ = _warp(source, target, cameras[0], cameras[1], scale=1.03)
+    assert error < 6
+    assert np.abs(shifted - target.rgb)[same].mean() > 2 * error
+
+
+def test_depth_is_that_of_the_triangulated_detections(sample: RoomSample) -> None:
+    model = pycolmap.Reconstruction(sample.folder / "sparse" / "0")
+    scene = read_colmap(sample.folder)
+    depths = {view.name: view.load().depth for view in scene}
+    errors = []
+    for point in model.points3D.values():
+        if point.track.length() < 4:
+            continue
+        rows = []
+        seen = []
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            assert image.camera is not None
+            P = image.camera.calibration_matrix() @ image.cam_from_world().matrix()
+            x, y = image.points2D[element.point2D_idx].xy
+            rows += [x * P[2] - P[0], y * P[2] - P[1]]
+            seen.append((image, x, y))
+        solution = np.linalg.svd(np.array(rows))[2][-1]
+        position = solution[:3] / solution[3]
+        for image, x, y in seen:
+            depth = depths[image.name]
+            assert depth is not None
+            row, column = min(int(y), depth.shape[0] - 1), min(int(x), depth.shape[1] - 1)
+            z = (image.cam_from_world().matrix() @ [*position, 1])[2]
+            errors.append(abs(depth[row, column] / z - 1))
+    assert len(errors) > 300
+    # 0.3 px of noise at this size moves a triangulated point by about half a percent.
+    assert np.median(errors) < 0.01
+
+
+def test_model_reads_back_through_pycolmap(sample: RoomSample) -> None:
+    model = pycolmap.Reconstruction(sample.folder / "sparse" / "0")
+    assert {image.name for image in model.images.values()} == {*sample.context, *sample.targets}
+    assert model.num_points3D() > 200
+    # Two independent coordinates of 0.3 px noise: mean length 0.3 sqrt(pi / 2).
+    assert model.compute_mean_reprojection_error() == pytest.approx(0.376, abs=0.03)
+    assert min(point.track.length() for point in model.points3D.values()) >= 2
+    for name in (*sample.context, *sample.targets):
+        with Image.open(sample.folder / "images" / name) as image:
+            assert image.size == (SIZE["width"], SIZE["height"])
+
+
+def test_reader_finds_depth_everywhere_and_nothing_to_complain(
+    scene: Scene, frames: list[Frame], sample: RoomSample
+) -> None:
+    assert scene.names == tuple(sorted((*sample.context, *sample.targets)))
+    assert [f.message for f in scene.findings if f.level != "info"] == []
+    for frame in frames:
+        assert frame.depth is not None
+        assert (frame.depth > 0.1).all() and (frame.depth < 9).all()
+
+
+def test_targets_lead_away_from_what_the_context_sees(
+    scene: Scene, frames: list[Frame], sample: RoomSample
+) -> None:
+    index = {name: i for i, name in enumerate(scene.names)}
+    seen = []
+    for target in sample.targets:
+        i = index[target]
+        covered = np.zeros(frames[i].rgb.shape[:2], bool)
+        for name in sample.context:
+            j = index[name]
+            covered |= _warp(frames[j], frames[i], scene.cameras[j], scene.cameras[i])[1]
+        seen.append(covered.mean())
+    assert seen[0] > 0.5
+    assert seen[-1] < 0.4 * seen[0]
+
+
+def test_pictures_look_like_photographs(frames: list[Frame]) -> None:
+    values = np.stack([frame.rgb for frame in frames])
+    assert 70 < values.mean() < 170
+    assert values.std() > 30
+    assert (values == 255).all(-1).mean() < 0.02
+    assert (values == 0).all(-1).mean() < 0.02
+
+
+def test_same_seed_same_bytes(sample: RoomSample, tmp_path: Path) -> None:
+    again = write_room(tmp_path / "again", seed=0, **SIZE)
+    files = sorted(p.relative_to(sample.folder) for p in sample.folder.rglob("*") if p.is_file())
+    assert files == sorted(
+        p.relative_to(again.folder) for p in again.folder.rglob("*") if p.is_file()
+    )
+    assert len(files) >= 2 * SIZE["views"] + 3
+    for file in files:
+        assert (sample.folder / file).read_bytes() == (again.folder / file).read_bytes(), file
+
+
+def test_another_seed_is_another_room() -> None:
+    one, other = furnished_room(1), furnished_room(2)
+    assert np.abs(one.size - other.size).max() > 0.05
+    assert len(one.patches) != len(other.patches)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_cameras_stand_clear_of_furniture(seed: int) -> None:
+    room = furnished_room(seed)
+    half = room.size[:2] / 2
+    angle = np.linspace(0, 2 * np.pi, 90)
+    ring = half + (half - 1.2) * np.stack([np.cos(angle), np.sin(angle)], -1)
+    eyes = np.concatenate([np.c_[ring, np.full(len(ring), up)] for up in (1.34, 1.56)])
+    for patch in room.patches:
+        points = patch.hull()
+        low, high = points.min(0), points.max(0)
+        if (high - low)[:2].max() > 0.8 * room.size[:2].min():
+            continue
+        gap = np.linalg.norm(eyes - np.clip(eyes, low, high), axis=-1)
+        assert gap.min() > 0.15
+    for patch in room.patches:
+        assert (patch.hull() > -1e-9).all() and (patch.hull() < room.size + 1e-9).all()
+
+
+def test_existing_sample_is_kept_and_others_refused(sample: RoomSample, tmp_path: Path) -> None:
+    picture = sample.folder / "images" / sample.context[0]
+    before = picture.stat().st_mtime_ns
+    assert write_room(sample.folder, seed=0, **SIZE) == sample
+    assert picture.stat().st_mtime_ns == before
+    with pytest.raises(ProjectError, match="another sample"):
+        write_room(sample.folder, seed=1, **SIZE)
+    (tmp_path / "note.txt").write_text("mine")
+    with pytest.raises(ProjectError, match="something other than a sample"):
+        write_room(tmp_path, seed=0, **SIZE)
+    assert (tmp_path / "note.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("bad", [{"seed": -1}, {"views": 3}, {"width": 8}])
+def test_impossible_options_are_refused(tmp_path: Path, bad: dict[str, int]) -> None:
+    with pytest.raises(OptionError, match="expected a seed of 0 or more"):
+        write_room(tmp_path / "room", **bad)
+    assert not (tmp_path / "room").exists()
+
+
+def test_look_at_puts_the_aim_on_the_optical_axis() -> None:
+    eye, aim = np.array([1.0, 2.0, 1.5]), np.array([4.0, 1.0, 0.5])
+    pose = look_at(eye, aim)
+    x, y, z = pose[:3, :3] @ aim + pose[:3, 3]
+    assert (x, y) == pytest.approx((0, 0), abs=1e-12)
+    assert z == pytest.approx(np.linalg.norm(aim - eye))
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+    # What is higher in the world is higher in the image, where y points down.
+    assert (pose[:3, :3] @ [0, 0, 1])[1] < 0

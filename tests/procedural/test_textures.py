@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gvtools.errors import OptionError
+from gvtools.procedural.color import decode_srgb
+from gvtools.procedural.patterns import color, noise, pattern
+from gvtools.procedural.photographs import LONGEST, PHOTOGRAPHS, photograph, photograph_names
+from gvtools.procedural.textures import LEVELS, OFFSETS, SIDE, picture, stacked, texture
+
+
+def test_splits_share_no_photograph() -> None:
+    train, held_out = (PHOTOGRAPHS[split] for split in ("train", "held-out"))
+    assert not set(train) & set(held_out)
+    thumbnails = {
+        name: np.sort(photograph(name).reshape(-1, 3).mean(1))[:: photograph(name).size // 300][
+            :100
+        ]
+        for split in PHOTOGRAPHS
+        for name in photograph_names(split)
+    }
+    for a in photograph_names("train"):
+        for b in photograph_names("held-out"):
+            assert not np.array_equal(thumbnails[a], thumbnails[b])
+
+
+def test_photographs_of_installed_wheels_alone() -> None:
+    for split in PHOTOGRAPHS:
+        names = photograph_names(split)
+        assert len(names) >= 6
+        for name in names:
+            image = photograph(name)
+            assert image.dtype == np.uint8 and image.shape[2] == 3
+            assert max(image.shape) <= LONGEST and image.std() > 5
+    with pytest.raises(OptionError, match="held-out"):
+        photograph_names("test")
+
+
+def test_textures_follow_from_their_generator() -> None:
+    names = photograph_names("train")
+    first, again = (texture(np.random.default_rng([3, 1]), names) for _ in range(2))
+    other = texture(np.random.default_rng([3, 2]), names)
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+def test_pictures_are_neither_black_nor_blank() -> None:
+    rng = np.random.default_rng(0)
+    images = [picture(rng, photograph_names("train")) for _ in range(60)]
+    assert all(image.shape == (SIDE, SIDE, 3) and image.dtype == np.uint8 for image in images)
+    assert np.median([image.mean() for image in images]) > 60
+    assert np.mean([image.std() > 8 for image in images]) > 0.9
+
+
+def test_patterns_are_varied() -> None:
+    rng = np.random.default_rng(0)
+    images = [pattern(rng, 64) for _ in range(80)]
+    assert all(image.shape == (64, 64, 3) and image.dtype == np.uint8 for image in images)
+    spread = np.array([image.std((0, 1)).max() for image in images])
+    # Plain paint is wanted as well as strong contrast.
+    assert (spread < 6).any() and (spread > 30).any()
+    colors = np.array([color(rng) for _ in range(500)])
+    assert colors.min() >= 0 and colors.max() <= 1 and (colors.std(0) > 0.15).all()
+
+
+def test_noise_fills_its_range() -> None:
+    field = noise(np.random.default_rng(1), 32, coarsest=4)
+    assert field.shape == (32, 32) and field.min() == 0 and field.max() == pytest.approx(1)
+
+
+def test_levels_are_block_means_in_linear_light() -> None:
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (2, SIDE, SIDE, 3), np.uint8)
+    texels = stacked(list(images))
+    linear = decode_srgb(images).astype(np.float64)
+    for level in range(LEVELS):
+        side = SIDE >> level
+        block = 1 << level
+        expected = linear.reshape(2, side, block, side, block, 3).mean((2, 4))
+        found = texels[:, OFFSETS[level] : OFFSETS[level + 1]].reshape(2, side, side, 3)
+        np.testing.assert_allclose(found, expected, atol=2e-6)

@@ -1,0 +1,186 @@
+"""The one parser of settings, on a run's, and what it prints of them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gvtools.depth.foundation.options import FoundationOptions
+from gvtools.depth.stereo.options import StereoOptions
+from gvtools.errors import OptionError
+from gvtools.scenes.rgbd import RgbdOptions
+from gvtools.settings import (
+    changes,
+    listing,
+    markdown,
+    with_file,
+    with_profile,
+    with_texts,
+    with_values,
+)
+from gvtools.settings.base import Settings, entries, keys
+from gvtools.training.options import TrainingSettings
+from pipelines.cli import main
+from pipelines.reconstruction.settings import FusionOptions, RunSettings, SavingsOptions
+
+RUN = RunSettings()
+
+
+def test_texts_are_converted_to_the_field_s_type():
+    texts = ["splat.band=0.03", "views_per_round=4", "voxel=auto", "max_side=NULL"]
+    config = with_texts(RUN, [*texts, "splat.occluders=false", "completer=none"])
+    assert (config.splat.band, config.views_per_round, config.voxel) == (0.03, 4, None)
+    assert (config.max_side, config.splat.occluders, config.completer) == (None, False, "none")
+
+
+def test_options_of_the_completer_go_by_its_name(tmp_path):
+    config = with_texts(RUN, ["completer.sweeps=3", "completer.name=none"])
+    assert config.completer == "none" and config.completer_options == {"sweeps": "3"}
+    path = tmp_path / "c.json"
+    path.write_text('{"completer": {"name": "none", "sweeps": "3"}}')
+    assert with_file(RUN, path) == config
+    path.write_text('{"completer_options": null}')
+    assert with_file(config, path).completer_options == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("splat.bnad=1", "no setting 'splat.bnad'; did you mean 'splat.band'"),
+        ("viewsperround=1", "did you mean 'views_per_round'"),
+        ("zzzz=1", "known keys: context, "),
+        ("voxel.edge=1", "voxel is a value without settings below it"),
+        ("splat=1", "it is a section; set one of its own, such as splat."),
+        ("views_per_round=two", "views_per_round 'two'; expected a valid integer"),
+        ("views_per_round=1.5", "views_per_round '1.5'; expected a valid integer"),
+        ("views_per_round=0", "views_per_round 0; expected at least 1"),
+        ("views_per_round=none", "views_per_round 'none'; expected a valid integer"),
+        ("fusion.voxel_scale=wide", "fusion.voxel_scale 'wide'; expected a valid number"),
+        ("fusion.voxel_scale=nan", "fusion.voxel_scale nan; expected more than 0"),
+        ("device=gpu", "device 'gpu'; expected 'auto', 'cpu' or 'cuda'"),
+        ("splat.band", "expected KEY=VALUE"),
+        ("seed=", "seed ''; expected a valid integer"),
+        ("profile=quick", "profile 'quick'; expected one of fast, balanced, accurate"),
+        ("stereo.window=4", "stereo.window 4; expected an odd number"),
+        ("stereo.views=5", "stereo.views 5 is more than stereo.sources 4"),
+    ],
+)
+def test_a_wrong_text_is_one_line(text, complaint):
+    with pytest.raises(OptionError) as error:
+        with_texts(RUN, [text])
+    assert complaint in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["[1]", "{", '{"nosuch": 1}', '{"seed": true}', '{"context": 3}', '{"profile": {}}']
+)
+def test_a_bad_file_is_named(tmp_path, text):
+    path = tmp_path / "c.json"
+    path.write_text(text)
+    with pytest.raises(OptionError, match=r"c\.json: "):
+        with_file(RUN, path)
+
+
+SECTIONS: list[tuple[Settings, str]] = [
+    (kind(), name)
+    for kind in (FusionOptions, SavingsOptions, StereoOptions, FoundationOptions, RgbdOptions,
+                 RunSettings)
+    for name, entry in entries(kind).items()
+    if entry.limits
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("section", "name"), SECTIONS, ids=[f"{type(s).__name__}.{n}" for s, n in SECTIONS]
+)
+def test_a_range_holds_its_ends_and_nothing_beyond(section, name):
+    for end, limit in entries(type(section))[name].limits.items():
+        beyond = limit + (1 if end in ("at most", "less than") else -1)
+        included = end.startswith("at")
+        for value in [beyond, float("nan"), *([] if included else [limit])]:
+            with pytest.raises(OptionError, match=rf"{name} .*; expected "):
+                section.replaced(**{name: value})
+        # The other fields of stereo have to fit an end.
+        room = {"sources": 8} if name == "views" and isinstance(section, StereoOptions) else {}
+        if included and not (name == "sources" and limit == 0):
+            assert getattr(section.replaced(**room, **{name: limit}), name) == limit
+
+
+FIELDS = st.fixed_dictionaries(
+    {},
+    optional={
+        "voxel": st.none() | st.floats(1e-6, 1e6),
+        "seed": st.integers(0, 2**40),
+        "context": st.text(min_size=1),
+        "completer.sweeps": st.integers() | st.text(),
+        "fusion.max_psnr_drop_db": st.none() | st.floats(0, 100),
+        "savings.reuse": st.booleans(),
+        "splat.band": st.floats(1e-6, 1),
+        "stereo.align": st.none() | st.booleans(),
+    },
+)
+
+
+@given(FIELDS, st.sampled_from(list(RunSettings.profiles)))
+def test_what_changed_makes_the_same_settings_again(values, profile):
+    config = with_values(with_profile(RUN, profile), values)
+    assert with_values(RUN, changes(RUN, config)) == config.replaced(profile="balanced")
+    assert changes(config, config) == {}
+    assert "profile" not in changes(RUN, config)
+    # As JSON has it, and as texts have it.
+    assert with_values(RUN, json.loads(json.dumps(changes(RUN, config)))).voxel == config.voxel
+    plain = {key: value for key, value in values.items() if key not in ("context",)}
+    texts = with_texts(with_profile(RUN, profile), [f"{k}={v}" for k, v in plain.items()])
+    left = {"context": config.context, "completer_options": config.completer_options}
+    assert texts.replaced(**left) == config
+
+
+def test_saved_settings_read_back_equal(tmp_path):
+    config = with_texts(RUN, ["seed=7", "profile=fast", "completer.sweeps=3", "voxel=0.01"])
+    path = tmp_path / "settings.json"
+    path.write_text(json.dumps(config.to_dict()))
+    assert with_file(RUN, path) == config
+
+
+@pytest.mark.parametrize(("profile", "direction"), [(None, 0.0), ("fast", 2.0)])
+def test_a_file_stands_over_its_profile_and_over_one_named_beside_it(tmp_path, profile, direction):
+    path = tmp_path / "c.json"
+    path.write_text('{"memory": {"observations_per_voxel": 8}, "profile": "accurate"}')
+    config = with_file(RUN, path, profile=profile)
+    assert config.memory.observations_per_voxel == 8
+    assert (config.profile, config.memory.same_direction) == (profile or "accurate", direction)
+
+
+def test_later_texts_stand_over_earlier_ones_a_profile_included():
+    assert with_texts(RUN, ["max_side=100", "profile=fast"]).max_side == 480
+    assert with_texts(RUN, ["profile=fast", "max_side=100"]).max_side == 100
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_settings_that_depend_on_each_other_may_come_in_any_order(order):
+    config = with_texts(RUN, ["stereo.sources=8", "stereo.views=8"][::order])
+    assert (config.stereo.sources, config.stereo.views) == (8, 8)
+
+
+@pytest.mark.parametrize("settings", [RUN, TrainingSettings()])
+def test_every_setting_is_documented(settings):
+    text, table = listing(settings), markdown(settings)
+    for key in keys(type(settings)):
+        assert f"  {key}=" in text and f"| `{key}` | `" in table
+    assert all(row.count(" |") == 5 for row in table.splitlines() if row.startswith("| `"))
+    for line in text.splitlines():
+        assert len(line) <= 100
+    wanting = [row for row in table.splitlines() if row.startswith("| `") and row.endswith("|  |")]
+    assert not wanting
+
+
+def test_help_settings_ends_the_program(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["reconstruct", "--help-settings"])
+    assert end.value.code == 0
+    out = capsys.readouterr().out
+    assert "  max_side=1600 px  (integer, at least 64, or none)\n      Longer side" in out
+    assert "fusion: What is taken of depth and of completions." in out

@@ -1,0 +1,64 @@
+"""The README and the generated pages keep up with the code."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from tiny_scan import write_scan
+
+import gvtools
+
+ROOT = Path(gvtools.__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def hooks() -> ModuleType:
+    """What MkDocs runs for each build."""
+    pytest.importorskip("mkdocs")
+    from importlib.util import module_from_spec, spec_from_file_location
+
+    spec = spec_from_file_location("documentation_hooks", ROOT / "docs" / "hooks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
+    assert len(README.split()) < 700
+    links = [link for link in re.findall(r"\]\(([^)#]+)\)", README) if "://" not in link]
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
+    assert (ROOT / "docs/images/growth.png").stat().st_size <= 1_000_000
+
+
+def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not hasattr(gvtools.SpatialMemory, "observe"):
+        pytest.skip("SpatialMemory has no observe yet")
+    code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[0]
+    write_scan(tmp_path / "my" / "scan")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(compile(code, "README.md", "exec"), names)
+    assert names["completion"].depth.shape == names["guidance"].depth.shape  # type: ignore[attr-defined]
+    assert len(names["cloud"].point.positions) == len(names["memory"]) > 0  # type: ignore[attr-defined, arg-type]
+
+
+def test_the_generated_pages_hold_every_command_and_public_name(hooks: ModuleType) -> None:
+    from pipelines.cli import COMMANDS
+
+    commands, python = hooks.commands_page(), hooks.python_page()
+    assert [name for name in COMMANDS if f"\n## gvtools {name}\n" not in commands] == []
+    assert [name for name in gvtools._SOURCES if f"\n## {name}\n" not in python] == []
+
+
+def test_every_setting_has_a_row_with_its_meaning(hooks: ModuleType) -> None:
+    rows = [line.split(" | ") for line in hooks.settings_page().splitlines() if "| `" in line]
+    names = [row[0].strip("| `") for row in rows]
+    assert {"voxel", "seed", "memory.weight_cap"} <= set(names)
+    assert [row[0] for row in rows if len(row[-1].strip(" |")) < 3] == []

@@ -1,0 +1,66 @@
+"""The scripts in ``examples/`` run on a small room and leave what they promise."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+from gvtools.scenes.synthetic import write_room
+
+import gvtools
+
+FOLDER = Path(gvtools.__file__).parent.parent / "examples"
+SCRIPTS = sorted(FOLDER.glob("0*.py"))
+# Of each script: a file that it leaves, and a figure that it prints with its bounds. Holes that
+# stay black give 10 to 15 dB, a projection through a wrong camera about as much.
+PROMISES = {
+    "01_colmap_project": ("colmap/memory.ply", r"PSNR (\S+) dB", 20, 45),
+    "02_scan": ("memory.npz", r"context_01.png: .* (\S+) dB", 22, 45),
+    "03_own_completer": ("completer_nearest/run.json", r"nearest: PSNR (\S+) dB", 20, 45),
+    "04_open3d": ("cloud.ply", r"largest plane .*: (\d+)%", 8, 80),
+    "05_trajectory_errors": ("", r"ATE: .* scale (\S+)", 2.45, 2.55),
+    "06_figure": ("figure/target.png", r"written: .*, .*target.png()", None, None),
+    "07_core_alone": ("core.png", r"depth afterwards (\S+)%", 90, 100),
+    "08_memory_notebook": ("notebook.npz", r"completed: (\S+)%", 90, 100),
+}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("room") / "room"
+    return write_room(folder, views=12, width=160, height=120).folder
+
+
+def test_there_are_eight_short_scripts() -> None:
+    assert [path.stem for path in SCRIPTS] == list(PROMISES)
+    for path in SCRIPTS:
+        assert len(path.read_text(encoding="utf-8").splitlines()) < 50, path.name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_an_example_runs(
+    script: Path,
+    room: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    source = script.read_text(encoding="utf-8")
+    if re.search(r"memory\.(observe|cloud)", source):
+        for name in ("observe", "cloud"):
+            if not hasattr(gvtools.SpatialMemory, name):
+                pytest.skip(f"SpatialMemory has no {name} yet")
+    arguments = [] if script.stem.startswith("05") else [str(room), str(tmp_path)]
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    monkeypatch.setattr(sys, "argv", [str(script), *arguments])
+    monkeypatch.syspath_prepend(str(FOLDER))
+    runpy.run_path(str(script), run_name="__main__")
+    file, pattern, least, most = PROMISES[script.stem]
+    assert (tmp_path / file).stat().st_size > 0
+    found = re.search(pattern, capsys.readouterr().out)
+    assert found
+    assert least is None or most is None or least <= float(found[1]) <= most
