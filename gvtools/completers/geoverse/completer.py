@@ -202,7 +202,7 @@ class GeoVerseCompleter(Completer):
         complete_fill = filled is not None and bool((filled.depth > 0).all())
         cascade = options.cascade_steps
         with self._precision():
-            made = self.model.generate(
+            generated = self.model.generate(
                 batch.to(self._device),
                 seed=seed,
                 names=[names],
@@ -218,13 +218,18 @@ class GeoVerseCompleter(Completer):
             known = context_depth(context, part, size)
             alignment = options.alignment or self.config.alignment
             return to_scene_scale(
-                made, part, cameras, known, alignment=alignment, color_alignment=color_alignment
+                generated,
+                part,
+                cameras,
+                known=known,
+                alignment=alignment,
+                color_alignment=color_alignment,
             )
 
         if filled is None:
             return scaled(options.color_alignment or self.config.color_alignment)
-        made = seamless(made, self.config.patch)
-        return corrected(made, part, filled, back=None if complete_fill else scaled("none"))
+        generated = seamless(generated, self.config.patch)
+        return corrected(generated, part, filled, back=None if complete_fill else scaled("none"))
 
     @property
     def _device(self) -> torch.device:
@@ -240,7 +245,7 @@ class GeoVerseCompleter(Completer):
 
 
 class _Canvas:
-    """The completion, begun from what the memory knows."""
+    """The completion under construction: first the memory's pixels, then what each pass adds."""
 
     def __init__(self, guidance: Guidance) -> None:
         valid = guidance.valid
@@ -256,18 +261,20 @@ class _Canvas:
         nothing = ScaleAlignment(ScaleStatus.NOTHING_TO_COMPLETE)
         self.alignment = [nothing] * len(guidance)
 
-    def put(self, rows: Sequence[int], made: Completed, part: Guidance) -> None:
+    def put(self, rows: Sequence[int], completed: Completed, part: Guidance) -> None:
         """Fill the holes of some views."""
         for position, row in enumerate(rows):
             hole = ~self.valid[row]
-            self.rgb[row][hole] = made.rgb[position][hole]
-            self.depth[row][hole] = made.depth[position][hole]
-            self.confidence[row][hole] = made.confidence[position][hole]
-            if made.rays is not None and np.isfinite(made.scales[position]):
-                self.rays[row][hole] = made.rays[position][hole]
-            self.alignment[row] = made.alignment[position]
-            self.spent["unfilled"] += float((made.depth[position][hole] <= 0).sum())
-            placed = np.isfinite(made.scales[position]) or bool((made.depth[position] > 0).any())
+            self.rgb[row][hole] = completed.rgb[position][hole]
+            self.depth[row][hole] = completed.depth[position][hole]
+            self.confidence[row][hole] = completed.confidence[position][hole]
+            if completed.rays is not None and np.isfinite(completed.scales[position]):
+                self.rays[row][hole] = completed.rays[position][hole]
+            self.alignment[row] = completed.alignment[position]
+            self.spent["unfilled"] += float((completed.depth[position][hole] <= 0).sum())
+            placed = np.isfinite(completed.scales[position]) or bool(
+                (completed.depth[position] > 0).any()
+            )
             self.spent["views_without_scale"] += float(not placed)
 
     def completion(self, spent: dict[str, float]) -> Completion:

@@ -56,37 +56,37 @@ class Completed:
 
 
 def to_scene_scale(
-    made: Generated,
-    part: Guidance,
+    generated: Generated,
+    guidance: Guidance,
     cameras: Cameras,
-    known: NDArray[np.float32],
     *,
+    known: NDArray[np.float32],
     alignment: str,
     color_alignment: str,
 ) -> Completed:
     """Pictures, depth, confidence and rays of the targets at their own size, in scene units.
 
     Args:
-        made: of the pass.
-        part: its targets' projections.
+        generated: of the pass.
+        guidance: its targets' projections.
         cameras: of all views, at the model's size.
         known: (C, h, w) depth of the context at the model's size.
         alignment: see ``depth_scale``.
         color_alignment: see ``color_field``.
     """
-    geometry, context = made.decoded.geometry, len(known)
-    full = (part.depth.shape[1], part.depth.shape[2])
-    rgb = resampled(made.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
+    geometry, context = generated.decoded.geometry, len(known)
+    full = (guidance.depth.shape[1], guidance.depth.shape[2])
+    rgb = resampled(generated.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
     if color_alignment == "field":
-        hint = torch.from_numpy(part.rgb).permute(0, 3, 1, 2)
-        rgb = aligned_color(rgb, hint, torch.from_numpy(part.valid)[:, None])
-    depth = resampled_depth(made.decoded.depth[0].float().cpu(), full)
+        hint = torch.from_numpy(guidance.rgb).permute(0, 3, 1, 2)
+        rgb = aligned_color(rgb, hint, torch.from_numpy(guidance.valid)[:, None])
+    depth = resampled_depth(generated.decoded.depth[0].float().cpu(), full)
     world_from_cam = cameras.world_from_cam
     whole = pass_scale(geometry, world_from_cam, known)
     # A pixel without a colour has no depth either: nothing of it enters the memory.
     depth = torch.where(rgb.isfinite().all(1), depth, torch.nan)
-    scaled = scaled_depth(depth, part.depth, part.valid, whole=whole, alignment=alignment)
-    confidence = _certainty(made.decoded.depth_confidence[0], full)
+    scaled = scaled_depth(depth, guidance.depth, guidance.valid, whole=whole, alignment=alignment)
+    confidence = _certainty(generated.decoded.depth_confidence[0], full)
     confidence[~((scaled.depth > 0) & np.isfinite(confidence))] = 0
     found = scaled.scale[np.isfinite(scaled.scale)]
     rays = None
@@ -97,33 +97,33 @@ def to_scene_scale(
 
 
 def corrected(
-    made: Generated, part: Guidance, fill: Filled, *, back: Completed | None = None
+    generated: Generated, guidance: Guidance, fill: Filled, *, back: Completed | None = None
 ) -> Completed:
     """The filled projection with what the model changed, in views that memory tells of.
 
     Args:
-        made: with the hints' decoding.
-        part: the targets' projections.
+        generated: with the hints' decoding.
+        guidance: the targets' projections.
         fill: the filled projections.
         back: what stands where the fill has no depth; None where it has depth everywhere.
     """
-    assert made.hint is not None
-    full = (part.depth.shape[1], part.depth.shape[2])
+    assert generated.hint is not None
+    full = (guidance.depth.shape[1], guidance.depth.shape[2])
     filled = torch.from_numpy(fill.rgb).permute(0, 3, 1, 2), torch.from_numpy(fill.depth)
     both = [
         (
             resampled(found.rgb[0].float().cpu(), full),
             resampled_depth(found.depth[0].float().cpu(), full)[:, None],
         )
-        for found in (made.decoded, made.hint)
+        for found in (generated.decoded, generated.hint)
     ]
-    valid = torch.from_numpy(part.valid)[:, None]
+    valid = torch.from_numpy(guidance.valid)[:, None]
     rgb = corrected_color(filled[0], both[0][0], both[1][0], valid)
     rgb = rgb.clamp(0, 1).permute(0, 2, 3, 1)
     depth = corrected_depth(filled[1][:, None], both[0][1], both[1][1], valid)[:, 0]
     use = (filled[1] > 0) & rgb.isfinite().all(-1) & depth.isfinite()
     known = use.numpy()
-    scales = depth_ratios(part, both[0][1][:, 0].numpy())
+    scales = depth_ratios(guidance, both[0][1][:, 0].numpy())
     if back is None:
         nothing = np.zeros(known.shape, np.float32)
         back = Completed(
@@ -135,7 +135,7 @@ def corrected(
             tuple(ScaleAlignment(ScaleStatus.UNSUPPORTED, np.nan) for _ in scales),
         )
     if fill.confidence is None:
-        certain = _certainty(made.decoded.depth_confidence[0], full)
+        certain = _certainty(generated.decoded.depth_confidence[0], full)
         certain[~np.isfinite(scales)] = UNSCALED
         certain[~np.isfinite(certain)] = 0
     else:
@@ -155,15 +155,17 @@ def corrected(
     )
 
 
-def depth_ratios(part: Guidance, made: NDArray[np.float32]) -> NDArray[np.float64]:
+def depth_ratios(guidance: Guidance, generated: NDArray[np.float32]) -> NDArray[np.float64]:
     """(T,) scene units per unit of the model; NaN where its depth is not the memory's by a factor.
 
     Args:
-        part: the targets' projections.
-        made: (T, H, W) depth in the model's unit.
+        guidance: the targets' projections.
+        generated: (T, H, W) depth in the model's unit.
     """
-    found = np.full(len(part), np.nan)
-    for index, (view, known, valid) in enumerate(zip(made, part.depth, part.valid, strict=True)):
+    found = np.full(len(guidance), np.nan)
+    for index, (view, known, valid) in enumerate(
+        zip(generated, guidance.depth, guidance.valid, strict=True)
+    ):
         both = valid & (known > 0) & (view > 0) & np.isfinite(known) & np.isfinite(view)
         ratio = np.log(known[both] / view[both])[:: max(1, int(both.sum()) // LOOKED_AT)]
         if len(ratio) < LEAST:
@@ -180,11 +182,11 @@ def _certainty(confidence: Tensor, full: tuple[int, int]) -> NDArray[np.float32]
     return (GENERATED * (1 - 1 / certain.clamp_min(1))).numpy().astype(np.float32)
 
 
-def averaged(part: Guidance) -> Filled:
+def averaged(guidance: Guidance) -> Filled:
     """Projections filled as the model fills them, at their own size."""
-    valid = torch.from_numpy(part.valid)[:, None]
-    color = push_pull(torch.from_numpy(part.rgb).permute(0, 3, 1, 2), valid)
-    depth = push_pull_depth(torch.from_numpy(part.depth)[:, None], valid)
+    valid = torch.from_numpy(guidance.valid)[:, None]
+    color = push_pull(torch.from_numpy(guidance.rgb).permute(0, 3, 1, 2), valid)
+    depth = push_pull_depth(torch.from_numpy(guidance.depth)[:, None], valid)
     return Filled(color.permute(0, 2, 3, 1).numpy(), depth[:, 0].numpy())
 
 

@@ -46,11 +46,15 @@ def surface_fill(
         guidance: the projections.
         shared: carry fills from view to view; their order does not matter.
     """
-    made = InpaintCompleter().complete(context, guidance)
+    completion = InpaintCompleter().complete(context, guidance)
     known = guidance.valid
     if shared and len(guidance) > 1:
-        known = _shared(context, guidance, made)
-    rgb, depth, confidence = made.rgb.copy(), made.depth.copy(), made.confidence.copy()
+        known = _shared(context, guidance, completion)
+    rgb, depth, confidence = (
+        completion.rgb.copy(),
+        completion.depth.copy(),
+        completion.confidence.copy(),
+    )
     holes = ~(depth > 0) & known.any(axis=(1, 2), keepdims=True)
     for index in np.flatnonzero(holes.any(axis=(1, 2))):
         hole = holes[index]
@@ -65,9 +69,9 @@ def surface_fill(
 
 
 def _shared(
-    context: Sequence[ContextView], guidance: Guidance, made: Completion
+    context: Sequence[ContextView], guidance: Guidance, completion: Completion
 ) -> NDArray[np.bool_]:
-    """Carry fills from view to view, the best known view first; ``made`` is written into.
+    """Carry fills from view to view, the best known view first; ``completion`` is written into.
 
     Returns:
         (V, H, W) where memory or another view's fill knows.
@@ -81,15 +85,15 @@ def _shared(
         if memory is not None:
             carried = memory.project(view.cameras)
             surer = ~view.valid & carried.valid
-            surer &= carried.confidence > SURER * made.confidence[index]
+            surer &= carried.confidence > SURER * completion.confidence[index]
             if surer.any():
                 view = _with(view, carried, surer)
                 again = InpaintCompleter().complete(context, view)
-                made.rgb[index], made.depth[index] = again.rgb[0], again.depth[0]
-                made.confidence[index] = again.confidence[0]
+                completion.rgb[index], completion.depth[index] = again.rgb[0], again.depth[0]
+                completion.confidence[index] = again.confidence[0]
                 known[index] = view.valid[0]
         if index != order[-1]:
-            memory = _lifted(memory, view, made, index)
+            memory = _lifted(memory, view, completion, index)
     return known
 
 
@@ -105,20 +109,20 @@ def _with(view: Guidance, carried: Guidance, where: NDArray[np.bool_]) -> Guidan
 
 
 def _lifted(
-    memory: SpatialMemory | None, view: Guidance, made: Completion, index: int
+    memory: SpatialMemory | None, view: Guidance, completion: Completion, index: int
 ) -> SpatialMemory | None:
     """The memory of the fills, with what this view filled itself."""
-    confidence = made.confidence[index]
+    confidence = completion.confidence[index]
     own = ~view.valid[0] & (confidence >= CARRIED)
     if not own.any():
         return memory
     if memory is None:
         memory = SpatialMemory(
-            _footprint(made.depth[index], view.cameras), origin=view.cameras.centers[0]
+            _footprint(completion.depth[index], view.cameras), origin=view.cameras.centers[0]
         )
     points = back_project(
-        np.rint(np.clip(made.rgb[index], 0, 1) * 255).astype(np.uint8),
-        made.depth[index],
+        np.rint(np.clip(completion.rgb[index], 0, 1) * 255).astype(np.uint8),
+        completion.depth[index],
         view.cameras,
         frame=memory.frame,
         # Unused outside the mask, where it must still be positive.

@@ -198,19 +198,11 @@ def test_a_value_of_ones_own_takes_its_place_among_the_others():
     assert list(axes_of("recorded", config)["far voxels, footprints"]) == ["1", "0"]
 
 
-def test_the_generative_cores_settings_are_swept_where_it_completes(tmp_path):
-    pytest.importorskip("safetensors", reason="weights are read with safetensors")
-    import geoverse_models as micro
-
-    prior = "holes without video prior, share of the diagonal"
-    for injection in ("none", "control"):
-        weights = micro.weights_folder(tmp_path / injection, micro.config(injection=injection))
-        # What the prior is read from; nothing is completed here.
-        (weights / "video").mkdir()
-        core = ["completer=geoverse", f"completer.weights={weights}", "completer.steps=2"]
-        axes = axes_of("recorded", with_texts(RunSettings(), core))
-        assert (prior in axes) == (injection == "control")
-        assert axes["generative steps"]["2"] == {} and "1" in axes["generative steps"]
-        assert list(axes["completer"]) == ["none", "inpaint", "geoverse"]
-    own = with_texts(RunSettings(), [*core, "completer.no_prior_holes=0.2"])
-    assert axes_of("recorded", own)[prior]["0"] == {"completer.no_prior_holes": 0.0}
+def test_the_generative_cores_settings_are_swept_where_it_completes():
+    reduced = "holes of reduced effort, share of the diagonal"
+    assert reduced not in axes_of("recorded", RunSettings())
+    core = ["completer=geoverse", "completer.steps=2", "effort.reduced_below=0.2"]
+    axes = axes_of("recorded", with_texts(RunSettings(), core))
+    assert list(axes[reduced]) == ["0.3", "0.2", "0.1", "0"] and axes[reduced]["0.2"] == {}
+    assert axes["generative steps"]["2"] == {} and "1" in axes["generative steps"]
+    assert list(axes["completer"]) == ["none", "inpaint", "geoverse"]
