@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gvtools.settings import changes, with_values
 from pipelines.console import Console
 from pipelines.reconstruction.voxel_edge import automatic_voxel
 
@@ -52,17 +51,19 @@ class Plan:
     @property
     def derived(self) -> dict[str, Any]:
         """What the run's settings leave open, by dotted key: voxel edge, rounds, device, ..."""
+        from gvtools.settings import changes
+
         return changes(self.settings, self.config)
 
 
 def make_plan(
-    scene: Scene, config: RunSettings, *, say: Callable[[str], None] | None = None
+    scene: Scene, settings: RunSettings, *, say: Callable[[str], None] | None = None
 ) -> Plan:
     """Resolve selections, depth source, voxel edge and schedule.
 
     Args:
         scene: the project.
-        config: as the user gave it.
+        settings: as the user gave them.
         say: is told what is computed meanwhile.
 
     Raises:
@@ -83,7 +84,7 @@ def make_plan(
             f"{scene.root}: {errors[0]}"
             + (f" (and {len(errors) - 1} more; see 'gvtools check')" if len(errors) > 1 else "")
         )
-    settings, config = config, _on_device(config)
+    config = _on_device(settings)
     scene = reduced(scene, config.max_side)
     completer = create(config.completer, **config.completer_options)
     # By name: a project may list its views in any order, and merging depends on theirs.
@@ -134,6 +135,7 @@ def _on_device(config: RunSettings) -> RunSettings:
     "auto" is CUDA where the torch back end was chosen, may choose, and finds such a device.
     """
     from gvtools.errors import OptionError
+    from gvtools.settings import with_values
 
     splat, device = config.splat, config.device
     if device == "cuda" and splat.backend in ("nearest", "open3d"):

@@ -22,7 +22,16 @@ from gvtools.settings import (
     with_values,
 )
 from gvtools.settings.base import Settings, entries, keys
-from gvtools.training.options import TrainingSettings
+from gvtools.training.corruption import CorruptionOptions
+from gvtools.training.options import (
+    DataOptions,
+    DenoiserStageOptions,
+    EncoderStageOptions,
+    HeadsStageOptions,
+    OptimizerOptions,
+    ReflowStageOptions,
+    TrainingSettings,
+)
 from pipelines.cli import main
 from pipelines.reconstruction.settings import FusionOptions, RunSettings, SavingsOptions
 
@@ -87,7 +96,8 @@ def test_a_bad_file_is_named(tmp_path, text):
 SECTIONS: list[tuple[Settings, str]] = [
     (kind(), name)
     for kind in (FusionOptions, SavingsOptions, StereoOptions, FoundationOptions, RgbdOptions,
-                 RunSettings)
+                 RunSettings, OptimizerOptions, EncoderStageOptions, DenoiserStageOptions,
+                 ReflowStageOptions, HeadsStageOptions, DataOptions, CorruptionOptions)
     for name, entry in entries(kind).items()
     if entry.limits
 ]  # fmt: skip

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from gvtools.cameras import Cameras, Float64, concatenate
 from gvtools.errors import DegenerateError, OptionError, ShapeError
@@ -31,13 +32,13 @@ from gvtools.evaluation.pose_probe.lifting import lift_keypoints
 from gvtools.evaluation.pose_probe.located import LOCATED, Located
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.options import check_range
+from gvtools.settings import Settings
 
 # Cells along the longer side of a picture, in which the spread of the inliers is counted.
 CELLS = 16
 
 
-@dataclass(frozen=True, kw_only=True)
-class PoseProbeOptions:
+class PoseProbeOptions(Settings):
     """How a picture is located, and when it counts as located.
 
     The thresholds on inliers and cells were set on a real room of 5 to 50 context views at 640x480.
@@ -45,35 +46,25 @@ class PoseProbeOptions:
     photographs of the room, where things are symmetric, 20; photographs cut into 8x8 pieces and
     shuffled, 66 in 8 cells, which are those of one piece. Held-out photographs have 51 and more, in
     27 cells and more. COLMAP's mapper asks for 30.
-
-    Attributes:
-        views: context views to match; all are when there are no more.
-        prominent: keypoints of a picture by which those views are chosen.
-        edge: a keypoint is lifted where the depths around it spread over less than this share.
-        max_error: reprojection error of an inlier, pixels; None means 1/160 of the picture's
-            longer side (4 pixels at 640, 12 at 1920), at least 2.
-        min_inliers: fewer do not locate a picture.
-        min_cells: nor do inliers in fewer cells of the picture; its longer side has 16.
-        max_rival: nor does a pose while another, which contradicts it, has this share of its
-            inliers.
     """
 
-    views: int = 10
-    prominent: int = 500
-    edge: float = 0.05
-    max_error: float | None = None
-    min_inliers: int = 25
-    min_cells: int = 10
-    max_rival: float = 0.5
+    section = "pose_probe"
 
-    def __post_init__(self) -> None:
-        check_range("pose_probe.views", self.views, least=1)
-        check_range("pose_probe.prominent", self.prominent, least=1)
-        check_range("pose_probe.edge", self.edge, above=0)
-        check_range("pose_probe.max_error", self.max_error, above=0)
-        check_range("pose_probe.min_inliers", self.min_inliers, least=4)
-        check_range("pose_probe.min_cells", self.min_cells, least=1)
-        check_range("pose_probe.max_rival", self.max_rival, above=0, most=1)
+    views: int = Field(10, ge=1)
+    """Context views to match; all are when there are no more."""
+    prominent: int = Field(500, ge=1)
+    """Keypoints of a picture by which those views are chosen."""
+    edge: float = Field(0.05, gt=0)
+    """A keypoint is lifted where the depths around it spread over less than this share."""
+    max_error: float | None = Field(None, gt=0)
+    """Reprojection error of an inlier; none means 1/160 of the picture's longer side (4 pixels at
+    640, 12 at 1920), at least 2. [px]"""
+    min_inliers: int = Field(25, ge=4)
+    """Fewer do not locate a picture."""
+    min_cells: int = Field(10, ge=1)
+    """Nor do inliers in fewer cells of the picture; its longer side has 16."""
+    max_rival: float = Field(0.5, gt=0, le=1)
+    """Nor does a pose while another, which contradicts it, has this share of its inliers."""
 
 
 @dataclass(frozen=True, eq=False)
