@@ -137,7 +137,7 @@ def _on_device(config: RunSettings) -> RunSettings:
     from gvtools.errors import OptionError
     from gvtools.settings import with_values
 
-    splat, device = config.splat, config.device
+    splat, device = config.splat, str(config.device)
     if device == "cuda" and splat.backend in ("nearest", "open3d"):
         raise OptionError(
             f"device cuda with splat.backend {splat.backend}, which computes on the CPU; expected "

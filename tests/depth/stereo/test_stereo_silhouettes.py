@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from stereo_scenes import plane_scene
@@ -100,7 +98,7 @@ def test_growth_fills_what_no_view_confirms_and_leaves_blank_surfaces_unknown():
     options = StereoOptions(levels=2, align=False, speckle=20, tolerance=0.004)
     known = {}
     for regrow in (0, 20):
-        chosen = replace(options, regrow=regrow)
+        chosen = options.replaced(regrow=regrow)
         stereo = PlaneSweepStereo(scene, options=chosen, views=scene.names)
         known[regrow] = stereo.depth(scene, view, view.load()).depth
     x = view.camera.centers[0, 0] + made.depths[2] * view.camera.rays()[..., 0]

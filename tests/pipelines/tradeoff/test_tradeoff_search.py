@@ -276,7 +276,7 @@ def knobs_in(source: str, config: RunSettings) -> dict[str, Knob]:
     """The knobs of a run whose depth comes from ``source``, by name."""
     cameras = SimpleNamespace(width=np.array([640]), height=np.array([480]))
     plan = SimpleNamespace(
-        config=replace(config, voxel=0.01),
+        config=config.replaced(voxel=0.01),
         targets=SimpleNamespace(cameras=cameras),
         source=SimpleNamespace(name=source),
     )
