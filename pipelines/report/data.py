@@ -93,7 +93,7 @@ def collect(
         title=f"{path.resolve().name}: a run of gvtools",
         facts=_facts(record, reports),
         rounds=reports,
-        changed=_changed(settings),
+        changed=_changed(dotted(record["settings"])),
         settings={key: _said(value) for key, value in settings.items()},
         warnings=[
             *_warnings(record, reports),

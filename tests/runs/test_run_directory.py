@@ -45,7 +45,7 @@ def test_the_settings_of_a_run_with_rounds_bind(scan, tmp_path, capsys):
     assert reconstruct(scan, out) == 0
     shutil.rmtree(out / "round_002")
     assert reconstruct(scan, out, "--resume", "--voxel", "0.3") == 2
-    assert "config differ" in capsys.readouterr().err
+    assert "settings, derived differ" in capsys.readouterr().err
 
 
 def test_a_changed_reading_of_the_project_is_another_run(scan, tmp_path, capsys):

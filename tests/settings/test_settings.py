@@ -164,6 +164,13 @@ def test_a_file_stands_over_its_profile_and_over_one_named_beside_it(tmp_path, p
     assert (config.profile, config.memory.same_direction) == (profile or "accurate", direction)
 
 
+def test_a_section_by_itself_goes_by_its_full_name():
+    assert with_texts(StereoOptions(), ["planes=16", "align=auto"]).planes == 16
+    for text, complaint in (("plane=1", "'stereo.planes'"), ("planes=1", "stereo.planes 1;")):
+        with pytest.raises(OptionError, match=complaint):
+            with_texts(StereoOptions(), [text])
+
+
 def test_later_texts_stand_over_earlier_ones_a_profile_included():
     assert with_texts(RUN, ["max_side=100", "profile=fast"]).max_side == 480
     assert with_texts(RUN, ["profile=fast", "max_side=100"]).max_side == 100
