@@ -73,6 +73,7 @@ def test_options_of_the_completer_go_by_its_name(tmp_path):
         ("splat.band", "expected KEY=VALUE"),
         ("seed=", "seed ''; expected a valid integer"),
         ("profile=quick", "profile 'quick'; expected one of fast, balanced, accurate"),
+        ("da3.device=tpu", "da3.device 'tpu'; expected 'auto', 'cpu' or 'cuda'"),
         ("stereo.window=4", "stereo.window 4; expected an odd number"),
         ("stereo.views=5", "stereo.views 5 is more than stereo.sources 4"),
     ],
@@ -140,9 +141,7 @@ def test_what_changed_makes_the_same_settings_again(values, profile):
     assert with_values(RUN, changes(RUN, config)) == config.replaced(profile="balanced")
     assert changes(config, config) == {}
     assert "profile" not in changes(RUN, config)
-    # As JSON has it, and as texts have it.
-    assert with_values(RUN, json.loads(json.dumps(changes(RUN, config)))).voxel == config.voxel
-    plain = {key: value for key, value in values.items() if key not in ("context",)}
+    plain = {key: value for key, value in values.items() if not key.startswith("co")}
     texts = with_texts(with_profile(RUN, profile), [f"{k}={v}" for k, v in plain.items()])
     left = {"context": config.context, "completer_options": config.completer_options}
     assert texts.replaced(**left) == config

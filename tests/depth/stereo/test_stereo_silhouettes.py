@@ -9,7 +9,6 @@ from stereo_scenes import plane_scene
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.depth.stereo.silhouettes import ALIKE, ROUNDS, regrown, trimmed
-from gvtools.errors import OptionError
 
 ROOF, SKY = 60, 230
 
@@ -108,8 +107,3 @@ def test_growth_fills_what_no_view_confirms_and_leaves_blank_surfaces_unknown():
     new = (known[20] > 0) & (known[0] == 0) & textured
     error = np.abs(known[20][new] / made.depths[2][new] - 1)
     assert np.median(error) < 0.02
-
-
-def test_a_negative_reach_is_refused():
-    with pytest.raises(OptionError, match="regrow"):
-        StereoOptions(regrow=-1)

@@ -16,7 +16,7 @@ from gvtools.depth.stereo.motion import enough_disparity
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.depth.stereo.texture import CLEAR, detail_of, noise_of, textured
-from gvtools.errors import DegenerateError, OptionError
+from gvtools.errors import DegenerateError
 from gvtools.scenes.scene import Scene, View
 
 OPTIONS = StereoOptions(levels=2, speckle=20)
@@ -119,8 +119,3 @@ def test_depth_follows_the_scene_units(scale):
     known = depth > 0
     assert known.mean() > 0.7
     assert np.median(np.abs(depth[known] / (scale * made.depths[1][known]) - 1)) < 0.005
-
-
-def test_more_confirming_views_than_sources_are_refused():
-    with pytest.raises(OptionError, match=r"stereo\.views 5 .* stereo\.sources 2"):
-        StereoOptions(sources=2, views=5)
