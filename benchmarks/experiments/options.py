@@ -2,42 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
-from gvtools.options import check_range
+from pydantic import Field
+
+from gvtools.settings import Settings
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExperimentOptions:
-    """Options of every experiment; each says which it reads.
-
-    Attributes:
-        weights: of the student, or what a training starts from; None takes those that ship.
-        teacher: the undistilled model's; None leaves its rows out.
-        scenes: held-out scenes.
-        size: of the pictures, px; None for the experiment's own.
-        seed: of scenes, noise and training.
-        steps: of a training within the experiment.
-        out: folder of what a training within the experiment leaves.
-        project: a recorded scene.
-        pictures: folder for pictures side by side.
-        training: the configuration of a training within the experiment, see ``gvtools train``.
-    """
+class ExperimentOptions(Settings):
+    """Options of every experiment; each says which it reads."""
 
     weights: Path | None = None
+    """Of the student, or what a training starts from; none takes those that ship."""
     teacher: Path | None = None
-    scenes: int = 64
-    size: int | None = None
-    seed: int = 0
-    steps: int = 600
+    """The undistilled model's; none leaves its rows out."""
+    scenes: int = Field(64, ge=1)
+    """Held-out scenes."""
+    size: int | None = Field(None, ge=48)
+    """Of the pictures; none for the experiment's own. [px]"""
+    seed: int = Field(0, ge=0)
+    """Of scenes, noise and training."""
+    steps: int = Field(600, ge=1)
+    """Of a training within the experiment."""
     out: Path | None = None
+    """Folder of what a training within the experiment leaves."""
     project: Path | None = None
+    """A recorded scene."""
     pictures: Path | None = None
+    """Folder for pictures side by side."""
     training: str = "tiny"
-
-    def __post_init__(self) -> None:
-        check_range("scenes", self.scenes, least=1)
-        check_range("size", self.size, least=48)
-        check_range("seed", self.seed, least=0)
-        check_range("steps", self.steps, least=1)
+    """The settings of a training within the experiment, see ``gvtools train``."""

@@ -92,7 +92,7 @@ class Entry:
     kind: Any
     limits: Mapping[str, float]
     doc: str
-    unit: str
+    unit: str = ""
 
     @property
     def section(self) -> type[Any] | None:
@@ -133,8 +133,9 @@ def _entry(kind: Any, metadata: Sequence[Any], doc: str) -> Entry:
         for end, word in _ENDS.items()
         if getattr(item, end, None) is not None
     }
-    text, unit = re.fullmatch(r"(.*?)(?: \[([^\]]*)\])?", " ".join(doc.split())).groups("")
-    return Entry(kind, limits, text, unit)
+    text = " ".join(doc.split())
+    unit = re.search(r" \[([^\]]*)\]$", text)
+    return Entry(kind, limits, text[: unit.start()], unit[1]) if unit else Entry(kind, limits, text)
 
 
 def describe(error: ValidationError, kind: type[Settings]) -> str:

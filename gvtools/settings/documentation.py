@@ -42,8 +42,8 @@ def markdown(settings: Settings) -> str:
 _Rows = list[tuple[str, str, str, Entry]]
 
 
-def _sections(settings: Any, prefix: str = "") -> Iterator[tuple[str, str, _Rows]]:
-    """Each section's key, first line of documentation, and its rows."""
+def _sections(settings: Any, prefix: str = "", doc: str = "") -> Iterator[tuple[str, str, _Rows]]:
+    """Each section's key, its class's first line with its own documentation, and its rows."""
     rows: _Rows = []
     inner = []
     for name, entry in entries(type(settings)).items():
@@ -52,11 +52,11 @@ def _sections(settings: Any, prefix: str = "") -> Iterator[tuple[str, str, _Rows
             rows.append((key, _shown(value), _accepts(entry), entry))
         else:
             # What an absent section would hold.
-            inner.append((key, entry.section() if value is None else value))
+            inner.append((key, entry.section() if value is None else value, entry.doc))
     about = (type(settings).__doc__ or "").strip().split("\n")[0]
-    yield prefix.rstrip("."), about, rows
-    for key, value in inner:
-        yield from _sections(value, f"{key}.")
+    yield prefix.rstrip("."), f"{about} {doc}".strip(), rows
+    for key, value, doc in inner:
+        yield from _sections(value, f"{key}.", doc)
 
 
 def _shown(value: Any) -> str:

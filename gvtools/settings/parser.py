@@ -126,9 +126,10 @@ def _path(kind: type[Settings], key: str) -> list[str]:
     return [field, ".".join(rest)] if field and rest else [head, *rest]
 
 
-def _put(tree: dict[str, Any], path: list[str], value: Any, *, kind: type[Any]) -> None:
+def _put(tree: dict[str, Any], path: list[str], value: Any, *, kind: type[Settings]) -> None:
     """Enter a value into the tree of changes, converted as far as its text needs."""
-    key, inner, place = ".".join(path), kind, tree
+    inner: type[Any]
+    key, inner, place = ".".join([kind.section, *path] if kind.section else path), kind, tree
     for at, name in enumerate(path):
         entry = entries(inner).get(name)
         if entry is None:

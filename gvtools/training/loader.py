@@ -17,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 
 from gvtools.errors import GvError, OptionError
-from gvtools.options import check_range
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.dataset import Samples
 from gvtools.training.view_sample import Sample, collated
@@ -52,10 +51,6 @@ class BatchLoader:
         share: Callable[[range], range] | None = None,
         start: int = 0,
     ) -> None:
-        check_range("loader.batch", batch, least=1)
-        check_range("loader.workers", workers, least=0)
-        check_range("loader.ahead", ahead, least=1)
-        check_range("loader.start", start, least=0)
         self.data, self.batch, self.workers, self.ahead = data, batch, workers, ahead
         self.share = share
         self.next_index = start

@@ -228,7 +228,7 @@ class TrainingSettings(Settings):
 
     model: str = "tiny"
     """A configuration by name ("tiny", "base") or the path of its JSON file."""
-    seed: int = 0
+    seed: int = Field(0, ge=0)
     """Of everything random."""
     parallel: Literal["data", "sharded"] = "data"
     """What several processes hold: data, each of them everything; sharded, a part of all

@@ -36,7 +36,7 @@ STAND_IN = "the video prior is not run: random features stand in for its own"
 
 def complete_figures(options: CompleteOptions) -> dict[str, Any]:
     """The figures as a JSON object: rows under ``results``, what is null under ``notes``."""
-    config = options.model_config()
+    config = options.network()
     batch = random_views(options.picture(config), context=options.context, targets=options.targets)
     bounds = interval_bounds(options.steps, shift=config.flow.shift)
     cascade_bounds = interval_bounds(options.cascade_steps, shift=config.flow.shift)

@@ -2,61 +2,61 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import torch
+from pydantic import Field, model_validator
 
 from gvtools.completers.geoverse.config import GeoVerseConfig, named
 from gvtools.completers.geoverse.weights.folder import config_of
 from gvtools.errors import OptionError
-from gvtools.options import check_range
+from gvtools.settings import Settings
+
+Count = Annotated[int, Field(ge=1)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class CompleteOptions:
-    """See the module; ``None`` is derived, and written with the figures.
+class CompleteOptions(Settings):
+    """See the module; none is derived, and written with the figures."""
 
-    Attributes:
-        config: "tiny" or "base"; None for the weights' own, "tiny" without weights.
-        weights: folder of a model; None for random numbers.
-        size: (H, W), px; None for the configuration's square.
-        context: photographs in a pass.
-        targets: views to complete.
-        steps: of level 1.
-        cascade_steps: of level 0.
-        device: "auto" takes a GPU where there is one.
-        precision: "float32" or "bfloat16"; None for bfloat16 on a GPU and float32 on a CPU.
-        video: run the video prior; None: where the configuration has one, but not on a CPU.
-        repeat: timed passes.
-        flops_only: run nothing.
-        compile: compile the denoisers and the RGB head first.
-    """
+    section = "bench complete"
 
     config: str | None = None
+    """Tiny or base; none for the weights' own, tiny without weights."""
     weights: Path | None = None
+    """Folder of a model; none for random numbers."""
     size: tuple[int, int] | None = None
-    context: int = 2
-    targets: int = 6
-    steps: int = 3
-    cascade_steps: int = 1
-    device: str = "auto"
-    precision: str | None = None
+    """(H, W); none for the configuration's square. [px]"""
+    context: Count = 2
+    """Photographs in a pass."""
+    targets: Count = 6
+    """Views to complete."""
+    steps: Count = 3
+    """Of level 1."""
+    cascade_steps: Count = 1
+    """Of level 0."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where the model runs; "auto" takes a GPU where there is one."""
+    precision: Literal["float32", "bfloat16"] | None = None
+    """None for bfloat16 on a GPU and float32 on a CPU."""
     video: bool | None = None
-    repeat: int = 9
+    """Run the video prior; none: where the configuration has one, but not on a CPU."""
+    repeat: Count = 9
+    """Timed passes."""
     flops_only: bool = False
+    """Run nothing."""
     compile: bool = False
+    """Compile the denoisers and the RGB head first."""
 
-    def __post_init__(self) -> None:
-        for name in ("context", "targets", "steps", "cascade_steps", "repeat"):
-            check_range(f"bench complete: {name}", getattr(self, name), least=1)
+    @model_validator(mode="after")
+    def _check(self) -> CompleteOptions:
         if self.config is not None and self.weights is not None:
             raise OptionError(
                 "bench complete: both --config and --weights; a weights folder has its own config"
             )
         if self.device == "cuda" and not torch.cuda.is_available():
             raise OptionError("bench complete: --device cuda, and torch sees no CUDA device here")
-        config = self.model_config()
+        config = self.network()
         if self.video and config.video is None:
             raise OptionError(f"bench complete: --video, and {config.name} has no video prior")
         if any(side <= 0 or side % config.patch for side in self.picture(config)):
@@ -65,8 +65,9 @@ class CompleteOptions:
                 f"--size {height}x{width}: expected multiples of {config.patch}, a token's edge "
                 f"in {config.name}"
             )
+        return self
 
-    def model_config(self) -> GeoVerseConfig:
+    def network(self) -> GeoVerseConfig:
         """Of the model."""
         return named(self.config or "tiny") if self.weights is None else config_of(self.weights)
 

@@ -18,8 +18,8 @@ class HelpSettings(argparse.Action):
         options: of the option, see ``argparse.Action``.
     """
 
-    def __init__(self, *args: Any, settings: Callable[[], Settings], **options: Any) -> None:
-        super().__init__(*args, nargs=0, **options)
+    def __init__(self, *, settings: Callable[[], Settings], **options: Any) -> None:
+        super().__init__(**options, nargs=0)
         self._settings = settings
 
     def __call__(self, parser: argparse.ArgumentParser, *args: object) -> None:

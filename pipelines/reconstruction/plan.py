@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.runs.identity import array_digest, fingerprint
-from gvtools.settings import changes, with_values
+from gvtools.settings import changes
 from gvtools.view_selection import evenly_spread
 from pipelines.console import Console
 from pipelines.reconstruction.voxel_edge import automatic_voxel
@@ -58,17 +58,19 @@ class Plan:
     @property
     def derived(self) -> dict[str, Any]:
         """What the run's settings leave open, by dotted key: voxel edge, rounds, device, ..."""
+        from gvtools.settings import changes
+
         return changes(self.settings, self.config)
 
 
 def make_plan(
-    scene: Scene, config: RunSettings, *, say: Callable[[str], None] | None = None
+    scene: Scene, settings: RunSettings, *, say: Callable[[str], None] | None = None
 ) -> Plan:
     """Resolve selections, depth source, voxel edge and schedule.
 
     Args:
         scene: the project.
-        config: as the user gave it.
+        settings: as the user gave them.
         say: is told what is computed meanwhile.
 
     Raises:
@@ -87,7 +89,7 @@ def make_plan(
             f"{scene.root}: {errors[0]}"
             + (f" (and {len(errors) - 1} more; see 'gvtools check')" if len(errors) > 1 else "")
         )
-    settings, config = config, _on_device(config)
+    config = _on_device(settings)
     scene = reduced(scene, config.max_side)
     completer = config.effort.applied(create(config.completer, **config.completer_options))
     # By name: a project may list its views in any order, and merging depends on theirs.
@@ -151,9 +153,9 @@ def _on_device(config: RunSettings) -> RunSettings:
     "auto" is CUDA where the torch back end was chosen, may choose, and finds such a device.
     """
     from gvtools.errors import OptionError
+    from gvtools.settings import with_values
 
-    splat = config.splat
-    device: str = config.device
+    splat, device = config.splat, str(config.device)
     if device == "cuda" and splat.backend in ("nearest", "open3d"):
         raise OptionError(
             f"device cuda with splat.backend {splat.backend}, which computes on the CPU; expected "

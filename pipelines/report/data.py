@@ -86,7 +86,7 @@ def collect(
         title=f"{path.resolve().name}: a run of gvtools",
         facts=_facts(run),
         rounds=reports,
-        changed=_changed(settings),
+        changed=_changed(dotted(record["settings"])),
         settings={key: _said(value) for key, value in settings.items()},
         warnings=[
             *_warnings(record, reports),

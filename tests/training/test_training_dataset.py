@@ -332,5 +332,3 @@ def test_impossible_data_is_refused() -> None:
         ProceduralViews(views=4)
     with pytest.raises(OptionError, match="sample -1"):
         CLEAN.sample(-1)
-    with pytest.raises(OptionError, match=r"corruption\.holes"):
-        CorruptionOptions(holes=1.5)

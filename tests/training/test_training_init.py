@@ -227,4 +227,4 @@ def test_the_training_of_base_is_the_papers():
 
 def test_an_unknown_way_of_sharing_is_refused(tmp_path, capsys):
     assert main(["train", "micro", "--out", str(tmp_path), "--set", "parallel=fsdp"]) == 2
-    assert "parallel = 'fsdp'; expected data or sharded" in capsys.readouterr().err
+    assert "parallel 'fsdp'; expected 'data' or 'sharded'" in capsys.readouterr().err

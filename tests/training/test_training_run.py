@@ -256,7 +256,7 @@ def test_a_training_is_not_mixed_with_another(trained, tmp_path, capsys):
     assert train(tmp_path / "new", "denoiser") == 2
     assert "run --stage encoder first" in capsys.readouterr().err
     assert train(tmp_path / "new", "encoder", "--set", "encoder.optimizer.stepz=3") == 2
-    assert "did you mean 'steps'" in capsys.readouterr().err
+    assert "did you mean 'encoder.optimizer.steps'" in capsys.readouterr().err
     assert main(["train", "huge", "--out", str(tmp_path / "x")]) == 2
     assert "known: base, micro, tiny" in capsys.readouterr().err
 

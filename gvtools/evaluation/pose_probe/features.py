@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr
 
 from gvtools.errors import ShapeError
-from gvtools.networks.config_json import check_range
+from gvtools.settings import Settings
 
 # Lightness of BT.601, as grey pictures are commonly made for SIFT.
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
@@ -63,29 +64,23 @@ class FeatureMatcher(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
-class SiftMatcher:
+class SiftMatcher(Settings):
     """SIFT through pycolmap, matched by mutual nearest neighbours and the ratio test.
 
     The detector is COLMAP's (VLFeat's, on a picture of twice the size); descriptors are RootSIFT
     (R. Arandjelović and A. Zisserman, "Three things everyone should know to improve object
     retrieval", CVPR 2012). The ratio test is that of D. Lowe, IJCV 60(2), 2004, section 7.1.
-
-    Attributes:
-        max_features: of a picture; those of the largest scale are kept.
-        ratio: a match is kept when its distance is below this share of the second nearest's.
-        max_distance: between the unit descriptors of a match (0.7 is COLMAP's).
     """
 
-    max_features: int = 3000
-    ratio: float = 0.8
-    max_distance: float = 0.7
-    _extractor: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
+    section = "sift"
 
-    def __post_init__(self) -> None:
-        check_range("sift.max_features", self.max_features, ge=1)
-        check_range("sift.ratio", self.ratio, gt=0, le=1)
-        check_range("sift.max_distance", self.max_distance, gt=0, le=2)
+    max_features: int = Field(3000, ge=1)
+    """Of a picture; those of the largest scale are kept."""
+    ratio: float = Field(0.8, gt=0, le=1)
+    """A match is kept when its distance is below this share of the second nearest's."""
+    max_distance: float = Field(0.7, gt=0, le=2)
+    """Between the unit descriptors of a match (0.7 is COLMAP's)."""
+    _extractor: list[Any] = PrivateAttr(default_factory=list)
 
     def extract(self, rgb: NDArray[np.uint8]) -> Features:
         """The keypoints of a picture, those of the largest scale first.

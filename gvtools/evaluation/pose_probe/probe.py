@@ -56,8 +56,8 @@ class PoseProbeOptions(Settings):
     edge: float = Field(0.05, gt=0)
     """A keypoint is lifted where the depths around it spread over less than this share."""
     max_error: float | None = Field(None, gt=0)
-    """Reprojection error of an inlier, pixels; None means 1/160 of the picture's longer side (4
-    pixels at 640, 12 at 1920), at least 2."""
+    """Reprojection error of an inlier; none means 1/160 of the picture's longer side (4 pixels at
+    640, 12 at 1920), at least 2. [px]"""
     min_inliers: int = Field(25, ge=4)
     """Fewer do not locate a picture."""
     min_cells: int = Field(10, ge=1)

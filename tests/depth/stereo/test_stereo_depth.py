@@ -55,7 +55,7 @@ def test_torch_and_compiled_back_ends_agree():
     scene = made.scene
     maps = []
     for backend in ("cpu", "torch"):
-        options = replace(OPTIONS, backend=backend, device="cpu", sources=2, best=1)
+        options = OPTIONS.replaced(backend=backend, device="cpu", sources=2, best=1)
         stereo = PlaneSweepStereo(scene, options=options, views=scene.names)
         maps.append(stereo.depth(scene, scene["v1"], scene["v1"].load()).depth)
     both = (maps[0] > 0) & (maps[1] > 0)
@@ -71,7 +71,7 @@ def test_other_views_are_never_looked_at(slanted):
     held_out = replace(scene.views[3], load=forbidden)
     scene = replace(scene, views=(*scene.views[:3], held_out, scene.views[4]))
     names = tuple(name for name in scene.names if name != "v3")
-    stereo = PlaneSweepStereo(scene, options=replace(OPTIONS, align=True), views=names)
+    stereo = PlaneSweepStereo(scene, options=OPTIONS.replaced(align=True), views=names)
     found = stereo.depth(scene, scene["v2"], scene["v2"].load())
     assert (found.depth > 0).mean() > 0.5
 
@@ -99,7 +99,7 @@ def test_blank_surfaces_stay_unknown():
 
 def test_reduced_pictures_give_depth_at_full_size(slanted):
     scene = slanted.scene
-    options = replace(OPTIONS, max_side=96)
+    options = OPTIONS.replaced(max_side=96)
     stereo = PlaneSweepStereo(scene, options=options, views=scene.names)
     found = stereo.depth(scene, scene["v2"], scene["v2"].load())
     assert found.depth.shape == (120, 160)
@@ -123,12 +123,6 @@ def test_errors_name_what_is_wrong(slanted):
         PlaneSweepStereo(slanted.scene, views=("v0",))
     with pytest.raises(ProjectError, match="nothing"):
         PlaneSweepStereo(slanted.scene, views=("v0", "nothing"))
-    for wrong in (
-        {"sources": 0}, {"best": 9}, {"window": 4}, {"max_side": 8}, {"tolerance": 0},
-        {"planes": 2}, {"noise": 0}, {"cost": 2}, {"backend": "gpu"}, {"device": "tpu"},
-    ):  # fmt: skip
-        with pytest.raises(OptionError, match="stereo"):
-            StereoOptions(**wrong)
 
 
 def test_speckles_go_and_surfaces_stay():
@@ -186,7 +180,7 @@ def test_a_view_that_shares_nothing_is_refused_and_stops_no_other(slanted):
     away[0] = np.diag([-1.0, 1, -1, 1]) @ away[0]
     lost = replace(scene.views[4], camera=replace(scene.views[4].camera, cam_from_world=away))
     scene = replace(scene, views=(*scene.views[:4], lost))
-    stereo = PlaneSweepStereo(scene, options=replace(OPTIONS, align=True), views=scene.names)
+    stereo = PlaneSweepStereo(scene, options=OPTIONS.replaced(align=True), views=scene.names)
     found = stereo.depth(scene, scene["v1"], scene["v1"].load())
     assert (found.depth > 0).mean() > 0.5
     with pytest.raises(DegenerateError, match="shows what v4 does"):
