@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 from gvtools.errors import OptionError
 
 if TYPE_CHECKING:
+    from gvtools.scenes.scene import Scene
     from pipelines.config import RunConfig
     from pipelines.console import Console
+    from pipelines.reconstruction.plan import Plan
 
 SUMMARY = "try a run's settings on held-out views: what each gives and takes, and what to choose"
 EXAMPLES = (
@@ -66,9 +68,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.runs.folder_lock import held_folder
     from gvtools.runs.identity import run_identity
     from pipelines import config as settings
-    from pipelines.commands.scene_arguments import open_scene, reading_of
+    from pipelines.commands.scene_arguments import reading_of
     from pipelines.console import write_json
-    from pipelines.reconstruction.plan import make_plan
     from pipelines.tradeoff.results import write_results
     from pipelines.tradeoff.search_axes import longest_side, search_axes
     from pipelines.tradeoff.sweep import Sweep
@@ -81,6 +82,43 @@ def run(args: argparse.Namespace, console: Console) -> None:
     if limit_kind != "seconds" or limit is None:
         raise OptionError(f"--limit {args.limit}; expected a time, such as 900 or 15m")
     config = asked_for(args)
+    scene, plan = _planned(args, config, console)
+    config = replace(config, voxel=plan.config.voxel, memory=plan.config.memory)
+    names = plan.targets.cameras.names
+    with held_folder(args.out):
+        identity = run_identity(plan, reading_of(args))
+        folder = args.out / "trials"
+        folder.mkdir(exist_ok=True)
+        trials = Trials(scene, config, names, folder=folder, identity=identity)
+        sweep = Sweep(
+            search_axes(plan), trials.outcome, longest_side(plan), limit, console.line, trials.kept
+        )
+        sweep.run(
+            {name: settings.difference(config, asked_for(args, name)) for name in settings.PROFILES}
+        )
+        chosen = write_results(
+            sweep,
+            args.out,
+            title=f"{scene.root.name}: {len(names)} held-out views",
+            identity=identity,
+            budget=(kind, budget),
+            console=console,
+        )
+        file = args.out / "profile.json"
+        if chosen is None:
+            file.unlink(missing_ok=True)
+            return
+        # Everything but which views are given and which are completed.
+        changed = settings.changed_settings(applied(config, chosen.outcome.settings))
+        write_json(file, {k: changed[k] for k in changed if k not in ("context", "targets")})
+        console.line(f"gvtools reconstruct ... --config {file}; more results in {args.out}")
+
+
+def _planned(args: argparse.Namespace, config: RunConfig, console: Console) -> tuple[Scene, Plan]:
+    """The scene, and the plan of the run that the sweep starts from."""
+    from pipelines.commands.scene_arguments import open_scene
+    from pipelines.reconstruction.plan import make_plan
+
     if config.rounds is not None:
         raise OptionError(
             f"rounds {config.rounds}: a sweep completes all views that it holds out; give fewer "
@@ -93,42 +131,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             f"--targets {args.targets}: no views of the project; expected a selection of them, "
             "since a trial is measured against their pictures"
         )
-    config = replace(config, voxel=plan.config.voxel, memory=plan.config.memory)
-    with held_folder(args.out):
-        identity = run_identity(plan, reading_of(args))
-        trials = Trials(scene, config, plan.targets.cameras.names, args.out / "trials", identity)
-        trials.folder.mkdir(exist_ok=True)
-        sweep = Sweep(
-            search_axes(plan),
-            trials.outcome,
-            longest_side(plan),
-            limit,
-            say=console.line,
-            kept=trials.kept,
-        )
-        sweep.run(
-            {name: settings.difference(config, asked_for(args, name)) for name in settings.PROFILES}
-        )
-        chosen = write_results(
-            sweep,
-            args.out,
-            title=f"{scene.root.name}: {len(trials.names)} held-out views",
-            identity=identity,
-            budget=budget,
-            budget_of=kind,
-            console=console,
-        )
-        if chosen is None:
-            (args.out / "profile.json").unlink(missing_ok=True)
-            return
-        # Everything but which views are given and which are completed.
-        changed = settings.changed_settings(applied(config, chosen.outcome.settings))
-        profile = {key: changed[key] for key in changed if key not in ("context", "targets")}
-        write_json(args.out / "profile.json", profile)
-        console.line(
-            f"gvtools reconstruct ... --config {args.out / 'profile.json'}; more results in "
-            f"{args.out}: front.png, front.csv, trials.csv, tradeoff.json"
-        )
+    return scene, plan
 
 
 def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunConfig:

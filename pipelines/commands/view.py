@@ -150,7 +150,7 @@ def _serve(source: ViewSource, args: argparse.Namespace, console: Console) -> No
         if lacking:
             console.line(lacking)
             viewer.set_note(lacking)
-        following = Following(source, shown, viewer.update, console)
+        following = Following(source, shown, viewer.update, console=console)
         while True:
             time.sleep(POLL_SECONDS)
             if args.live:
@@ -174,6 +174,7 @@ class Following:
         source: ViewSource,
         shown: RunView,
         update: Callable[[RunView], None],
+        *,
         console: Console,
     ) -> None:
         self._source, self._update, self._console = source, update, console

@@ -48,8 +48,7 @@ def write_results(
     *,
     title: str,
     identity: Mapping[str, Any],
-    budget: float | None,
-    budget_of: str,
+    budget: tuple[str, float | None],
     console: Console,
 ) -> Trial | None:
     """Write trials.csv, front.csv, front.png and tradeoff.json, and print what they say.
@@ -59,18 +58,19 @@ def write_results(
         out: the folder.
         title: of the plot.
         identity: of the start, as run.json holds it.
-        budget: of a run; None for no limit.
-        budget_of: "seconds" or "bytes".
+        budget: "seconds" or "bytes" of a run, and how many; None for no limit.
         console: prints the tables and the recommendation.
 
     Returns:
         The recommended trial; None where none is within the budget.
     """
-    from gvtools.files import replaced_when_written, write_text
+    from gvtools.files import write_text
     from pipelines.console import write_json
 
+    budget_of, most = budget
+
     def fits(outcome: Outcome) -> bool:
-        return budget is None or getattr(outcome, budget_of) <= budget
+        return most is None or getattr(outcome, budget_of) <= most
 
     front = pareto_front(sweep.trials)
     chosen = sweep.recommended(fits)
@@ -85,7 +85,7 @@ def write_results(
     write_text(out / "front.csv", csv_text(edge))
     data = {
         **{key: identity[key] for key in PROJECT},
-        "budget": budget,
+        "budget": most,
         "budget_of": budget_of,
         "trials": _entries(sweep.trials),
         "front": _entries(front),
@@ -95,18 +95,10 @@ def write_results(
         "left_out": sweep.left_out,
     }
     write_json(out / FILE, data)
-    drawn = _trade_off(FILE, data)
-    with replaced_when_written(out / "front.png") as temporary:
-        draw_pareto(
-            drawn.trials,
-            front=drawn.front,
-            recommended=drawn.recommended,
-            budget=drawn.budget,
-            title=title,
-        ).savefig(temporary, format="png", dpi=120)
+    _draw(_trade_off(FILE, data), out / "front.png", title)
     values = tuple(tuple(row[key] for key in MARGINAL) for row in marginal)
-    title = "What each setting gives and takes by itself"
-    console.line(markdown(Table(tuple(MARGINAL.values()), values, title)))
+    caption = "What each setting gives and takes by itself"
+    console.line(markdown(Table(tuple(MARGINAL.values()), values, caption)))
     console.line(markdown(edge))
     if sweep.left_out:
         console.warn(
@@ -115,6 +107,19 @@ def write_results(
         )
     _print_recommendation(sweep, chosen, budget_of, console)
     return chosen
+
+
+def _draw(drawn: TradeOff, path: Path, title: str) -> None:
+    from gvtools.files import replaced_when_written
+
+    with replaced_when_written(path) as temporary:
+        draw_pareto(
+            drawn.trials,
+            front=drawn.front,
+            recommended=drawn.recommended,
+            budget=drawn.budget,
+            title=title,
+        ).savefig(temporary, format="png", dpi=120)
 
 
 def _print_recommendation(
