@@ -86,8 +86,7 @@ def protocol_split(
     """
     _check_numbers(1, context=context, targets=targets, rounds=rounds, stride=stride)
     _check_numbers(0, seed=seed)
-    if layout is None:
-        layout = "ends" if rounds == 1 else "first"
+    layout = layout or ("ends" if rounds == 1 else "first")
     if layout not in LAYOUTS:
         raise OptionError(f"layout {layout!r}; expected one of {', '.join(LAYOUTS)}")
     if len(set(names)) < len(names):

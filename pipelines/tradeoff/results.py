@@ -76,21 +76,18 @@ def write_results(
     chosen = sweep.recommended(fits)
     marginal = sweep.marginal_values()
     edge = Table(MEASURED, _rows(front), "Pareto front of time and PSNR")
-    every = Table(
-        (Column("trial"), *MEASURED),
-        tuple((t.label, *row) for t, row in zip(sweep.trials, _rows(sweep.trials), strict=True)),
-        "Trials",
-    )
+    labelled = zip(sweep.trials, _rows(sweep.trials), strict=True)
+    every = Table((Column("trial"), *MEASURED), tuple((t.label, *row) for t, row in labelled))
     write_text(out / "trials.csv", csv_text(every))
     write_text(out / "front.csv", csv_text(edge))
     data = {
         **{key: identity[key] for key in PROJECT},
         "budget": most,
         "budget_of": budget_of,
-        "trials": _entries(sweep.trials),
-        "front": _entries(front),
+        "trials": [_entry(trial) for trial in sweep.trials],
+        "front": [_entry(trial) for trial in front],
         "marginal": marginal,
-        "recommended": None if chosen is None else _entries([chosen])[0],
+        "recommended": None if chosen is None else _entry(chosen),
         "refused": sweep.refused,
         "left_out": sweep.left_out,
     }
@@ -191,8 +188,8 @@ def _point(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {"kind": kind, **{key: entry[key] for key in ("label", "seconds", "bytes", "psnr")}}
 
 
-def _entries(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    return [{"label": trial.label, **trial.outcome.to_json()} for trial in trials]
+def _entry(trial: Trial) -> dict[str, Any]:
+    return {"label": trial.label, **trial.outcome.to_json()}
 
 
 def _rows(trials: Sequence[Trial]) -> tuple[tuple[Any, ...], ...]:
