@@ -253,11 +253,10 @@ def _lens(
         raise _wrong("camera_model", model, what, "a model's name")
     if values.get("is_fisheye") not in (None, False, True):
         raise _wrong("is_fisheye", values["is_fisheye"], what, "true or false")
-    for key in COEFFICIENTS:
-        _number(values, key, what, 0.0)
     width, height = _size(values, file, what)
     params = lens_parameters(
-        {key: value for key, value in values.items() if key not in ("frames", "transform_matrix")},
+        values,
+        [_number(values, key, what, 0.0) for key in COEFFICIENTS],
         focal=_focal(values, width, what),
         center=(
             _number(values, "cx", what, width / 2),

@@ -93,9 +93,7 @@ def write_results(
     }
     write_json(out / FILE, data)
     _draw(_trade_off(FILE, data), out / "front.png", title)
-    values = tuple(tuple(row[key] for key in MARGINAL) for row in marginal)
-    caption = "What each setting gives and takes by itself"
-    console.line(markdown(Table(tuple(MARGINAL.values()), values, caption)))
+    console.line(markdown(_marginal_table(marginal)))
     console.line(markdown(edge))
     if sweep.left_out:
         console.warn(
@@ -104,6 +102,12 @@ def write_results(
         )
     _print_recommendation(sweep, chosen, budget_of, console)
     return chosen
+
+
+def _marginal_table(marginal: Sequence[Mapping[str, Any]]) -> Table:
+    values = tuple(tuple(row[key] for key in MARGINAL) for row in marginal)
+    caption = "What each setting gives and takes by itself"
+    return Table(tuple(MARGINAL.values()), values, caption)
 
 
 def _draw(drawn: TradeOff, path: Path, title: str) -> None:
