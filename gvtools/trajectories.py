@@ -54,13 +54,7 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
         rows = [rows[-1], *rows, 0, 1]
     world = cameras.world_from_cam[rows]
     rotation = Rotation.from_matrix(world[:, :3, :3])
-    moved = np.linalg.norm(np.diff(world[:, :3, 3], axis=0), axis=1)
-    turned = (rotation[:-1].inv() * rotation[1:]).magnitude()
-    real = moved > max(STEP * moved.max(), ROUNDING * np.abs(world[:, :3, 3]).max())
-    unit = float(np.median(moved[real])) if real.any() else 1.0
-    steps = moved + unit * turned
-    # Keys that repeat their predecessor would give the spline two values at one place.
-    steps[steps <= STEP * steps.sum()] = 0
+    steps = _steps(world[:, :3, 3], (rotation[:-1].inv() * rotation[1:]).magnitude())
     keep = np.concatenate([[True], steps > 0])
     if keep.sum() < 2:
         raise DegenerateError("interpolate: all key cameras are the same; give cameras that differ")
@@ -87,6 +81,17 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
         cameras.height[nearest],
         _names("path", count),
     )
+
+
+def _steps(centers: Float64, turned: Float64) -> Float64:
+    """(V - 1,) motion between keys: distance, and angle times the median distance."""
+    moved = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    real = moved > max(STEP * moved.max(), ROUNDING * np.abs(centers).max())
+    unit = float(np.median(moved[real])) if real.any() else 1.0
+    steps = moved + unit * turned
+    # Keys that repeat their predecessor would give the spline two values at one place.
+    steps[steps <= STEP * steps.sum()] = 0
+    return steps
 
 
 def focus_point(cameras: Cameras) -> Float64:

@@ -84,12 +84,9 @@ def protocol_split(
     Raises:
         OptionError: numbers below 1, an unknown layout, a name twice, or too few views.
     """
-    numbers = {"context": context, "targets": targets, "rounds": rounds, "stride": stride}
-    for what, number, least in (*((k, v, 1) for k, v in numbers.items()), ("seed", seed, 0)):
-        if number is not None and not number >= least:
-            raise OptionError(f"{what} {number}; expected at least {least}")
-    if layout is None:
-        layout = "ends" if rounds == 1 else "first"
+    _check_numbers(1, context=context, targets=targets, rounds=rounds, stride=stride)
+    _check_numbers(0, seed=seed)
+    layout = layout or ("ends" if rounds == 1 else "first")
     if layout not in LAYOUTS:
         raise OptionError(f"layout {layout!r}; expected one of {', '.join(LAYOUTS)}")
     if len(set(names)) < len(names):
@@ -122,6 +119,12 @@ def protocol_split(
         views=len(names),
         seed=seed,
     )
+
+
+def _check_numbers(least: int, **numbers: int | None) -> None:
+    for what, number in numbers.items():
+        if number is not None and not number >= least:
+            raise OptionError(f"{what} {number}; expected at least {least}")
 
 
 def split_from_dict(data: Mapping[str, Any]) -> Split:

@@ -167,7 +167,8 @@ def parse_benchmark(text: str, origin: str) -> Benchmark:
         protocol, published = dict(data.pop("protocol")), dict(data.pop("published"))
         figures = {name: {"name": name, **dict(f)} for name, f in dict(data["figures"]).items()}
         data["figures"] = figures
-        return Benchmark(**data, **protocol, rows=_rows(published, list(figures)))
+        rows = _rows(published, list(figures))
+        return Benchmark.model_validate({**data, **protocol, "rows": rows})
     except yaml.YAMLError as error:
         reason = f"no readable YAML ({' '.join(str(error).split())})"
     except ValidationError as error:

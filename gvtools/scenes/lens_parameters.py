@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from gvtools.errors import ProjectError
@@ -22,6 +22,7 @@ class LensParameters(NamedTuple):
 
 def lens_parameters(
     values: Mapping[str, Any],
+    coefficients: Sequence[float],
     *,
     focal: tuple[float, float],
     center: tuple[float, float],
@@ -30,7 +31,8 @@ def lens_parameters(
     """The COLMAP camera of a frame's keys.
 
     Args:
-        values: the frame's keys over the file's: ``camera_model``, ``is_fisheye``, ``k1`` ...
+        values: the frame's keys over the file's: ``camera_model``, ``is_fisheye``.
+        coefficients: of COEFFICIENTS.
         focal: fx, fy, pixels.
         center: cx, cy, pixels; first pixel centre (0.5, 0.5).
         what: where they were read, for the message.
@@ -39,13 +41,7 @@ def lens_parameters(
         ProjectError: a model that is not perspective, or coefficients that no model holds.
     """
     named = str(values.get("camera_model", ""))
-    coefficients = {}
-    for key in COEFFICIENTS:
-        value = values.get(key, 0.0)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ProjectError(f"{what}: {key} is {value!r}; expected a number")
-        coefficients[key] = float(value)
-    k1, k2, k3, k4, p1, p2 = coefficients.values()
+    k1, k2, k3, k4, p1, p2 = coefficients
     if named in FISHEYE or (not named and values.get("is_fisheye")):
         return LensParameters("OPENCV_FISHEYE", (*focal, *center, k1, k2, k3, k4))
     if named not in PERSPECTIVE:

@@ -32,7 +32,7 @@ Float64 = NDArray[np.float64]
 COLOR_FOLDERS = ("color", "image", "rgb")
 PREFERRED_LOG = "trajectory.log"
 # The sensor of these recordings, as Open3D's own "PrimeSense default".
-PRIMESENSE = pinhole(525.0, 525.0, 319.5, 239.5)
+PRIMESENSE = pinhole((525.0, 525.0, 319.5, 239.5))
 
 
 def _matches(root: Path) -> bool:

@@ -133,8 +133,9 @@ def pictures_in(folder: Path) -> list[Path]:
     return sorted(paths, key=lambda path: natural_key(path.name))
 
 
-def pinhole(fx: float, fy: float, cx: float, cy: float) -> Float64:
-    """(3, 3) intrinsics, pixels."""
+def pinhole(values: Sequence[float]) -> Float64:
+    """(3, 3) intrinsics of fx, fy, cx, cy, pixels."""
+    fx, fy, cx, cy = values
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 

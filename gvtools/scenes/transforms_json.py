@@ -75,16 +75,47 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
         if not Path(images).is_dir():
             raise ProjectError(f"{images}: no such image folder")
         files = [Path(images) / name for name in names]
+    photographs, absent, defects = _photographs(path, data, list(zip(names, files, strict=True)),
+                                                masks, findings)  # fmt: skip
+    if not photographs:
+        raise ProjectError(
+            f"{path}: none of the pictures of its {len(frames)} frames is on disk (looked for "
+            f"{named([str(file) for file in files])}); expected them there; give their folder with "
+            "--images"
+        )
+    if absent:
+        message = f"{len(absent)} of {len(frames)} frames are absent on disk: {named(absent)}"
+        findings.append(Finding("warning", message))
+    photographs.sort(key=lambda item: natural_key(item.name))
+    findings += rotation_findings(defects)
+    findings += lens_findings([item.lens for item in photographs])
+    findings += header_findings([(item.image, item.lens.source_size) for item in photographs])
+    views = tuple(item.view() for item in photographs)
+    return Scene(path.parent, "transforms", views, None, tuple(findings), metric=False)
+
+
+def _photographs(
+    path: Path,
+    data: dict[str, Any],
+    files: list[tuple[str, Path]],
+    masks: Path | None,
+    findings: list[Finding],
+) -> tuple[list[Photograph], list[str], list[float]]:
+    """Photographs of the frames on disk, names of the others, and defects of the rotations.
+
+    ``files`` holds each frame's name and picture; ``findings`` is added to.
+    """
     lenses: dict[tuple[Any, ...], Undistortion] = {}
     photographs, absent, defects, unmasked = [], [], [], 0
-    for i, (frame, file, name) in enumerate(zip(frames, files, names, strict=True)):
+    for i, (frame, (name, file)) in enumerate(zip(data["frames"], files, strict=True)):
         what = f"{path}, frame {i} ({name})"
         if not os.path.isfile(file):
             absent.append(name)
             continue
+        values = {**data, **frame}
         pose, defect = rigid_transform(_matrix(frame, what), what=what)
         defects.append(defect)
-        lens = _lens({**data, **frame}, file, what, lenses)
+        lens = _lens(values, file, what, lenses)
         mask = _beside(path.parent, frame, "mask_path", what)
         depth = _beside(path.parent, frame, "depth_file_path", what)
         lost = [item.name for item in (mask, depth) if item and not os.path.isfile(item)]
@@ -93,9 +124,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
         if mask is None and masks is not None:
             mask = masks / f"{name}.png"
             unmasked += not os.path.isfile(mask)
-        unit = _number(
-            {**data, **frame}, "depth_unit_scale_factor", what, MILLIMETRES, positive=True
-        )
+        unit = _number(values, "depth_unit_scale_factor", what, MILLIMETRES, positive=True)
         photographs.append(
             Photograph(
                 name,
@@ -107,22 +136,8 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
                 partial(read_depth, unit=unit),
             )
         )
-    if not photographs:
-        raise ProjectError(
-            f"{path}: none of the pictures of its {len(frames)} frames is on disk (looked for "
-            f"{named([str(file) for file in files])}); expected them there; give their folder with "
-            "--images"
-        )
-    if absent:
-        message = f"{len(absent)} of {len(frames)} frames are absent on disk: {named(absent)}"
-        findings.append(Finding("warning", message))
     findings += mask_findings(unmasked, masks)
-    photographs.sort(key=lambda item: natural_key(item.name))
-    findings += rotation_findings(defects)
-    findings += lens_findings([item.lens for item in photographs])
-    findings += header_findings([(item.image, item.lens.source_size) for item in photographs])
-    views = tuple(item.view() for item in photographs)
-    return Scene(path.parent, "transforms", views, None, tuple(findings), metric=False)
+    return photographs, absent, defects
 
 
 def write_transforms(
@@ -238,11 +253,10 @@ def _lens(
         raise _wrong("camera_model", model, what, "a model's name")
     if values.get("is_fisheye") not in (None, False, True):
         raise _wrong("is_fisheye", values["is_fisheye"], what, "true or false")
-    for key in COEFFICIENTS:
-        _number(values, key, what, 0.0)
     width, height = _size(values, file, what)
     params = lens_parameters(
-        {key: value for key, value in values.items() if key not in ("frames", "transform_matrix")},
+        values,
+        [_number(values, key, what, 0.0) for key in COEFFICIENTS],
         focal=_focal(values, width, what),
         center=(
             _number(values, "cx", what, width / 2),

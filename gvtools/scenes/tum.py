@@ -165,8 +165,8 @@ def _intrinsics(root: Path) -> tuple[Float64, tuple[float, ...], str]:
         return open3d_intrinsics(root / "camera.json"), (), "camera.json"
     for name, (values, distortion) in PUBLISHED.items():
         if name in root.resolve().name:
-            return pinhole(*values), distortion, f"published for {name}"
-    return pinhole(*DRIVER_DEFAULT), (), "the driver's default 525, 525, 319.5, 239.5"
+            return pinhole(values), distortion, f"published for {name}"
+    return pinhole(DRIVER_DEFAULT), (), "the driver's default 525, 525, 319.5, 239.5"
 
 
 TUM = RgbdLayout("TUM (rgb.txt, depth.txt, groundtruth.txt)", _matches, _record)

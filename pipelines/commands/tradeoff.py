@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 from gvtools.errors import OptionError
 
 if TYPE_CHECKING:
+    from gvtools.scenes.scene import Scene
     from pipelines.console import Console
+    from pipelines.reconstruction.plan import Plan
     from pipelines.reconstruction.settings import RunSettings
 
 SUMMARY = "try a run's settings on held-out views: what each gives and takes, and what to choose"
@@ -64,8 +66,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.files import write_json
     from gvtools.runs.folder_lock import folder_lock
     from gvtools.settings import changes
-    from pipelines.commands.scene_arguments import open_scene, reading_of
-    from pipelines.reconstruction.plan import make_plan, run_identity
+    from pipelines.commands.scene_arguments import reading_of
+    from pipelines.reconstruction.plan import run_identity
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.tradeoff.results import write_results
     from pipelines.tradeoff.search_axes import longest_side, search_axes
@@ -79,6 +81,41 @@ def run(args: argparse.Namespace, console: Console) -> None:
     if limit_kind != "seconds" or limit is None:
         raise OptionError(f"--limit {args.limit}; expected a time, such as 900 or 15m")
     config = asked_for(args)
+    scene, plan = _planned(args, config, console)
+    config = config.replaced(voxel=plan.config.voxel, memory=plan.config.memory)
+    names = plan.targets.cameras.names
+    with folder_lock(args.out):
+        identity = run_identity(plan, reading_of(args))
+        folder = args.out / "trials"
+        folder.mkdir(exist_ok=True)
+        trials = Trials(scene, config, names, folder=folder, identity=identity)
+        sweep = Sweep(
+            search_axes(plan), trials.outcome, longest_side(plan), limit, console.line, trials.kept
+        )
+        sweep.run({name: changes(config, asked_for(args, name)) for name in config.profiles})
+        chosen = write_results(
+            sweep,
+            args.out,
+            title=f"{scene.root.name}: {len(names)} held-out views",
+            identity=identity,
+            budget=(kind, budget),
+            console=console,
+        )
+        file = args.out / "profile.json"
+        if chosen is None:
+            file.unlink(missing_ok=True)
+            return
+        # Everything but which views are given and which are completed.
+        changed = changes(RunSettings(), applied(config, chosen.outcome.settings))
+        write_json(file, {k: changed[k] for k in changed if k not in ("context", "targets")})
+        console.line(f"gvtools reconstruct ... --config {file}; more results in {args.out}")
+
+
+def _planned(args: argparse.Namespace, config: RunSettings, console: Console) -> tuple[Scene, Plan]:
+    """The scene, and the plan of the run that the sweep starts from."""
+    from pipelines.commands.scene_arguments import open_scene
+    from pipelines.reconstruction.plan import make_plan
+
     if config.rounds is not None:
         raise OptionError(
             f"rounds {config.rounds}: a sweep completes all views that it holds out; give fewer "
@@ -91,40 +128,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             f"--targets {args.targets}: no views of the project; expected a selection of them, "
             "since a trial is measured against their pictures"
         )
-    config = config.replaced(voxel=plan.config.voxel, memory=plan.config.memory)
-    with folder_lock(args.out):
-        identity = run_identity(plan, reading_of(args))
-        trials = Trials(scene, config, plan.targets.cameras.names, args.out / "trials", identity)
-        trials.folder.mkdir(exist_ok=True)
-        sweep = Sweep(
-            search_axes(plan),
-            trials.outcome,
-            longest_side(plan),
-            limit,
-            say=console.line,
-            kept=trials.kept,
-        )
-        sweep.run({name: changes(config, asked_for(args, name)) for name in config.profiles})
-        chosen = write_results(
-            sweep,
-            args.out,
-            title=f"{scene.root.name}: {len(trials.names)} held-out views",
-            identity=identity,
-            budget=budget,
-            budget_of=kind,
-            console=console,
-        )
-        if chosen is None:
-            (args.out / "profile.json").unlink(missing_ok=True)
-            return
-        # Everything but which views are given and which are completed.
-        changed = changes(RunSettings(), applied(config, chosen.outcome.settings))
-        profile = {key: changed[key] for key in changed if key not in ("context", "targets")}
-        write_json(args.out / "profile.json", profile)
-        console.line(
-            f"gvtools reconstruct ... --config {args.out / 'profile.json'}; more results in "
-            f"{args.out}: front.png, front.csv, trials.csv, tradeoff.json"
-        )
+    return scene, plan
 
 
 def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunSettings:

@@ -48,8 +48,7 @@ def write_results(
     *,
     title: str,
     identity: Mapping[str, Any],
-    budget: float | None,
-    budget_of: str,
+    budget: tuple[str, float | None],
     console: Console,
 ) -> Trial | None:
     """Write trials.csv, front.csv, front.png and tradeoff.json, and print what they say.
@@ -59,53 +58,41 @@ def write_results(
         out: the folder.
         title: of the plot.
         identity: of the start, as run.json holds it.
-        budget: of a run; None for no limit.
-        budget_of: "seconds" or "bytes".
+        budget: "seconds" or "bytes" of a run, and how many; None for no limit.
         console: prints the tables and the recommendation.
 
     Returns:
         The recommended trial; None where none is within the budget.
     """
-    from gvtools.files import replaced_when_written, write_json, write_text
+    from gvtools.files import write_json, write_text
+
+    budget_of, most = budget
 
     def fits(outcome: Outcome) -> bool:
-        return budget is None or getattr(outcome, budget_of) <= budget
+        return most is None or getattr(outcome, budget_of) <= most
 
     front = pareto_front(sweep.trials)
     chosen = sweep.recommended(fits)
     marginal = sweep.marginal_values()
     edge = Table(MEASURED, _rows(front), "Pareto front of time and PSNR")
-    every = Table(
-        (Column("trial"), *MEASURED),
-        tuple((t.label, *row) for t, row in zip(sweep.trials, _rows(sweep.trials), strict=True)),
-        "Trials",
-    )
+    labelled = zip(sweep.trials, _rows(sweep.trials), strict=True)
+    every = Table((Column("trial"), *MEASURED), tuple((t.label, *row) for t, row in labelled))
     write_text(out / "trials.csv", csv_text(every))
     write_text(out / "front.csv", csv_text(edge))
     data = {
         **{key: identity[key] for key in PROJECT},
-        "budget": budget,
+        "budget": most,
         "budget_of": budget_of,
-        "trials": _entries(sweep.trials),
-        "front": _entries(front),
+        "trials": [_entry(trial) for trial in sweep.trials],
+        "front": [_entry(trial) for trial in front],
         "marginal": marginal,
-        "recommended": None if chosen is None else _entries([chosen])[0],
+        "recommended": None if chosen is None else _entry(chosen),
         "refused": sweep.refused,
         "left_out": sweep.left_out,
     }
     write_json(out / FILE, data)
-    drawn = _trade_off(FILE, data)
-    with replaced_when_written(out / "front.png") as temporary:
-        draw_pareto(
-            drawn.trials,
-            front=drawn.front,
-            recommended=drawn.recommended,
-            budget=drawn.budget,
-            title=title,
-        ).savefig(temporary, format="png", dpi=120)
-    values = tuple(tuple(row[key] for key in MARGINAL) for row in marginal)
-    title = "What each setting gives and takes by itself"
-    console.line(markdown(Table(tuple(MARGINAL.values()), values, title)))
+    _draw(_trade_off(FILE, data), out / "front.png", title)
+    console.line(markdown(_marginal_table(marginal)))
     console.line(markdown(edge))
     if sweep.left_out:
         console.warn(
@@ -114,6 +101,25 @@ def write_results(
         )
     _print_recommendation(sweep, chosen, budget_of, console)
     return chosen
+
+
+def _marginal_table(marginal: Sequence[Mapping[str, Any]]) -> Table:
+    values = tuple(tuple(row[key] for key in MARGINAL) for row in marginal)
+    caption = "What each setting gives and takes by itself"
+    return Table(tuple(MARGINAL.values()), values, caption)
+
+
+def _draw(drawn: TradeOff, path: Path, title: str) -> None:
+    from gvtools.files import replaced_when_written
+
+    with replaced_when_written(path) as temporary:
+        draw_pareto(
+            drawn.trials,
+            front=drawn.front,
+            recommended=drawn.recommended,
+            budget=drawn.budget,
+            title=title,
+        ).savefig(temporary, format="png", dpi=120)
 
 
 def _print_recommendation(
@@ -185,8 +191,8 @@ def _point(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {"kind": kind, **{key: entry[key] for key in ("label", "seconds", "bytes", "psnr")}}
 
 
-def _entries(trials: Sequence[Trial]) -> list[dict[str, Any]]:
-    return [{"label": trial.label, **trial.outcome.to_json()} for trial in trials]
+def _entry(trial: Trial) -> dict[str, Any]:
+    return {"label": trial.label, **trial.outcome.to_json()}
 
 
 def _rows(trials: Sequence[Trial]) -> tuple[tuple[Any, ...], ...]:

@@ -99,6 +99,7 @@ class Trials:
         scene: Scene,
         config: RunSettings,
         names: Sequence[str],
+        *,
         folder: Path,
         identity: Mapping[str, Any],
     ) -> None:

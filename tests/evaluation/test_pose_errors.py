@@ -12,7 +12,6 @@ from walks import disturbed, line, moved, path
 from gvtools.errors import DegenerateError, OptionError, ShapeError
 from gvtools.evaluation.association import by_index, by_name, by_time
 from gvtools.evaluation.trajectories import (
-    Statistics,
     absolute_errors,
     area_under_recall,
     pose_auc,
@@ -74,24 +73,6 @@ def test_a_scale_is_seen_by_a_rigid_alignment_alone():
     assert rigid.translation is not None
     assert rigid.translation.rmse > 0.05
     assert rigid.scale == 1
-
-
-def test_figures_over_the_extent_have_no_unit():
-    reference = path()
-    estimate = disturbed(reference, metres=0.05)
-    metres = absolute_errors(reference, estimate, align="none")
-    factor = np.diag([1000.0, 1000, 1000, 1])
-    millimetres = absolute_errors(
-        *(np.concatenate([p[:, :, :3], (factor @ p)[:, :, 3:]], axis=2)
-          for p in (reference, estimate)),
-        align="none",
-    )  # fmt: skip
-    assert metres.translation_share is not None
-    assert millimetres.translation_share is not None
-    assert metres.translation_share.rmse == pytest.approx(millimetres.translation_share.rmse)
-    assert metres.extent == pytest.approx(
-        2 * np.linalg.norm(reference[:, :3, 3] - reference[:, :3, 3].mean(0), axis=1).max()
-    )
 
 
 def test_millimetres_at_a_million_metres_are_kept():
@@ -175,10 +156,6 @@ def test_auc_of_cameras_that_stand_still_counts_their_rotation():
     assert auc.median_direction_deg is None
     assert auc.auc[3.0] == pytest.approx(1 / 3, abs=1e-3)
     assert pose_auc(poses[:1], poses[:1]).auc == dict.fromkeys((3.0, 5.0, 10.0, 30.0))
-
-
-def test_statistics_of_nothing_are_none():
-    assert Statistics.of([]) is None
 
 
 def test_wrong_shapes_and_values_are_refused():

@@ -9,15 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.experiments.generated_pixels import (
-    EDGES,
-    FIGURES,
-    NO_DEPTH,
-    GeneratedScore,
-    figures,
-    gradient_energy,
-    score,
-)
 from gvtools.errors import ShapeError
 from gvtools.evaluation.images import image_figures, psnr, relative_depth_error, ssim
 from gvtools.evaluation.intervals import mean_interval
@@ -114,88 +105,6 @@ def test_depth_that_is_none_is_not_compared(bad):
     assert relative_depth_error(np.full_like(DEPTH, bad), DEPTH) is None
     assert relative_depth_error(DEPTH, DEPTH, mask=~EVERYWHERE) is None
     assert relative_depth_error(DEPTH[:1, :1], DEPTH[:1, :1]) == 0
-
-
-SHAPE = (2, 12, 16)
-RGB = np.random.default_rng(2).random((*SHAPE, 3)).astype(np.float32)
-LENGTHS = np.random.default_rng(3).uniform(1, 4, SHAPE).astype(np.float32)
-JUDGED = np.ones(SHAPE, np.bool_)
-
-
-def scored(**changes: Any) -> GeneratedScore:
-    given_ = {
-        "rgb": RGB, "depth": LENGTHS, "true_rgb": RGB, "true_depth": LENGTHS, "generated": JUDGED,
-    }  # fmt: skip
-    return score(**(given_ | changes))
-
-
-def test_a_perfect_completion_reaches_the_ends_of_the_scales():
-    found = figures([scored(distance=np.zeros(SHAPE, np.float32))])
-    assert found["psnr"] == found["psnr_view"] == 100
-    assert found["depth_view"] == 0
-    assert found["depth"] is not None and found["depth"] < EDGES[1]
-    assert found["distance"] == found["distance_view"] == 0
-    assert found["energy"] == 1
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-@pytest.mark.parametrize("what", ["rgb", "true_rgb", "distance"])
-def test_judged_pixels_that_are_not_finite_are_refused_and_others_may_be(what, bad):
-    values = RGB.copy() if "rgb" in what else np.ones(SHAPE, np.float32)
-    values[0] = bad
-    with pytest.raises(ShapeError, match="NaN or infinity"):
-        scored(**{what: values})
-    second = JUDGED & (np.arange(2) == 1)[:, None, None]
-    if what != "distance":
-        clean = figures([scored(generated=second)])
-        assert figures([scored(generated=second, **{what: values})]) == clean
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 0.0, -1.0])
-def test_completed_depth_that_is_none_is_the_largest_error(bad):
-    depth = LENGTHS.copy()
-    depth[0] = bad
-    found = figures([scored(depth=depth)])
-    assert found["depth_view"] == pytest.approx(NO_DEPTH / 2)
-    depth[:] = bad
-    found = figures([scored(depth=depth)])
-    assert found["depth"] is None
-    assert found["depth_view"] == NO_DEPTH
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 0.0, -1.0])
-def test_true_depth_that_is_none_is_not_judged(bad):
-    truth = LENGTHS.copy()
-    truth[0] = bad
-    found = figures([scored(depth=1.5 * LENGTHS, true_depth=truth)])
-    assert found["depth_view"] == pytest.approx(0.5)
-    truth[:] = bad
-    found = figures([scored(true_depth=truth)])
-    assert found["depth"] is None and found["depth_view"] is None
-
-
-def test_gradient_energy_of_what_has_no_gradient():
-    for rgb, where in (
-        (np.full_like(RGB, 0.3), JUDGED),
-        (RGB, ~JUDGED),
-        (RGB[:, :1, :1], JUDGED[:, :1, :1]),
-        (np.where(JUDGED[..., None], np.float32(np.nan), RGB), ~JUDGED),
-    ):
-        assert gradient_energy(rgb, where) == 0
-    flat = np.full_like(RGB, 0.3)
-    assert figures([scored(true_rgb=flat)])["energy"] is None
-    assert figures([scored(rgb=flat)])["energy"] == 0
-
-
-def test_nothing_to_judge_has_no_figure():
-    for scores in ([], [scored(generated=~JUDGED)]):
-        assert figures(scores) == dict.fromkeys(FIGURES)
-    one = slice(None), slice(0, 1), slice(0, 1)
-    small = score(
-        RGB[one], LENGTHS[one], true_rgb=RGB[one], true_depth=LENGTHS[one], generated=JUDGED[one]
-    )
-    found = figures([small])
-    assert found["psnr"] == 100 and found["psnr_view"] is None and found["energy"] is None
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import pytest
 from scenes_workspace import HEIGHT, WIDTH, depth_picture, pose_matrix, ramp, save, sevenscenes
 
 from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
-from gvtools.scenes.quaternions import rotation_from_quaternion
 from gvtools.scenes.redwood import read_redwood
 from gvtools.scenes.rgbd_recording import RgbdOptions
 from gvtools.scenes.scannet import read_scannet
@@ -92,13 +91,6 @@ def test_impossible_poses_name_their_file(tmp_path, change, told):
         read_sevenscenes(root)
     assert "frame-000001.pose.txt" in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_pose_of_words(tmp_path):
-    root = sevenscenes(tmp_path)
-    (root / "frame-000001.pose.txt").write_text("lost\n")
-    with pytest.raises(ProjectError, match=r"frame-000001\.pose\.txt: unreadable"):
-        read_sevenscenes(root)
 
 
 @pytest.mark.parametrize("codes", [[[90, 5, 0], [0, 90, 0], [0, 0, 1]], [[0, 0, 0]] * 3])
@@ -280,15 +272,6 @@ def test_association_is_the_greedy_one_over_all_pairs():
             used.add(j)
     assert associate(first, second, 0.02) == expected
     assert len(expected) > 20
-
-
-def test_quaternion_matches_scipy():
-    from scipy.spatial.transform import Rotation
-
-    rotation = Rotation.random(20, rng=np.random.default_rng(2))
-    for quaternion, matrix in zip(rotation.as_quat(), rotation.as_matrix(), strict=True):
-        np.testing.assert_allclose(rotation_from_quaternion(quaternion), matrix, atol=1e-12)
-    np.testing.assert_allclose(rotation_from_quaternion(2 * quaternion), 4 * matrix, atol=1e-12)
 
 
 # --- Redwood ----------------------------------------------------------------------------------

@@ -24,7 +24,6 @@ from viz.run_view.point_colors import (
     depth_errors,
     point_colors,
     view_counts,
-    viridis,
 )
 from viz.run_view.render import RunRenderer, picture_of
 from viz.run_view.view import CONTEXT, TARGET
@@ -142,13 +141,6 @@ def test_colours_say_what_is_so(run):
     }  # fmt: skip
     with pytest.raises(OptionError, match="colour mode"):
         point_colors(memory, "colour")
-
-
-def test_viridis_runs_through_its_anchors():
-    np.testing.assert_array_equal(viridis(np.linspace(0, 1, 9)), [rgb(c) for c in VIRIDIS])
-    np.testing.assert_array_equal(
-        viridis(np.array([-1.0, 2.0])), [rgb(VIRIDIS[0]), rgb(VIRIDIS[-1])]
-    )
 
 
 def test_views_of_a_voxel_are_counted(run):

@@ -152,18 +152,7 @@ def feature_consistency(
     itself, back = _common(first, first, where, occlusion)
     same, _ = _dissimilarity(_sample(ours, itself), _sample(ours, back))
     compared = len(here) - undefined
-    status = "measured"
-    if score is None:
-        status = (
-            f"empty: {first.name} and {second.name} have no co-visible place with features"
-            if first.depth is not None and second.depth is not None
-            else f"empty: {first.name if first.depth is None else second.name} has no depth"
-        )
-    elif reference is not None and same is not None and reference - same < LEAST_SCALE:
-        status = (
-            f"degenerate: {network.name} gives unrelated content {reference:.3g} and the same "
-            f"picture {same:.3g}; it tells nothing apart here"
-        )
+    status = _status(first, second, network.name, (score, reference, same))
     return FeatureConsistency(
         first=first.name,
         second=second.name,
@@ -177,6 +166,26 @@ def feature_consistency(
         unrelated=reference,
         unrelated_source=source,
     )
+
+
+def _status(
+    first: PosedPicture,
+    second: PosedPicture,
+    network: str,
+    scores: tuple[float | None, float | None, float | None],
+) -> str:
+    """What scores of second, of unrelated content and of first itself stand for."""
+    score, reference, same = scores
+    if score is None and first.depth is not None and second.depth is not None:
+        return f"empty: {first.name} and {second.name} have no co-visible place with features"
+    if score is None:
+        return f"empty: {first.name if first.depth is None else second.name} has no depth"
+    if reference is not None and same is not None and reference - same < LEAST_SCALE:
+        return (
+            f"degenerate: {network} gives unrelated content {reference:.3g} and the same "
+            f"picture {same:.3g}; it tells nothing apart here"
+        )
+    return "measured"
 
 
 def load_met3r(size: int = 256) -> tuple[Callable[..., Any] | None, str]:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Float64
+
+if TYPE_CHECKING:
+    import pycolmap
 
 # Rounds of refining over all inliers and counting them anew; the set settles within two or three.
 ROUNDS = 4
@@ -85,31 +89,48 @@ def absolute_pose(
     if found is None:
         return None
     pose, inliers = found["cam_from_world"], found["inlier_mask"]
-    for _ in range(ROUNDS):
-        if inliers.sum() < LEAST:
-            return None
-        refined = pycolmap.refine_absolute_pose(pose, pinhole, local, inliers, camera)
-        if refined is None:
-            return None
-        pose, before = refined["cam_from_world"], inliers
-        errors = _reprojection_errors(pose.matrix(), pinhole, local, camera.calibration_matrix())
-        inliers = errors <= max_error
-        if np.array_equal(inliers, before):
-            break
-    if inliers.sum() < LEAST:
+    refined = _refined(pose, inliers, pinhole, local, camera, max_error)
+    if refined is None:
         return None
+    pose, inliers, errors = refined
     cam_from_world = np.eye(4)
     cam_from_world[:3] = pose.matrix()
     cam_from_world[:3, 3] -= cam_from_world[:3, :3] @ origin
     return AbsolutePose(cam_from_world, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
 
 
+def _refined(
+    pose: pycolmap.Rigid3d,
+    inliers: NDArray[np.bool_],
+    xy: Float64,
+    points: Float64,
+    camera: pycolmap.Camera,
+    max_error: float,
+) -> tuple[pycolmap.Rigid3d, NDArray[np.bool_], Float64] | None:
+    """Pose, inliers and errors (M,) once refining changes no inlier; None with too few of them."""
+    import pycolmap
+
+    errors = np.full(len(xy), np.inf)
+    for _ in range(ROUNDS):
+        if inliers.sum() < LEAST:
+            return None
+        refined = pycolmap.refine_absolute_pose(pose, xy, points, inliers, camera)
+        if refined is None:
+            return None
+        pose, before = refined["cam_from_world"], inliers
+        errors = _reprojection_errors(pose.matrix(), xy, points, camera.calibration_matrix())
+        inliers = errors <= max_error
+        if np.array_equal(inliers, before):
+            break
+    return None if inliers.sum() < LEAST else (pose, inliers, errors)
+
+
 def rival_pose(
-    pose: AbsolutePose,
     xy: Float64,
     points: Float64,
     K: Float64,
     *,
+    pose: AbsolutePose,
     width: int,
     height: int,
     max_error: float,
@@ -122,10 +143,10 @@ def rival_pose(
     chairs of one kind, pictures put together from pieces.
 
     Args:
-        pose: of these matches.
         xy: (M, 2), pixels.
         points: (M, 3), world frame, scene units.
         K: (3, 3), pixels.
+        pose: of these matches.
         width: of the picture, pixels.
         height: of the picture, pixels.
         max_error: reprojection error of an inlier, pixels.

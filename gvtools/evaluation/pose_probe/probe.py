@@ -233,10 +233,10 @@ class PoseProbe:
             return None, _Counts(len(features), len(places), 0, 0, 0)
         agreed = np.unique(place[pose.inliers])
         rival = rival_pose(
-            pose,
             xy,
             points,
             K,
+            pose=pose,
             **size,
             max_error=error,
             share=self.options.max_rival,
