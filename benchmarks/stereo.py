@@ -21,10 +21,10 @@ import numpy as np
 from gvtools.depth.stereo.confidence import Reliability, reliability
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+from gvtools.procedural.room_sample import write_room
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
 from gvtools.scenes.selection import select
-from gvtools.procedural.room_sample import write_room
 
 SETTINGS = {
     "320 px, 2 sources": StereoOptions(max_side=320, sources=2, best=1),

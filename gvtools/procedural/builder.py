@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.procedural.shading import Look
 from gvtools.procedural.geometry import BOX, Geometry
+from gvtools.procedural.shading import Look
 from gvtools.procedural.textures import level_starts, picture, stacked, texture
 
 Float64 = NDArray[np.float64]
@@ -151,7 +151,14 @@ class SceneBuilder:
         c, s = np.cos(tilt), np.sin(tilt)
         lean = np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
         self.solids.append(
-            (kind, lean @ turn, np.asarray(centre, float), np.asarray(half, float), material, shades)
+            (
+                kind,
+                lean @ turn,
+                np.asarray(centre, float),
+                np.asarray(half, float),
+                material,
+                shades,
+            )
         )
         boxes = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in cuts]
         self.cutters.append(boxes)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,7 +95,14 @@ class _Furnisher:
         )  # fmt: skip
 
     def on_legs(
-        self, at: _Place, low: ArrayLike, high: ArrayLike, *, board: float, leg: float, material: int
+        self,
+        at: _Place,
+        low: ArrayLike,
+        high: ArrayLike,
+        *,
+        board: float,
+        leg: float,
+        material: int,
     ) -> None:
         """A board on four legs: a box with two tunnels that cross below the board."""
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low), np.asarray(high)
@@ -235,7 +243,7 @@ def _shelf(room: _Furnisher, at: _Place, width: float) -> float:
     levels = np.linspace(0.06, height - board, 5)
     cuts = [
         ((-half + board, 0.02, low + board), (half - board, 1, high))
-        for low, high in zip(levels[:-1], levels[1:], strict=True)
+        for low, high in pairwise(levels)
     ]
     room.box(at, (-half, 0, 0), (half, deep, height), material=room.wood(), cuts=cuts)
     coats = [room.tiled("text", (color,), contrast=0.13) for color in COATS]
@@ -289,9 +297,7 @@ def _bench(room: _Furnisher, at: _Place, width: float) -> float:
     """A padded bench on four legs."""
     cloth = room.tiled("grass", RUGS, contrast=0.1)
     half, deep, seat = width / 2, 0.5, 0.42
-    room.on_legs(
-        at, (-half, 0.13, 0), (half, deep, seat), board=0.14, leg=0.05, material=cloth
-    )
+    room.on_legs(at, (-half, 0.13, 0), (half, deep, seat), board=0.14, leg=0.05, material=cloth)
     room.box(at, (-half, 0.03, seat - 0.14), (half, 0.13, seat + 0.38), material=cloth)
     return seat + 0.38
 
@@ -300,7 +306,9 @@ def _corners(room: _Furnisher, size: Float64) -> None:
     """A column in one corner, a floor lamp in another."""
     rng = room.rng
     inset = 0.42
-    spots = [np.array([x, y, 0]) for x in (inset, size[0] - inset) for y in (inset, size[1] - inset)]
+    spots = [
+        np.array([x, y, 0]) for x in (inset, size[0] - inset) for y in (inset, size[1] - inset)
+    ]
     first, second = rng.permutation(4)[:2]
     stone = room.tiled(("brick", "gravel")[rng.integers(2)], ACCENTS)
     room.post(spots[first], rng.uniform(0.17, 0.22), float(size[2]), material=stone)
@@ -317,20 +325,24 @@ def _middle(room: _Furnisher, size: Float64) -> None:
     at = _Place(size * [0.5, 0.5, 0], rng.uniform(-0.5, 0.5))
     rug = room.tiled("grass", RUGS, contrast=0.18)
     room.box(at, (-1.15, -0.85, 0), (1.15, 0.85, 0.012), material=rug, shades=False)
-    x, y, top = rng.uniform(0.55, 0.72), rng.uniform(0.36, 0.44), 0.74
-    room.on_legs(at, (-x, -y, 0), (x, y, top), board=0.035, leg=0.05, material=room.wood())
-    room.ball(at.world([-x * 0.5, y * 0.2, top + 0.15]), 0.15, ("moon", "retina", "astronaut"))
-    room.post(at.world([x * 0.1, -y * 0.5, top]), 0.045, 0.1, material=room.paint(COATS))
-    spot = _Place(at.world([x * 0.6, y * 0.25, top]), at.yaw + rng.uniform(-0.6, 0.6))
+    half, deep, top = rng.uniform(0.55, 0.72), rng.uniform(0.36, 0.44), 0.74
+    room.on_legs(
+        at, (-half, -deep, 0), (half, deep, top), board=0.035, leg=0.05, material=room.wood()
+    )
+    room.ball(
+        at.world([-half * 0.5, deep * 0.2, top + 0.15]), 0.15, ("moon", "retina", "astronaut")
+    )
+    room.post(at.world([half * 0.1, -deep * 0.5, top]), 0.045, 0.1, material=room.paint(COATS))
+    spot = _Place(at.world([half * 0.6, deep * 0.25, top]), at.yaw + rng.uniform(-0.6, 0.6))
     z = 0.0
     for _ in range(3):
-        corner = rng.uniform((0.1, 0.07, 0.025), (0.15, 0.1, 0.05))
+        x, y, thick = rng.uniform((0.1, 0.07, 0.025), (0.15, 0.1, 0.05))
         cover = room.tiled("text", COATS, contrast=0.11)
-        room.box(spot, corner * [-1, -1, 0] + [0, 0, z], corner + [0, 0, z], material=cover)
-        z += corner[2]
+        room.box(spot, (-x, -y, z), (x, y, z + thick), material=cover)
+        z += thick
     for side in (-1, 1):
         turn = at.yaw + (np.pi if side > 0 else 0.0) + rng.uniform(-0.35, 0.35)
-        _chair(room, _Place(at.world([rng.uniform(-0.2, 0.2), side * (y + 0.3), 0]), turn))
+        _chair(room, _Place(at.world([rng.uniform(-0.2, 0.2), side * (deep + 0.3), 0]), turn))
 
 
 def _chair(room: _Furnisher, at: _Place) -> None:

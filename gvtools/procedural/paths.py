@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.options import check_range
-from gvtools.procedural.ray_cast import cast
 from gvtools.procedural.geometry import Geometry, clearance
+from gvtools.procedural.ray_cast import cast
 
 Float64 = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.kernels import FAST, compiled
-from gvtools.procedural.intervals import enter_solid, leave_rooms, turned
 from gvtools.procedural.geometry import Geometry
+from gvtools.procedural.intervals import enter_solid, leave_rooms, turned
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

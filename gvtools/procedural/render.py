@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.kernels import FAST, compiled
 from gvtools.procedural.color import encode_srgb
+from gvtools.procedural.geometry import Geometry
 from gvtools.procedural.light import light_on
 from gvtools.procedural.ray_cast import CODES, FLOATS, rectangles, trace_row, world_rays
 from gvtools.procedural.shading import Look, add_colors, surface_places, texture_levels
-from gvtools.procedural.geometry import Geometry
 
 Float32 = NDArray[np.float32]
 

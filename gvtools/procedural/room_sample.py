@@ -93,7 +93,9 @@ def write_room(
         return sample
     room = furnished_room(seed)
     rng = np.random.default_rng([seed, 21])
-    cameras = _path(room.geometry.rooms[0, 1], context, targets, width=width, height=height, rng=rng)
+    cameras = _path(
+        room.geometry.rooms[0, 1], context, targets, width=width, height=height, rng=rng
+    )
     write_sample(folder, _photographed(room, cameras, rng), record=record)
     return sample
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from gvtools.errors import OptionError
 from gvtools.options import check_range
-from gvtools.training.context_choice import ContextOptions
-from gvtools.training.corruption import CorruptionOptions, drawn
-from gvtools.training.hints import Clip, HintOptions
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import PathOptions, camera_path
 from gvtools.procedural.photographs import check_split, photograph_names
 from gvtools.procedural.render import SUPERSAMPLE, developed, radiance
+from gvtools.training.context_choice import ContextOptions
+from gvtools.training.corruption import CorruptionOptions, drawn
+from gvtools.training.hints import Clip, HintOptions
 from gvtools.training.view_sample import Sample, make_sample
 
 # Streams of random numbers of one sample.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
+from gvtools.procedural.photographs import photograph_names
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.dataset import MixedViews, ProceduralViews
@@ -12,7 +13,6 @@ from gvtools.training.dataset import Samples as DataSet
 from gvtools.training.loader import BatchLoader
 from gvtools.training.loop import Trainer
 from gvtools.training.options import TrainingConfig
-from gvtools.procedural.photographs import photograph_names
 from gvtools.training.processes import Processes
 from gvtools.training.sample_pool import PooledViews
 from gvtools.training.view_sample import collated

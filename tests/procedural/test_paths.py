@@ -5,10 +5,10 @@ import pytest
 from reference_rays import is_free
 
 from gvtools.errors import OptionError
-from gvtools.training.context_choice import ContextOptions, chosen_context
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import PathOptions, camera_path
 from gvtools.procedural.ray_cast import cast
+from gvtools.training.context_choice import ContextOptions, chosen_context
 
 SIZE = (48, 64)
 

@@ -9,6 +9,7 @@ import torch
 from seen_surfaces import seen_by_context
 
 from gvtools.errors import OptionError, ShapeError
+from gvtools.procedural.photographs import photograph_names
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.corruption import (
     NOTHING,
@@ -20,7 +21,6 @@ from gvtools.training.corruption import (
 )
 from gvtools.training.dataset import MixedViews, ProceduralViews
 from gvtools.training.hints import Clip, observed, projected
-from gvtools.procedural.photographs import photograph_names
 from gvtools.training.view_sample import Sample, collated
 
 CLEAN = ProceduralViews(faults=None)

@@ -11,13 +11,13 @@ from tiny_scan import render, world_from_cam, write_colmap_scan
 
 from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, ProjectError
+from gvtools.procedural.layouts import scene
+from gvtools.procedural.paths import PathOptions, camera_path
+from gvtools.procedural.render import developed, radiance
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.dataset import ProceduralViews
-from gvtools.procedural.layouts import scene
-from gvtools.procedural.paths import PathOptions, camera_path
-from gvtools.procedural.render import developed, radiance
 from gvtools.training.scene_views import SceneViews, overlaps
 from gvtools.training.view_sample import collated
 
