@@ -60,7 +60,7 @@ class _Furnisher:
 
     def color(self, choices: Sequence[Color]) -> Color:
         """One of the colours, slightly varied."""
-        color = np.array(choices[self.rng.integers(len(choices))])
+        color = np.array(choices[int(self.rng.integers(len(choices)))])
         red, green, blue = np.clip(color * self.rng.uniform(0.92, 1.06, 3), 0, 1).tolist()
         return red, green, blue
 
@@ -87,9 +87,10 @@ class _Furnisher:
         shades: bool = True,
     ) -> None:
         """A box between two corners in a place's axes, less boxes between such corners."""
-        middle = (np.asarray(low) + high) / 2
+        lowest, highest = np.asarray(low, np.float64), np.asarray(high, np.float64)
+        middle = (lowest + highest) / 2
         self.build.solid(
-            BOX, at.world(middle), (np.asarray(high) - low) / 2, material=material, yaw=at.yaw,
+            BOX, at.world(middle), (highest - lowest) / 2, material=material, yaw=at.yaw,
             cuts=[(np.asarray(a) - middle, np.asarray(b) - middle) for a, b in cuts],
             shades=shades,
         )  # fmt: skip
@@ -115,12 +116,12 @@ class _Furnisher:
 
     def post(self, foot: Float64, radius: float, height: float, *, material: int) -> None:
         """An upright cylinder."""
-        half = [radius, radius, height / 2]
-        self.build.solid(TUBE, foot + [0, 0, height / 2], half, material=material)
+        half = np.array([radius, radius, height / 2])
+        self.build.solid(TUBE, foot + half * [0, 0, 1], half, material=material)
 
     def ball(self, centre: Float64, radius: float, names: Sequence[str]) -> None:
         """A sphere that shows one of the photographs."""
-        image = globe(names[self.rng.integers(len(names))])
+        image = globe(names[int(self.rng.integers(len(names)))])
         self.build.solid(BALL, centre, [radius] * 3, material=self.build.coated(image, 1.0))
 
     def face(

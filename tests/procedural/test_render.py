@@ -226,7 +226,7 @@ def test_a_picture_hangs_upright_and_unmirrored() -> None:
     build.room([-5, -5, -5], [5, 5, 5], [build.coated(np.zeros_like(image), 1.0)] * 6)
     shown = build.coated(image, 2.0, offset=-1.0, emission=1.0)
     build.solid(BOX, [0, 0, 0], [1, 0.01, 1], material=shown)
-    look = build.look(Light(*np.zeros((2, 2, 3)), np.zeros((1, 2, 3)), 1.0, False))
+    look = build.look(Light(np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((1, 2, 3)), 1.0, False))
     # Seen along the box's second axis.
     camera = _towards(np.array([0.0, -2.0, 0.0]), np.zeros(3))
     picture = radiance(build.geometry(), look, camera)[0][0]
