@@ -30,26 +30,20 @@ class Surfaces:
 
     Attributes:
         depth: (V, H, W) float64 z-depth, metres; 0 for a camera that stands in no room.
-        room: (V, H, W) int64, whose wall it is, where it is one.
         solid: (V, H, W) int64, -1 for a wall.
-        code: (V, H, W) int64, see ``geometry``.
-        cutter: (V, H, W) int64, -1 where nothing was cut.
     """
 
     depth: Float64
-    room: Int64
     solid: Int64
-    code: Int64
-    cutter: Int64
 
 
 def cast(geometry: Geometry, cameras: Cameras) -> Surfaces:
     """The surfaces at the pixel centres of cameras of one size."""
     shape = (len(cameras), int(cameras.height[0]), int(cameras.width[0]))
-    out = Surfaces(np.empty(shape), *(np.empty(shape, np.int64) for _ in range(4)))
+    out = Surfaces(np.empty(shape), np.empty(shape, np.int64))
     _cast_rows(
         geometry, world_rays(cameras), cameras.centers, rectangles(geometry, cameras),
-        out.depth, out.room, out.solid, out.code, out.cutter,
+        out.depth, out.solid,
     )  # fmt: skip
     return out
 
@@ -197,7 +191,7 @@ def _enter_plain_box(
 
 
 @compiled(parallel=True)
-def _cast_rows(geometry, rays, centers, rects, depth, room, solid, code, cutter):
+def _cast_rows(geometry, rays, centers, rects, depth, solid):
     views, height, width = depth.shape
     total = len(geometry.rooms)
     for job in prange(views * height):
@@ -207,8 +201,8 @@ def _cast_rows(geometry, rays, centers, rects, depth, room, solid, code, cutter)
         local = np.empty((6, width))
         floats = np.empty((FLOATS + 2 * total, width))
         codes = np.empty((CODES + total, width), np.int64)
+        hits = np.empty((3, width), np.int64)
         trace_row(
             geometry, v, rays, centers, rects, row, row + 0.5, 1, ends[:3], ends[3:], local,
-            floats, codes,
-            depth[v, row], room[v, row], solid[v, row], code[v, row], cutter[v, row],
+            floats, codes, depth[v, row], hits[0], solid[v, row], hits[1], hits[2],
         )  # fmt: skip

@@ -15,7 +15,7 @@ from gvtools.kernels import FAST, compiled
 from gvtools.procedural.color import encode_srgb
 from gvtools.procedural.geometry import Geometry
 from gvtools.procedural.light import light_on
-from gvtools.procedural.ray_cast import CODES, FLOATS, rectangles, trace_row, world_rays
+from gvtools.procedural.ray_cast import CODES, FLOATS, cast, rectangles, trace_row, world_rays
 from gvtools.procedural.shading import Look, add_colors, surface_places, texture_levels
 
 Float32 = NDArray[np.float32]
@@ -41,13 +41,13 @@ def radiance(
         (V, H, W, 3) and (V, H, W) float32.
     """
     shape = (len(cameras), int(cameras.height[0]), int(cameras.width[0]))
-    color, depth = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
+    color = np.empty((*shape, 3), np.float32)
     focal = np.sqrt(cameras.K[:, 0, 0] * cameras.K[:, 1, 1])
     _render_rows(
         geometry, look, world_rays(cameras), cameras.centers, rectangles(geometry, cameras), focal,
-        supersample, color, depth,
+        supersample, color,
     )  # fmt: skip
-    return color, depth
+    return color, cast(geometry, cameras).depth.astype(np.float32)
 
 
 def developed(light: Float32, exposure: float) -> NDArray[np.uint8]:
@@ -61,8 +61,8 @@ _TONES = encode_srgb(np.linspace(0, BRIGHTEST, STEPS, dtype=np.float32))
 
 
 @compiled(parallel=True)
-def _render_rows(geometry, look, rays, centers, rects, focal, supersample, color, depth):
-    views, height = depth.shape[:2]
+def _render_rows(geometry, look, rays, centers, rects, focal, supersample, color):
+    views, height = color.shape[:2]
     for job in prange(views * height):
         v = job // height
         row = job % height
@@ -71,7 +71,6 @@ def _render_rows(geometry, look, rays, centers, rects, focal, supersample, color
             geometry, look, v, rays, centers, rects, row, supersample,
             1.0 / (supersample * focal[v]), color[v, row],
         )  # fmt: skip
-        _depth_row(geometry, v, rays, centers, rects, row, depth[v, row])
 
 
 @compiled(fastmath=FAST)
@@ -114,25 +113,6 @@ def _color_row(geometry, look, view, rays, centers, rects, row, supersample, pix
     for col in range(len(color)):
         for k in range(3):
             color[col, k] *= share
-
-
-@compiled()
-def _depth_row(geometry, view, rays, centers, rects, row, depth):
-    """Depths of the rays through a row's pixel centres."""
-    width = len(depth)
-    total = len(geometry.rooms)
-    ends = np.empty((6, width))
-    local = np.empty((6, width))
-    floats = np.empty((FLOATS + 2 * total, width))
-    codes = np.empty((CODES + total, width), np.int64)
-    hits = np.empty((4, width), np.int64)
-    t = np.empty(width)
-    trace_row(
-        geometry, view, rays, centers, rects, row, row + 0.5, 1, ends[:3], ends[3:], local,
-        floats, codes, t, hits[0], hits[1], hits[2], hits[3],
-    )  # fmt: skip
-    for col in range(width):
-        depth[col] = t[col]
 
 
 @compiled()

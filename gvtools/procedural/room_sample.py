@@ -6,31 +6,30 @@ what a run makes of the room can be measured. No file is downloaded.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, invert_rigid
 from gvtools.errors import OptionError
-from gvtools.procedural.furnished_room import Room, furnished_room
-from gvtools.scenes.ray_casting import Grid, Hits, cast, shade
-from gvtools.scenes.room_light import bake
+from gvtools.procedural.builder import ProceduralScene
+from gvtools.procedural.furnished_room import furnished_room
+from gvtools.procedural.render import developed, radiance
 from gvtools.scenes.sample_workspace import SampleContent, is_written, write_sample
+from gvtools.trajectories import look_at
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-AMBIENT = np.array([0.42, 0.42, 0.44])
 CONTEXT_SHARE = 0.4  # of the views
 CONTEXT_SWEEP = (0.0, 1.25)  # radians along the path, from its start
 TARGET_SWEEP = (0.15, 2.9)
 POINTS_PER_VIEW = 220
 DETECTION_NOISE = 0.3  # standard deviation, pixels
-SAME_SURFACE = 0.01  # relative z-depth by which a point may differ from the pixel it falls in
+SAME_SURFACE = 0.005  # relative z-depth by which a point may differ from the pixel it falls in
 
 
 @dataclass(frozen=True)
@@ -88,13 +87,15 @@ def write_room(
     context = tuple(f"context_{i:02d}.png" for i in range(count))
     targets = tuple(f"target_{i:02d}.png" for i in range(views - count))
     sample = RoomSample(folder, context, targets, context + targets, seed)
-    record: dict[str, Any] = {"sample": "room", "version": 1, "width": width, "height": height}
+    record: dict[str, Any] = {"sample": "room", "version": 2, "width": width, "height": height}
     record |= {key: value for key, value in asdict(sample).items() if key != "folder"}
     if is_written(folder, record):
         return sample
     room = furnished_room(seed)
     rng = np.random.default_rng([seed, 21])
-    cameras = _path(room.size, context, targets, width=width, height=height, rng=rng)
+    cameras = _path(
+        room.geometry.rooms[0, 1], context, targets, width=width, height=height, rng=rng
+    )
     write_sample(folder, _photographed(room, cameras, rng), record=record)
     return sample
 
@@ -116,102 +117,79 @@ def _path(
     sweep = np.concatenate(
         [np.linspace(*CONTEXT_SWEEP, len(context)), np.linspace(*TARGET_SWEEP, len(targets))]
     )
-    poses = []
-    for i, along in enumerate(start + sense * sweep):
-        axis = np.array([np.cos(along), np.sin(along)]) * (size[:2] / 2 - 1.2)
-        # Context views alternate in height, as somebody holding a camera does.
-        up = 1.45 + (0.22 * (i % 2) - 0.11 if i < len(context) else 0.08 * np.sin(3 * along))
-        eye = np.array([*(size[:2] / 2 + axis), up])
-        aim = np.array([*(size[:2] / 2 - 0.5 * axis), 0.95])
-        poses.append(look_at(eye, aim))
+    angle = start + sense * sweep
+    axis = np.stack([np.cos(angle), np.sin(angle)], -1) * (size[:2] / 2 - 1.2)
+    # Context views alternate in height, as somebody holding a camera does.
+    number = np.arange(len(angle))
+    up = np.where(
+        number < len(context), 1.34 + 0.22 * (number % 2), 1.45 + 0.08 * np.sin(3 * angle)
+    )
+    eye = np.column_stack([size[:2] / 2 + axis, up])
+    aim = np.column_stack([size[:2] / 2 - 0.5 * axis, np.full(len(angle), 0.95)])
+    poses = invert_rigid(look_at(eye, aim, up=[0.0, 0.0, 1.0]))
     count = len(poses)
     return Cameras(
         np.repeat(K[None], count, axis=0),
-        np.stack(poses),
+        poses,
         np.full(count, width),
         np.full(count, height),
         context + targets,
     )
 
 
-def look_at(eye: Float64, aim: Float64) -> Float64:
-    """(4, 4) cam_from_world of a level camera at ``eye`` that looks at ``aim``; z is up."""
-    forward = aim - eye
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return pose
-
-
-def _photographed(room: Room, cameras: Cameras, rng: np.random.Generator) -> SampleContent:
-    lights = bake(
-        room.patches, solids=room.solids, lamps=room.lamps, ambient=AMBIENT, room=room.size
-    )
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        shots = list(pool.map(partial(_shot, room, lights), cameras))
-    images = [image for image, _, _ in shots]
-    grids = [grid for _, grid, _ in shots]
-    hits = [hit for _, _, hit in shots]
-    points, colors, patch = _detected(images, grids, hits, rng)
-    tracks = _tracks(cameras, hits, points, patch)
-    tracks[2][:] += rng.normal(0, DETECTION_NOISE, tracks[2].shape)
-    kept, point_index = np.unique(tracks[0], return_inverse=True)
+def _photographed(
+    room: ProceduralScene, cameras: Cameras, rng: np.random.Generator
+) -> SampleContent:
+    """Pictures, depth, and noisy detections of surface points in them."""
+    light, depth = radiance(room.geometry, room.look, cameras)
+    images = developed(light, room.key / float(light.mean()))
+    points, colors = _detected(cameras, images, depth, rng)
+    point_index, view_index, xy = _tracks(cameras, depth, points)
+    xy += rng.normal(0, DETECTION_NOISE, xy.shape)
+    kept, point_index = np.unique(point_index, return_inverse=True)
     return SampleContent(
         cameras=cameras,
-        images=images,
-        depths=[hit.z.astype(np.float32) for hit in hits],
+        images=list(images),
+        depths=list(depth),
         points=points[kept],
         colors=colors[kept],
-        tracks=(point_index, *tracks[1:]),
+        tracks=(point_index, view_index, xy),
     )
-
-
-def _shot(
-    room: Room, lights: list[NDArray[np.float32]], camera: Cameras
-) -> tuple[NDArray[np.uint8], Grid, Hits]:
-    """A picture of 2 x 2 samples a pixel, and what the pixel centres hit."""
-    image = shade(room.patches, lights, *cast(room.patches, camera, supersample=2))
-    return image, *cast(room.patches, camera)
 
 
 def _detected(
-    images: list[NDArray[np.uint8]], grids: list[Grid], hits: list[Hits], rng: np.random.Generator
-) -> tuple[Float64, NDArray[np.uint8], NDArray[np.int16]]:
-    """Surface points where the pictures have detail: positions, colours, and their patches."""
-    points, colors, patches = [], [], []
-    for image, grid, hit in zip(images, grids, hits, strict=True):
-        gradient = np.hypot(*np.gradient(image.astype(np.float64).mean(-1))).ravel()
-        chance = np.where(hit.patch.ravel() >= 0, gradient + 0.2, 0)
-        chosen = rng.choice(
-            chance.size, min(POINTS_PER_VIEW, chance.size // 4), False, chance / chance.sum()
-        )
+    cameras: Cameras, images: NDArray[np.uint8], depth: Float32, rng: np.random.Generator
+) -> tuple[Float64, NDArray[np.uint8]]:
+    """Surface points where the pictures have detail: positions and colours."""
+    points, colors = [], []
+    for view, image in enumerate(images):
+        chance = np.hypot(*np.gradient(image.astype(np.float64).mean(-1))).ravel() + 0.2
+        count = min(POINTS_PER_VIEW, chance.size // 4)
+        chosen = rng.choice(chance.size, count, False, chance / chance.sum())
         y, x = np.divmod(np.sort(chosen), image.shape[1])
-        points.append(grid.center + hit.z[y, x][:, None] * grid.directions(y, x))
+        local = cameras.rays(view)[y, x] * depth[view, y, x, None]
+        world = cameras.world_from_cam[view]
+        points.append(local @ world[:3, :3].T + world[:3, 3])
         colors.append(image[y, x])
-        patches.append(hit.patch[y, x])
-    return np.concatenate(points), np.concatenate(colors), np.concatenate(patches)
+    return np.concatenate(points), np.concatenate(colors)
 
 
 def _tracks(
-    cameras: Cameras, hits: list[Hits], points: Float64, patch: NDArray[np.int16]
+    cameras: Cameras, depth: Float32, points: Float64
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Float64]:
     """Point index, view index and projection wherever at least two views see a point.
 
-    A view sees a point when the pixel that it falls in shows the same patch at the same depth.
+    A view sees a point when the pixel that it falls in shows something at the point's depth.
     """
     xy, z = cameras.project(points)
+    height, width = depth.shape[1:]
     seen = np.zeros(z.shape, bool)
-    for view, hit in enumerate(hits):
-        height, width = hit.z.shape
+    for view in range(len(cameras)):
         with np.errstate(invalid="ignore"):
-            inside = (xy[view] >= 0).all(-1) & (xy[view, :, 0] < width) & (xy[view, :, 1] < height)
+            inside = (xy[view] >= 0).all(-1) & (xy[view] < [width, height]).all(-1)
         rows = np.flatnonzero(inside)
         x, y = np.floor(xy[view, rows]).astype(int).T
-        near = np.abs(hit.z[y, x] / z[view, rows] - 1) < SAME_SURFACE
-        seen[view, rows] = near & (hit.patch[y, x] == patch[rows])
+        seen[view, rows] = np.abs(depth[view, y, x] / z[view, rows] - 1) < SAME_SURFACE
     seen[:, seen.sum(0) < 2] = False
     point_index, view_index = np.nonzero(seen.T)
     return point_index, view_index, xy[view_index, point_index]

@@ -1,4 +1,4 @@
-"""The log of a training: one JSON line a record, and TensorBoard's file where it is installed."""
+"""A training's stages, and its log: one JSON line a record, and TensorBoard's file if installed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from gvtools.files import write_text
 
+STAGES = ("encoder", "denoiser", "reflow", "heads")  # in order
 LOG = "log.jsonl"
 
 

@@ -27,10 +27,9 @@ from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.encoder_stage import EncoderStage, measure_statistics
 from gvtools.training.heads_stage import HeadsStage
 from gvtools.training.loop import Reporting, Trainer, check_parts
-from gvtools.training.names import STAGES
 from gvtools.training.options import ReflowStageOptions, TrainingSettings
 from gvtools.training.processes import Processes
-from gvtools.training.records import TrainingLog, read_log
+from gvtools.training.records import STAGES, TrainingLog, read_log
 from gvtools.training.reflow_stage import ReflowStage
 from gvtools.training.samples import TrainingSamples
 from gvtools.training.sheets import completion_sheet, encoder_sheet, write_png

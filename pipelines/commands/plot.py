@@ -113,8 +113,7 @@ def read_training(folder: Path) -> dict[str, list[dict[str, object]]]:
     Raises:
         ProjectError: no log there.
     """
-    from gvtools.training.names import STAGES
-    from gvtools.training.records import read_log
+    from gvtools.training.records import STAGES, read_log
 
     logs = {stage: read_log(folder / stage) for stage in STAGES}
     logs = {stage: records for stage, records in logs.items() if records}

@@ -28,7 +28,7 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    from gvtools.training.names import STAGES
+    from gvtools.training.records import STAGES
 
     parser.add_argument(
         "config", metavar="CONFIG", help="a training that ships (tiny, base, micro), or a JSON file"
@@ -85,9 +85,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """
     from gvtools.files import check_parent, make_folder, write_text
     from gvtools.settings import with_texts
-    from gvtools.training.names import STAGES
     from gvtools.training.options import shipped_or_read
     from gvtools.training.processes import started
+    from gvtools.training.records import STAGES
     from gvtools.training.run import StageRun
 
     config, folder = shipped_or_read(args.config)

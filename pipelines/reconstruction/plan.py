@@ -58,8 +58,6 @@ class Plan:
     @property
     def derived(self) -> dict[str, Any]:
         """What the run's settings leave open, by dotted key: voxel edge, rounds, device, ..."""
-        from gvtools.settings import changes
-
         return changes(self.settings, self.config)
 
 

@@ -14,8 +14,7 @@ from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pre
 from gvtools.completers.geoverse.weights.published import CONFIG_FILE, WHOLE_FILE
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
-from gvtools.training.names import STAGES
-from gvtools.training.records import read_log
+from gvtools.training.records import STAGES, read_log
 from gvtools.training.run import SETTINGS, WEIGHTS
 
 # Records of a stage's log that are kept.

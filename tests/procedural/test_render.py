@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 from reference_rays import first_surface, is_free
 
-from gvtools.cameras import Cameras
-from gvtools.procedural.builder import ProceduralScene, SceneBuilder
+from gvtools.cameras import Cameras, invert_rigid
+from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
 from gvtools.procedural.geometry import BALL, BOX, TUBE, clearance
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import cast
 from gvtools.procedural.render import developed, radiance
 from gvtools.procedural.shading import Look
+from gvtools.trajectories import look_at
 
 SEEDS = range(8)
 SIZE = (20, 20)
@@ -35,7 +36,7 @@ def _white(look: Look, **changes) -> Look:
         "emission": np.zeros_like(look.emission),
         "ambient": np.zeros((2, 3)),
         "sun": np.array([[0, 0, 1.0], [0, 0, 0]]),
-        "lamp": np.zeros((2, 3)),
+        "lamps": np.zeros((1, 2, 3)),
         "shadows": False,
     }
     return look._replace(**{**black, **changes})
@@ -78,10 +79,14 @@ def test_solids_on_their_own_and_from_within_their_hull() -> None:
 
 
 def _towards(eye: np.ndarray, aim: np.ndarray) -> Cameras:
-    from gvtools.procedural.room_sample import look_at
-
     K = np.array([[16.0, 0, 20], [0, 16, 20], [0, 0, 1]])
-    return Cameras(K[None], look_at(eye, aim)[None], np.array([40]), np.array([40]), ("a",))
+    return Cameras(
+        K[None],
+        invert_rigid(look_at(eye[None], aim, up=[0, 0, 1])),
+        np.array([40]),
+        np.array([40]),
+        ("a",),
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 5])
@@ -119,12 +124,12 @@ def test_normals_are_those_of_neighbouring_surface_points(seed: int) -> None:
 def test_the_lamp_lights_what_it_sees(seed: int) -> None:
     place, cameras = _drawn(seed, views=1)
     geometry = place.geometry
-    lamp = np.stack([place.look.lamp[0], np.ones(3)])
+    lamp = np.stack([place.look.lamps[0, 0], np.ones(3)])
     assert is_free(geometry, lamp[0])
-    lit = radiance(geometry, _white(place.look, lamp=lamp, shadows=True), cameras, supersample=1)[
-        0
-    ][0, ..., 0].ravel()
-    open_ = radiance(geometry, _white(place.look, lamp=lamp), cameras, supersample=1)[0]
+    lit = radiance(
+        geometry, _white(place.look, lamps=lamp[None], shadows=True), cameras, supersample=1
+    )[0][0, ..., 0].ravel()
+    open_ = radiance(geometry, _white(place.look, lamps=lamp[None]), cameras, supersample=1)[0]
     facing = open_[0, ..., 0].ravel() > 1e-3
     rays = _rays(cameras, 0)
     depth = cast(geometry, cameras).depth[0].reshape(-1, 1)
@@ -211,3 +216,39 @@ def test_scenes_are_those_of_their_seed() -> None:
     first, again, other = (scene(np.random.default_rng(n), "train") for n in (7, 7, 8))
     assert all(np.array_equal(a, b) for a, b in zip(arrays(first), arrays(again), strict=True))
     assert not np.array_equal(first.geometry.rooms[0], other.geometry.rooms[0])
+
+
+def test_a_picture_hangs_upright_and_unmirrored() -> None:
+    image = np.zeros((64, 64, 3), np.uint8)
+    image[:32, :32, 0] = 200  # red, upper left
+    image[:32, 32:, 1] = 200  # green, upper right
+    build = SceneBuilder(np.random.default_rng(0), ())
+    build.room([-5, -5, -5], [5, 5, 5], [build.coated(np.zeros_like(image), 1.0)] * 6)
+    shown = build.coated(image, 2.0, offset=-1.0, emission=1.0)
+    build.solid(BOX, [0, 0, 0], [1, 0.01, 1], material=shown)
+    look = build.look(Light(np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((1, 2, 3)), 1.0, False))
+    # Seen along the box's second axis.
+    camera = _towards(np.array([0.0, -2.0, 0.0]), np.zeros(3))
+    picture = radiance(build.geometry(), look, camera)[0][0]
+    assert picture[16, 16, 0] > 0.5 and picture[16, 16, 1] < 0.01
+    assert picture[16, 24, 1] > 0.5 and picture[16, 24, 0] < 0.01
+    assert picture[24, 20].max() < 0.01
+
+
+def test_several_lamps_add_up_and_some_things_cast_no_shadow() -> None:
+    build = SceneBuilder(np.random.default_rng(0), ())
+    white = build.coated(np.full((8, 8, 3), 255, np.uint8), 1.0)
+    build.room([-3, -3, 0], [3, 3, 3], [white] * 6)
+    build.solid(BOX, [0, 0, 1], [0.3, 0.3, 0.1], material=white, shades=False)
+    lamps = np.array([[[0.0, 0.0, 2.5], [1, 1, 1]], [[1.5, 1.0, 2.0], [1, 0.5, 0.2]]])
+    camera = _towards(np.array([-2.0, -2.0, 1.5]), np.zeros(3))
+
+    def light(lamps: np.ndarray, *, shades: bool) -> np.ndarray:
+        geometry = build.geometry()._replace(shades=np.array([shades]))
+        look = build.look(Light(np.zeros((2, 3)), np.zeros((2, 3)), lamps, 2.0, True))
+        return radiance(geometry, look, camera)[0]
+
+    apart = light(lamps[:1], shades=True) + light(lamps[1:], shades=True)
+    np.testing.assert_allclose(light(lamps, shades=True), apart, rtol=1e-5, atol=1e-6)
+    shadow = light(lamps, shades=False) - apart
+    assert shadow.min() > -1e-6 and (shadow > 0.1).mean() > 0.01

@@ -6,12 +6,14 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from reference_rays import first_surface, is_free
 from scipy.ndimage import map_coordinates
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ProjectError
 from gvtools.procedural.furnished_room import furnished_room
-from gvtools.procedural.room_sample import RoomSample, look_at, write_room
+from gvtools.procedural.geometry import clearance
+from gvtools.procedural.room_sample import RoomSample, write_room
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.scene import Frame, Scene
 
@@ -56,6 +58,18 @@ def _warp(
         -1,
     )
     return colors.reshape(*target.depth.shape, 3), same.reshape(target.depth.shape)
+
+
+def test_depth_is_where_rays_leave_free_space(scene: Scene, frames: list[Frame]) -> None:
+    geometry = furnished_room(0).geometry
+    rng = np.random.default_rng(2)
+    for view, frame in enumerate(frames):
+        assert frame.depth is not None
+        y, x = (rng.integers(0, side, 40) for side in frame.depth.shape)
+        pose = scene.cameras.cam_from_world[view, :3, :3]
+        rays = scene.cameras.rays(view)[y, x] @ pose
+        expected = first_surface(geometry, scene.cameras.centers[view], rays)
+        np.testing.assert_allclose(frame.depth[y, x], expected, rtol=1e-5)
 
 
 def test_depth_carries_one_views_colours_into_another(scene: Scene, frames: list[Frame]) -> None:
@@ -157,27 +171,26 @@ def test_same_seed_same_bytes(sample: RoomSample, tmp_path: Path) -> None:
 
 
 def test_another_seed_is_another_room() -> None:
-    one, other = furnished_room(1), furnished_room(2)
-    assert np.abs(one.size - other.size).max() > 0.05
-    assert len(one.patches) != len(other.patches)
+    one, other = furnished_room(1).geometry, furnished_room(2).geometry
+    assert np.abs(one.rooms - other.rooms).max() > 0.05
+    assert len(one.kind) != len(other.kind)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_cameras_stand_clear_of_furniture(seed: int) -> None:
-    room = furnished_room(seed)
-    half = room.size[:2] / 2
+    geometry = furnished_room(seed).geometry
+    half = geometry.rooms[0, 1, :2] / 2
     angle = np.linspace(0, 2 * np.pi, 90)
     ring = half + (half - 1.2) * np.stack([np.cos(angle), np.sin(angle)], -1)
     eyes = np.concatenate([np.c_[ring, np.full(len(ring), up)] for up in (1.34, 1.56)])
-    for patch in room.patches:
-        points = patch.hull()
-        low, high = points.min(0), points.max(0)
-        if (high - low)[:2].max() > 0.8 * room.size[:2].min():
-            continue
-        gap = np.linalg.norm(eyes - np.clip(eyes, low, high), axis=-1)
-        assert gap.min() > 0.15
-    for patch in room.patches:
-        assert (patch.hull() > -1e-9).all() and (patch.hull() < room.size + 1e-9).all()
+    assert clearance(geometry, eyes).min() > 0.15
+    assert (geometry.centre > -1e-9).all() and (geometry.centre < geometry.rooms[0, 1] + 1e-9).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lamps_hang_in_free_space(seed: int) -> None:
+    room = furnished_room(seed)
+    assert is_free(room.geometry, room.look.lamps[:, 0]).all()
 
 
 def test_existing_sample_is_kept_and_others_refused(sample: RoomSample, tmp_path: Path) -> None:
@@ -198,14 +211,3 @@ def test_impossible_options_are_refused(tmp_path: Path, bad: dict[str, int]) -> 
     with pytest.raises(OptionError, match="expected a seed of 0 or more"):
         write_room(tmp_path / "room", **bad)
     assert not (tmp_path / "room").exists()
-
-
-def test_look_at_puts_the_aim_on_the_optical_axis() -> None:
-    eye, aim = np.array([1.0, 2.0, 1.5]), np.array([4.0, 1.0, 0.5])
-    pose = look_at(eye, aim)
-    x, y, z = pose[:3, :3] @ aim + pose[:3, 3]
-    assert (x, y) == pytest.approx((0, 0), abs=1e-12)
-    assert z == pytest.approx(np.linalg.norm(aim - eye))
-    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
-    # What is higher in the world is higher in the image, where y points down.
-    assert (pose[:3, :3] @ [0, 0, 1])[1] < 0

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from gvtools.errors import OptionError
-from gvtools.procedural.color import decode_srgb
+from gvtools.procedural import materials
+from gvtools.procedural.color import decode_srgb, encode_srgb
 from gvtools.procedural.patterns import color, noise, pattern
 from gvtools.procedural.photographs import LONGEST, PHOTOGRAPHS, photograph, photograph_names
-from gvtools.procedural.textures import LEVELS, OFFSETS, SIDE, picture, stacked, texture
+from gvtools.procedural.textures import SIDE, level_starts, picture, stacked, texture
 
 
 def test_splits_share_no_photograph() -> None:
@@ -73,9 +74,28 @@ def test_levels_are_block_means_in_linear_light() -> None:
     images = rng.integers(0, 256, (2, SIDE, SIDE, 3), np.uint8)
     texels = stacked(list(images))
     linear = decode_srgb(images).astype(np.float64)
-    for level in range(LEVELS):
+    starts = level_starts(SIDE)
+    for level in range(len(starts) - 1):
         side = SIDE >> level
         block = 1 << level
         expected = linear.reshape(2, side, block, side, block, 3).mean((2, 4))
-        found = texels[:, OFFSETS[level] : OFFSETS[level + 1]].reshape(2, side, side, 3)
+        found = texels[:, starts[level] : starts[level + 1]].reshape(2, side, side, 3)
         np.testing.assert_allclose(found, expected, atol=2e-6)
+
+
+def test_room_materials_have_their_colour_and_size() -> None:
+    rng = np.random.default_rng(0)
+    color = (0.5, 0.6, 0.7)
+    for image in (materials.paint(color), materials.tiled("brick", color)):
+        np.testing.assert_allclose(image.mean((0, 1)) / 255, color, atol=0.03)
+    boards = materials.planks(color, rng)
+    assert boards.std() > materials.paint(color).std()
+    for image in (boards, materials.globe("moon"), materials.picture("rocket")[0]):
+        assert image.shape == (materials.SIDE, materials.SIDE, 3) and image.dtype == np.uint8
+
+
+def test_colour_codes_round_trip_below_the_roll_off() -> None:
+    codes = np.arange(0, 215, dtype=np.uint8)
+    np.testing.assert_array_equal(encode_srgb(decode_srgb(codes)), codes)
+    bright = encode_srgb(np.linspace(0.6, 5, 50).astype(np.float32))
+    assert (np.diff(bright.astype(int)) >= 0).all()

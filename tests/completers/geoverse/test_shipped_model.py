@@ -12,7 +12,7 @@ from benchmarks.experiments.options import ExperimentOptions
 from gvtools.completers.base import create
 from gvtools.completers.geoverse.completer import SHIPPED, GeoVerseCompleter
 from gvtools.completers.geoverse.weights.checks import config_of
-from gvtools.training.names import STAGES
+from gvtools.training.records import STAGES
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from stereo_scenes import plane_scene
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, invert_rigid
 from gvtools.depth.stereo.alignment import adjusted, pose_equations
 from gvtools.depth.stereo.consistency import agreement
 from gvtools.depth.stereo.depth_range import estimate_range, range_of_depths, seen_points
@@ -19,8 +19,8 @@ from gvtools.depth.stereo.pyramid import build_pyramid, level_of
 from gvtools.depth.stereo.residual_flow import residual_flow
 from gvtools.depth.stereo.sources import choose_sources, parallax
 from gvtools.errors import DegenerateError
-from gvtools.procedural.room_sample import look_at
 from gvtools.scenes.scene import Scene, SparsePoints
+from gvtools.trajectories import look_at
 
 
 def with_points(scene: Scene, depth: float = 2.0, count: int = 60) -> Scene:
@@ -49,9 +49,8 @@ def ring(count: int = 8, radius: float = 3.0) -> Scene:
     for i in range(count):
         angle = 0.25 * i
         eye = np.array([radius * np.cos(angle), radius * np.sin(angle), 0.1 * (i % 2)])
-        camera = replace(
-            base.views[0].camera, cam_from_world=look_at(eye, np.zeros(3))[None], names=(f"r{i}",)
-        )
+        pose = look_at(eye[None], np.zeros(3), up=[0, 0, 1])
+        camera = replace(base.views[0].camera, cam_from_world=invert_rigid(pose), names=(f"r{i}",))
         views.append(replace(base.views[0], name=f"r{i}", camera=camera))
     return Scene(Path("ring"), "colmap", tuple(views))
 
