@@ -73,9 +73,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
         GvError: a wrong setting, a state of another training, or weights that do not fit.
     """
     from gvtools.files import check_parent, make_folder, write_text
+    from gvtools.training.distributed import started
     from gvtools.training.names import STAGES
     from gvtools.training.options import shipped_or_read, with_settings
-    from gvtools.training.processes import started
     from gvtools.training.run import StageRun
 
     config, folder = shipped_or_read(args.config)

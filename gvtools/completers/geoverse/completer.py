@@ -244,7 +244,7 @@ class GeoVerseCompleter:
                 names=[names],
                 bounds=bounds,
                 cascade_bounds=self._cascade_bounds(model),
-                guidance=self.guidance,
+                cfg_scale=self.guidance,
                 temperature=self.temperature,
                 prior=prior,
                 targets_alone=told,

@@ -91,11 +91,11 @@ def test_tokens_near_a_hole_are_its_own_and_those_around():
 
 
 @pytest.mark.parametrize(
-    ("bounds", "guidance", "injection", "used"),
+    ("bounds", "cfg_scale", "injection", "used"),
     [(BOUNDS, 1.0, "none", True), (BOUNDS[::3], 1.0, "none", False), (BOUNDS, 2.0, "none", False),
      (BOUNDS, 1.0, "control", False)],
 )  # fmt: skip
-def test_passes_that_need_whole_steps_make_them(bounds, guidance, injection, used, monkeypatch):
+def test_passes_that_need_whole_steps_make_them(bounds, cfg_scale, injection, used, monkeypatch):
     built: GeoVerse = micro.model(micro.config(injection=injection))
     given: list[Any] = []
     forward = Denoiser.forward
@@ -109,7 +109,7 @@ def test_passes_that_need_whole_steps_make_them(bounds, guidance, injection, use
     monkeypatch.setattr(model_module, "near_tokens", few)
     batch = micro.batch(1, context=2, targets=2)
     video = None if injection == "none" else micro.video_features(1, 4)
-    built.generate(batch, bounds=bounds, guidance=guidance, video=video, near_holes=True)
+    built.generate(batch, bounds=bounds, cfg_scale=cfg_scale, video=video, near_holes=True)
     assert {near is not None for near in given} == {used}
 
 
