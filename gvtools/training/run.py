@@ -102,12 +102,12 @@ class StageRun:
                 "choose another --out"
             )
         model = self._start(say)
-        held = self._distributed(self._module(model), model.video)
-        if held.about:
-            say(f"{self.stage}: {held.about}")
+        distributed = self._distributed(self._module(model), model.video)
+        if distributed.about:
+            say(f"{self.stage}: {distributed.about}")
         samples = TrainingSamples(self.config, self.model_config)
         trainer = Trainer(
-            held,
+            distributed,
             self.options.optimizer,
             samples.batch,
             folder=self.folder,
@@ -136,14 +136,14 @@ class StageRun:
             shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if not k.endswith(COUNTS))
             say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
 
-        drawing = sheet_every and (held.together or log is not None)
+        drawing = sheet_every and (distributed.collective or log is not None)
         held_out = samples.held_out(SHEET_SAMPLES) if drawing else None
 
         def sheet(step: int) -> None:
             if held_out is None:
                 return
             batch = held_out.to(self.processes.device)
-            with held.usable():
+            with distributed.usable():
                 # What processes hold parts of, all of them have to run.
                 draw = encoder_sheet if self.stage == "encoder" else completion_sheet
                 drawn = draw(model, batch)
