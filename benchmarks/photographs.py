@@ -1,6 +1,6 @@
 """Photographs alone: a memory from computed depth, against COLMAP's sparse points.
 
-    python benchmarks/photographs.py PROJECT [PROJECT ...] [--variants]
+    python -m benchmarks.photographs PROJECT [PROJECT ...] [--variants]
 
 Every eighth photograph of each COLMAP project is held out and nothing of it is looked at. Depth of
 the others is computed, lifted and fused; the held-out cameras are projected without a completer.
@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.exposures import Exposures, estimate_exposures
 from gvtools.depth.choice import choose_source
 from gvtools.depth.source import DepthMap
-from gvtools.depth.stereo.exposure import Exposures, estimate_exposures
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.evaluation.images import psnr
 from gvtools.memory.back_projection import back_project

@@ -1,6 +1,6 @@
 """Depth from photographs: accuracy against time, and how far the confidence can be believed.
 
-    python benchmarks/stereo.py SEVENSCENES_FOLDER [--views 10] [--every 2] [--plot FILE]
+    python -m benchmarks.stereo SEVENSCENES_FOLDER [--views 10] [--every 2] [--plot FILE]
 
 The scenes are the procedural room, whose depth is exact, and a 7-Scenes folder with registered
 depth, of which stereo gets the pictures and poses alone. ``kept`` is the share of pixels with true
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gvtools.depth.stereo.confidence import Reliability, reliability
+from benchmarks.reliability import Reliability, reliability
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.procedural.room_sample import write_room

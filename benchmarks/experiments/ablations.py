@@ -34,8 +34,8 @@ from gvtools.evaluation.tables import Table
 from gvtools.files import write_json
 from gvtools.networks.config_json import to_json
 from gvtools.settings import with_texts
+from gvtools.training.distributed import started
 from gvtools.training.options import TrainingSettings, shipped_or_read
-from gvtools.training.processes import started
 from gvtools.training.run import StageRun
 from pipelines.console import Console
 
@@ -171,7 +171,7 @@ def _start(encoder: Path, config: GeoVerseConfig, folder: Path) -> Path:
 
 def _save_random_prior(folder: Path) -> None:
     """Wan VACE of four narrow blocks and its VAE, random, in the layout of a truncated folder."""
-    from gvtools.completers.geoverse.video_prior.wan_library import network_class
+    from gvtools.completers.geoverse.video_prior.wan_folder import network_class
 
     with torch.random.fork_rng():
         torch.manual_seed(0)

@@ -26,9 +26,9 @@ from gvtools.evaluation.tables import Table
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import select
 from gvtools.settings import with_texts
+from gvtools.training.distributed import started
 from gvtools.training.hints import Observation, projected
 from gvtools.training.options import shipped_or_read
-from gvtools.training.processes import started
 from gvtools.training.run import StageRun
 from pipelines.console import Console
 

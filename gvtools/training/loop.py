@@ -21,11 +21,10 @@ from torch import Tensor, nn
 
 from gvtools.errors import OptionError
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.copies import Copies
+from gvtools.training.distributed import Processes, Replicated
 from gvtools.training.draws import Draws
 from gvtools.training.ema import AveragedWeights
 from gvtools.training.options import OptimizerOptions
-from gvtools.training.processes import Processes
 from gvtools.training.state import Progress, StageState, load_state, save_state
 
 
@@ -68,7 +67,8 @@ class Trainer:
     """One stage in training.
 
     Args:
-        held: what this process holds of a stage (see Stage); what it leaves trainable is trained.
+        distributed: what this process holds of a stage (see Stage); what it leaves trainable is
+            trained.
         options: of the optimiser.
         batches: gives the samples with these numbers.
         folder: of the state.
@@ -78,7 +78,7 @@ class Trainer:
 
     def __init__(
         self,
-        held: Copies,
+        distributed: Replicated,
         options: OptimizerOptions,
         batches: Batches,
         *,
@@ -86,7 +86,8 @@ class Trainer:
         seed: int,
         identity: dict[str, Any],
     ) -> None:
-        self.held, self.stage, self.processes = held, held.stage, held.processes
+        self.distributed = distributed
+        self.stage, self.processes = distributed.stage, distributed.processes
         self.options, self.batches = options, batches
         self.folder, self.seed, self.identity = folder, seed, identity
         self.parameters = [(n, p) for n, p in self.stage.named_parameters() if p.requires_grad]
@@ -105,15 +106,15 @@ class Trainer:
 
     def resume(self) -> bool:
         """Continue from the saved state; False where there is none."""
-        state = load_state(self.folder, self.identity, mapped=self.held.together)
+        state = load_state(self.folder, self.identity, mapped=self.distributed.collective)
         if state is None:
             return False
         with torch.no_grad():
             for name, parameter in self.parameters:
-                parameter.copy_(self.held.placed(state.model[name], parameter))
+                parameter.copy_(self.distributed.placed(state.model[name], parameter))
         self.optimizer.load_state_dict(self._placed_moments(state.optimizer))
         shadow = {
-            name: self.held.placed(state.ema["shadow"][name], value)
+            name: self.distributed.placed(state.ema["shadow"][name], value)
             for name, value in self.ema.shadow.items()
         }
         self.ema.load_state_dict({**state.ema, "shadow": shadow})
@@ -125,7 +126,7 @@ class Trainer:
         parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         moments = {
             index: {
-                name: value if name == "step" else self.held.placed(value, parameters[index])
+                name: value if name == "step" else self.distributed.placed(value, parameters[index])
                 for name, value in entry.items()
             }
             for index, entry in state["state"].items()
@@ -135,7 +136,7 @@ class Trainer:
     def save(self) -> None:
         """Write the state, from the first process; called by all of them."""
         model, optimizer, ema = (
-            self.held.gathered(part)
+            self.distributed.gathered(part)
             for part in (
                 {name: parameter.detach() for name, parameter in self.parameters},
                 self.optimizer.state_dict(),
@@ -199,8 +200,8 @@ class Trainer:
         trained = [parameter for _, parameter in self.parameters]
         bad = self.processes.any(not good)
         if not bad:
-            self.held.average_gradients(trained)
-            norm = self.held.number(nn.utils.clip_grad_norm_(trained, options.clip))
+            self.distributed.average_gradients(trained)
+            norm = self.distributed.number(nn.utils.clip_grad_norm_(trained, options.clip))
             bad = not math.isfinite(norm)
         if bad:
             self.progress.skipped += 1

@@ -22,13 +22,12 @@ from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text
 from gvtools.networks.config_json import to_json
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.copies import Copies, models_of
 from gvtools.training.denoiser_stage import DenoiserStage
+from gvtools.training.distributed import Processes, Replicated, models_of
 from gvtools.training.encoder_stage import EncoderStage, measure_statistics
 from gvtools.training.heads_stage import HeadsStage
 from gvtools.training.loop import Reporting, Trainer, check_parts
 from gvtools.training.options import ReflowStageOptions, TrainingSettings
-from gvtools.training.processes import Processes
 from gvtools.training.records import STAGES, TrainingLog, read_log
 from gvtools.training.reflow_stage import ReflowStage
 from gvtools.training.samples import TrainingSamples
@@ -102,12 +101,12 @@ class StageRun:
                 "choose another --out"
             )
         model = self._start(say)
-        held = self._distributed(self._module(model), model.video)
-        if held.about:
-            say(f"{self.stage}: {held.about}")
+        distributed = self._distributed(self._module(model), model.video)
+        if distributed.about:
+            say(f"{self.stage}: {distributed.about}")
         samples = TrainingSamples(self.config, self.model_config)
         trainer = Trainer(
-            held,
+            distributed,
             self.options.optimizer,
             samples.batch,
             folder=self.folder,
@@ -136,14 +135,14 @@ class StageRun:
             shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if not k.endswith(COUNTS))
             say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
 
-        drawing = sheet_every and (held.together or log is not None)
+        drawing = sheet_every and (distributed.collective or log is not None)
         held_out = samples.held_out(SHEET_SAMPLES) if drawing else None
 
         def sheet(step: int) -> None:
             if held_out is None:
                 return
             batch = held_out.to(self.processes.device)
-            with held.usable():
+            with distributed.usable():
                 # What processes hold parts of, all of them have to run.
                 draw = encoder_sheet if self.stage == "encoder" else completion_sheet
                 drawn = draw(model, batch)
@@ -214,17 +213,17 @@ class StageRun:
             return HeadsStage(model, self.options)
         return ReflowStage(model, self.options)
 
-    def _distributed(self, module: nn.Module, video: VideoPrior | None) -> Copies:
+    def _distributed(self, module: nn.Module, video: VideoPrior | None) -> Replicated:
         """What this process holds of the stage."""
         if video is not None:
             for model in models_of(module):
                 # A teacher does without its copy: it is large, and never trained.
                 model.attach_video(video)
         if self.config.parallel == "sharded" and self.processes.count > 1:
-            from gvtools.training.shards import Shards
+            from gvtools.training.sharded import Sharded
 
-            return Shards(module, self.processes)
-        return Copies(module, self.processes)
+            return Sharded(module, self.processes)
+        return Replicated(module, self.processes)
 
     def _identity(self, samples: TrainingSamples) -> dict[str, Any]:
         """What may not change between the parts of a stage."""
@@ -249,7 +248,7 @@ class StageRun:
     def _write_weights(self, model: GeoVerse, trainer: Trainer, samples: TrainingSamples) -> None:
         """The averaged weights; after stage 0 with the latents' statistics."""
         with trainer.ema.swapped_in():
-            whole = trainer.held.whole_model(model)
+            whole = trainer.distributed.whole_model(model)
             if whole is not None:
                 if self.stage == "encoder":
                     device = self.processes.device
@@ -281,7 +280,7 @@ class StageRun:
 
 def _sampled_as(config: GeoVerseConfig, flow: FlowConfig) -> GeoVerseConfig:
     """The configuration with the bounds and the guidance that its weights were distilled for."""
-    known = replace(config.flow, level1=flow.level1, guidance=flow.guidance)
+    known = replace(config.flow, level1=flow.level1, cfg_scale=flow.cfg_scale)
     return replace(config, flow=known)
 
 
@@ -289,7 +288,7 @@ def _distilled(config: GeoVerseConfig, options: ReflowStageOptions) -> GeoVerseC
     """The student's configuration: it takes one step an interval, and its guidance is inside it."""
     flow = replace(config.flow, level1=options.bounds or config.flow.level1)
     if options.guidance != 1:
-        flow = replace(flow, guidance=1.0)
+        flow = replace(flow, cfg_scale=1.0)
     return replace(config, flow=flow)
 
 

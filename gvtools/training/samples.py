@@ -10,10 +10,10 @@ from gvtools.training.batch import TrainingBatch
 from gvtools.training.context_choice import ContextOptions
 from gvtools.training.dataset import MixedViews, ProceduralViews
 from gvtools.training.dataset import Samples as DataSet
+from gvtools.training.distributed import Processes
 from gvtools.training.loader import BatchLoader
 from gvtools.training.loop import Trainer
 from gvtools.training.options import TrainingSettings
-from gvtools.training.processes import Processes
 from gvtools.training.sample_pool import PooledViews
 from gvtools.training.view_sample import collated
 

@@ -19,8 +19,7 @@ from gvtools.completers.geoverse.video_prior.prior import (
     VideoPrior,
     VideoPriorConfig,
 )
-from gvtools.completers.geoverse.video_prior.wan_folder import dtype_of
-from gvtools.completers.geoverse.video_prior.wan_library import empty_network
+from gvtools.completers.geoverse.video_prior.wan_folder import dtype_of, empty_network
 
 # Of random weights: small enough for the activations of deep networks to stay finite.
 DEVIATION = 0.02

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse import denoiser, shared_attention
+from gvtools.completers.geoverse import denoiser_blocks, shared_attention
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.stages import LEVEL0, LEVEL1, no_clock
@@ -146,16 +146,16 @@ def compare_attention(timed: TimedPass, *, repeat: int) -> Comparison | str:
 @contextmanager
 def explicit_attention() -> Iterator[None]:
     """Let the denoisers spell their attention out."""
-    kept = denoiser.attend
+    kept = denoiser_blocks.attend
 
     def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         return ((q * q.shape[-1] ** -0.5) @ k.mT).softmax(-1) @ v
 
-    denoiser.attend = shared_attention.attend = attend
+    denoiser_blocks.attend = shared_attention.attend = attend
     try:
         yield
     finally:
-        denoiser.attend = shared_attention.attend = kept
+        denoiser_blocks.attend = shared_attention.attend = kept
 
 
 def free_bytes(device: torch.device) -> int:

@@ -85,8 +85,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """
     from gvtools.files import check_parent, make_folder, write_text
     from gvtools.settings import with_texts
+    from gvtools.training.distributed import started
     from gvtools.training.options import shipped_or_read
-    from gvtools.training.processes import started
     from gvtools.training.records import STAGES
     from gvtools.training.run import StageRun
 

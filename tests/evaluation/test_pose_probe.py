@@ -208,6 +208,8 @@ def test_lightglue_reads_weights_of_a_folder_and_refuses_others(
 
     from gvtools.evaluation.pose_probe import lightglue
 
+    pytest.importorskip("kornia.feature.aliked", reason="kornia without ALIKED")
+
     torch.manual_seed(0)
     random = lightglue.networks(64)
     for network, name in zip(random, lightglue.FILES, strict=True):

@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from gvtools.training.processes import started
+from gvtools.training.distributed import started
 
 
 def threads() -> int:

@@ -194,7 +194,7 @@ def test_a_student_is_sampled_by_the_bounds_that_it_was_distilled_for(trained, t
     assert train(tmp_path, "heads", *steps("heads", 1), *bounds) == 0
     for stage in ("reflow", "heads"):
         flow = from_pretrained(tmp_path / stage / "weights").config.flow
-        assert flow.level1 == (1, 0.4, 0) and flow.guidance == 1
+        assert flow.level1 == (1, 0.4, 0) and flow.cfg_scale == 1
     own = from_pretrained(trained / "heads" / "weights").config.flow
     assert len(own.level1) == 4
 

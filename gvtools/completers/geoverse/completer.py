@@ -208,7 +208,7 @@ class GeoVerseCompleter(Completer):
                 names=[names],
                 bounds=effort.bounds,
                 cascade_bounds=interval_bounds(cascade) if cascade else self.config.flow.cascade,
-                guidance=options.cfg_scale,
+                cfg_scale=options.cfg_scale,
                 temperature=options.temperature,
                 prior=effort.prior,
                 targets_alone=complete_fill,

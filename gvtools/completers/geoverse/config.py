@@ -35,7 +35,7 @@ class FlowConfig:
         shift: of the training times, t' = s t / (1 + (s - 1) t); 1 for none (the paper).
         most_time: training times are drawn below it, before the shift; 1 for the paper's U(0, 1),
             0.999 is Geometric Latent Diffusion's.
-        guidance: classifier-free guidance scale over the cameras; 1 for none (the paper).
+        cfg_scale: classifier-free guidance scale over the cameras; 1 for none (the paper).
         temperature: of the noise that level 1 starts from, its standard deviation; 1 draws from
             what the model has learned (the paper), less stays nearer to its mean.
     """
@@ -47,7 +47,7 @@ class FlowConfig:
     cascade: tuple[float, ...] = (1.0, 0.0)
     shift: float = 1.0
     most_time: float = 0.999
-    guidance: float = 1.0
+    cfg_scale: float = 1.0
     temperature: float = 1.0
 
     def __post_init__(self) -> None:
@@ -59,7 +59,7 @@ class FlowConfig:
             raise OptionError("flow.skip needs flow.prediction = 'clean'")
         check_range("flow.least_time", self.least_time, gt=0, le=1)
         check_range("flow.shift", self.shift, gt=0)
-        check_range("flow.guidance", self.guidance, ge=0)
+        check_range("flow.cfg_scale", self.cfg_scale, ge=0)
         check_range("flow.temperature", self.temperature, ge=0)
         check_range("flow.most_time", self.most_time, gt=0, le=1)
         check_bounds(self.level1, whole=True)

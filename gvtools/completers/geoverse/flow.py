@@ -248,7 +248,7 @@ def sample(
     bounds: Sequence[float],
     *,
     unconditional: Velocity | None = None,
-    guidance: float = 1.0,
+    cfg_scale: float = 1.0,
     callback: Callable[[int, Tensor, Tensor], None] | None = None,
 ) -> Tensor:
     """From noise to clean with one Euler step an interval.
@@ -257,12 +257,12 @@ def sample(
         velocity: see ``integrate``.
         noise: (B, ...), the state at t = 1.
         bounds: K + 1 times, see ``check_bounds``; the last is 0 in GeoVerse.
-        unconditional: the network without the condition that ``guidance`` is to strengthen.
-        guidance: scale, 1 = none, see ``guided``.
+        unconditional: the network without the condition that ``cfg_scale`` is to strengthen.
+        cfg_scale: of classifier-free guidance, 1 = none, see ``guided``.
         callback: see ``integrate``.
 
     Returns:
         The state (B, ...) at the last bound.
     """
-    step = guided(velocity, unconditional, guidance)
+    step = guided(velocity, unconditional, cfg_scale)
     return integrate(step, noise, check_bounds(bounds), callback=callback)

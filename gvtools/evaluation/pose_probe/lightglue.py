@@ -106,10 +106,19 @@ class LightGlueMatcher:
 
 def networks(max_features: int) -> tuple[Any, Any]:
     """Kornia's ALIKED and LightGlue with random weights, in evaluation mode."""
-    from kornia.feature import ALIKED, LightGlue
+    try:
+        from kornia.feature import ALIKED, LightGlue
+    except ImportError as error:
+        raise CheckpointError(
+            f"LightGlue: {error}; expected kornia 0.9 or later, which needs Python 3.11"
+        ) from None
 
-    # A named configuration of LightGlue would be downloaded.
-    matcher = LightGlue(features=None, input_dim=DESCRIPTOR, weights=None)
+    # Without a name nothing is downloaded; kornia's annotation leaves that out.
+    matcher = LightGlue(
+        features=None,  # type: ignore[arg-type]
+        input_dim=DESCRIPTOR,
+        weights=None,
+    )
     return ALIKED(max_num_keypoints=max_features).eval(), matcher.eval()
 
 

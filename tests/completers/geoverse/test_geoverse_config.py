@@ -28,9 +28,9 @@ def test_a_least_time_outside_the_path_is_refused(value):
 
 
 def test_negative_guidance_is_refused():
-    with pytest.raises(OptionError, match=r"flow\.guidance .*at least 0"):
-        FlowConfig(guidance=-1.0)
-    assert FlowConfig(guidance=0.0).guidance == 0
+    with pytest.raises(OptionError, match=r"flow\.cfg_scale .*at least 0"):
+        FlowConfig(cfg_scale=-1.0)
+    assert FlowConfig(cfg_scale=0.0).cfg_scale == 0
 
 
 def test_a_negative_temperature_is_refused():

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from gvtools.completers.geoverse.control import ControlBranch, ControlConfig
-from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, DenoiserBlock, Positions
+from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
+from gvtools.completers.geoverse.denoiser_blocks import DenoiserBlock
 from gvtools.completers.geoverse.projective import Projective
 from gvtools.completers.geoverse.shared_attention import SharedAttention, SharedAttentionConfig
 from gvtools.errors import ShapeError

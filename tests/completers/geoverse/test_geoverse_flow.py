@@ -294,11 +294,11 @@ def test_guidance_moves_away_from_the_unconditional_velocity():
 
     for scale, expected in ((1.5, 6.5), (0.0, 2.0), (3.0, 11.0)):
         found = sample(
-            lambda x, t: given_, noise, [1, 0], unconditional=unconditional, guidance=scale
+            lambda x, t: given_, noise, [1, 0], unconditional=unconditional, cfg_scale=scale
         )
         torch.testing.assert_close(noise - found, torch.full_like(noise, expected))
     calls.clear()
-    sample(lambda x, t: given_, noise, [1, 0], unconditional=unconditional, guidance=1.0)
+    sample(lambda x, t: given_, noise, [1, 0], unconditional=unconditional, cfg_scale=1.0)
     assert not calls
     with pytest.raises(OptionError, match="needs an unconditional"):
         guided(lambda x, t: x, None, 1.5)

@@ -158,11 +158,11 @@ def test_guidance_takes_a_second_evaluation_where_it_is_not_1(monkeypatch, injec
     model, batch = built(injection), micro.batch(1)
     video = features(injection, batch)
     calls = counted(monkeypatch, GeoVerse, "velocity1")
-    plain = model.generate(batch, bounds=BOUNDS, guidance=1.0, video=video)
+    plain = model.generate(batch, bounds=BOUNDS, cfg_scale=1.0, video=video)
     assert len(calls) == 4
     calls.clear()
-    half = model.generate(batch, bounds=BOUNDS, guidance=0.0, video=video)
-    double = model.generate(batch, bounds=BOUNDS, guidance=2.0, video=video)
+    half = model.generate(batch, bounds=BOUNDS, cfg_scale=0.0, video=video)
+    double = model.generate(batch, bounds=BOUNDS, cfg_scale=2.0, video=video)
     assert len(calls) == 16
     assert (half.level1 - plain.level1).abs().max() > 1e-3
     assert (double.level1 - plain.level1).abs().max() > 1e-3
@@ -180,7 +180,7 @@ def test_guidance_is_over_the_cameras():
     assert not camera.map[:, :, 1:].any() and camera.map[:, 2:, :1].all()
     without = model.level1(noise, t, replace(prepared.level1, camera=camera))
     for scale in (0.0, 1.0, 3.0):
-        found = model.sample1(prepared, noise, bounds=(1.0, 0.0), guidance=scale)
+        found = model.sample1(prepared, noise, bounds=(1.0, 0.0), cfg_scale=scale)
         expected = noise - (without + scale * (known - without))
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 

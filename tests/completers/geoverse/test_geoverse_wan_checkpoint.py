@@ -27,8 +27,11 @@ from gvtools.completers.geoverse.video_prior.wan_checkpoint import (
     write_empty_prompt,
 )
 from gvtools.completers.geoverse.video_prior.wan_files import TensorFiles
-from gvtools.completers.geoverse.video_prior.wan_folder import EMPTY_PROMPT, check_folder
-from gvtools.completers.geoverse.video_prior.wan_library import network_class
+from gvtools.completers.geoverse.video_prior.wan_folder import (
+    EMPTY_PROMPT,
+    check_folder,
+    network_class,
+)
 from gvtools.completers.geoverse.video_prior.wan_names import diffusers_name
 from gvtools.errors import CheckpointError, OptionError, ProjectError
 

@@ -9,10 +9,9 @@ import pytest
 from stereo_scenes import plane_scene
 
 from gvtools.depth.stereo.cleanup import enlarged, weighted_median, without_speckles
-from gvtools.depth.stereo.confidence import reliability
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
-from gvtools.errors import DegenerateError, OptionError, ProjectError, ShapeError
+from gvtools.errors import DegenerateError, OptionError, ProjectError
 from gvtools.scenes.scene import Frame
 
 OPTIONS = StereoOptions(levels=2, align=False, speckle=20)
@@ -162,16 +161,6 @@ def test_enlarged_keeps_planes_exact_edges_sharp_and_holes_empty():
     large, _ = enlarged(depth, flat, fine, np.ones_like(depth))
     assert not ((large > 3.5) & (large < 8.9)).any()
     assert (large[10:20, 10:20] == 0).all()
-
-
-def test_reliability_of_a_calibrated_claim_is_near_zero():
-    rng = np.random.default_rng(0)
-    claimed = rng.uniform(0, 1, 40_000)
-    right = rng.uniform(0, 1, 40_000) < claimed
-    assert reliability(claimed, right).error < 0.02
-    assert reliability(claimed, np.zeros(40_000, bool)).error == pytest.approx(0.5, abs=0.01)
-    with pytest.raises(ShapeError, match="as many"):
-        reliability([0.5], [])
 
 
 def test_a_view_that_shares_nothing_is_refused_and_stops_no_other(slanted):

@@ -12,10 +12,10 @@ import pytest
 import torch
 from torch import nn
 
-from gvtools.completers.geoverse import denoiser, shared_attention
+from gvtools.completers.geoverse import denoiser_blocks, shared_attention
 from gvtools.completers.geoverse.attention import attend
 from gvtools.completers.geoverse.config import named
-from gvtools.completers.geoverse.denoiser import CameraAttention
+from gvtools.completers.geoverse.denoiser_blocks import CameraAttention
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.projective import Projective
 from gvtools.completers.geoverse.stages import LEVEL0, LEVEL1
@@ -380,12 +380,12 @@ def test_explicit_attention_is_the_same_network(injection):
 
 
 def test_explicit_attention_is_really_used_and_put_back():
-    kept = denoiser.attend
+    kept = denoiser_blocks.attend
     with explicit_attention():
-        assert denoiser.attend is shared_attention.attend is not kept
+        assert denoiser_blocks.attend is shared_attention.attend is not kept
         q = torch.randn(1, 2, 5, 8)
-        torch.testing.assert_close(denoiser.attend(q, q, q), kept(q, q, q))
-    assert denoiser.attend is shared_attention.attend is kept
+        torch.testing.assert_close(denoiser_blocks.attend(q, q, q), kept(q, q, q))
+    assert denoiser_blocks.attend is shared_attention.attend is kept
 
 
 def test_scores_that_do_not_fit_are_not_made(monkeypatch):

@@ -6,12 +6,16 @@
     vae/config.json, diffusion_pytorch_model.safetensors            as published
     empty_prompt.safetensors                                        ``embedding`` (1, 4096)
 
-Both networks are in diffusers' form; ``wan_checkpoint.truncate`` makes it.
+Both networks are in diffusers' form; ``wan_checkpoint.truncate`` makes the folder. diffusers is
+imported when first needed; no pipeline and no scheduler of it is used, and so no transformers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,10 +27,10 @@ from gvtools.completers.geoverse.video_prior.wan_files import (
     check_present,
     check_tensors,
 )
-from gvtools.completers.geoverse.video_prior.wan_library import empty_network, read_config
 from gvtools.completers.geoverse.video_prior.wan_names import kept_in_float32
 from gvtools.errors import CheckpointError
 
+COMPONENTS = {"transformer": "WanVACETransformer3DModel", "vae": "AutoencoderKLWan"}
 EMPTY_PROMPT = "empty_prompt.safetensors"
 _MAKER = "gvtools.completers.geoverse.video_prior.wan_checkpoint"
 
@@ -52,11 +56,11 @@ class FolderReport(NamedTuple):
 
     Attributes:
         bytes: of its weights.
-        said: what it holds, in a line.
+        summary: what it holds, in a line.
     """
 
     bytes: int
-    said: str
+    summary: str
 
 
 def check_folder(folder: Path, *, prompt: bool = True) -> FolderReport:
@@ -69,17 +73,17 @@ def check_folder(folder: Path, *, prompt: bool = True) -> FolderReport:
     Raises:
         CheckpointError: what is absent or does not fit.
     """
-    size, said = 0, []
+    size, found = 0, []
     for component in ("transformer", "vae"):
         place = Path(folder) / component
         expected = expected_tensors(read_config(place), component=component)
         files = TensorFiles.find(place)
         check_tensors(files, expected, where=place)
         size += sum(path.stat().st_size for path in set(files.files.values()))
-        said.append(f"{component}: {len(expected)} tensors")
+        found.append(f"{component}: {len(expected)} tensors")
     if prompt:
-        said.append(f"empty prompt: {tuple(read_empty_prompt(folder).shape)}")
-    return FolderReport(size, ", ".join(said))
+        found.append(f"empty prompt: {tuple(read_empty_prompt(folder).shape)}")
+    return FolderReport(size, ", ".join(found))
 
 
 def load_network(
@@ -145,3 +149,91 @@ def cast(name: str, tensor: Tensor, dtype: torch.dtype | None) -> Tensor:
 def dtype_of(name: str, dtype: torch.dtype) -> torch.dtype:
     """``dtype``, or float32 where diffusers keeps that beside smaller types."""
     return torch.float32 if kept_in_float32(name) else dtype
+
+
+def network_class(component: str) -> Any:
+    """The class of "transformer" or "vae".
+
+    Raises:
+        CheckpointError: diffusers is absent, too old, or does not work.
+    """
+    name = COMPONENTS[component]
+    with _broken_torchvision_hidden() as hidden:
+        try:
+            import diffusers
+            from diffusers.utils import import_utils
+
+            if hidden:
+                # Whoever imported diffusers before has let it believe otherwise.
+                import_utils._torchvision_available = False
+            return getattr(diffusers, name)
+        except (ImportError, AttributeError, RuntimeError) as error:
+            raise CheckpointError(
+                f"the video prior needs diffusers' {name}, which cannot be imported "
+                f"({str(error).strip().splitlines()[-1]}); pip install 'gvtools[wan]', or switch "
+                "the video prior off"
+            ) from error
+
+
+def empty_network(component: str, config: Mapping[str, Any]) -> nn.Module:
+    """A network of a diffusers config, on the meta device: shapes, no numbers, no memory.
+
+    Args:
+        component: "transformer" or "vae".
+        config: as in the component's config.json.
+
+    Raises:
+        CheckpointError: diffusers is absent, or makes no network of the config.
+    """
+    kind = network_class(component)
+    try:
+        with torch.device("meta"):
+            network: nn.Module = kind.from_config(dict(config))
+    except Exception as error:
+        raise CheckpointError(
+            f"no {COMPONENTS[component]} comes of this configuration ({error}); take the "
+            "config.json that belongs to the weights"
+        ) from error
+    return network
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """A component's config.json.
+
+    Raises:
+        CheckpointError: absent, or not a JSON object.
+    """
+    path = folder / "config.json"
+    try:
+        config = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CheckpointError(
+            f"{path}: cannot be read ({error.strerror or error}); expected the config.json of a "
+            "network in diffusers' form"
+        ) from error
+    except ValueError as error:
+        raise CheckpointError(f"{path}: not JSON ({error}); download it again") from error
+    if not isinstance(config, dict):
+        raise CheckpointError(f"{path}: a {type(config).__name__}; expected a JSON object")
+    return config
+
+
+@contextmanager
+def _broken_torchvision_hidden() -> Iterator[bool]:
+    """Where torchvision does not fit torch, diffusers would fail on it, and can do without.
+
+    Gives whether that is so.
+    """
+    try:
+        import torchvision  # noqa: F401
+    except Exception:
+        for name in [name for name in sys.modules if name.split(".")[0] == "torchvision"]:
+            del sys.modules[name]
+        # None makes the import system, and diffusers with it, take the package as not installed.
+        sys.modules["torchvision"] = None  # type: ignore[assignment]
+        try:
+            yield True
+        finally:
+            del sys.modules["torchvision"]
+        return
+    yield False

@@ -275,8 +275,11 @@ def check_video_folder(folder: Path) -> None:
 def _video_report(folder: Path, config: VideoPriorConfig) -> PartReport:
     """The truncated video model's folder; its own modules say what is wrong with it."""
     from gvtools.completers.geoverse.video_prior.wan_folder import check_folder as check_wan
-    from gvtools.completers.geoverse.video_prior.wan_folder import read_empty_prompt
-    from gvtools.completers.geoverse.video_prior.wan_library import empty_network, read_config
+    from gvtools.completers.geoverse.video_prior.wan_folder import (
+        empty_network,
+        read_config,
+        read_empty_prompt,
+    )
 
     try:
         check_video_folder(folder)

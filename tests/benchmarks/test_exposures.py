@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from stereo_scenes import plane_scene
 
+from benchmarks.exposures import estimate_exposures
+from benchmarks.reliability import reliability
 from gvtools.depth.source import DepthMap
-from gvtools.depth.stereo.exposure import estimate_exposures
-from gvtools.errors import DegenerateError
+from gvtools.errors import DegenerateError, ShapeError
 from gvtools.scenes.scene import Frame, Scene
 
 GAINS = np.array([[1.0, 1.0, 1.0], [0.7, 0.75, 0.8], [1.2, 1.1, 1.0], [0.9, 1.0, 1.1], [1, 0.8, 1]])
@@ -98,3 +99,13 @@ def test_views_without_depth_are_never_looked_at():
     assert estimate_exposures(scene, depths).gain.shape == (4, 3)
     with pytest.raises(DegenerateError, match="0 views"):
         estimate_exposures(scene, {})
+
+
+def test_reliability_of_a_calibrated_claim_is_near_zero():
+    rng = np.random.default_rng(0)
+    claimed = rng.uniform(0, 1, 40_000)
+    right = rng.uniform(0, 1, 40_000) < claimed
+    assert reliability(claimed, right).error < 0.02
+    assert reliability(claimed, np.zeros(40_000, bool)).error == pytest.approx(0.5, abs=0.01)
+    with pytest.raises(ShapeError, match="as many"):
+        reliability([0.5], [])

@@ -23,10 +23,10 @@ from torch.distributed.tensor import DTensor, distribute_tensor
 from gvtools.completers.geoverse.model import GeoVerse, empty_model
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior
 from gvtools.networks.tensors import load
-from gvtools.training.copies import Copies, models_of
+from gvtools.training.distributed import Replicated, models_of
 
 
-class Shards(Copies):
+class Sharded(Replicated):
     """See the module; the processes' group has to be there, with more than one process.
 
     Args:
@@ -34,7 +34,7 @@ class Shards(Copies):
         processes: this process and the others.
     """
 
-    together = True
+    collective = True
 
     def _distribute(self) -> None:
         mesh = init_device_mesh(self.processes.device.type, (self.processes.count,))
