@@ -34,21 +34,21 @@ OFF: dict[str, dict[str, Any]] = {
     "voxel edge measured": {"fusion.voxel_loss": None},
     # With one edge throughout, the typical footprint's is the sensible one.
     "voxels as wide as footprints": {
-        "memory.footprints": 0.0,
+        "memory.voxels_per_footprint": 0.0,
         "fusion.voxel_percentile": 50.0,
     },
     "alike observations merged": {
-        "memory.same_direction": 0.0,
+        "memory.merge_angle_deg": 0.0,
         "memory.observations_per_voxel": 64,
     },
-    "four pixels a point where voxels are coarser": {"savings.joined": 0.0},
+    "four pixels a point where voxels are coarser": {"savings.pixel_binning": 0.0},
     "observed content projected once": {"savings.reuse": False},
     "small holes left to inpaint": {"savings.minor_holes": 0.0},
     "middle holes in one step": {"savings.one_step": 0.0},
     "middle holes in half the size": {"savings.half_size": 0.0},
     "middle holes without the video prior": {"savings.no_prior": 0.0},
     "later steps near holes alone": {"savings.near_holes": False},
-    "explained views without computed depth": {"savings.explained": None},
+    "explained views without computed depth": {"savings.depth_from_memory": None},
 }
 COSTLY = ("geoverse", "exemplar")
 

@@ -261,7 +261,7 @@ def sweep(context: list[Shot], targets: list[Shot], console: Console) -> list[di
         )
     for degrees in (0.0, 5.0, 15.0):
         settings.append(
-            (f"same_direction {degrees:g}", VOXEL, replace(plain, same_direction=degrees))
+            (f"merge_angle_deg {degrees:g}", VOXEL, plain.replaced(merge_angle_deg=degrees))
         )
     for voxel in (0.0035, 0.01, 0.02):
         settings.append((f"voxel {voxel * 1e3:g} mm", voxel, plain))

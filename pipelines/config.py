@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import json
 import math
@@ -18,6 +19,7 @@ from gvtools.memory.spatial_memory import MemoryOptions
 from gvtools.memory.splat.api import DEVICES, SplatOptions
 from gvtools.options import check_range
 from gvtools.scenes.reduced import SMALLEST
+from gvtools.settings import Settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +31,8 @@ class FusionOptions:
         max_scale_residual: a completion whose depth fits the memory's worse than this relative
             residual is refused.
         voxel_percentile: the automatic edge of the finest voxels follows this percentile of the
-            context's pixel footprints; what is farther gets wider ones (``memory.footprints``).
+            context's pixel footprints; what is farther gets wider ones 
+            (``memory.voxels_per_footprint``).
         voxel_scale: how many such footprints the edge is.
         voxel_loss: of edges from half to four times the footprints', dB by which context views,
             predicted from their neighbours, may be worse than with the best one for a coarser one
@@ -54,14 +57,15 @@ class FusionOptions:
 class SavingsOptions:
     """What a run does not compute because the scene does not require it.
 
-    The voxel edge (``fusion.voxel_loss``), wider voxels for what is far (``memory.footprints``) and
-    what a voxel keeps (``memory.same_direction``, ``memory.observations_per_voxel``) are savings,
+    The voxel edge (``fusion.voxel_loss``), wider voxels for what is far
+    (``memory.voxels_per_footprint``) and
+    what a voxel keeps (``memory.merge_angle_deg``, ``memory.observations_per_voxel``) are savings,
     too.
 
     Attributes:
         reuse: what observed views show of a target is not projected again after completions were
             fused; the pictures are the same.
-        joined: 2 x 2 pixels become one point, their mean, where they are together at most this many
+        pixel_binning: 2 x 2 pixels become one point, their mean, where they are together at most this many
             voxel edges wide, unless the surface is steep; 0 lifts each by itself.
         minor_holes: a view with no unknown pixel farther than this share of the image diagonal from
             a known one is left to ``inpaint`` where the completer is a costly one (geoverse,
@@ -73,22 +77,22 @@ class SavingsOptions:
         no_prior: likewise, they are completed without the video prior of a model that has one.
         near_holes: steps of the generative core after the first one look at tokens near holes
             alone, where there is no video prior.
-        explained: a context view whose depth would have to be computed takes memory's instead where
+        depth_from_memory: a context view whose depth would have to be computed takes memory's instead where
             the views before it explain this share of its pixels; None computes all.
     """
 
     reuse: bool = True
-    joined: float = 1.0
+    pixel_binning: float = 1.0
     minor_holes: float = 0.02
     one_step: float = 0.1
     half_size: float = 0.1
     no_prior: float = 0.1
     near_holes: bool = True
-    explained: float | None = 0.9
+    depth_from_memory: float | None = 0.9
 
     def __post_init__(self) -> None:
-        check_range("savings.explained", self.explained, above=0, most=1)
-        check_range("savings.joined", self.joined, least=0)
+        check_range("savings.depth_from_memory", self.depth_from_memory, above=0, most=1)
+        check_range("savings.pixel_binning", self.pixel_binning, least=0)
         check_range("savings.minor_holes", self.minor_holes, least=0)
         check_range("savings.one_step", self.one_step, least=0)
         check_range("savings.half_size", self.half_size, least=0)
@@ -155,7 +159,13 @@ class RunConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return asdict(self)
+        found = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return {
+            name: value.to_dict() if isinstance(value, Settings)
+            else asdict(value) if is_dataclass(value) and not isinstance(value, type)
+            else copy.deepcopy(value)
+            for name, value in found.items()
+        }
 
 
 # What each profile changes; "balanced" is the defaults.
@@ -176,8 +186,8 @@ PROFILES: dict[str, dict[str, Any]] = {
         "savings.half_size": 0.0,
         "savings.no_prior": 0.0,
         "savings.near_holes": False,
-        "savings.explained": None,
-        "memory.same_direction": 0.0,
+        "savings.depth_from_memory": None,
+        "memory.merge_angle_deg": 0.0,
         "memory.observations_per_voxel": 64,
     },
 }
@@ -230,7 +240,7 @@ def with_settings(config: RunConfig, texts: Iterable[str]) -> RunConfig:
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals:
-            raise OptionError(f"--set {text!r}; expected KEY=VALUE, such as splat.band=0.03")
+            raise OptionError(f"--set {text!r}; expected KEY=VALUE, such as splat.depth_band=0.03")
         if key.strip() == "profile":
             config = with_profile(config, value.strip())
         else:
@@ -254,6 +264,13 @@ def with_setting(config: RunConfig, key: str, value: Any) -> RunConfig:
     if head not in names or key == "completer_options":
         raise _unknown(key, config)
     current = getattr(config, head)
+    if isinstance(current, Settings):
+        if rest not in type(current).model_fields:
+            raise _unknown(key, config)
+        empty = str(value).lower() in ("none", "null", "auto")
+        nullable = type(current).model_fields[rest].default is None
+        section = current.replaced(**{rest: None if empty and nullable else value})
+        return _with(config, head, section)
     if is_dataclass(current) and not isinstance(current, type):
         known = [entry.name for entry in fields(current)]
         if rest not in known:

@@ -51,7 +51,7 @@ class SparingCompleter:
         parts = []
         for completer, rows in ((self.cheap, spared), (self.costly, others)):
             if rows:
-                made = completer.complete(context, guidance.rows(rows), seed=seed)
+                made = completer.complete(context, guidance.select(rows), seed=seed)
                 parts.append((rows, made))
         return _merged(guidance, parts, len(spared))
 

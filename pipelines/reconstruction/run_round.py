@@ -75,7 +75,7 @@ def _lift_context(
     clock: rounds.Clock,
     console: Console,
 ) -> tuple[FuseReport, dict[str, Any]]:
-    least = plan.config.savings.explained
+    least = plan.config.savings.depth_from_memory
 
     def known(view: View, frame: Frame) -> DepthMap | None:
         if least is None:

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
 from pipelines.reconstruction.grid_frame import grid_frame
@@ -118,7 +117,9 @@ def at_scale(config: RunConfig, scale: float) -> RunConfig:
     An edge of twice the typical footprint means voxels of twice the footprint everywhere.
     """
     assert config.voxel is not None
-    memory = replace(config.memory, footprints=scale * config.memory.footprints)
+    memory = config.memory.replaced(
+        voxels_per_footprint=scale * config.memory.voxels_per_footprint
+    )
     return replace(config, voxel=scale * config.voxel, memory=memory)
 
 
@@ -223,17 +224,15 @@ def _fused(probe: _Probe, config: RunConfig) -> SpatialMemory:
     )
     for camera, frame, mask in probe.seen:
         assert frame.depth is not None
-        points = back_project(
+        memory.observe(
             frame.rgb,
             frame.depth,
             camera,
-            frame=probe.frame,
+            round=0,
             mask=mask,
             options=config.back_projection,
-            levels=memory.levels,
-            joined=config.savings.joined,
+            pixel_binning=config.savings.pixel_binning,
         )
-        memory.fuse(points, round=0)
     return memory
 
 

@@ -99,11 +99,11 @@ def knobs_of(plan: Plan) -> list[Knob]:
     completers = _completers(plan)
     knobs = [
         Knob("voxel edge", tuple(_edge(config.voxel, share) for share in EDGES), EDGES.index(1.0)),
-        _far_voxels(config.memory.footprints),
+        _far_voxels(config.memory.voxels_per_footprint),
         _numbers("observations a voxel", "memory.observations_per_voxel",
                  (2, 4, 12, 48), config.memory.observations_per_voxel),
-        _numbers("merging angle, degrees", "memory.same_direction",
-                 (15.0, 8.0, 2.0, 0.0), config.memory.same_direction),
+        _numbers("merging angle, degrees", "memory.merge_angle_deg",
+                 (15.0, 8.0, 2.0, 0.0), config.memory.merge_angle_deg),
         Knob(
             "projection",
             (
@@ -152,8 +152,8 @@ def knobs_of(plan: Plan) -> list[Knob]:
         ]  # fmt: skip
     if plan.source.name != RecordedDepth.name:
         knobs.append(
-            _values("views explained, share of pixels", "savings.explained",
-                    (0.7, 0.8, 0.9, None), config.savings.explained)
+            _values("views explained, share of pixels", "savings.depth_from_memory",
+                    (0.7, 0.8, 0.9, None), config.savings.depth_from_memory)
         )  # fmt: skip
     if plan.source.name == "plane-sweep":
         knobs += [
@@ -221,7 +221,7 @@ def _far_voxels(footprints: float) -> Knob:
     levels = tuple(
         Level(
             f"at most {value:g} footprints wide" if value else "as wide as near ones",
-            {"memory.footprints": value},
+            {"memory.voxels_per_footprint": value},
         )
         for value in values
     )

@@ -11,14 +11,14 @@ from memory_scenes import camera, points, saved_bytes
 
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
-from gvtools.memory.splat.nearest import project_nearest
+from gvtools.memory.splat.one_pixel import project_nearest
 
 EDGES = (0.1, 1 / 3, 0.02, 0.5, 1e-6, 7e5)
 BACKENDS = ("cpu", "torch", "nearest")
 
 
 def _cells(memory: SpatialMemory) -> np.ndarray:
-    return np.floor(memory.records.position.astype(float) * (1.0 / memory.voxel))
+    return np.floor(memory.columns.positions.astype(float) * (1.0 / memory.voxel))
 
 
 @settings(max_examples=60, deadline=None)

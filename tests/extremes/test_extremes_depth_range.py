@@ -80,7 +80,7 @@ def test_what_is_too_far_is_counted_and_wide_voxels_go_farther():
 
 def test_with_one_edge_nine_decades_are_too_many():
     source = camera(**WIDE)
-    memory = SpatialMemory(1e-4, options=MemoryOptions(footprints=0.0))
+    memory = SpatialMemory(1e-4, options=MemoryOptions(voxels_per_footprint=0.0))
     report = memory.fuse(plane_view(source, _halves(1e-4, 1e5)), round=0)
     # The column beside the step is a depth edge.
     assert report.out_of_reach == (WIDE["width"] // 2 - 1) * WIDE["height"]

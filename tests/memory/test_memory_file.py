@@ -33,7 +33,7 @@ def _same(one: SpatialMemory, two: SpatialMemory, folder: Path) -> bool:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_loaded_is_what_was_saved(seed, tmp_path):
-    memory = random_memory(seed, options=MemoryOptions(same_direction=7.5, weight_cap=9))
+    memory = random_memory(seed, options=MemoryOptions(merge_angle_deg=7.5, weight_cap=9))
     memory.save(tmp_path / "memory.npz")
     loaded = SpatialMemory.load(tmp_path / "memory.npz")
     assert loaded.voxel == memory.voxel
@@ -42,11 +42,11 @@ def test_what_is_loaded_is_what_was_saved(seed, tmp_path):
     n = len(memory)
     assert len(loaded) == n
     assert loaded.voxels == memory.voxels
-    for name in memory.records.ARRAYS:
+    for name in memory.columns.ARRAYS:
         np.testing.assert_array_equal(
             getattr(loaded.records, name)[:n], getattr(memory.records, name)[:n], err_msg=name
         )
-    for name in memory.runs.ARRAYS:
+    for name in memory.segments.ARRAYS:
         one, two = (getattr(m.runs, name)[: m.runs.count] for m in (loaded, memory))
         np.testing.assert_array_equal(one, two, err_msg=name)
     for i in range(len(memory.views)):
@@ -173,7 +173,7 @@ def test_a_file_of_another_make_is_refused_by_name(change, complaint, tmp_path):
 
 
 def test_a_file_of_before_levels_is_read_with_one_edge(tmp_path):
-    memory = random_memory(4, options=MemoryOptions(footprints=0.0))
+    memory = random_memory(4, options=MemoryOptions(voxels_per_footprint=0.0))
     path = tmp_path / "memory.npz"
     memory.save(path)
 
@@ -190,7 +190,7 @@ def test_a_file_of_before_levels_is_read_with_one_edge(tmp_path):
 @pytest.mark.parametrize("kind", [np.int8, np.int64, np.float64])
 def test_levels_of_another_kind_are_refused(kind, tmp_path, monkeypatch):
     memory = _small()
-    levels = memory.records.level.astype(kind)
+    levels = memory.columns.level.astype(kind)
     levels[0] = -1
     monkeypatch.setattr(memory.records, "level", levels)
     memory.save(tmp_path / "memory.npz")

@@ -6,7 +6,7 @@ import pytest
 from memory_scenes import camera
 
 from gvtools.errors import OptionError
-from gvtools.memory.splat.nearest import NearestImage, project_nearest, project_open3d
+from gvtools.memory.splat.one_pixel import NearestImage, project_nearest, project_open3d
 
 
 def _target(seed: int, *, width=160, height=120):

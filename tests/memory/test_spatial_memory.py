@@ -9,7 +9,7 @@ from memory_scenes import camera, plane_view, points, random_memory, random_poin
 from gvtools.errors import OptionError, ShapeError
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 
-OPTIONS = MemoryOptions(observations_per_voxel=3, same_direction=8)
+OPTIONS = MemoryOptions(observations_per_voxel=3, merge_angle_deg=8)
 
 
 def _rounds(seed: int, rounds: int) -> list[list[tuple]]:
@@ -62,7 +62,7 @@ def test_forgetting_after_loading_is_forgetting(seed, tmp_path):
 def test_forgetting_an_earlier_round_keeps_what_later_ones_stored(forgotten, tmp_path):
     memory = _fused(_rounds(4, 3))
     n = len(memory)
-    stays = memory.views.round[memory.records.view[:n]] != forgotten
+    stays = memory.views.round[memory.columns.view[:n]] != forgotten
     columns = {
         name: getattr(memory.records, name)[:n][stays].copy()
         for name in ("x", "y", "z", "color", "confidence", "spacing")
@@ -76,9 +76,9 @@ def test_forgetting_an_earlier_round_keeps_what_later_ones_stored(forgotten, tmp
     for log in memory.agreements.values():
         for rows, weights in log:
             np.add.at(added, rows, weights)
-    np.testing.assert_array_equal(memory.records.agreement, added)
+    np.testing.assert_array_equal(memory.columns.agreement, added)
     assert added.any()
-    runs, records = memory.runs, memory.records
+    runs, records = memory.segments, memory.records
     run = np.repeat(np.arange(runs.count), runs.length[: runs.count])
     assert len(run) == len(memory)
     assert (records.position >= runs.box[run, :3]).all()
@@ -114,7 +114,7 @@ def test_fusing_in_two_parts_fills_the_same_voxels(seed, cut):
     assert parts.voxels == whole.voxels == len(whole) == len(parts)
 
     def cells(memory):
-        return np.unique(np.floor(memory.records.position.astype(float) * (1.0 / 0.2)), axis=0)
+        return np.unique(np.floor(memory.columns.positions.astype(float) * (1.0 / 0.2)), axis=0)
 
     np.testing.assert_array_equal(cells(whole), cells(parts))
 
@@ -124,7 +124,7 @@ def test_agreement_of_later_rounds_raises_confidence_and_changes_nothing_else():
     memory.fuse(points([(0.1, 0.1, 2.1)], confidence=0.5, colors=(10, 20, 30)), round=0)
     report = memory.fuse(points([(0.3, 0.3, 2.3)], confidence=0.75, colors=(90, 90, 90)), round=1)
     assert (report.agreed, report.merged, report.added) == (1, 1, 0)
-    np.testing.assert_array_equal(memory.records.color[0], (10, 20, 30))
+    np.testing.assert_array_equal(memory.columns.colors[0], (10, 20, 30))
     np.testing.assert_allclose(memory.positions, [(0.1, 0.1, 2.1)], rtol=1e-6)
     assert memory.confidence.tolist() == [1.25]
     memory.forget(round=1)
@@ -192,16 +192,16 @@ def test_an_origin_that_is_no_point_is_refused(origin):
 
 def test_the_open3d_cloud_holds_every_attribute():
     memory = random_memory(3)
-    cloud = memory.point_cloud()
+    cloud = memory.cloud
     n = len(memory)
     np.testing.assert_allclose(
         cloud.point.positions.numpy().astype(float) + memory.origin, memory.positions
     )
-    np.testing.assert_array_equal(cloud.point.colors.numpy(), memory.records.color[:n])
-    view = memory.records.view[:n]
+    np.testing.assert_array_equal(cloud.point.colors.numpy(), memory.columns.colors[:n])
+    view = memory.columns.view[:n]
     for name, expected in (
         ("confidence", memory.confidence),
-        ("spacing", memory.records.spacing[:n]),
+        ("spacing", memory.columns.spacing[:n]),
         ("round", memory.views.round[view]),
         ("view", view),
         ("generated", memory.generated),

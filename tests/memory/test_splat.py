@@ -85,7 +85,7 @@ def test_boxes_hold_their_observations_also_after_merging():
     for _ in range(4):
         where = rng.uniform((-1, -1, 2), (1, 1, 4), (500, 3))
         memory.fuse(points(where, source=source, spacing=rng.uniform(0.1, 2, 500)), round=0)
-    records, runs = memory.records, memory.runs
+    records, runs = memory.records, memory.segments
     run = np.repeat(np.arange(runs.count), runs.length[: runs.count])
     assert (records.position >= runs.box[run, :3]).all()
     assert (records.position <= runs.box[run, 3:6]).all()
@@ -346,6 +346,6 @@ def test_one_pixel_back_ends_show_the_nearest_observation(backend):
     assert len(best) > 100
     for (r, c), i in best.items():
         assert seen.depth[0, r, c] == pytest.approx(z[0, i], rel=1e-5)
-        np.testing.assert_allclose(seen.rgb[0, r, c] * 255, memory.records.color[i], atol=1e-3)
+        np.testing.assert_allclose(seen.rgb[0, r, c] * 255, memory.columns.colors[i], atol=1e-3)
         assert seen.confidence[0, r, c] == memory.confidence[i]
         assert seen.generated[0, r, c] == memory.generated[i]

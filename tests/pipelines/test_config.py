@@ -20,9 +20,9 @@ from pipelines.config import (
 def test_settings_are_converted_to_the_fields_type():
     config = with_settings(
         RunConfig(),
-        ["splat.band=0.03", "views_per_round=4", "voxel=auto", "splat.occluders=false"],
+        ["splat.depth_band=0.03", "views_per_round=4", "voxel=auto", "splat.occluders=false"],
     )
-    assert config.splat.band == 0.03
+    assert config.splat.depth_band == 0.03
     assert config.views_per_round == 4
     assert config.voxel is None
     assert config.splat.occluders is False
@@ -37,9 +37,9 @@ def test_completer_options_go_by_their_prefix():
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("splat.bnad=1", "splat.band"),
+        ("splat.depth_bnad=1", "splat.depth_band"),
         ("viewsperround=1", "views_per_round"),
-        ("memory.same_directon=1", "memory.same_direction"),
+        ("memory.merge_angle_de=1", "memory.merge_angle_deg"),
     ],
 )
 def test_an_unknown_key_names_the_nearest(text, named):
@@ -48,7 +48,7 @@ def test_an_unknown_key_names_the_nearest(text, named):
 
 
 @pytest.mark.parametrize(
-    "text", ["views_per_round=two", "views_per_round=1.5", "splat.band=wide", "splat.band", "seed="]
+    "text", ["views_per_round=two", "views_per_round=1.5", "splat.depth_band=wide", "splat.depth_band", "seed="]
 )
 def test_a_value_of_the_wrong_type_is_refused(text):
     with pytest.raises(OptionError):
@@ -65,17 +65,17 @@ def test_a_saved_configuration_reads_back_equal(tmp_path):
 
 def test_the_file_s_own_settings_win_over_its_profile(tmp_path):
     path = tmp_path / "c.json"
-    path.write_text(json.dumps({"memory": {"same_direction": 3.5}, "profile": "accurate"}))
+    path.write_text(json.dumps({"memory": {"merge_angle_deg": 3.5}, "profile": "accurate"}))
     config = with_file(RunConfig(), path)
-    assert config.memory.same_direction == 3.5
+    assert config.memory.merge_angle_deg == 3.5
     assert config.memory.observations_per_voxel == 64
 
 
 def test_a_profile_named_beside_a_file_stands_below_the_file(tmp_path):
     path = tmp_path / "c.json"
-    path.write_text(json.dumps({"memory.same_direction": 8.0, "profile": "fast"}))
+    path.write_text(json.dumps({"memory.merge_angle_deg": 8.0, "profile": "fast"}))
     config = with_file(RunConfig(), path, profile="accurate")
-    assert (config.profile, config.memory.same_direction) == ("accurate", 8.0)
+    assert (config.profile, config.memory.merge_angle_deg) == ("accurate", 8.0)
     assert config.memory.observations_per_voxel == 64
 
 
@@ -113,10 +113,10 @@ def test_settings_that_depend_on_each_other_may_come_in_any_order():
 
 
 def test_changed_settings_are_those_that_a_file_needs(tmp_path):
-    texts = ["voxel=0.02", "splat.band=0.03", "completer=geoverse", "completer.steps=2", "seed=0"]
+    texts = ["voxel=0.02", "splat.depth_band=0.03", "completer=geoverse", "completer.steps=2", "seed=0"]
     config = with_settings(RunConfig(), [*texts, "profile=fast"])
     changed = changed_settings(config)
-    assert changed["splat.band"] == 0.03 and changed["completer.steps"] == "2"
+    assert changed["splat.depth_band"] == 0.03 and changed["completer.steps"] == "2"
     assert "seed" not in changed and "profile" not in changed and "splat.support" not in changed
     (tmp_path / "profile.json").write_text(json.dumps(changed))
     again = with_file(RunConfig(), tmp_path / "profile.json")

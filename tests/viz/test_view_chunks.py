@@ -17,7 +17,7 @@ SIZE, CELL = 100, 0.05
 def memory():
     """Two walls and stray points far off, in two rounds."""
     rng = np.random.default_rng(0)
-    options = MemoryOptions(footprints=0.0)
+    options = MemoryOptions(voxels_per_footprint=0.0)
     found = SpatialMemory(0.01, origin=(5.0, 0.0, -2.0), options=options)
     for round, z in enumerate((2.0, 4.0)):
         wall = rng.uniform(-2, 2, (4000, 3))
@@ -52,7 +52,7 @@ def test_each_observation_is_in_one_chunk_and_all_are_about_as_large(memory, chu
     # Walls have many equal coordinates, and what lies far off must not draw the cuts there.
     fair = len(memory) / len(chunks)
     assert np.percentile(sizes, 5) > 0.6 * fair and max(sizes) < 2 * fair
-    position = memory.records.position
+    position = memory.columns.positions
     for chunk, rows in enumerate(held):
         assert (np.diff(rows) > 0).all()
         assert (chunks.number(memory, rows) == chunk).all()
@@ -69,7 +69,7 @@ def test_no_cell_of_the_coarse_points_is_cut(memory, chunks):
 def test_chunks_in_view_are_found_nearest_first(memory, table):
     cam = seen_by(memory, 0.3, -0.2, 1.2, rotation=(0.1, -0.4, 0.2))
     found = table.near(cam, reach=np.inf, budget=len(memory))
-    xy, z = cam.project(memory.records.position.astype(np.float64))
+    xy, z = cam.project(memory.columns.positions.astype(np.float64))
     size = np.array([cam.width[0], cam.height[0]])
     seen = (z[0] > 0) & (xy[0] >= 0).all(axis=1) & (xy[0] < size).all(axis=1)
     by_chunk = [bool(seen[table.rows(chunk)].any()) for chunk in range(len(table.boxes))]

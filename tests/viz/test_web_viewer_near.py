@@ -115,15 +115,15 @@ def test_every_observation_near_the_camera_is_sent_in_place_of_the_coarse_ones(c
         for round, places in found.places.items():
             node, mine = nodes[chunk, round], found.rows[places]
             assert (run.round_of_points()[mine] == round).all()
-            expected = viewer.frame.points(memory.records.position[mine])
+            expected = viewer.frame.points(memory.columns.positions[mine])
             # To a hundredth of a point's size.
             np.testing.assert_allclose(
                 node.points.astype(np.float32) + node.position, expected, atol=node.point_size / 100
             )
-            np.testing.assert_array_equal(node.colors, memory.records.color[mine])
+            np.testing.assert_array_equal(node.colors, memory.columns.colors[mine])
             assert node.points.nbytes + node.colors.nbytes == 9 * len(mine)
     assert {node.point_size for node in nodes.values()} <= {
-        viewer.frame.scale * float(s) for s in np.unique(memory.records.spacing[: len(memory)])
+        viewer.frame.scale * float(s) for s in np.unique(memory.columns.spacing[: len(memory)])
     }
     assert max(node.point_size for node in nodes.values()) < viewer._points._point_size()
 

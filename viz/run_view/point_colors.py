@@ -83,7 +83,7 @@ def point_colors(
     """
     chosen = np.arange(len(memory)) if rows is None else rows
     if mode == "color":
-        return PointColors(memory.records.color[chosen], Legend("as photographed or completed"))
+        return PointColors(memory.columns.colors[chosen], Legend("as photographed or completed"))
     if mode == "round":
         return _by_round(memory, chosen)
     if mode == "source":
@@ -159,7 +159,7 @@ def _rgb(color: str) -> tuple[int, int, int]:
 
 
 def _by_round(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
-    rounds = memory.views.round[memory.records.view[rows]]
+    rounds = memory.views.round[memory.columns.view[rows]]
     last = max(1, *memory.rounds, 1)
     rgb = viridis((rounds - 1) / max(1, last - 1))
     rgb[rounds == 0] = _rgb(GREY)
@@ -171,8 +171,8 @@ def _by_round(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
 def _by_source(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
     names = ("observed", "generated")
     tint = np.array([_rgb(COLORS[name]) for name in names], np.float32)
-    light = memory.records.color[rows] @ np.array([0.299, 0.587, 0.114], np.float32) / 255
-    kind = memory.views.generated[memory.records.view[rows]].astype(np.int64)
+    light = memory.columns.colors[rows] @ np.array([0.299, 0.587, 0.114], np.float32) / 255
+    kind = memory.views.generated[memory.columns.view[rows]].astype(np.int64)
     rgb = np.clip(tint[kind] * (0.45 + 0.75 * light)[:, None], 0, 255)
     swatches = tuple((COLORS[name], name) for name in names)
     return PointColors(rgb.round().astype(np.uint8), Legend("where a point comes from", swatches))

@@ -97,7 +97,7 @@ class RunView:
     def round_of_points(self) -> NDArray[np.int32]:
         """(N,) int32, for each observation the round it was fused in."""
         memory = self.memory
-        return memory.views.round[memory.records.view[: len(memory)]]
+        return memory.views.round[memory.columns.view[: len(memory)]]
 
     def counts(self, round: int) -> Counts:
         """What the memory held after a round.
@@ -189,7 +189,7 @@ class RunView:
         rows, positions = self._sample()
         if not len(rows):
             return 1.0
-        away = positions - self.memory.views.centers[self.memory.records.view[rows]]
+        away = positions - self.memory.views.centers[self.memory.columns.view[rows]]
         return float(np.median(np.linalg.norm(away, axis=1))) or 1.0
 
 

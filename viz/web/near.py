@@ -262,8 +262,8 @@ class NearPoints:
             before.source = source
             return before
         memory = source.run.memory
-        size = float(np.median(memory.records.spacing[rows]))
-        places = dict(groups(memory.views.round[memory.records.view[rows]]))
+        size = float(np.median(memory.columns.spacing[rows]))
+        places = dict(groups(memory.views.round[memory.columns.view[rows]]))
         points = positions_on_page(memory, rows, self._frame)
         # A chunk is some hundred spacings wide, of which half precision keeps hundredths.
         around = np.median(points, axis=0)

@@ -54,7 +54,7 @@ class PointNodes:
         before = {key: self.rows[places] for key, places in self._places.items()}
         same_size = drawn.size == self.size
         self.rows, self.size = drawn.rows, drawn.size
-        rounds = memory.views.round[memory.records.view[drawn.rows]]
+        rounds = memory.views.round[memory.columns.view[drawn.rows]]
         span = int(rounds.max(initial=0)) + 1
         keys = chunks.number(memory, drawn.rows).astype(np.int64) * span + rounds
         self._places = {divmod(key, span): places for key, places in groups(keys)}

@@ -180,10 +180,10 @@ class GeoVerseCompleter:
         most = min(self.context_views or model.config.context, views - 1)
         room = views - min(most, len(context))
         passes = steps = 0
-        filled = self._filled(model, context, guidance.rows(holes)) if holes else None
+        filled = self._filled(model, context, guidance.select(holes)) if holes else None
         for first in range(0, len(holes), room):
             rows = holes[first : first + room]
-            part = guidance.rows(rows)
+            part = guidance.select(rows)
             fill = None if filled is None else filled.rows(range(first, first + len(rows)))
             shown = part.depth if fill is None else fill.depth
             chosen = chosen_views(context, part.cameras, shown, most, by=self.context_by)

@@ -1,6 +1,6 @@
 """The splatting kernels: depth pass, blending pass, resolving.
 
-The image is cut into bands of rows; each band walks the same runs in the same order, so the result
+The image is cut into bands of rows; each band walks the same segments in the same order, so the result
 does not depend on how many threads share the work.
 """
 
@@ -12,9 +12,9 @@ from numba import prange
 from gvtools.kernels import FAST, compiled
 from gvtools.memory.culling import REACHABLE
 
-# Channels of the accumulator: weighted rgb, weight, weighted z in Target.unit, kernel.
+# Channels of the accumulator: weighted rgb, weight, weighted z in FrameBuffers.unit, kernel.
 CHANNELS = 6
-# Confidence x proximity counts as no less: below, sums of float32 would vanish.
+# Confidence x view weight counts as no less: below, sums of float32 would vanish.
 FAINTEST = np.float32(1e-36)
 # The smallest float32 of full precision, and the least weight that a pixel is divided by.
 SMALLEST = np.finfo(np.float32).tiny
@@ -31,11 +31,11 @@ def closed_off(u, v, reach, width, height, reachable):
 
 
 @compiled(fastmath=FAST)
-def _project_run(
-    x, y, z, spacing, M, fx, fy, skew, cx, cy, focal, near, factor, size_cap, width, top, bottom,
+def _project_segment(
+    positions, x, y, z, spacing, M, fx, fy, skew, cx, cy, focal, z_near, factor, max_splat_px, width, top, bottom,
     u, v, depth, reach, c0, c1, r0, r1,
 ):  # fmt: skip
-    """Centre-of-pixel coordinates, depth, reach (pixels) and window of one run's points.
+    """Centre-of-pixel coordinates, depth, reach (pixels) and window of one segment's points.
 
     The window is the pixels within reach, cut to the image and to the rows ``top`` to ``bottom``;
     it is empty behind the camera.
@@ -48,15 +48,21 @@ def _project_run(
     right = np.float32(width)
     above = np.float32(top - 1)
     below = np.float32(bottom + 1)
-    for k in range(len(x)):
+    # Apart, because vector units want them so.
+    flat = positions.reshape(-1)
+    for k in range(len(positions)):
+        x[k] = flat[np.uint64(3 * k)]
+        y[k] = flat[np.uint64(3 * k + 1)]
+        z[k] = flat[np.uint64(3 * k + 2)]
+    for k in range(len(positions)):
         px = m00 * x[k] + m01 * y[k] + m02 * z[k] + m03
         py = m10 * x[k] + m11 * y[k] + m12 * z[k] + m13
         pz = m20 * x[k] + m21 * y[k] + m22 * z[k] + m23
         depth[k] = pz
-        inverse = one / max(pz, near)
+        inverse = one / max(pz, z_near)
         col = (fx * px + skew * py) * inverse + cx
         row = fy * py * inverse + cy
-        h = factor * min(max(spacing[k] * focal * inverse, one), size_cap)
+        h = factor * min(max(spacing[k] * focal * inverse, one), max_splat_px)
         u[k] = col
         v[k] = row
         reach[k] = h
@@ -68,22 +74,22 @@ def _project_run(
         c0[k] = max(first_col, np.int32(0))
         c1[k] = min(last_col, np.int32(width - 1))
         r0[k] = max(first_row, np.int32(top))
-        r1[k] = min(last_row, np.int32(bottom)) if pz > near else np.int32(-1)
+        r1[k] = min(last_row, np.int32(bottom)) if pz > z_near else np.int32(-1)
 
 
 @compiled(parallel=True, fastmath=FAST)
-def splat_runs(
-    runs, run_start, run_length, run_view, rect, x, y, z, color, confidence, agreement, spacing,
-    view_weight, M, K, near, unit, limit, reachable, band, depth_reach, blend_reach, size_cap,
-    weight_cap, threads, blend, width, height, depth, total,
+def splat_segments(
+    segments, segment_start, segment_length, segment_view, rect, positions, color, confidence, spacing,
+    view_weight, M, K, z_near, unit, limit, reachable, depth_band, depth_reach, blend_reach, max_splat_px,
+    threads, blend, width, height, depth, total,
 ):  # fmt: skip
     """Depth pass, then blending inside the depth band.
 
-    ``runs`` (n,) are added in their order. Only what is nearer than ``limit`` (H x W,) makes a
+    ``segments`` (n,) are added in their order. Only what is nearer than ``limit`` (H x W,) makes a
     depth; 0 shuts a pixel. ``reachable`` (H x W,) bool holds the pixels within REACHABLE pixels of
-    one to be written; it is empty when most of the image is open. ``band`` is the relative depth
+    one to be written; it is empty when most of the image is open. ``depth_band`` is the relative depth
     band that blends; ``depth_reach`` and ``blend_reach`` are the footprints' half width and the
-    kernel's radius in spacings; footprints wider than ``size_cap`` pixels are cut to it. Without
+    kernel's radius in spacings; footprints wider than ``max_splat_px`` pixels are cut to it. Without
     ``blend`` it stops after the depth pass. Depths are summed in the power of two ``unit``.
 
     Writes ``depth`` (H x W,) float32, the nearest depth, or ``limit`` where nothing is nearer, and
@@ -96,8 +102,8 @@ def splat_runs(
     cy = np.float32(K[1, 2] - 0.5)
     focal = np.float32(np.sqrt(K[0, 0] * K[1, 1]))
     longest = 0
-    for r in runs:
-        longest = max(longest, run_length[r])
+    for r in segments:
+        longest = max(longest, segment_length[r])
     one = np.float32(1)
     zero = np.float32(0)
     per_unit = one / unit
@@ -107,6 +113,9 @@ def splat_runs(
         b = (task % bands) * threads + task // bands
         top = b * height // (bands * threads)
         bottom = (b + 1) * height // (bands * threads) - 1
+        x = np.empty(longest, np.float32)
+        y = np.empty(longest, np.float32)
+        z = np.empty(longest, np.float32)
         u = np.empty(longest, np.float32)
         v = np.empty(longest, np.float32)
         depths = np.empty(longest, np.float32)
@@ -119,14 +128,14 @@ def splat_runs(
             depth[i] = limit[i]
             if blend and limit[i] > 0:
                 total[i] = 0
-        for r in runs:
+        for r in segments:
             if rect[r, 3] < top or rect[r, 2] > bottom:
                 continue
-            first = run_start[r]
-            last = first + run_length[r]
-            _project_run(
-                x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx, fy, skew,
-                cx, cy, focal, near, depth_reach, size_cap, width, top, bottom,
+            first = segment_start[r]
+            last = first + segment_length[r]
+            _project_segment(
+                positions[first:last], x, y, z, spacing[first:last], M, fx, fy, skew,
+                cx, cy, focal, z_near, depth_reach, max_splat_px, width, top, bottom,
                 u, v, depths, reach, c0, c1, r0, r1,
             )  # fmt: skip
             for k in range(last - first):
@@ -141,15 +150,15 @@ def splat_runs(
                             depth[cell] = zk
         if not blend:
             continue
-        for r in runs:
+        for r in segments:
             if rect[r, 3] < top or rect[r, 2] > bottom:
                 continue
-            first = run_start[r]
-            last = first + run_length[r]
-            proximity = view_weight[run_view[r]]
-            _project_run(
-                x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx, fy, skew,
-                cx, cy, focal, near, blend_reach, size_cap, width, top, bottom,
+            first = segment_start[r]
+            last = first + segment_length[r]
+            weight = view_weight[segment_view[r]]
+            _project_segment(
+                positions[first:last], x, y, z, spacing[first:last], M, fx, fy, skew,
+                cx, cy, focal, z_near, blend_reach, max_splat_px, width, top, bottom,
                 u, v, depths, reach, c0, c1, r0, r1,
             )  # fmt: skip
             for k in range(last - first):
@@ -157,8 +166,8 @@ def splat_runs(
                     continue
                 zk = depths[k]
                 q = one / (reach[k] * reach[k])
-                near_side = zk / (one + band)
-                scale = min(confidence[first + k] + agreement[first + k], weight_cap) * proximity
+                near_side = zk / (one + depth_band)
+                scale = confidence[first + k] * weight
                 scale = max(scale, FAINTEST)
                 red = scale * np.float32(color[first + k, 0])
                 green = scale * np.float32(color[first + k, 1])
@@ -182,7 +191,7 @@ def splat_runs(
 
 
 @compiled(parallel=True, fastmath=FAST)
-def resolve(total, open_, support, unit, made, rgb, depth, valid, confidence, generated):
+def resolve(total, open_, support, unit, is_generated, rgb, depth, valid, confidence, generated):
     """Turn accumulators into pixels where ``open_`` and the support suffices."""
     for row in prange(total.shape[0]):
         for col in range(total.shape[1]):
@@ -197,5 +206,5 @@ def resolve(total, open_, support, unit, made, rgb, depth, valid, confidence, ge
                 rgb[row, col, c] = total[row, col, c] * scale * np.float32(1 / 255)
             depth[row, col] = total[row, col, 4] * scale * unit
             confidence[row, col] = weight / kernel
-            generated[row, col] = made
+            generated[row, col] = is_generated
             valid[row, col] = True

@@ -18,7 +18,7 @@ from pipelines.cli import main
 from pipelines.reconstruction.depth_cache import colored, off_scale
 
 RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3", "--quiet")
-ALL = ("--set", "savings.explained=none")
+ALL = ("--set", "savings.depth_from_memory=none")
 
 
 class Exact:
@@ -74,7 +74,7 @@ def test_computed_depth_is_kept_and_asked_for_once(scan, tmp_path):
 
 def test_a_view_that_memory_explains_needs_none_computed(scan, tmp_path):
     out = tmp_path / "run"
-    assert reconstruct(scan, out, "--voxel", "0.03", "--set", "savings.explained=0.8") == 0
+    assert reconstruct(scan, out, "--voxel", "0.03", "--set", "savings.depth_from_memory=0.8") == 0
     report = json.loads((out / "round_000" / "report.json").read_text())
     sources = [entry["source"] for entry in report["depth"]]
     assert sources[0] == "exact" and sources.count("memory") == 3 - Exact.asked > 0
@@ -149,7 +149,7 @@ def test_views_off_the_sparse_points_scale_are_reported_and_named(
     scan, out = write_colmap_scan(tmp_path / "colmap", views=8), tmp_path / "run"
     options = ("--context", "not:first:1", "--targets", "first:1", "--completer", "none")
     # Every view's depth is asked for, whatever memory explains.
-    every = ("--set", "savings.explained=none")
+    every = ("--set", "savings.depth_from_memory=none")
     words = ["reconstruct", str(scan), "--out", str(out), *options, *every, "--quiet"]
     assert main(words) == 0
     for entry in json.loads((out / "round_000" / "report.json").read_text())["depth"]:

@@ -12,7 +12,7 @@ from gvtools.completers.base import Completion
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, together
 from gvtools.memory.back_projection import back_project
-from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.config import RunConfig
 from pipelines.reconstruction.rounds import Clock, complete_targets
@@ -61,7 +61,7 @@ def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras])
         calls.append(cameras.names[0])
         return project(cameras, **options)
 
-    followed = [FollowedCamera(memory, target, reuse=False) for target in targets]
+    followed = [CachedProjection(memory, target, reuse=False) for target in targets]
     for target in followed:
         target.guidance()
     memory.project = counted  # type: ignore[method-assign]

@@ -96,7 +96,7 @@ def test_a_run_takes_the_measured_edge_unless_told_otherwise(scan):
     }
     assert edges["any"] == pytest.approx(SCALES[-1] * edges["footprint"], rel=0.01)
     wide = make_plan(scene, with_settings(RunConfig(), [*texts, "fusion.voxel_loss=100"])).config
-    assert wide.memory.footprints == SCALES[-1] * RunConfig().memory.footprints
+    assert wide.memory.voxels_per_footprint == SCALES[-1] * RunConfig().memory.voxels_per_footprint
     assert edges["accurate"] <= edges["balanced"] and edges["given"] == 0.0123
     with pytest.raises(OptionError, match=r"fusion\.voxel_loss"):
         with_settings(RunConfig(), ["fusion.voxel_loss=-1"])

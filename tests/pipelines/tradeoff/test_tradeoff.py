@@ -91,7 +91,7 @@ def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
     arguments = ["tradeoff", "scan", "--out", "out", "--config", str(file)]
     args = build_parser().parse_args(arguments + [word for text in own for word in ("--set", text)])
     start = asked_for(args)
-    assert start.profile == "accurate" and start.memory.same_direction == 0
+    assert start.profile == "accurate" and start.memory.merge_angle_deg == 0
     for name, changes in PROFILES.items():
         wanted = with_settings(with_profile(RunConfig(), name), ["savings.minor_holes=0.07"])
         wanted = with_settings(wanted, [text for text in own if "profile" not in text])

@@ -288,12 +288,12 @@ def test_what_is_swept_is_what_the_run_has():
     computed = knobs_in("plane-sweep", RunConfig(completer="none"))
     planes, explained = computed["stereo planes"], computed["views explained, share of pixels"]
     assert planes.levels[planes.usual].settings == {"stereo.planes": None}
-    assert explained.levels[explained.usual].settings == {"savings.explained": 0.9}
-    assert explained.levels[-1].settings == {"savings.explained": None}
+    assert explained.levels[explained.usual].settings == {"savings.depth_from_memory": 0.9}
+    assert explained.levels[-1].settings == {"savings.depth_from_memory": None}
     # A value that is not among the usual ones is one of the levels, too.
-    own = with_setting(RunConfig(completer="none"), "savings.explained", 0.95)
+    own = with_setting(RunConfig(completer="none"), "savings.depth_from_memory", 0.95)
     explained = knobs_in("da3", own)["views explained, share of pixels"]
-    assert explained.levels[explained.usual].settings == {"savings.explained": 0.95}
+    assert explained.levels[explained.usual].settings == {"savings.depth_from_memory": 0.95}
     # Every level is a setting that a run takes.
     for knob in computed.values():
         for level in knob.levels:
@@ -303,9 +303,9 @@ def test_what_is_swept_is_what_the_run_has():
 
 @pytest.mark.parametrize("footprints", [0.0, 0.7, 1.0, 4.0])
 def test_far_voxels_are_swept_from_the_widest_to_those_of_near_ones(footprints):
-    config = with_setting(RunConfig(completer="none"), "memory.footprints", footprints)
+    config = with_setting(RunConfig(completer="none"), "memory.voxels_per_footprint", footprints)
     knob = knobs_in("recorded", config)["far voxels"]
-    values = [level.settings["memory.footprints"] for level in knob.levels]
+    values = [level.settings["memory.voxels_per_footprint"] for level in knob.levels]
     assert values == sorted(set(values), reverse=True)
     assert values[-1] == 0 and values[knob.usual] == footprints
     assert len({level.name for level in knob.levels}) == len(values) > 1
