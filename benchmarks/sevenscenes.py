@@ -116,7 +116,7 @@ def built(context: list[Shot], voxel: float, options: MemoryOptions | None = Non
     """A memory of the context."""
     memory = SpatialMemory(voxel, options=options)
     for shot in context:
-        memory.fuse(back_project(shot.rgb, shot.depth, shot.camera), round=0)
+        memory.observe(shot.rgb, shot.depth, shot.camera, round=0)
     return memory
 
 
@@ -248,7 +248,7 @@ def _moved(points: PointSet, copy: int) -> PointSet:
 
 
 def _fuse(memory: SpatialMemory, shot: Shot) -> None:
-    memory.fuse(back_project(shot.rgb, shot.depth, shot.camera), round=1)
+    memory.observe(shot.rgb, shot.depth, shot.camera, round=1)
 
 
 def sweep(context: list[Shot], targets: list[Shot], console: Console) -> list[dict[str, Any]]:
@@ -257,7 +257,7 @@ def sweep(context: list[Shot], targets: list[Shot], console: Console) -> list[di
     settings: list[tuple[str, float, MemoryOptions]] = [("default", VOXEL, plain)]
     for count in (1, 2, 4, 64):
         settings.append(
-            (f"observations_per_voxel {count}", VOXEL, replace(plain, observations_per_voxel=count))
+            (f"observations_per_voxel {count}", VOXEL, plain.replaced(observations_per_voxel=count))
         )
     for degrees in (0.0, 5.0, 15.0):
         settings.append(

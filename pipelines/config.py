@@ -31,7 +31,7 @@ class FusionOptions:
         max_scale_residual: a completion whose depth fits the memory's worse than this relative
             residual is refused.
         voxel_percentile: the automatic edge of the finest voxels follows this percentile of the
-            context's pixel footprints; what is farther gets wider ones 
+            context's pixel footprints; what is farther gets wider ones
             (``memory.voxels_per_footprint``).
         voxel_scale: how many such footprints the edge is.
         voxel_loss: of edges from half to four times the footprints', dB by which context views,
@@ -65,8 +65,8 @@ class SavingsOptions:
     Attributes:
         reuse: what observed views show of a target is not projected again after completions were
             fused; the pictures are the same.
-        pixel_binning: 2 x 2 pixels become one point, their mean, where they are together at most this many
-            voxel edges wide, unless the surface is steep; 0 lifts each by itself.
+        pixel_binning: 2 x 2 pixels become one point, their mean, where they are together at most this
+            many voxel edges wide, unless the surface is steep; 0 lifts each by itself.
         minor_holes: a view with no unknown pixel farther than this share of the image diagonal from
             a known one is left to ``inpaint`` where the completer is a costly one (geoverse,
             exemplar); 0 leaves it none.
@@ -77,8 +77,8 @@ class SavingsOptions:
         no_prior: likewise, they are completed without the video prior of a model that has one.
         near_holes: steps of the generative core after the first one look at tokens near holes
             alone, where there is no video prior.
-        depth_from_memory: a context view whose depth would have to be computed takes memory's instead where
-            the views before it explain this share of its pixels; None computes all.
+        depth_from_memory: a context view whose depth would have to be computed takes memory's
+            instead where the views before it explain this share of its pixels; None computes all.
     """
 
     reuse: bool = True

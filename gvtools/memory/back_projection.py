@@ -60,8 +60,8 @@ def back_project(
         mask: (H, W) bool, True = use.
         options: see BackProjectionOptions.
         levels: the voxels that the points are for (``memory.levels``); for ``pixel_binning``.
-        pixel_binning: where 2 x 2 pixels together are at most so many voxel edges wide, they become one
-            point, their mean, unless the surface is steep; 0 keeps every pixel's, and so does
+        pixel_binning: where 2 x 2 pixels together are at most so many voxel edges wide, they become
+            one point, their mean, unless the surface is steep; 0 keeps every pixel's, and so does
             leaving ``levels`` out.
 
     Raises:

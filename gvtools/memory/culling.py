@@ -110,8 +110,8 @@ def in_front(
     """Those of ``segments`` (n,) with a sampled point in front of ``depth`` by ``margin``.
 
     A segment wholly behind the farthest depth of its rectangle's tiles (``farthest``) is not
-    sampled; of the others, every SAMPLE-th point is looked up in the image. A point in space that one of
-    the T views with free-space ``grids`` (T, h, w) saw through does not count.
+    sampled; of the others, every SAMPLE-th point is looked up in the image. A point in space that one
+    of the T views with free-space ``grids`` (T, h, w) saw through does not count.
     """
     height, width = depth.shape
     hit = np.zeros(len(segments), np.bool_)

@@ -2,9 +2,9 @@
 
 Views near the target know best how it looks from there, so observations are splatted in tiers,
 nearest views first, and a later tier writes only pixels that are still open; segments whose
-rectangle holds no open pixel are not touched at all. Then what observed views of later tiers know to stand
-clearly in front is let through, unless a view of the first tier saw that space to be free. Last
-come generated views, in tiers of their own: they fill what is open still.
+rectangle holds no open pixel are not touched at all. Then what observed views of later tiers know
+to stand clearly in front is let through, unless a view of the first tier saw that space to be free.
+Last come generated views, in tiers of their own: they fill what is open still.
 
 Which segments go into which pixels is decided here; a back end (``Splatter``) does the splatting.
 """

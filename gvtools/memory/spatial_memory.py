@@ -201,7 +201,8 @@ class SpatialMemory(Store):
         groups, group = np.unique(keys, axis=0, return_inverse=True)
         for i, (number, made, row) in enumerate(groups.tolist()):
             label = f"{name} {row}" if "view" in column else name
-            camera = Cameras(np.eye(3)[None], pose[None], np.ones(1, int), np.ones(1, int), (label,))
+            one = np.ones(1, np.int64)
+            camera = Cameras(np.eye(3)[None], pose[None], one, one, (label,))
             rows = np.flatnonzero(group.reshape(-1) == i)
             points = PointSet(
                 columns["positions"][rows], colors[rows].astype(np.uint8), confidence[rows],

@@ -29,7 +29,6 @@ def open_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
     from gvtools.memory.spatial_memory import SpatialMemory
 
     if path.suffix.lower() == ".ply":
-        
         memory = SpatialMemory.from_ply(path)
     else:
         memory = SpatialMemory.load(memory_file(path))

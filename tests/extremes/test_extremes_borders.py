@@ -101,7 +101,7 @@ def test_of_equal_depths_the_lower_index_wins_whatever_stands_between(seed, coun
     rng = np.random.default_rng(seed)
     z = rng.choice(np.array([2.0, 2.0000002, 3.0], np.float32), count)
     zero = np.zeros(count, np.float32)
-    image = project_nearest((zero, zero, z), camera())
+    image = project_nearest(np.stack([zero, zero, z], 1), camera())
     assert image.index.max() == np.argmin(z)
     assert (image.index >= 0).sum() == 1
 
@@ -140,7 +140,7 @@ def test_every_part_of_a_pixel_belongs_to_one_pixel(shift, degrees):
     x = (columns + shift - SIZE["width"] / 2) / f * depth
     y = (rows + shift - SIZE["height"] / 2) / f * depth
     xyz = [axis.ravel().astype(np.float32) for axis in (x, y, np.full(x.shape, depth))]
-    image = project_nearest((xyz[0], xyz[1], xyz[2]), camera(**SIZE, focal=f))
+    image = project_nearest(np.stack(xyz, 1), camera(**SIZE, focal=f))
     number = np.arange(columns.size).reshape(columns.shape)
     wrong = image.index != number
     # On the border itself the side is that of a rounded product.

@@ -15,12 +15,13 @@ from numba import njit
 from reference_splat import reference_project
 
 from gvtools.errors import MemoryFileError, OptionError
-from gvtools.memory import fusion
+from gvtools.memory import fusion_kernels
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.io.ply import export_memory_ply, read_ply, write_ply
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.cpu_kernels import FAINTEST
+from gvtools.memory.store.columns import Columns
 
 BACKENDS = ("cpu", "torch", "nearest")
 LARGEST = float(np.finfo(np.float32).max)
@@ -119,7 +120,7 @@ def test_huge_confidences_saturate_within_and_across_rounds(tmp_path):
     assert saved_bytes(loaded, tmp_path) == saved_bytes(memory, tmp_path)
     for round_ in (2, 1):
         memory.forget(round=round_)
-    assert np.isfinite(memory.columns.agreement[:1]).all()
+    assert np.isfinite(memory.confidence).all()
 
 
 @pytest.mark.parametrize("cap", [0.0, 1e-21, 1e21, np.inf, np.nan])
@@ -199,16 +200,14 @@ def test_a_million_points_of_one_view_in_one_voxel():
 
 
 @njit
-def _merge_again(times, where, color, own, cap, x, y, z, c, confidence, spacing, view):
+def _merge_again(times, where, color, own, cap, columns):
     p, sums = np.empty(3), np.empty(6)
     for i in range(times):
         k = i % len(where)
         for axis in range(3):
             p[axis] = where[k, axis]
             sums[3 + axis] = own * color[k, axis]
-        fusion._merge(
-            0, p, sums, own, own, 1.0, i + 1, 1.0, x, y, z, c, confidence, spacing, view, cap
-        )
+        fusion_kernels._merge(0, p, sums, own, own, 1.0, i + 1, 1.0, columns, cap)
 
 
 def merged_again(times: int, where, color, *, own=1.0, start=None, cap=100.0) -> SimpleNamespace:
@@ -220,15 +219,14 @@ def merged_again(times: int, where, color, *, own=1.0, start=None, cap=100.0) ->
     color = np.atleast_2d(np.asarray(color, np.float64))
     first, tint = (where[0], color[0]) if start is None else start
     single = np.float32
-    x, y, z = (np.array([value], single) for value in first)
-    c = np.array([tint]).astype(np.uint8)
-    confidence = np.array([own], single)
-    _merge_again(
-        times, where, color, float(single(own)), cap, x, y, z, c, confidence, np.ones(1, single),
-        np.zeros(1, np.int32),
-    )  # fmt: skip
+    columns = Columns()
+    columns.reserve(1)
+    one = columns.arrays
+    one.positions[:], one.colors[:] = first, np.asarray(tint).astype(np.uint8)
+    one.confidence[:], one.spacing[:] = own, 1
+    _merge_again(times, where, color, float(single(own)), cap, one)
     return SimpleNamespace(
-        position=np.array([x[0], y[0], z[0]]), color=c[0], confidence=confidence[0]
+        position=one.positions[0].copy(), color=one.colors[0].copy(), confidence=one.confidence[0]
     )
 
 
@@ -281,11 +279,12 @@ def test_a_wrong_first_observation_is_outvoted_up_to_the_rounding_of_storage(own
     assert np.abs(found.color.astype(float) - (255, 130, 20)).max() <= 11
 
 
-def test_a_million_agreements_of_later_rounds_add_up():
+def test_many_agreements_of_later_rounds_add_up():
     memory = SpatialMemory(1.0)
     memory.fuse(points([(0.5, 0.5, 2.5)], confidence=1e-4), round=0)
-    rows = np.zeros(MILLION, np.int32)
-    memory.columns.agree(rows, np.full(MILLION, 1e-4, np.float32))
+    row = np.zeros(1, np.int32)
+    for _ in range(100_000):
+        memory.agree(row, np.full(1, 1e-3, np.float32), round=1)
     assert memory.confidence[0] == pytest.approx(100, rel=0.01)
-    memory.columns.agree(rows, np.full(MILLION, LARGEST, np.float32))
+    memory.agree(row, np.full(1, LARGEST, np.float32), round=1)
     assert memory.confidence[0] == 100

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from memory_scenes import camera, points
 from reference_fusion import ReferenceMemory, chains_of
 
-from gvtools.memory.fusion import group_by_block, voxel_keys
+from gvtools.memory.fusion_kernels import group_by_block
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-from gvtools.memory.store.voxel_index import EMPTY_KEY, MAX_VOXEL
+from gvtools.memory.store.voxel_index import EMPTY_KEY, MAX_VOXEL, voxel_keys
 
 ONE_EDGE = MemoryOptions(voxels_per_footprint=0.0)
 
@@ -37,7 +37,7 @@ def test_fusion_does_what_a_plain_dictionary_does(seed, views, capacity, degrees
     rng = np.random.default_rng(seed)
     options = MemoryOptions(
         merge_angle_deg=degrees, observations_per_voxel=capacity, weight_cap=4.0,
-        footprints=footprints,
+        voxels_per_footprint=footprints,
     )  # fmt: skip
     memory, reference = SpatialMemory(0.1, options=options), ReferenceMemory(0.1, options)
     for view in range(views):

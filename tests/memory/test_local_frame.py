@@ -82,7 +82,7 @@ def test_a_turned_memory_is_saved_exported_and_undone(tmp_path):
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "memory.npz").read_bytes()
     cloud = loaded.cloud
     np.testing.assert_allclose(
-        cloud.point.positions.numpy().astype(float) + memory.origin, memory.positions, atol=1e-5
+        memory.frame.to_world(cloud.point.positions.numpy()), memory.positions, atol=1e-5
     )
     loaded.forget(round=2)
     assert not loaded.generated.any() and 0 < len(loaded) < len(memory)

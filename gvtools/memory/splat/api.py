@@ -44,8 +44,8 @@ class SplatOptions(Settings):
     occluders: bool = True
     """Look for things in front that the first tiers did not see."""
     backend: Literal["cpu", "torch", "nearest", "open3d"] = "cpu"
-    """The kernels: "cpu" (compiled), "torch" (the same on ``device``), or without blending, one pixel a point:
-    "nearest" (our own) and "open3d" (``project_to_rgbd_image``)."""
+    """The kernels: "cpu" (compiled), "torch" (the same on ``device``), or without blending, one
+    pixel a point: "nearest" (our own) and "open3d" (``project_to_rgbd_image``)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where "torch" computes: "cpu", "cuda", or "auto" for CUDA where there is one."""
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class CpuSplatter:
-    """Splats segments of a memory on the processor's cores; see gvtools.memory.splat.api.Splatter."""
+    """Splats segments of a memory on the processor's cores; see splat.api.Splatter."""
 
     def __init__(self, store: Store, options: SplatOptions) -> None:
         self.store, self.options = store, options
@@ -42,15 +42,22 @@ class CpuSplatter:
         columns, options = self.store.columns.arrays, self.options
         segments = self.store.segments
         reachable = np.empty(0, np.bool_) if table is None else culling.near_to(table)
+        K, single = target.camera.K[0], np.float32
+        lens = splat_kernels.Lens(
+            target.cam_from_local.astype(single), single(K[0, 0]), single(K[1, 1]),
+            single(K[0, 1]), single(K[0, 2] - 0.5), single(K[1, 2] - 0.5),
+            single(np.sqrt(K[0, 0] * K[1, 1])), target.z_near, target.unit, width, height,
+        )  # fmt: skip
+        rules = splat_kernels.SplatRules(
+            single(options.depth_band), single(options.depth_reach),
+            single(options.blend_reach), single(options.max_splat_px),
+        )  # fmt: skip
+        table_of = splat_kernels.SegmentColumns(
+            segments.start, segments.length, segments.view, target.rect
+        )
         splat_kernels.splat_segments(
-            chosen, segments.start, segments.length, segments.view, target.rect,
-            columns.positions, columns.colors, columns.confidence, columns.spacing, weight,
-            target.cam_from_local.astype(np.float32), target.camera.K[0], target.z_near, target.unit,
-            limit.reshape(-1), reachable,
-            np.float32(options.depth_band), np.float32(options.depth_reach),
-            np.float32(options.blend_reach), np.float32(options.max_splat_px),
-            numba.get_num_threads(), blend,
-            width, height, self.zbuffer.reshape(-1),
+            chosen, table_of, columns, weight, lens, rules, limit.reshape(-1), reachable,
+            numba.get_num_threads(), blend, self.zbuffer.reshape(-1),
             self.total.reshape(-1, splat_kernels.CHANNELS),
         )  # fmt: skip
         return self.zbuffer

@@ -1,9 +1,10 @@
 """Projection without blending: one pixel an observation, the nearest one wins.
 
-The plain choice, and the check of the others: no tiers, no footprints, so a memory coarser than the
-image shows holes, and generated content in front of observed content is seen. Each point lands in
-the pixel whose centre is nearest. Points come in voxel order, so consecutive points hit neighbouring
-pixels and the buffer stays in the cache. Open3D's projection does the same, many times slower.
+The plain choice, and the check of the others: no tiers, no footprints, so a memory coarser than
+the image shows holes, and generated content in front of observed content is seen. Each point lands
+in the pixel whose centre is nearest. Points come in voxel order, so consecutive points hit
+neighbouring pixels and the buffer stays in the cache. Open3D's projection does the same, many times
+slower.
 """
 
 from __future__ import annotations

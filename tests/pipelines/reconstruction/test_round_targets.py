@@ -61,7 +61,7 @@ def test_an_error_comes_where_the_round_begins(memory, monkeypatch):
     def broken(self: CachedProjection, snapshot: Any) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(CachedProjection, "look", broken)
+    monkeypatch.setattr(CachedProjection, "prefetch", broken)
     with RoundTargets(plan(1, 1), memory) as targets:
         targets.look_ahead(2)
         with pytest.raises(ZeroDivisionError):
@@ -69,7 +69,7 @@ def test_an_error_comes_where_the_round_begins(memory, monkeypatch):
 
 
 def test_a_run_that_is_stopped_waits_for_one_target_at_most(memory, monkeypatch):
-    monkeypatch.setattr(CachedProjection, "look", lambda self, snapshot: time.sleep(0.5))
+    monkeypatch.setattr(CachedProjection, "prefetch", lambda self, snapshot: time.sleep(0.5))
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt), RoundTargets(plan(1, 20), memory) as targets:
         targets.look_ahead(2)

@@ -119,12 +119,12 @@ def test_looking_ahead_beside_fusions_gives_the_picture_of_a_whole_projection(me
 
     def look() -> None:
         for target in targets:
-            target.look(snapshot)
+            target.prefetch(snapshot)
 
     with ThreadPoolExecutor(1) as pool:
         looked = pool.submit(look)
         for number in range(8):
-            # Into the runs that are there, and into new ones.
+            # Into the segments that are there, and into new ones.
             fuse(memory, camera(0.2 * number - 0.8, -0.2), 4 + number, generated=True, round=1)
         looked.result()
 
@@ -137,7 +137,7 @@ def test_looking_ahead_beside_fusions_gives_the_picture_of_a_whole_projection(me
     for target, guidance in zip(targets, seen, strict=True):
         assert same(guidance, memory.project(target.camera))
     # What was observed since makes a look worthless.
-    targets[0].look(memory.snapshot())
+    targets[0].prefetch(memory.snapshot())
     fuse(memory, camera(-1.5, -0.2), 99, generated=False, round=2)
     assert same(targets[0].guidance(), memory.project(targets[0].camera))
 
