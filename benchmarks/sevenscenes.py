@@ -89,7 +89,7 @@ def main() -> None:
         target = shots(scene, "first:2")[1].camera
         side = int(min(target.height[0], 504))
         window = target.cropped(0, 0, side, side)
-        points = built(context, VOXEL).records.position
+        points = built(context, VOXEL).columns.positions
         rows += bench_splat.compare_one_pixel(points, window, repeat=args.repeat)
         report(rows, console, None)
         figures["pixel"] = [row.to_dict() for row in rows]

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 import difflib
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
+
+from pydantic_core import to_jsonable_python
 
 from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.stereo.options import StereoOptions
@@ -65,8 +66,8 @@ class SavingsOptions:
     Attributes:
         reuse: what observed views show of a target is not projected again after completions were
             fused; the pictures are the same.
-        pixel_binning: 2 x 2 pixels become one point, their mean, where they are together at most this
-            many voxel edges wide, unless the surface is steep; 0 lifts each by itself.
+        pixel_binning: 2 x 2 pixels become one point, their mean, where they are together at most
+            this many voxel edges wide, unless the surface is steep; 0 lifts each by itself.
         minor_holes: a view with no unknown pixel farther than this share of the image diagonal from
             a known one is left to ``inpaint`` where the completer is a costly one (geoverse,
             exemplar); 0 leaves it none.
@@ -159,13 +160,8 @@ class RunConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        found = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        return {
-            name: value.to_dict() if isinstance(value, Settings)
-            else asdict(value) if is_dataclass(value) and not isinstance(value, type)
-            else copy.deepcopy(value)
-            for name, value in found.items()
-        }
+        found: dict[str, Any] = to_jsonable_python(self)
+        return found
 
 
 # What each profile changes; "balanced" is the defaults.

@@ -110,8 +110,8 @@ def in_front(
     """Those of ``segments`` (n,) with a sampled point in front of ``depth`` by ``margin``.
 
     A segment wholly behind the farthest depth of its rectangle's tiles (``farthest``) is not
-    sampled; of the others, every SAMPLE-th point is looked up in the image. A point in space that one
-    of the T views with free-space ``grids`` (T, h, w) saw through does not count.
+    sampled; of the others, every SAMPLE-th point is looked up in the image. A point in space that
+    one of the T views with free-space ``grids`` (T, h, w) saw through does not count.
     """
     height, width = depth.shape
     hit = np.zeros(len(segments), np.bool_)
@@ -139,9 +139,7 @@ def in_front(
                 continue
             free = False
             for t in range(len(grids)):
-                free = free or seen_through(
-                    x, y, z, grid_K[t], grid_cam[t], grids[t], tolerance
-                )
+                free = free or seen_through(x, y, z, grid_K[t], grid_cam[t], grids[t], tolerance)
             if not free:
                 hit[i] = True
                 break

@@ -58,6 +58,7 @@ class FuseReport:
         numbers = {k: v + getattr(other, k) for k, v in asdict(self).items() if k != "dropped"}
         return FuseReport(**numbers, dropped=dict(dropped))
 
+
 def fuse(store: Store, points: PointSet, *, round: int, generated: bool = False) -> FuseReport:
     """Take one view's points in; see SpatialMemory.fuse."""
     _check(store, points, round)

@@ -370,9 +370,7 @@ def _observed_there(head, p, level, rules, index, columns):
     if _any_observed(head, columns):
         return True
     for other in range(rules.top + 1):
-        if other != level and _any_observed(
-            _head_at(p, other, rules.inverse_edge, index), columns
-        ):
+        if other != level and _any_observed(_head_at(p, other, rules.inverse_edge, index), columns):
             return True
     return False
 

@@ -40,15 +40,11 @@ def view_distance(store: Store, camera: Cameras, scale: float) -> NDArray[np.flo
     forward = store.frame.cam_from_local(camera.cam_from_world)[0, 2, :3]
     cosine = store.views.cam_from_local[:, 2, :3] @ forward
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    distance = np.linalg.norm(
-        store.views.centers - store.frame.from_world(camera.centers), axis=1
-    )
+    distance = np.linalg.norm(store.views.centers - store.frame.from_world(camera.centers), axis=1)
     return angle / 15 + distance / (0.15 * scale)
 
 
-def project(
-    store: Store, cameras: Cameras, *, options: SplatOptions | None = None
-) -> Guidance:
+def project(store: Store, cameras: Cameras, *, options: SplatOptions | None = None) -> Guidance:
     """Project the memory into cameras of one image size.
 
     What is nearer to the camera's plane than a voxel and than 1e-4 of the typical depth is not

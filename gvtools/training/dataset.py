@@ -6,10 +6,11 @@ that is continued see what one process would have seen.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic_core import to_jsonable_python
 
 from gvtools.errors import OptionError
 from gvtools.options import check_range
@@ -144,7 +145,7 @@ class ProceduralViews:
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides the samples, as plain data."""
-        return {"source": "procedural", **asdict(self)}
+        return {"source": "procedural", **to_jsonable_python(self)}
 
     @property
     def _seed(self) -> list[int]:

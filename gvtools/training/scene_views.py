@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from pydantic_core import to_jsonable_python
 
 from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.geoverse.resampling import resampled
@@ -157,7 +158,10 @@ class SceneViews:
                 for scene, views in zip(self.scenes, self._usable, strict=True)
             ],
             **{name: getattr(self, name) for name in plain},
-            **{n: None if getattr(self, n) is None else asdict(getattr(self, n)) for n in parts},
+            **{
+                n: None if getattr(self, n) is None else to_jsonable_python(getattr(self, n))
+                for n in parts
+            },
         }
 
     def _frame(self, scene: int, row: int) -> _Reduced:

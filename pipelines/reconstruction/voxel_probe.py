@@ -117,9 +117,7 @@ def at_scale(config: RunConfig, scale: float) -> RunConfig:
     An edge of twice the typical footprint means voxels of twice the footprint everywhere.
     """
     assert config.voxel is not None
-    memory = config.memory.replaced(
-        voxels_per_footprint=scale * config.memory.voxels_per_footprint
-    )
+    memory = config.memory.replaced(voxels_per_footprint=scale * config.memory.voxels_per_footprint)
     return replace(config, voxel=scale * config.voxel, memory=memory)
 
 

@@ -11,6 +11,7 @@ from memory_scenes import points, random_memory, saved_bytes
 from gvtools.errors import GvError, MemoryFileError, ProjectError
 from gvtools.memory.io import npz
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+from gvtools.memory.store.columns import LAYOUT
 
 
 def _small() -> SpatialMemory:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import open3d as o3d
 import pytest
@@ -196,3 +198,16 @@ def test_a_copy_on_a_device_is_projected_and_shares_nothing():
 def test_a_round_out_of_range_is_refused(number):
     with pytest.raises(OptionError, match="expected 0 to 65535"):
         SpatialMemory(0.1).fuse(points([(0, 0, 1)]), round=number)
+
+
+def test_a_deep_copy_and_a_recoloured_one_leave_the_memory_alone():
+    memory = random_memory(3)
+    colors = memory.columns.colors.copy()
+    whole = copy.deepcopy(memory)
+    painted = memory.recolored(np.zeros_like(colors))
+    assert not painted.columns.colors.any()
+    assert np.shares_memory(painted.columns.positions, memory.columns.positions)
+    whole.forget(round=memory.rounds[-1])
+    whole.columns.arrays.positions[:] = 0
+    np.testing.assert_array_equal(memory.columns.colors, colors)
+    assert len(whole) < len(memory) and memory.columns.positions.any()

@@ -93,5 +93,5 @@ def cell_keys(memory: SpatialMemory, edge: float, *, whole: bool = False) -> NDA
 
 def coordinates(memory: SpatialMemory) -> tuple[NDArray[np.float32], ...]:
     """x, y and z (N,) of the observations, in the memory's frame, scene units."""
-    records, count = memory.records, len(memory)
-    return records.x[:count], records.y[:count], records.z[:count]
+    x, y, z = memory.columns.positions.T
+    return x, y, z

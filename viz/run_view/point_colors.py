@@ -105,8 +105,7 @@ def view_counts(memory: SpatialMemory) -> NDArray[np.int64]:
 
     What several views agreed on counts for the one that keeps it, so this is the least number.
     """
-    records = memory.records
-    view = records.view[: len(memory)].astype(np.int64)
+    view = memory.columns.view.astype(np.int64)
     _, voxel = np.unique(cell_keys(memory, memory.voxel, whole=True), return_inverse=True)
     views = max(1, len(memory.views))
     pairs = np.unique(voxel.astype(np.int64) * views + view)
@@ -122,8 +121,8 @@ def depth_errors(
     averaging in voxels changed; of completed views and computed depth it is the error.
     """
     errors = np.full(len(rows), np.nan, np.float32)
-    records, views = memory.records, memory.views
-    view_of = records.view[rows]
+    columns, views = memory.columns, memory.views
+    view_of = columns.view[rows]
     for view in np.unique(view_of).tolist():
         camera = views[view].camera
         truth = true_depth(camera.names[0])
@@ -132,7 +131,7 @@ def depth_errors(
             continue
         mine = np.flatnonzero(view_of == view)
         at = rows[mine]
-        local = np.stack([records.x[at], records.y[at], records.z[at]], axis=1).astype(np.float64)
+        local = columns.positions[at].astype(np.float64)
         pose = views.cam_from_local[view]
         seen = local @ pose[:3, :3].T + pose[:3, 3]
         z = seen[:, 2]

@@ -180,8 +180,7 @@ class RunView:
         """Rows of some observations, and where they are, (P, 3) in the memory's frame."""
         memory = self.memory
         rows = np.arange(0, len(memory), max(1, len(memory) // 100_000))
-        records = memory.records
-        return rows, np.stack([records.x[rows], records.y[rows], records.z[rows]], axis=1)
+        return rows, memory.columns.positions[rows]
 
     @cached_property
     def typical_depth(self) -> float:

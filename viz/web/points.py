@@ -146,8 +146,7 @@ def positions_on_page(
     memory: SpatialMemory, rows: NDArray[np.int64], frame: PageFrame
 ) -> NDArray[np.float32]:
     """(P, 3) float32, where observations are on the page."""
-    records = memory.records
-    return frame.points(np.stack([records.x[rows], records.y[rows], records.z[rows]], axis=1))
+    return frame.points(memory.columns.positions[rows])
 
 
 def groups(values: NDArray[np.integer]) -> list[tuple[int, NDArray[np.int64]]]:

@@ -76,8 +76,8 @@ def _project_segment(positions, spacing, lens, factor, max_splat_px, top, bottom
     """Centre-of-pixel coordinates, depth, reach (pixels) and window of one segment's points.
 
     ``part`` holds scratch rows for the positions and, for these results, u, v, depth, reach and the
-    window's first and last column and row. The window is the pixels within reach, cut to the image and to the rows ``top`` to ``bottom``;
-    it is empty behind the camera.
+    window's first and last column and row. The window is the pixels within reach, cut to the image
+    and to the rows ``top`` to ``bottom``; it is empty behind the camera.
     """
     M, z_near, width = lens.M, lens.z_near, lens.width
     fx, fy, skew, cx, cy, focal = lens.fx, lens.fy, lens.skew, lens.cx, lens.cy, lens.focal

@@ -239,16 +239,12 @@ def project_one_pixel(store: Store, cameras: Cameras, *, open3d: bool = False) -
     return Guidance(cameras, rgb, depth, valid, confidence, generated)
 
 
-def _nearest(
-    store: Store, camera: Cameras
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _nearest(store: Store, camera: Cameras) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     image = project_nearest(store.columns.positions, store.frame.seen_from(camera))
     return image.depth, image.index
 
 
-def _open3d(
-    store: Store, camera: Cameras
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _open3d(store: Store, camera: Cameras) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """The winners' numbers travel through Open3D as colours."""
     number = np.arange(len(store))
     tag = np.stack([number // _SPLIT, number % _SPLIT, np.zeros_like(number)], axis=1)

@@ -152,6 +152,20 @@ class Columns:
         other._tensors = {name: self.tensor(name).to(there, copy=True) for name in LAYOUT}
         return other
 
+    def __deepcopy__(self, _: dict[int, Any]) -> Columns:
+        return self.to(self.device)
+
+    def with_colors(self, colors: NDArray[np.uint8]) -> Columns:
+        """The rows in use with other colours (N, 3); the other columns are shared."""
+        import open3d as o3d
+
+        other = Columns(self.device)
+        other.count = self.count
+        other._tensors = {name: self.tensor(name) for name in LAYOUT}
+        there = o3d.core.Device(self.device)
+        other._tensors["colors"] = o3d.core.Tensor(np.ascontiguousarray(colors), device=there)
+        return other
+
     def cloud(self) -> o3d.t.geometry.PointCloud:
         """The rows in use as a point cloud in the store's own memory."""
         import open3d as o3d

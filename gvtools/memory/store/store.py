@@ -179,9 +179,7 @@ class Store:
             if not views.generated[i]
         ]
 
-    def agree(
-        self, rows: NDArray[np.int32], weights: NDArray[np.float32], *, round: int
-    ) -> None:
+    def agree(self, rows: NDArray[np.int32], weights: NDArray[np.float32], *, round: int) -> None:
         """Raise the confidence of ``rows``, each once, up to the cap; ``forget`` can undo it."""
         confidence = self.columns.arrays.confidence
         before = confidence[rows]
@@ -260,6 +258,12 @@ class Store:
         other = copy(self)
         other.columns, other.segments = copy(self.columns), copy(self.segments)
         other.views = ViewTable(self.frame, [self.views[i] for i in range(len(self.views))])
+        return other
+
+    def recolored(self: S, colors: NDArray[np.uint8]) -> S:
+        """A snapshot with other colours (N, 3); nothing else is copied."""
+        other = self.snapshot()
+        other.columns = self.columns.with_colors(colors)
         return other
 
     def to(self: S, device: str) -> S:
