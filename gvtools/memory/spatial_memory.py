@@ -179,7 +179,7 @@ class SpatialMemory(Store):
         memory._fuse_groups(columns, distance, name)
         if not len(memory):
             raise DegenerateError(
-                f"none of {len(positions)} points has a positive, finite confidence and spacing"
+                f"none of its {len(positions)} points has a positive, finite confidence and spacing"
             )
         return memory
 

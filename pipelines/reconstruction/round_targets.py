@@ -55,7 +55,7 @@ class RoundTargets:
         targets = self._followed(number)
         snapshot = self.memory.snapshot()
         # One by one, so that a run that is stopped need not wait for all.
-        looks = [self._pool.submit(target.look, snapshot) for target in targets]
+        looks = [self._pool.submit(target.prefetch, snapshot) for target in targets]
         self._next = (number, targets, looks)
 
     def _followed(self, number: int) -> list[CachedProjection]:
