@@ -265,8 +265,9 @@ def with_setting(config: RunConfig, key: str, value: Any) -> RunConfig:
             raise _unknown(key, config)
         empty = str(value).lower() in ("none", "null", "auto")
         nullable = type(current).model_fields[rest].default is None
-        section = current.replaced(**{rest: None if empty and nullable else value})
-        return _with(config, head, section)
+        return _with(
+            config, head, current.replaced(**{rest: None if empty and nullable else value})
+        )
     if is_dataclass(current) and not isinstance(current, type):
         known = [entry.name for entry in fields(current)]
         if rest not in known:

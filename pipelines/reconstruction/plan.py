@@ -123,7 +123,7 @@ def _on_device(config: RunConfig) -> RunConfig:
 
     splat = config.splat
     if config.device == "cpu" and splat.device != "cpu":
-        return replace(config, splat=replace(splat, device="cpu"))
+        return replace(config, splat=splat.replaced(device="cpu"))
     if config.device != "cuda":
         return config
     if splat.backend in ("nearest", "open3d"):
@@ -138,7 +138,7 @@ def _on_device(config: RunConfig) -> RunConfig:
             f"device cuda: torch {torch.__version__} finds no CUDA device; expected one; use "
             "--device cpu, or install a CUDA build of torch"
         )
-    return replace(config, splat=replace(splat, backend="torch", device="cuda"))
+    return replace(config, splat=splat.replaced(backend="torch", device="cuda"))
 
 
 def make_schedule(

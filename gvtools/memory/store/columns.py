@@ -138,7 +138,8 @@ class Columns:
         """Hold other rows: ``values`` gives each column's."""
         fresh = Columns(self.device)
         fresh.reserve(count)
-        for name, array in zip(LAYOUT, fresh.arrays, strict=True):
+        arrays: tuple[NDArray[Any], ...] = fresh.arrays
+        for name, array in zip(LAYOUT, arrays, strict=True):
             array[:count] = values(name)
         self._tensors, self._arrays, self.count = fresh._tensors, fresh._arrays, count
 
