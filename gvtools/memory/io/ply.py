@@ -114,7 +114,7 @@ def read_point_cloud(path: Path) -> o3d.t.geometry.PointCloud:
     cloud.point.colors = tensor(np.stack([vertices[k] for k in ("red", "green", "blue")], 1))
     for name in ("confidence", "spacing", "round", "view", "generated"):
         if name in names:
-            cloud.point[name] = tensor(np.ascontiguousarray(vertices[name])[:, None])
+            cloud.point[name] = tensor(vertices[name][:, None].copy())
     return cloud
 
 
