@@ -32,11 +32,11 @@ OFF: dict[str, dict[str, Any]] = {
     "voxel edge measured": {"fusion.max_psnr_drop_db": None},
     # With one edge throughout, the typical footprint's is the sensible one.
     "voxels as wide as footprints": {
-        "memory.footprints": 0.0,
+        "memory.voxels_per_footprint": 0.0,
         "fusion.voxel_percentile": 50.0,
     },
     "alike observations merged": {
-        "memory.same_direction": 0.0,
+        "memory.merge_angle_deg": 0.0,
         "memory.observations_per_voxel": 64,
     },
     "four pixels a point where voxels are coarser": {"savings.pixel_binning": 0.0},

@@ -90,7 +90,7 @@ def main() -> None:
         target = shots(scene, "first:2")[1].camera
         side = int(min(target.height[0], 504))
         window = target.cropped(0, 0, width=side, height=side)
-        points = built(context, VOXEL).records.position
+        points = built(context, VOXEL).columns.positions
         rows += bench_splat.compare_one_pixel(points, window, repeat=args.repeat)
         report(rows, console, None)
         figures["pixel"] = [row.to_dict() for row in rows]
@@ -117,7 +117,7 @@ def built(context: list[Shot], voxel: float, options: MemoryOptions | None = Non
     """A memory of the context."""
     memory = SpatialMemory(voxel, options=options)
     for shot in context:
-        memory.fuse(back_project(shot.rgb, shot.depth, shot.camera), round=0)
+        memory.observe(shot.rgb, shot.depth, shot.camera, round=0)
     return memory
 
 
@@ -249,7 +249,7 @@ def _moved(points: PointSet, copy: int) -> PointSet:
 
 
 def _fuse(memory: SpatialMemory, shot: Shot) -> None:
-    memory.fuse(back_project(shot.rgb, shot.depth, shot.camera), round=1)
+    memory.observe(shot.rgb, shot.depth, shot.camera, round=1)
 
 
 def sweep(context: list[Shot], targets: list[Shot], console: Console) -> list[dict[str, Any]]:
@@ -258,11 +258,11 @@ def sweep(context: list[Shot], targets: list[Shot], console: Console) -> list[di
     settings: list[tuple[str, float, MemoryOptions]] = [("default", VOXEL, plain)]
     for count in (1, 2, 4, 64):
         settings.append(
-            (f"observations_per_voxel {count}", VOXEL, replace(plain, observations_per_voxel=count))
+            (f"observations_per_voxel {count}", VOXEL, plain.replaced(observations_per_voxel=count))
         )
     for degrees in (0.0, 5.0, 15.0):
         settings.append(
-            (f"same_direction {degrees:g}", VOXEL, replace(plain, same_direction=degrees))
+            (f"merge_angle_deg {degrees:g}", VOXEL, plain.replaced(merge_angle_deg=degrees))
         )
     for voxel in (0.0035, 0.01, 0.02):
         settings.append((f"voxel {voxel * 1e3:g} mm", voxel, plain))

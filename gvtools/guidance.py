@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, concatenate
+from gvtools import cameras as camera_batches
+from gvtools.cameras import Cameras
 from gvtools.errors import ShapeError
 
 
@@ -37,9 +38,9 @@ class Guidance:
 
     def __getitem__(self, index: int) -> Guidance:
         """One view, as a batch of one."""
-        return self.rows([index])
+        return self.select([index])
 
-    def rows(self, index: Sequence[int]) -> Guidance:
+    def select(self, index: Sequence[int]) -> Guidance:
         """Some views, in that order."""
         rows = list(index)
         return Guidance(
@@ -51,7 +52,7 @@ class Guidance:
             self.generated[rows],
         )
 
-    def emptied(self) -> Guidance:
+    def blank(self) -> Guidance:
         """The same cameras, and a memory that knows nothing."""
         zeros = {
             name: np.zeros_like(getattr(self, name))
@@ -65,7 +66,7 @@ class Guidance:
         return float(self.valid.mean()) if self.valid.size else 0.0
 
 
-def together(views: Sequence[Guidance]) -> Guidance:
+def concatenate(views: Sequence[Guidance]) -> Guidance:
     """Several guidances of one picture size as one batch, in their order.
 
     Raises:
@@ -75,7 +76,7 @@ def together(views: Sequence[Guidance]) -> Guidance:
     if len(sizes) != 1:
         raise ShapeError(f"guidance of {len(sizes)} picture sizes {sizes}; expected one")
     return Guidance(
-        concatenate([guidance.cameras for guidance in views]),
+        camera_batches.concatenate([guidance.cameras for guidance in views]),
         *(
             np.concatenate([getattr(guidance, name) for guidance in views])
             for name in ("rgb", "depth", "valid", "confidence", "generated")

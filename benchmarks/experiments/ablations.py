@@ -192,4 +192,4 @@ def _save_random_prior(folder: Path) -> None:
 def _unprojected(cases: Iterator[Case]) -> Iterator[Case]:
     """The same cases with nothing projected; the same pixels are judged."""
     for case in cases:
-        yield replace(case, guidance=case.guidance.emptied(), judged=case.generated)
+        yield replace(case, guidance=case.guidance.blank(), judged=case.generated)

@@ -25,7 +25,7 @@ from gvtools.evaluation.pose_probe.probe import PoseProbe
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.tables import Column, Table
 from gvtools.memory.back_projection import back_project
-from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.training.hints import Clip
 from pipelines.reconstruction.rounds import Clock, complete_targets
@@ -126,7 +126,7 @@ def _follow(
         cameras = truth.cameras[rows]
         if arm.memory:
             results, _ = complete_targets(
-                [FollowedCamera(memory, camera, options=config.splat) for camera in cameras],
+                [CachedProjection(memory, camera, options=config.splat) for camera in cameras],
                 number + 1,
                 memory=memory,
                 completer=arm.completer,
@@ -137,7 +137,7 @@ def _follow(
             )
             made = [result.completion.rgb[0] for result in results]
         else:
-            nothing = memory.project(cameras, options=config.splat).emptied()
+            nothing = memory.project(cameras, options=config.splat).blank()
             completion = arm.completer.complete(known, nothing, seed=seed + number + 1)
             made = list(completion.rgb)
             known = list(context) + [

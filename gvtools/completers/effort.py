@@ -78,7 +78,7 @@ class SmallHolesInpainted(Completer):
         for completer, cheap in ((self.cheap_one, True), (self.costly_one, False)):
             rows = [row for row, is_small in enumerate(small) if is_small == cheap]
             if rows:
-                completion = completer.complete(context, guidance.rows(rows), seed=seed)
+                completion = completer.complete(context, guidance.select(rows), seed=seed)
                 parts.append((rows, completion))
         return _merged(guidance, parts, sum(small))
 

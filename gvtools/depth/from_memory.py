@@ -20,7 +20,7 @@ MOST_GAIN = 4.0
 MEMORY = "memory"
 
 
-def explained_depth(
+def depth_from_memory(
     memory: SpatialMemory,
     camera: Cameras,
     rgb: NDArray[np.uint8],

@@ -2,44 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
 from gvtools.kernels import compiled
-from gvtools.memory.pixel_binning import join_blocks
+from gvtools.memory.pixel_binning import bin_pixels
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.points import PointSet
 from gvtools.memory.store.voxel_levels import VoxelLevels
-from gvtools.options import check_range
+from gvtools.settings import Settings
 
 # Side of a cell of the free-space grid, pixels.
 FREE_CELL = 4
 
 
-@dataclass(frozen=True, kw_only=True)
-class BackProjectionOptions:
-    """How a depth image becomes points.
+class BackProjectionOptions(Settings):
+    """How a depth image becomes points."""
 
-    Attributes:
-        edge: drop a pixel whose 3x3 neighbours spread over more than this share of its depth,
-            beyond what a plane's slope explains; such pixels mix foreground and background
-            ("flying pixels").
-        depth_max: drop what is farther, scene units; None keeps all.
-        grazing: the smallest cosine between ray and surface normal that is still kept.
-    """
+    section = "back_projection"
 
-    edge: float = 0.05
-    depth_max: float | None = None
-    grazing: float = 0.05
-
-    def __post_init__(self) -> None:
-        check_range("back_projection.edge", self.edge, above=0)
-        check_range("back_projection.depth_max", self.depth_max, above=0)
-        check_range("back_projection.grazing", self.grazing, least=0, below=1)
+    edge: float = Field(0.05, gt=0)
+    """Drop a pixel whose 3x3 neighbours spread over more than this share of its depth, beyond what
+    a plane's slope explains; such pixels mix foreground and background ("flying pixels")."""
+    depth_max: float | None = Field(None, gt=0)
+    """Drop what is farther, scene units; None keeps all."""
+    grazing: float = Field(0.05, ge=0, lt=1)
+    """The smallest cosine between ray and surface normal that is still kept."""
 
 
 def back_project(
@@ -52,7 +43,7 @@ def back_project(
     mask: NDArray[np.bool_] | None = None,
     options: BackProjectionOptions | None = None,
     levels: VoxelLevels | None = None,
-    joined: float = 0.0,
+    pixel_binning: float = 0.0,
 ) -> PointSet:
     """Lift the pixels of one view to points.
 
@@ -68,9 +59,9 @@ def back_project(
         confidence: (H, W) float32 of the source, > 0; None means 1.
         mask: (H, W) bool, True = use.
         options: see BackProjectionOptions.
-        levels: the voxels that the points are for (``memory.levels``); for ``joined``.
-        joined: where 2 x 2 pixels together are at most so many voxel edges wide, they become one
-            point, their mean, unless the surface is steep; 0 keeps every pixel's, and so does
+        levels: the voxels that the points are for (``memory.levels``); for ``pixel_binning``.
+        pixel_binning: where 2 x 2 pixels together are at most so many voxel edges wide, they become
+            one point, their mean, unless the surface is steep; 0 keeps every pixel's, and so does
             leaving ``levels`` out.
 
     Raises:
@@ -102,15 +93,15 @@ def back_project(
     colors = np.empty((height * width, 3), np.uint8)
     weight = np.empty(height * width, np.float32)
     spacing = np.empty(height * width, np.float32)
-    pixels = np.empty(height * width if levels and joined > 0 else 0, np.int64)
+    pixels = np.empty(height * width if levels and pixel_binning > 0 else 0, np.int64)
     count, invalid, edges, masked = _lift(
         np.ascontiguousarray(rgb, np.uint8), z, trust, use, camera.K[0], local_from_cam,
         options.edge, np.inf if options.depth_max is None else options.depth_max, options.grazing,
         positions, colors, weight, spacing, pixels,
     )  # fmt: skip
-    if levels and joined > 0:
-        count = join_blocks(
-            pixels[:count], (height, width), joined * levels.edge, levels.per_spacing,
+    if levels and pixel_binning > 0:
+        count = bin_pixels(
+            pixels[:count], (height, width), pixel_binning * levels.edge, levels.per_spacing,
             positions[:count], colors[:count], weight[:count], spacing[:count],
         )  # fmt: skip
     far = np.inf if options.depth_max is None else options.depth_max

@@ -1,7 +1,7 @@
 """Kernels that spare the splatting its work, and rule on what may stand in front.
 
-Which runs are in view, which of them can still write a pixel, and which hold something nearer than
-what the first tier saw.
+Which segments are in view, which of them can still write a pixel, and which hold something nearer
+than what the first tier saw.
 """
 
 # mypy: no-check-untyped-defs
@@ -20,11 +20,11 @@ REACHABLE = 3
 
 
 @compiled(parallel=True)
-def cull_runs(boxes, rows, cam_from_local, K, width, height, reach, rect, z_range):
-    """Image rectangle and depth range of each run's box.
+def cull_segments(boxes, rows, cam_from_local, K, width, height, reach, rect, z_range):
+    """Image rectangle and depth range of each segment's box.
 
     Args:
-        boxes: (R, 7) float32, see Runs.
+        boxes: (R, 7) float32, see Segments.
         rows: (n,) int64, the boxes that are asked.
         cam_from_local: (4, 4) float64.
         K: (3, 3) float64.
@@ -32,7 +32,7 @@ def cull_runs(boxes, rows, cam_from_local, K, width, height, reach, rect, z_rang
         height: pixels.
         reach: footprints extend this many spacings from their centre.
         rect: out (R, 4) int32: first and last column, first and last row; empty (0, -1, 0, -1)
-            when the run is out of view.
+            when the segment is out of view.
         z_range: out (R, 2) float32, nearest and farthest depth.
     """
     focal = max(K[0, 0], K[1, 1])
@@ -87,14 +87,14 @@ def cull_runs(boxes, rows, cam_from_local, K, width, height, reach, rect, z_rang
 
 
 @compiled()
-def touching(rect, writable, runs):
-    """Those of ``runs`` (n,) whose rectangle holds a pixel to be written.
+def touching(rect, writable, segments):
+    """Those of ``segments`` (n,) whose rectangle holds a pixel to be written.
 
     ``writable``: (H + 1, W + 1) int32, summed-area table of the pixels to be written.
     """
-    out = np.empty(len(runs), np.int64)
+    out = np.empty(len(segments), np.int64)
     n = 0
-    for r in runs:
+    for r in segments:
         c0, c1, r0, r1 = rect[r, 0], rect[r, 1] + 1, rect[r, 2], rect[r, 3] + 1
         if writable[r1, c1] - writable[r0, c1] - writable[r1, c0] + writable[r0, c0] > 0:
             out[n] = r
@@ -104,33 +104,34 @@ def touching(rect, writable, runs):
 
 @compiled(parallel=True, fastmath=FAST)
 def in_front(
-    runs, run_start, run_length, rect, z_range, x, y, z, M, K, depth, farthest, margin,
-    grid_K, grid_cam, grids, tolerance,
+    segments, segment_start, segment_length, rect, z_range, positions, M, K, depth, farthest,
+    margin, grid_K, grid_cam, grids, tolerance,
 ):  # fmt: skip
-    """Those of ``runs`` (n,) of which a sampled point lies in front of ``depth`` by ``margin``.
+    """Those of ``segments`` (n,) with a sampled point in front of ``depth`` by ``margin``.
 
-    A run wholly behind the farthest depth of its rectangle's tiles (``farthest``) is not sampled;
-    of the others, every SAMPLE-th point is looked up in the image. A point in space that one of
-    the T views with free-space ``grids`` (T, h, w) saw through does not count.
+    A segment wholly behind the farthest depth of its rectangle's tiles (``farthest``) is not
+    sampled; of the others, every SAMPLE-th point is looked up in the image. A point in space that
+    one of the T views with free-space ``grids`` (T, h, w) saw through does not count.
     """
     height, width = depth.shape
-    hit = np.zeros(len(runs), np.bool_)
+    hit = np.zeros(len(segments), np.bool_)
     share = np.float32(1 - margin)
-    for i in prange(len(runs)):
-        r = runs[i]
+    for i in prange(len(segments)):
+        r = segments[i]
         bound = np.float32(0)
         for row in range(rect[r, 2] // TILE, rect[r, 3] // TILE + 1):
             for col in range(rect[r, 0] // TILE, rect[r, 1] // TILE + 1):
                 bound = max(bound, farthest[row, col])
         if z_range[r, 0] >= bound * share:
             continue
-        first = run_start[r]
-        for p in range(first, first + run_length[r], SAMPLE):
-            pz = M[2, 0] * x[p] + M[2, 1] * y[p] + M[2, 2] * z[p] + M[2, 3]
+        first = segment_start[r]
+        for p in range(first, first + segment_length[r], SAMPLE):
+            x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]
+            pz = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z + M[2, 3]
             if pz <= 0:
                 continue
-            px = M[0, 0] * x[p] + M[0, 1] * y[p] + M[0, 2] * z[p] + M[0, 3]
-            py = M[1, 0] * x[p] + M[1, 1] * y[p] + M[1, 2] * z[p] + M[1, 3]
+            px = M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3]
+            py = M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3]
             u = (K[0, 0] * px + K[0, 1] * py) / pz + K[0, 2]
             v = K[1, 1] * py / pz + K[1, 2]
             inside = u >= 0 and u < width and v >= 0 and v < height
@@ -138,13 +139,11 @@ def in_front(
                 continue
             free = False
             for t in range(len(grids)):
-                free = free or seen_through(
-                    x[p], y[p], z[p], grid_K[t], grid_cam[t], grids[t], tolerance
-                )
+                free = free or seen_through(x, y, z, grid_K[t], grid_cam[t], grids[t], tolerance)
             if not free:
                 hit[i] = True
                 break
-    return runs[hit]
+    return segments[hit]
 
 
 @compiled(parallel=True)

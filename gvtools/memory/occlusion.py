@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from gvtools.kernels import compiled
 from gvtools.memory.back_projection import FREE_CELL
-
-# K (3, 3), cam_from_world (4, 4) and free-space grid (h, w) of one view (see PointSet).
-FreeGrid = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]
+from gvtools.memory.store.views import FreeGrid
 
 
 @compiled()
@@ -46,7 +44,7 @@ def seen_through(x, y, z, K, cam_from_world, free_depth, tolerance):
 
 
 # Views that are looked at in one call: a call costs as much as some thousand points.
-TOGETHER = 32
+VIEWS_PER_CALL = 32
 
 
 @compiled(parallel=True)
@@ -78,8 +76,8 @@ def in_free_space(
         (N,) bool.
     """
     out = np.zeros(len(positions), np.bool_)
-    for first in range(0, len(views), TOGETHER):
-        _mark(positions, *stacked(views[first : first + TOGETHER]), tolerance, out)
+    for first in range(0, len(views), VIEWS_PER_CALL):
+        _mark(positions, *stacked(views[first : first + VIEWS_PER_CALL]), tolerance, out)
     return out
 
 

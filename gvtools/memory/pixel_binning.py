@@ -11,13 +11,13 @@ from gvtools.memory.store.voxel_levels import level_of
 
 SIDE = 2
 # A block may be so many times wider along its surface than across the line of sight: slanted
-# surfaces keep their points, and nothing is joined across a step. Noise widens blocks, too.
+# surfaces keep their points, and nothing is averaged across a step. Noise widens blocks, too.
 SLANTED = 4.0
 
 
 @compiled()
-def join_blocks(pixels, shape, largest, per_spacing, positions, colors, weight, spacing):
-    """Each block of 2 x 2 pixels that were all lifted is joined, where it is small enough.
+def bin_pixels(pixels, shape, largest, per_spacing, positions, colors, weight, spacing):
+    """Each block of 2 x 2 pixels that were all lifted becomes one point where it is small enough.
 
     Its width is that of its pixels across the line of sight; along the surface it may be SLANTED
     times as wide.
@@ -30,7 +30,7 @@ def join_blocks(pixels, shape, largest, per_spacing, positions, colors, weight, 
         positions: (N, 3) float32, rearranged in place, as the others.
         colors: (N, 3) uint8.
         weight: (N,) float32.
-        spacing: (N,) float32, of a pixel; a joined point keeps the mean of its pixels'.
+        spacing: (N,) float32, of a pixel; a binned point keeps the mean of its pixels'.
 
     Returns:
         How many points are left, at the arrays' beginning, in the order of their blocks.

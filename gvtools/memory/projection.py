@@ -1,31 +1,28 @@
 """Projection of the memory into target cameras by z-buffer splatting, without ray casting.
 
 Views near the target know best how it looks from there, so observations are splatted in tiers,
-nearest views first, and a later tier writes only pixels that are still open; runs whose rectangle
-holds no open pixel are not touched at all. Then what observed views of later tiers know to stand
-clearly in front is let through, unless a view of the first tier saw that space to be free. Last
-come generated views, in tiers of their own: they fill what is open still.
+nearest views first, and a later tier writes only pixels that are still open; segments whose
+rectangle holds no open pixel are not touched at all. Then what observed views of later tiers know
+to stand clearly in front is let through, unless a view of the first tier saw that space to be free.
+Last come generated views, in tiers of their own: they fill what is open still.
 
-Which runs go into which pixels is decided here; a back end (``Splatter``) does the splatting.
+Which segments go into which pixels is decided here; a back end (``Splatter``) does the splatting.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
-from gvtools.guidance import Guidance, together
+from gvtools.guidance import Guidance, concatenate
 from gvtools.memory import culling
 from gvtools.memory.occlusion import stacked
-from gvtools.memory.splat.api import ONE_PIXEL, SplatOptions, Splatter, Target
-
-if TYPE_CHECKING:
-    from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.splat.api import ONE_PIXEL, FrameBuffers, SplatOptions, Splatter
+from gvtools.memory.store.store import Store
 
 # Points nearer than this share of the typical depth, and than a voxel, are behind or inside the
 # camera.
@@ -34,24 +31,20 @@ NEAREST = 1e-4
 OCCLUDER_SIDE = 5
 
 
-def view_distance(memory: SpatialMemory, camera: Cameras, scale: float) -> NDArray[np.float64]:
+def view_distance(store: Store, camera: Cameras, scale: float) -> NDArray[np.float64]:
     """How differently each of the memory's views looks from a camera, without unit.
 
     The angle between the optical axes over 15 degrees, plus the distance of the centres over
     0.15 x ``scale`` (a typical depth, scene units): about 8 degrees of parallax.
     """
-    forward = memory.frame.cam_from_local(camera.cam_from_world)[0, 2, :3]
-    cosine = memory.views.cam_from_local[:, 2, :3] @ forward
+    forward = store.frame.cam_from_local(camera.cam_from_world)[0, 2, :3]
+    cosine = store.views.cam_from_local[:, 2, :3] @ forward
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    distance = np.linalg.norm(
-        memory.views.centers - memory.frame.from_world(camera.centers), axis=1
-    )
+    distance = np.linalg.norm(store.views.centers - store.frame.from_world(camera.centers), axis=1)
     return angle / 15 + distance / (0.15 * scale)
 
 
-def project(
-    memory: SpatialMemory, cameras: Cameras, *, options: SplatOptions | None = None
-) -> Guidance:
+def project(store: Store, cameras: Cameras, *, options: SplatOptions | None = None) -> Guidance:
     """Project the memory into cameras of one image size.
 
     What is nearer to the camera's plane than a voxel and than 1e-4 of the typical depth is not
@@ -71,14 +64,14 @@ def project(
     if options.backend in ONE_PIXEL:
         from gvtools.memory.splat.one_pixel import project_one_pixel
 
-        return project_one_pixel(memory, cameras, open3d=options.backend == "open3d")
-    splatter = _splatter(memory, options)
+        return project_one_pixel(store, cameras, open3d=options.backend == "open3d")
+    splatter = _splatter(store, options)
     views = []
     for camera in cameras:
-        projection = _Projection(memory, camera, options, splatter)
+        projection = _Projection(store, camera, options, splatter)
         projection.observe()
         views.append(projection.guidance())
-    return together(views)
+    return concatenate(views)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +79,7 @@ class Observed:
     """What observed views show of a camera; nothing generated changes it.
 
     Attributes:
-        rgb: see Target, as the others of its images.
+        rgb: see FrameBuffers, as the others of its images.
         scale: typical depth, scene units; 0 where no observed view shows anything.
         tiers: how many tiers of views there are.
         size: of the next one.
@@ -102,12 +95,12 @@ class Observed:
 
 
 def project_again(
-    memory: SpatialMemory, camera: Cameras, observed: Observed | None, *, options: SplatOptions
+    store: Store, camera: Cameras, observed: Observed | None, *, options: SplatOptions
 ) -> tuple[Guidance, Observed]:
     """``project`` into one camera, and what the observed views show there.
 
     Args:
-        memory: is projected.
+        store: is projected.
         camera: a batch of one.
         observed: from an earlier call; it is taken over. The caller knows that nothing observed
             was fused or forgotten since. None: all is splatted.
@@ -117,47 +110,47 @@ def project_again(
         The same guidance, to the bit, as ``project`` gives, and what the observed views show.
     """
     check_usable(camera)
-    projection = _Projection(memory, camera, options, _splatter(memory, options))
+    projection = _Projection(store, camera, options, _splatter(store, options))
     if observed is None:
         projection.observe()
         observed = projection.observed()
     else:
-        projection.take_over(observed)
+        projection.reuse(observed)
     return projection.guidance(), observed
 
 
-def observed_of(memory: SpatialMemory, camera: Cameras, *, options: SplatOptions) -> Observed:
+def observed_of(store: Store, camera: Cameras, *, options: SplatOptions) -> Observed:
     """What observed views show of a camera, a batch of one; for ``project_again``."""
     check_usable(camera)
-    projection = _Projection(memory, camera, options, _splatter(memory, options))
+    projection = _Projection(store, camera, options, _splatter(store, options))
     projection.observe()
     return projection.observed()
 
 
-def _splatter(memory: SpatialMemory, options: SplatOptions) -> Splatter:
+def _splatter(store: Store, options: SplatOptions) -> Splatter:
     if options.backend == "torch":
         from gvtools.memory.splat.torch_splatter import TorchSplatter
 
-        return TorchSplatter(memory, options)
+        return TorchSplatter(store, options)
     from gvtools.memory.splat.cpu import CpuSplatter
 
-    return CpuSplatter(memory, options)
+    return CpuSplatter(store, options)
 
 
 class _Projection:
     """The steps that write one target camera's images: what was observed, then the rest."""
 
     def __init__(
-        self, memory: SpatialMemory, camera: Cameras, options: SplatOptions, splatter: Splatter
+        self, store: Store, camera: Cameras, options: SplatOptions, splatter: Splatter
     ) -> None:
-        self.memory, self.camera, self.options = memory, camera, options
+        self.store, self.camera, self.options = store, camera, options
         self.splatter = splatter
         shape = (int(camera.height[0]), int(camera.width[0]))
-        cam_from_local = memory.frame.cam_from_local(camera.cam_from_world)[0]
-        self.target = Target(
+        cam_from_local = store.frame.cam_from_local(camera.cam_from_world)[0]
+        self.target = FrameBuffers(
             camera,
             cam_from_local,
-            np.empty((memory.runs.count, 4), np.int32),
+            np.empty((store.segments.count, 4), np.int32),
             np.float32(0),
             np.float32(1),
             np.zeros((*shape, 3), np.float32),
@@ -167,11 +160,11 @@ class _Projection:
             np.zeros(shape, np.bool_),
         )
         self.scale, self.tiers, self.size = 0.0, 0, options.nearest_views
-        self.tier = np.full(len(memory.views), -1)
+        self.tier = np.full(len(store.views), -1)
 
     def observe(self) -> None:
         """Write what observed views show."""
-        if self._select(generated=False):
+        if self._find_segments(generated=False):
             self._splat_tiers()
             if self.options.occluders:
                 self._splat_occluders()
@@ -184,7 +177,7 @@ class _Projection:
             self.scale, self.tiers, self.size,
         )  # fmt: skip
 
-    def take_over(self, observed: Observed) -> None:
+    def reuse(self, observed: Observed) -> None:
         """Write what observed views show, as an earlier projection found it."""
         t = self.target
         t.rgb[:], t.depth[:] = observed.rgb, observed.depth
@@ -196,7 +189,7 @@ class _Projection:
     def guidance(self) -> Guidance:
         """The images, after what was generated has been written where nothing was observed."""
         t = self.target
-        if self.memory.views.generated.any() and self._select(generated=True):
+        if self.store.views.generated.any() and self._find_segments(generated=True):
             self._splat_tiers()
         return Guidance(
             self.camera,
@@ -209,30 +202,31 @@ class _Projection:
 
     def _set_scale(self, scale: float) -> None:
         self.scale = scale
-        self.target.near = np.float32(min(NEAREST * scale, self.memory.voxel))
+        self.target.z_near = np.float32(min(NEAREST * scale, self.store.voxel))
         self.target.unit = np.float32(np.ldexp(1.0, int(np.frexp(scale)[1])))
 
-    def _select(self, *, generated: bool) -> bool:
-        """Find the runs in view, of one kind, and rank the views that they come from."""
-        memory, runs, target = self.memory, self.memory.runs, self.target
-        self.z_range = np.empty((runs.count, 2), np.float32)
-        groups = np.arange(runs.groups)
-        group_rect = np.empty((runs.groups, 4), np.int32)
-        self._cull_boxes(runs.group_box, groups, group_rect, np.empty((runs.groups, 2), np.float32))
-        rows = groups[group_rect[:, 1] >= 0, None] * runs.GROUP + np.arange(runs.GROUP)
+    def _find_segments(self, *, generated: bool) -> bool:
+        """Find the segments in view, of one kind, and rank the views that they come from."""
+        store, segments, target = self.store, self.store.segments, self.target
+        self.z_range = np.empty((segments.count, 2), np.float32)
+        groups = np.arange(segments.groups)
+        group_rect = np.empty((segments.groups, 4), np.int32)
+        group_z = np.empty((segments.groups, 2), np.float32)
+        self._cull_boxes(segments.group_box, groups, group_rect, group_z)
+        rows = groups[group_rect[:, 1] >= 0, None] * segments.GROUP + np.arange(segments.GROUP)
         rows = rows.ravel()
-        rows = rows[rows < runs.count]
-        rows = rows[memory.views.generated[runs.view[rows]] == generated]
-        self._cull_boxes(runs.box, rows, target.rect, self.z_range)
+        rows = rows[rows < segments.count]
+        rows = rows[store.views.generated[segments.view[rows]] == generated]
+        self._cull_boxes(segments.box, rows, target.rect, self.z_range)
         self.seen = rows[target.rect[rows, 1] >= 0]
         if not len(self.seen):
             return False
         # Of what was observed where there is any: it must not hang on what was added to it.
         if not self.scale:
             self._set_scale(float(np.median(self.z_range[self.seen, 1])))
-        self.distance = view_distance(memory, self.camera, self.scale)
+        self.distance = view_distance(store, self.camera, self.scale)
         present = np.bincount(
-            runs.view[self.seen], runs.length[self.seen], minlength=len(memory.views)
+            segments.view[self.seen], segments.length[self.seen], minlength=len(store.views)
         )
         order = np.argsort(self.distance, kind="stable")
         self.ranked = order[present[order] > 0]
@@ -246,7 +240,7 @@ class _Projection:
         z_range: NDArray[np.float32],
     ) -> None:
         height, width = self.target.shape
-        culling.cull_runs(
+        culling.cull_segments(
             boxes, rows, self.target.cam_from_local, self.camera.K[0], width, height,
             self.options.blend_reach, rect, z_range,
         )  # fmt: skip
@@ -265,7 +259,7 @@ class _Projection:
             self.tiers += 1
             at += self.size
             self.size *= 2
-        view = self.memory.runs.view[self.seen]
+        view = self.store.segments.view[self.seen]
         open_ = np.empty(target.shape, np.bool_)
         limit = np.empty(target.shape, np.float32)
         for number, views in enumerate(members, first):
@@ -288,11 +282,11 @@ class _Projection:
         members: NDArray[np.int64],
         table: NDArray[np.int32] | None,
     ) -> None:
-        """Splat and write; proximity counts from the nearest of the views ``members``."""
+        """Splat and write; the weight counts from the nearest of the views ``members``."""
         beyond = np.maximum(self.distance - self.distance[members].min(), 0)
-        weight = np.exp(-self.options.proximity * beyond).astype(np.float32)
+        weight = np.exp(-self.options.view_weight * beyond).astype(np.float32)
         self.splatter.splat(self.target, chosen, limit, weight=weight, table=table, blend=True)
-        made = bool(self.memory.views.generated[members[0]])
+        made = bool(self.store.views.generated[members[0]])
         self.splatter.resolve(self.target, open_, generated=made)
 
     def _splat_occluders(self) -> None:
@@ -301,24 +295,24 @@ class _Projection:
         A view of the first tier may have looked past an object that only others saw. Where a
         first-tier view saw the object's place to be free, the object is noise or has moved.
         """
-        memory, target = self.memory, self.target
-        runs, records, K = memory.runs, memory.records, self.camera.K[0]
-        view = runs.view[self.seen]
+        store, target = self.store, self.target
+        segments, K = store.segments, self.camera.K[0]
+        view = segments.view[self.seen]
         later = self.seen[self.tier[view] != 0]
         if not len(later):
             return
-        seen_free = stacked(memory.observed_grids(np.flatnonzero(self.tier == 0)))
-        tolerance = memory.options.free_space_tolerance
+        seen_free = stacked(store.observed_grids(np.flatnonzero(self.tier == 0)))
+        tolerance = store.options.free_space_tolerance
         chosen = culling.in_front(
-            later, runs.start, runs.length, target.rect, self.z_range,
-            records.x, records.y, records.z, target.cam_from_local, K,
-            target.depth, culling.tile_farthest(target.depth), 2 * self.options.band,
+            later, segments.start, segments.length, target.rect, self.z_range,
+            store.columns.positions, target.cam_from_local, K,
+            target.depth, culling.tile_farthest(target.depth), 2 * self.options.depth_band,
             *seen_free, tolerance,
         )  # fmt: skip
         if not len(chosen):
             return
-        limit = target.depth * np.float32(1 - 2 * self.options.band)
-        none = np.zeros(len(memory.views), np.float32)
+        limit = target.depth * np.float32(1 - 2 * self.options.depth_band)
+        none = np.zeros(len(store.views), np.float32)
         zbuffer = self.splatter.splat(target, chosen, limit, weight=none, table=None, blend=False)
         front = culling.not_free(zbuffer, limit, target.cam_from_local, K, *seen_free, tolerance)
         # Slivers along silhouettes are what an error of a pixel in a pose looks like.

@@ -1,4 +1,4 @@
-"""Cameras whose projections follow a growing memory: what has not changed is not splatted again."""
+"""Projections of a growing memory that are kept: what has not changed is not splatted again."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import ONE_PIXEL, SplatOptions
 
 
-class FollowedCamera:
+class CachedProjection:
     """One camera, and the memory as it is projected into it, now and after every change.
 
     Generated observations only fill what observed ones leave open, and never change these. So what
@@ -38,7 +38,7 @@ class FollowedCamera:
         self._observed: Observed | None = None
         self._guidance: Guidance | None = None
 
-    def look(self, snapshot: SpatialMemory) -> None:
+    def prefetch(self, snapshot: SpatialMemory) -> None:
         """Project what observed views show ahead of ``guidance``, where that is reused.
 
         Args:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gvtools.memory.store.voxel_levels import levels_above
 
 if TYPE_CHECKING:
-    from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.memory.store.store import Store
 
 # A level and three voxel indices fit one signed 64-bit key while the memory is below a million
 # voxels a side.
@@ -33,25 +33,25 @@ class Thinned:
     edge: float
 
 
-def thinned(memory: SpatialMemory, max_points: int | None) -> Thinned:
+def thinned(store: Store, max_points: int | None) -> Thinned:
     """One point per voxel; voxels grow from the memory's own until at most ``max_points`` remain.
 
     Larger ones are counted from the points' least corner: around the origin eight of them would
     stay apart however large they are.
 
     Args:
-        memory: with at least one observation.
+        store: with at least one observation.
         max_points: at least 1; None keeps the memory's voxels.
     """
-    positions = memory.records.position.astype(np.float64)
+    positions = store.columns.positions.astype(np.float64)
     # The most confident first; of equals, the earlier observation.
-    order = np.argsort(-memory.confidence, kind="stable")
-    level = memory.records.level[: len(memory)]
-    edge, corner = memory.voxel, np.zeros(3)
+    order = np.argsort(-store.confidence, kind="stable")
+    level = store.columns.level
+    edge, corner = store.voxel, np.zeros(3)
     while True:
         # Times the inverse, as the memory counts its voxels.
         cells = np.floor((positions - corner) * (1.0 / edge)).astype(np.int64)
-        above = levels_above(level, edge / memory.voxel)
+        above = levels_above(level, edge / store.voxel)
         cells >>= above[:, None]
         cells -= cells.min(axis=0)
         if int(cells.max()) < 1 << KEY_BITS:

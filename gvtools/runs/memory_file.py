@@ -28,9 +28,7 @@ def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
     from gvtools.memory.spatial_memory import SpatialMemory
 
     if path.suffix.lower() == ".ply":
-        from gvtools.memory.io.ply_memory import memory_from_ply
-
-        memory = memory_from_ply(path)
+        memory = SpatialMemory.from_ply(path)
     else:
         memory = SpatialMemory.load(memory_path(path))
     if up_to is not None:

@@ -17,7 +17,7 @@ from gvtools.cameras import Cameras
 from gvtools.completers.base import ContextView
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance
-from gvtools.memory.back_projection import BackProjectionOptions, back_project
+from gvtools.memory.back_projection import BackProjectionOptions
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.settings import Settings
@@ -129,8 +129,5 @@ def projected(
     voxel = options.voxel_scale * float(np.median(footprints)) if lifted else 1.0
     memory = SpatialMemory(voxel, origin=targets.centers[0], options=options.memory)
     for rgb, depth, camera in lifted:
-        points = back_project(
-            rgb, depth, camera, frame=memory.frame, options=options.back_projection
-        )
-        memory.fuse(points, round=0)
+        memory.observe(rgb, depth, camera, round=0, options=options.back_projection)
     return memory.project(targets, options=options.splat)

@@ -46,7 +46,7 @@ def compare_fusing(memory: SpatialMemory, frames: list[Frame], *, repeat: int) -
     voxel, voxels = memory.voxel, memory.voxels
     number = memory.rounds[-1] + 1 if memory.rounds else 0
     old = open3d_peers.cloud(
-        memory.records.position, memory.records.color[: len(memory)].astype(np.float32) / 255
+        memory.columns.positions, memory.columns.colors.astype(np.float32) / 255
     ).voxel_down_sample(voxel)
     lifted = [back_project(rgb, depth, camera) for rgb, depth, camera in frames]
     clouds = [
@@ -60,7 +60,7 @@ def compare_fusing(memory: SpatialMemory, frames: list[Frame], *, repeat: int) -
 
     def ours(turn: int) -> None:
         rgb, depth, camera = frames[turn]
-        memory.fuse(back_project(rgb, depth, camera, frame=memory.frame), round=number)
+        memory.observe(rgb, depth, camera, round=number)
 
     def concatenate(turn: int) -> None:
         open3d_peers.concatenated(old, clouds[turn], voxel)

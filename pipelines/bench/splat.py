@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.splat.nearest import NearestImage, project_nearest
+from gvtools.memory.splat.one_pixel import NearestImage, project_nearest
 from pipelines.bench import open3d_peers, procedural_cloud
 from pipelines.bench.side_by_side import Comparison, alternate, compared
 
@@ -31,7 +30,7 @@ def splat_rows(
     for turn in np.linspace(0, 2 * np.pi, VIEWS, endpoint=False):
         camera = procedural_cloud.inside_camera(size, turn=turn, width=width, height=height)
         rgb, depth = procedural_cloud.photograph(size, camera)
-        memory.fuse(back_project(rgb, depth, camera), round=0)
+        memory.observe(rgb, depth, camera, round=0)
         volume.integrate(*open3d_peers.images(rgb, depth), camera)
     half_step = np.pi / VIEWS
     cameras = [
@@ -79,7 +78,6 @@ def compare_one_pixel(
     """
     rng = np.random.default_rng(1)
     count = len(points)
-    x, y, z = (np.ascontiguousarray(points[:, k]) for k in range(3))
     # The first channel tells which point won; float32 holds it exactly.
     colors = rng.random((count, 3), np.float32)
     colors[:, 0] = np.arange(count)
@@ -88,7 +86,7 @@ def compare_one_pixel(
     random = open3d_peers.cloud(points[shuffled], colors[shuffled])
 
     def ours(_: int) -> NearestImage:
-        return project_nearest((x, y, z), camera, colors=colors)
+        return project_nearest(points, camera, colors=colors)
 
     image = ours(0)
     peer_rgb, peer_depth = open3d_peers.one_pixel(ordered, camera)

@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="splat.KEY=VALUE",
-        help="a setting of the projection, such as splat.band=0.03",
+        help="a setting of the projection, such as splat.depth_band=0.03",
     )
     parser.add_argument(
         "--backend", metavar="NAME", help="short for --set splat.backend=NAME (cpu, torch, ...)"

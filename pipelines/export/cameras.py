@@ -95,7 +95,7 @@ def write_colmap_export(
         folder / MODEL,
         distinct.cameras,
         points=memory.positions[kept.rows],
-        colors=memory.records.color[kept.rows],
+        colors=memory.columns.colors[kept.rows],
         point_index=point,
         view_index=view,
         xy=xy,
@@ -240,7 +240,7 @@ def _tracks(
     row_of_view: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Point, view and pixel of each track element: one observation for each point and view."""
-    view = row_of_view[memory.records.view[: len(memory)]]
+    view = row_of_view[memory.columns.view[: len(memory)]]
     order = np.argsort(-memory.confidence, kind="stable")
     pair = group[order] * np.int64(len(cameras)) + view[order]
     _, first = np.unique(pair, return_index=True)

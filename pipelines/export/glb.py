@@ -50,7 +50,7 @@ def write_glb(
     positions = memory.positions[kept.rows]
     middle = (positions.min(axis=0) + positions.max(axis=0)) / 2
     cloud = trimesh.PointCloud(
-        (positions - middle).astype(np.float32), colors=memory.records.color[kept.rows]
+        (positions - middle).astype(np.float32), colors=memory.columns.colors[kept.rows]
     )
     move = np.eye(4)
     move[:3, 3] = middle

@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
 from gvtools.kernels import run_beside_each_other
-from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.reconstruction.plan import Plan
 
@@ -25,7 +25,7 @@ class RoundTargets:
     def __init__(self, plan: Plan, memory: SpatialMemory) -> None:
         self.plan, self.memory = plan, memory
         self._pool = ThreadPoolExecutor(1)
-        self._next: tuple[int, list[FollowedCamera], list[Future[None]]] | None = None
+        self._next: tuple[int, list[CachedProjection], list[Future[None]]] | None = None
 
     def __enter__(self) -> RoundTargets:
         return self
@@ -38,7 +38,7 @@ class RoundTargets:
     ) -> None:
         self._pool.shutdown(cancel_futures=True)
 
-    def of(self, number: int) -> list[FollowedCamera]:
+    def of(self, number: int) -> list[CachedProjection]:
         """The targets of round ``number``, from 1, in order."""
         if self._next is None or self._next[0] != number:
             return self._followed(number)
@@ -55,12 +55,12 @@ class RoundTargets:
         targets = self._followed(number)
         snapshot = self.memory.snapshot()
         # One by one, so that a run that is stopped need not wait for all.
-        looks = [self._pool.submit(target.look, snapshot) for target in targets]
+        looks = [self._pool.submit(target.prefetch, snapshot) for target in targets]
         self._next = (number, targets, looks)
 
-    def _followed(self, number: int) -> list[FollowedCamera]:
+    def _followed(self, number: int) -> list[CachedProjection]:
         config = self.plan.config
         return [
-            FollowedCamera(self.memory, camera, options=config.splat, reuse=config.savings.reuse)
+            CachedProjection(self.memory, camera, options=config.splat, reuse=config.savings.reuse)
             for camera in self.plan.targets.cameras[list(self.plan.schedule[number - 1])]
         ]

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from gvtools.completers.base import Completer, Completion, ContextView, ScaleAlignment
 from gvtools.errors import ProjectError
-from gvtools.guidance import Guidance, together
-from gvtools.memory.back_projection import back_project
-from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.guidance import Guidance, concatenate
+from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.similarity import align_depth_scale
@@ -90,19 +89,18 @@ def observe_context(
             depth_map = source.depth(view, frame)
             reports.append(depth_report(scene, name, depth_map))
         with clock.stage("fuse"):
-            points = back_project(
+            report = memory.observe(
                 frame.rgb,
                 depth_map.depth,
                 view.camera,
-                frame=memory.frame,
+                round=0,
                 confidence=depth_map.confidence,
                 mask=frame.mask,
                 options=config.back_projection,
-                levels=memory.levels,
-                joined=config.savings.pixel_binning,
+                pixel_binning=config.savings.pixel_binning,
             )
-            total += memory.fuse(points, round=0)
-        for reason, count in points.dropped.items():
+        total += report
+        for reason, count in report.dropped.items():
             dropped[reason] = dropped.get(reason, 0) + count
     for entry in reports:
         entry["failed"] = source.failed.get(entry["view"])
@@ -145,7 +143,7 @@ def load_context(scene: Scene, names: Sequence[str], source: DepthCache) -> list
 
 
 def complete_targets(
-    targets: Sequence[FollowedCamera],
+    targets: Sequence[CachedProjection],
     number: int,
     *,
     memory: SpatialMemory,
@@ -213,7 +211,7 @@ def _completed_together(
     for index, guidance in enumerate(known):
         sizes.setdefault(guidance.valid.shape[1:], []).append(index)
     for rows in sizes.values():
-        completion = completer.complete(context, together([known[i] for i in rows]), seed=seed)
+        completion = completer.complete(context, concatenate([known[i] for i in rows]), seed=seed)
         for place, index in enumerate(rows):
             made[index] = _row(completion, place)
     return [completion for completion in made if completion is not None]
@@ -251,19 +249,18 @@ def _align_and_fuse(
         fused = np.zeros_like(fused)
     elif fused.any():
         with clock.stage("fuse"):
-            points = back_project(
+            report = memory.observe(
                 np.rint(np.clip(completion.rgb[0], 0, 1) * 255).astype(np.uint8),
                 (depth * np.float32(alignment.scale)).astype(np.float32),
                 guidance.cameras,
-                frame=memory.frame,
+                round=number,
+                generated=True,
                 # Unused outside the mask, where it must still be positive.
                 confidence=np.where(fused, confidence, np.float32(1)),
                 mask=fused,
                 options=config.back_projection,
-                levels=memory.levels,
-                joined=config.savings.pixel_binning,
+                pixel_binning=config.savings.pixel_binning,
             )
-            report = memory.fuse(points, round=number, generated=True)
     figures = {
         "name": guidance.cameras.names[0],
         "observed": float((valid & ~guidance.generated[0]).mean()),

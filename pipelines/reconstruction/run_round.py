@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gvtools.completers.base import ContextView
-from gvtools.depth.from_memory import MEMORY, explained_depth
+from gvtools.depth.from_memory import MEMORY, depth_from_memory
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
@@ -81,7 +81,7 @@ def _lift_context(
         if least is None:
             return None
         splat = plan.config.splat
-        depth_map = explained_depth(memory, view.camera, frame.rgb, least=least, options=splat)
+        depth_map = depth_from_memory(memory, view.camera, frame.rgb, least=least, options=splat)
         # What a view before it got wrong must not spread.
         fit = depth_map and scale_to_points(plan.scene, view.name, depth_map.depth)
         return None if fit and disagrees(fit) else depth_map

@@ -28,7 +28,7 @@ class FusionOptions(Settings):
     """A completion whose depth fits the memory's worse than this relative residual is refused."""
     voxel_percentile: float = Field(10.0, ge=0, le=100)
     """The automatic edge of the finest voxels follows this percentile of the context's pixel
-    footprints; what is farther gets wider ones (``memory.footprints``). [%]"""
+    footprints; what is farther gets wider ones (``memory.voxels_per_footprint``). [%]"""
     voxel_scale: float = Field(1.0, gt=0)
     """How many such footprints the edge is."""
     max_psnr_drop_db: float | None = Field(0.05, ge=0)
@@ -41,7 +41,7 @@ class SavingsOptions(Settings):
     """What a run does not compute because the scene does not require it.
 
     The voxel edge (``fusion.max_psnr_drop_db``), wider voxels for what is far
-    (``memory.footprints``) and what a voxel keeps (``memory.same_direction``,
+    (``memory.voxels_per_footprint``) and what a voxel keeps (``memory.merge_angle_deg``,
     ``memory.observations_per_voxel``) are savings, too.
     """
 
@@ -75,7 +75,7 @@ class RunSettings(Settings):
             "effort.inpaint_below": 0.0,
             "effort.reduced_below": 0.0,
             "savings.depth_from_memory": None,
-            "memory.same_direction": 0.0,
+            "memory.merge_angle_deg": 0.0,
             "memory.observations_per_voxel": 64,
         },
     }

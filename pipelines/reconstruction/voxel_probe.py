@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.settings import with_values
@@ -134,7 +133,7 @@ def at_scale(config: RunSettings, scale: float) -> RunSettings:
     assert config.voxel is not None
     changes = {
         "voxel": scale * config.voxel,
-        "memory.footprints": scale * config.memory.footprints,
+        "memory.voxels_per_footprint": scale * config.memory.voxels_per_footprint,
     }
     return with_values(config, changes)
 
@@ -238,17 +237,15 @@ def _fused(probe: _Probe, config: RunSettings) -> SpatialMemory:
     )
     for camera, frame, mask in probe.seen:
         assert frame.depth is not None
-        points = back_project(
+        memory.observe(
             frame.rgb,
             frame.depth,
             camera,
-            frame=probe.frame,
+            round=0,
             mask=mask,
             options=config.back_projection,
-            levels=memory.levels,
-            joined=config.savings.pixel_binning,
+            pixel_binning=config.savings.pixel_binning,
         )
-        memory.fuse(points, round=0)
     return memory
 
 

@@ -40,17 +40,18 @@ def search_axes(plan: Plan) -> list[SearchAxis]:
         plan: of a run with the settings that the sweep starts from and a voxel edge.
     """
     config = plan.config
-    voxel, far = config.voxel, config.memory.footprints
+    voxel, far = config.voxel, config.memory.voxels_per_footprint
     assert voxel is not None
     side = longest_side(plan)
     sides = [size for size in (side // 2,) if size >= 2 * SMALLEST]
     axes = [
         _axis("voxel edge", "voxel", [float(f"{share * voxel:.4g}") for share in EDGES], voxel),
-        _axis("far voxels, footprints", "memory.footprints", (2 * far or 1.0, far, 0.0), far),
+        _axis("far voxels, footprints", "memory.voxels_per_footprint",
+              (2 * far or 1.0, far, 0.0), far),
         _axis("observations a voxel", "memory.observations_per_voxel", (4, 12, 48),
               config.memory.observations_per_voxel),
-        _axis("merging angle, degrees", "memory.same_direction", (8.0, 2.0, 0.0),
-              config.memory.same_direction),
+        _axis("merging angle, degrees", "memory.merge_angle_deg", (8.0, 2.0, 0.0),
+              config.memory.merge_angle_deg),
         SearchAxis("projection", (
             ("one pixel a point", {"splat.backend": "nearest"}),
             ("as given", {}),

@@ -44,7 +44,6 @@ def test_held_out_photographs_from_five_views(shared: Path) -> None:
 @pytest.mark.data
 @pytest.mark.slow
 def test_held_out_photographs_and_shifted_projections(shared: Path) -> None:
-    from gvtools.memory.back_projection import back_project
     from gvtools.memory.spatial_memory import SpatialMemory
 
     folder = shared / "data" / "sevenscenes_reg"
@@ -59,7 +58,7 @@ def test_held_out_photographs_and_shifted_projections(shared: Path) -> None:
     memory = SpatialMemory(0.01)
     for one in context:
         assert one.depth is not None
-        memory.fuse(back_project(one.rgb, one.depth, one.camera), round=0)
+        memory.observe(one.rgb, one.depth, one.camera, round=0)
     for step, turn in (((0.0, 0, 0.2), (0, 0, 0)), ((0.0, 0, 0), (0, 5, 0))):
         move = np.eye(4)
         move[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()

@@ -11,14 +11,14 @@ from memory_scenes import camera, points, saved_bytes
 
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
-from gvtools.memory.splat.nearest import project_nearest
+from gvtools.memory.splat.one_pixel import project_nearest
 
 EDGES = (0.1, 1 / 3, 0.02, 0.5, 1e-6, 7e5)
 BACKENDS = ("cpu", "torch", "nearest")
 
 
 def _cells(memory: SpatialMemory) -> np.ndarray:
-    return np.floor(memory.records.position.astype(float) * (1.0 / memory.voxel))
+    return np.floor(memory.columns.positions.astype(float) * (1.0 / memory.voxel))
 
 
 @settings(max_examples=60, deadline=None)
@@ -93,7 +93,7 @@ def test_of_equal_depths_the_lower_index_wins_whatever_stands_between(seed, coun
     rng = np.random.default_rng(seed)
     z = rng.choice(np.array([2.0, 2.0000002, 3.0], np.float32), count)
     zero = np.zeros(count, np.float32)
-    image = project_nearest((zero, zero, z), camera())
+    image = project_nearest(np.stack([zero, zero, z], 1), camera())
     assert image.index.max() == np.argmin(z)
     assert (image.index >= 0).sum() == 1
 
@@ -132,7 +132,7 @@ def test_every_part_of_a_pixel_belongs_to_one_pixel(shift, degrees):
     x = (columns + shift - SIZE["width"] / 2) / f * depth
     y = (rows + shift - SIZE["height"] / 2) / f * depth
     xyz = [axis.ravel().astype(np.float32) for axis in (x, y, np.full(x.shape, depth))]
-    image = project_nearest((xyz[0], xyz[1], xyz[2]), camera(**SIZE, focal=f))
+    image = project_nearest(np.stack(xyz, 1), camera(**SIZE, focal=f))
     number = np.arange(columns.size).reshape(columns.shape)
     wrong = image.index != number
     # On the border itself the side is that of a rounded product.

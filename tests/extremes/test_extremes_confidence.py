@@ -15,13 +15,13 @@ from numba import njit
 from reference_splat import reference_project
 
 from gvtools.errors import MemoryFileError, OptionError
-from gvtools.memory import fusion
+from gvtools.memory import fusion_kernels
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.io.ply import export_memory_ply, read_ply, write_ply
-from gvtools.memory.io.ply_memory import memory_from_ply
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.cpu_kernels import FAINTEST
+from gvtools.memory.store.columns import Columns
 
 BACKENDS = ("cpu", "torch", "nearest")
 LARGEST = float(np.finfo(np.float32).max)
@@ -71,7 +71,7 @@ def test_a_point_cloud_without_a_usable_point_is_refused(column, tmp_path):
     vertices[column] = 0
     write_ply(path, vertices)
     with pytest.raises(MemoryFileError, match="none of its 3 points has a positive"):
-        memory_from_ply(path)
+        SpatialMemory.from_ply(path)
 
 
 @pytest.mark.parametrize("trust", [0.0, 1e-45, 1e-38, 1e30, LARGEST])
@@ -101,7 +101,7 @@ def test_mixed_confidences_average_as_in_float64(powers, seed):
     # Powers of two keep the sums of the oracle within float64, too.
     w = weight.astype(np.float64) / float(weight.max())
     np.testing.assert_allclose(memory.positions[0], w @ where / w.sum(), rtol=1e-6)
-    assert np.abs(memory.records.color[0] - w @ color / w.sum()).max() <= 0.5 + 1e-6
+    assert np.abs(memory.columns.colors[0] - w @ color / w.sum()).max() <= 0.5 + 1e-6
     assert memory.confidence[0] == min(weight.max(), np.float32(100))
 
 
@@ -111,7 +111,7 @@ def test_huge_confidences_saturate_within_and_across_rounds(tmp_path):
     for round_ in (0, 0, 1, 1, 2):
         memory.fuse(points(place, confidence=LARGEST, colors=COLOR), round=round_)
     assert memory.confidence.tolist() == [100]
-    np.testing.assert_array_equal(memory.records.color[0], COLOR)
+    np.testing.assert_array_equal(memory.columns.colors[0], COLOR)
     seen = memory.project(camera())
     assert finite(seen)
     np.testing.assert_allclose(seen.confidence[seen.valid], 100, rtol=1e-5)
@@ -120,7 +120,7 @@ def test_huge_confidences_saturate_within_and_across_rounds(tmp_path):
     assert saved_bytes(loaded, tmp_path) == saved_bytes(memory, tmp_path)
     for round_ in (2, 1):
         memory.forget(round=round_)
-    assert np.isfinite(memory.records.agreement[:1]).all()
+    assert np.isfinite(memory.confidence).all()
 
 
 @pytest.mark.parametrize("cap", [0.0, 1e-21, 1e21, np.inf, np.nan])
@@ -190,26 +190,24 @@ def test_a_million_points_of_one_view_in_one_voxel():
     report = memory.fuse(points(where, colors=color, confidence=0.3), round=0)
     assert (report.added, report.merged) == (1, MILLION - 1)
     np.testing.assert_allclose(memory.positions[0], where.mean(0, dtype=np.float64), rtol=6e-8)
-    np.testing.assert_array_equal(memory.records.color[0], np.rint(color.mean(0)))
+    np.testing.assert_array_equal(memory.columns.colors[0], np.rint(color.mean(0)))
     assert memory.confidence[0] == np.float32(0.3)
     same = SpatialMemory(1.0)
     place = np.array((0.1, 0.7, 2.3), np.float32)
     same.fuse(points(np.tile(place, (MILLION, 1)), colors=COLOR, confidence=0.3), round=0)
-    np.testing.assert_array_equal(same.records.position[0], place)
-    np.testing.assert_array_equal(same.records.color[0], COLOR)
+    np.testing.assert_array_equal(same.columns.positions[0], place)
+    np.testing.assert_array_equal(same.columns.colors[0], COLOR)
 
 
 @njit
-def _merge_again(times, where, color, own, cap, x, y, z, c, confidence, spacing, view):
+def _merge_again(times, where, color, own, cap, columns):
     p, sums = np.empty(3), np.empty(6)
     for i in range(times):
         k = i % len(where)
         for axis in range(3):
             p[axis] = where[k, axis]
             sums[3 + axis] = own * color[k, axis]
-        fusion._merge(
-            0, p, sums, own, own, 1.0, i + 1, 1.0, x, y, z, c, confidence, spacing, view, cap
-        )
+        fusion_kernels._merge(0, p, sums, own, own, 1.0, i + 1, 1.0, columns, cap)
 
 
 def merged_again(times: int, where, color, *, own=1.0, start=None, cap=100.0) -> SimpleNamespace:
@@ -221,15 +219,14 @@ def merged_again(times: int, where, color, *, own=1.0, start=None, cap=100.0) ->
     color = np.atleast_2d(np.asarray(color, np.float64))
     first, tint = (where[0], color[0]) if start is None else start
     single = np.float32
-    x, y, z = (np.array([value], single) for value in first)
-    c = np.array([tint]).astype(np.uint8)
-    confidence = np.array([own], single)
-    _merge_again(
-        times, where, color, float(single(own)), cap, x, y, z, c, confidence, np.ones(1, single),
-        np.zeros(1, np.int32),
-    )  # fmt: skip
+    columns = Columns()
+    columns.reserve(1)
+    one = columns.arrays
+    one.positions[:], one.colors[:] = first, np.asarray(tint).astype(np.uint8)
+    one.confidence[:], one.spacing[:] = own, 1
+    _merge_again(times, where, color, float(single(own)), cap, one)
     return SimpleNamespace(
-        position=np.array([x[0], y[0], z[0]]), color=c[0], confidence=confidence[0]
+        position=one.positions[0].copy(), color=one.colors[0].copy(), confidence=one.confidence[0]
     )
 
 
@@ -243,9 +240,9 @@ def test_merging_again_and_again_is_what_fusing_does():
     assert len(memory) == 1
     found = merged_again(299, np.roll(where, -1, 0), np.roll(color, -1, 0), own=0.3,
                          start=(where[0], color[0]))  # fmt: skip
-    np.testing.assert_array_equal(memory.records.position[0], found.position)
-    np.testing.assert_array_equal(memory.records.color[0], found.color)
-    assert memory.records.confidence[0] == found.confidence
+    np.testing.assert_array_equal(memory.columns.positions[0], found.position)
+    np.testing.assert_array_equal(memory.columns.colors[0], found.color)
+    assert memory.columns.confidence[0] == found.confidence
 
 
 @pytest.mark.parametrize("own", [1e-30, 1e-6, 0.3, 1.0, 100.0, LARGEST])
@@ -282,11 +279,12 @@ def test_a_wrong_first_observation_is_outvoted_up_to_the_rounding_of_storage(own
     assert np.abs(found.color.astype(float) - (255, 130, 20)).max() <= 11
 
 
-def test_a_million_agreements_of_later_rounds_add_up():
+def test_many_agreements_of_later_rounds_add_up():
     memory = SpatialMemory(1.0)
     memory.fuse(points([(0.5, 0.5, 2.5)], confidence=1e-4), round=0)
-    rows = np.zeros(MILLION, np.int32)
-    memory.records.agree(rows, np.full(MILLION, 1e-4, np.float32))
+    row = np.zeros(1, np.int32)
+    for _ in range(100_000):
+        memory.agree(row, np.full(1, 1e-3, np.float32), round=1)
     assert memory.confidence[0] == pytest.approx(100, rel=0.01)
-    memory.records.agree(rows, np.full(MILLION, LARGEST, np.float32))
+    memory.agree(row, np.full(1, LARGEST, np.float32), round=1)
     assert memory.confidence[0] == 100

@@ -20,7 +20,6 @@ from scipy.spatial import cKDTree
 
 from gvtools.errors import GvError, MemoryFileError, OptionError
 from gvtools.memory.io.ply import export_memory_ply
-from gvtools.memory.io.ply_memory import memory_from_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.store.voxel_index import VOXEL_RANGE, rounded_origin
@@ -142,7 +141,7 @@ def test_a_ply_of_any_unit_keeps_its_points(scale, tmp_path):
     memory.fuse(points(where, origin=offset, spacing=0.05 * scale), round=0)
     path = tmp_path / "cloud.ply"
     export_memory_ply(memory, path)
-    again = memory_from_ply(path)
+    again = SpatialMemory.from_ply(path)
     apart, _ = cKDTree(again.positions).query(memory.positions)
     # A fiftieth of the voxels that were written: points that shared a voxel are averaged.
     assert np.median(apart) < 1e-3 * scale
@@ -162,4 +161,4 @@ def test_a_ply_without_two_places_that_float64_tells_apart_is_refused(tmp_path):
     memory.fuse(points([(0.05, 0.05, 1.05)] * 3), round=0)
     export_memory_ply(memory, tmp_path / "one.ply")
     with pytest.raises(MemoryFileError, match="expected at least two"):
-        memory_from_ply(tmp_path / "one.ply")
+        SpatialMemory.from_ply(tmp_path / "one.ply")

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from memory_scenes import camera, points
 from reference_fusion import ReferenceMemory, chains_of
 
-from gvtools.memory.fusion import group_by_block, voxel_keys
+from gvtools.memory.fusion_kernels import group_by_block
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-from gvtools.memory.store.voxel_index import EMPTY_KEY, MAX_VOXEL
+from gvtools.memory.store.voxel_index import EMPTY_KEY, MAX_VOXEL, voxel_keys
 
-ONE_EDGE = MemoryOptions(footprints=0.0)
+ONE_EDGE = MemoryOptions(voxels_per_footprint=0.0)
 
 
 def _cloud(rng: np.random.Generator, count: int, source):
@@ -36,8 +36,8 @@ def _cloud(rng: np.random.Generator, count: int, source):
 def test_fusion_does_what_a_plain_dictionary_does(seed, views, capacity, degrees, footprints):
     rng = np.random.default_rng(seed)
     options = MemoryOptions(
-        same_direction=degrees, observations_per_voxel=capacity, weight_cap=4.0,
-        footprints=footprints,
+        merge_angle_deg=degrees, observations_per_voxel=capacity, weight_cap=4.0,
+        voxels_per_footprint=footprints,
     )  # fmt: skip
     memory, reference = SpatialMemory(0.1, options=options), ReferenceMemory(0.1, options)
     for view in range(views):
@@ -70,7 +70,7 @@ def test_voxels_are_the_distinct_floors_of_position_over_edge(seed, voxel, far):
     report = memory.fuse(points(where), round=0)
     cells = np.floor(where.astype(float) * (1.0 / voxel))
     assert memory.voxels == report.voxels == len(memory) == len(np.unique(cells, axis=0))
-    stored = np.floor(memory.records.position.astype(float) * (1.0 / voxel))
+    stored = np.floor(memory.columns.positions.astype(float) * (1.0 / voxel))
     np.testing.assert_array_equal(np.unique(stored, axis=0), np.unique(cells, axis=0))
 
 
@@ -83,8 +83,8 @@ def test_points_of_one_voxel_are_averaged_by_confidence():
     memory.fuse(fresh, round=0)
     assert len(memory) == 1
     np.testing.assert_allclose(memory.positions, [(0.5, 0.2, 2.2)], rtol=1e-6)
-    np.testing.assert_array_equal(memory.records.color[0], (150, 75, 30))
-    assert memory.records.spacing[0] == 4
+    np.testing.assert_array_equal(memory.columns.colors[0], (150, 75, 30))
+    assert memory.columns.spacing[0] == 4
     # Pixels of one view are no independent witnesses: their confidence does not add up.
     assert memory.confidence[0] == 3
 
@@ -95,17 +95,17 @@ def test_views_of_one_direction_merge_and_the_weight_is_capped():
         source = camera(name=f"v{number}")
         memory.fuse(points([(x, 0.5, 5.5)], source=source, confidence=weight), round=0)
     assert len(memory) == 1
-    assert memory.records.view[0] == 0  # ties and capped weights stay with the earlier view
+    assert memory.columns.view[0] == 0  # ties and capped weights stay with the earlier view
     np.testing.assert_allclose(memory.positions[0, 0], 0.3 + 0.5 * (0.8 - 0.3), rtol=1e-6)
     assert memory.confidence[0] == 2.5
     last = camera(name="last")
     memory.fuse(points([(0.5, 0.5, 5.5)], source=last, confidence=2.6), round=0)
-    assert memory.records.view[0] == 3  # the more confident view wins, numbers are not averaged
+    assert memory.columns.view[0] == 3  # the more confident view wins, numbers are not averaged
 
 
 @pytest.mark.parametrize(("degrees", "kept"), [(1.9, 1), (2.1, 2)])
 def test_directions_beyond_the_threshold_stand_side_by_side(degrees, kept):
-    memory = SpatialMemory(0.5, options=MemoryOptions(same_direction=2))
+    memory = SpatialMemory(0.5, options=MemoryOptions(merge_angle_deg=2))
     for angle in (0, np.radians(degrees)):
         source = camera(center=(-4 * np.sin(angle), 0, 4.25 - 4 * np.cos(angle)))
         memory.fuse(points([(0, 0, 4.25)], source=source), round=0)
@@ -131,8 +131,8 @@ def test_observed_points_pass_generated_ones_by():
     for _ in range(5):
         assert memory.fuse(points(place, colors=(9, 9, 9)), round=0).merged == 1
     assert memory.generated.tolist() == [True, False]
-    np.testing.assert_array_equal(memory.records.color[:2], [(128,) * 3, (9,) * 3])
-    assert memory.records.confidence[:2].tolist() == [1, 6]
+    np.testing.assert_array_equal(memory.columns.colors[:2], [(128,) * 3, (9,) * 3])
+    assert memory.columns.confidence[:2].tolist() == [1, 6]
     report = memory.fuse(points(place * 3), round=1, generated=True)
     assert (report.rejected_observed, report.added, report.merged) == (3, 0, 0)
 

@@ -51,8 +51,8 @@ def filled(frame: LocalFrame) -> SpatialMemory:
 def test_the_same_scene_in_another_world_is_the_same_memory():
     here, there = filled(world(False)), filled(world(True))
     assert len(here) == len(there) and here.voxels == there.voxels
-    np.testing.assert_allclose(here.records.position, there.records.position, atol=2e-5)
-    assert np.array_equal(here.records.color[: len(here)], there.records.color[: len(there)])
+    np.testing.assert_allclose(here.columns.positions, there.columns.positions, atol=2e-5)
+    assert np.array_equal(here.columns.colors[: len(here)], there.columns.colors[: len(there)])
     np.testing.assert_allclose(world(True).to_world(here.positions), there.positions, atol=2e-5)
     # And not that of a grid along the world's axes.
     assert len(filled(LocalFrame.at(PLACE))) != len(here) or not np.allclose(
@@ -80,9 +80,9 @@ def test_a_turned_memory_is_saved_exported_and_undone(tmp_path):
     assert np.array_equal(loaded.positions, memory.positions)
     loaded.save(tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "memory.npz").read_bytes()
-    cloud = loaded.point_cloud()
+    cloud = loaded.cloud
     np.testing.assert_allclose(
-        cloud.point.positions.numpy().astype(float) + memory.origin, memory.positions, atol=1e-5
+        memory.frame.to_world(cloud.point.positions.numpy()), memory.positions, atol=1e-5
     )
     loaded.forget(round=2)
     assert not loaded.generated.any() and 0 < len(loaded) < len(memory)

@@ -9,7 +9,9 @@ import pytest
 from memory_scenes import points, random_memory, saved_bytes
 
 from gvtools.errors import GvError, MemoryFileError, ProjectError
+from gvtools.memory.io import npz
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+from gvtools.memory.store.columns import LAYOUT
 
 
 def _small() -> SpatialMemory:
@@ -33,21 +35,20 @@ def _same(one: SpatialMemory, two: SpatialMemory, folder: Path) -> bool:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_loaded_is_what_was_saved(seed, tmp_path):
-    memory = random_memory(seed, options=MemoryOptions(same_direction=7.5, weight_cap=9))
+    memory = random_memory(seed, options=MemoryOptions(merge_angle_deg=7.5, weight_cap=9))
     memory.save(tmp_path / "memory.npz")
     loaded = SpatialMemory.load(tmp_path / "memory.npz")
     assert loaded.voxel == memory.voxel
     assert loaded.options == memory.options
     np.testing.assert_array_equal(loaded.origin, memory.origin)
-    n = len(memory)
-    assert len(loaded) == n
+    assert len(loaded) == len(memory)
     assert loaded.voxels == memory.voxels
-    for name in memory.records.ARRAYS:
+    for name in LAYOUT:
         np.testing.assert_array_equal(
-            getattr(loaded.records, name)[:n], getattr(memory.records, name)[:n], err_msg=name
+            getattr(loaded.columns, name), getattr(memory.columns, name), err_msg=name
         )
-    for name in memory.runs.ARRAYS:
-        one, two = (getattr(m.runs, name)[: m.runs.count] for m in (loaded, memory))
+    for name in memory.segments.ARRAYS:
+        one, two = (getattr(m.segments, name)[: m.segments.count] for m in (loaded, memory))
         np.testing.assert_array_equal(one, two, err_msg=name)
     for i in range(len(memory.views)):
         ours, theirs = loaded.views[i], memory.views[i]
@@ -154,13 +155,13 @@ def _rewritten(path: Path, change) -> None:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (lambda h: h.update(version=4), "version 4; this gvtools reads versions 2 to 3"),
-        (lambda h: h.update(version=1), "version 1; this gvtools reads versions 2 to 3"),
+        (lambda h: h.update(version=5), "version 5; this gvtools reads version 4"),
+        (lambda h: h.update(version=3), "version 3; this gvtools reads version 4"),
         (lambda h: h.update(format="other"), "not a gvtools memory"),
         (lambda h: h["names"].append("x"), "do not fit together"),
         (lambda h: h.pop("voxel"), "do not fit together"),
-        (lambda h: h["arrays"]["record_x"].__setitem__(0, "<f8"), "record_x is not what"),
-        (lambda h: h["arrays"].pop("run_box"), "run_box|do not fit together"),
+        (lambda h: h["arrays"]["positions"].__setitem__(0, "<f8"), "positions is not what"),
+        (lambda h: h["arrays"].pop("segment_box"), "segment_box|do not fit together"),
         (lambda h: h.update(voxel="-0x1p+0"), "positive length"),
     ],
 )
@@ -172,27 +173,12 @@ def test_a_file_of_another_make_is_refused_by_name(change, complaint, tmp_path):
         SpatialMemory.load(path)
 
 
-def test_a_file_of_before_levels_is_read_with_one_edge(tmp_path):
-    memory = random_memory(4, options=MemoryOptions(footprints=0.0))
-    path = tmp_path / "memory.npz"
-    memory.save(path)
-
-    def older(header):
-        header["version"] = 2
-        del header["options"]["footprints"], header["arrays"]["record_level"]
-
-    _rewritten(path, older)
-    found = SpatialMemory.load(path)
-    assert found.options == memory.options
-    assert _same(found, memory, tmp_path)
-
-
 @pytest.mark.parametrize("kind", [np.int8, np.int64, np.float64])
 def test_levels_of_another_kind_are_refused(kind, tmp_path, monkeypatch):
-    memory = _small()
-    levels = memory.records.level.astype(kind)
-    levels[0] = -1
-    monkeypatch.setattr(memory.records, "level", levels)
+    arrays = npz._arrays(memory := _small())
+    arrays["level"] = arrays["level"].astype(kind)
+    arrays["level"][0] = -1
+    monkeypatch.setattr(npz, "_arrays", lambda _: arrays)
     memory.save(tmp_path / "memory.npz")
     with pytest.raises(MemoryFileError, match="of a level that is not there"):
         SpatialMemory.load(tmp_path / "memory.npz")

@@ -28,13 +28,13 @@ def test_plyfile_reads_what_the_memory_holds(exported):
     assert ours.dtype.names == vertex.dtype.names == COLUMNS
     for name in COLUMNS:
         np.testing.assert_array_equal(vertex[name], ours[name], err_msg=name)
-    n, view = len(memory), memory.records.view[: len(memory)]
+    n, view = len(memory), memory.columns.view[: len(memory)]
     where = np.stack([vertex[axis] for axis in "xyz"], 1)
     np.testing.assert_allclose(where, memory.positions, atol=1e-6)
     color = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
-    np.testing.assert_array_equal(color, memory.records.color[:n])
+    np.testing.assert_array_equal(color, memory.columns.colors[:n])
     np.testing.assert_array_equal(vertex["confidence"], memory.confidence)
-    np.testing.assert_array_equal(vertex["spacing"], memory.records.spacing[:n])
+    np.testing.assert_array_equal(vertex["spacing"], memory.columns.spacing[:n])
     np.testing.assert_array_equal(vertex["round"], memory.views.round[view])
     np.testing.assert_array_equal(vertex["view"], view)
     np.testing.assert_array_equal(vertex["generated"], memory.generated)
@@ -46,12 +46,12 @@ def test_open3d_opens_it_with_the_attributes(exported):
     memory, path = exported
     cloud = o3d.t.io.read_point_cloud(str(path))
     np.testing.assert_allclose(cloud.point.positions.numpy(), memory.positions, atol=1e-6)
-    np.testing.assert_array_equal(cloud.point.colors.numpy(), memory.records.color[: len(memory)])
+    np.testing.assert_array_equal(cloud.point.colors.numpy(), memory.columns.colors[: len(memory)])
     for name, expected in (
         ("confidence", memory.confidence),
-        ("spacing", memory.records.spacing[: len(memory)]),
+        ("spacing", memory.columns.spacing[: len(memory)]),
         ("generated", memory.generated),
-        ("view", memory.records.view[: len(memory)]),
+        ("view", memory.columns.view[: len(memory)]),
     ):
         np.testing.assert_array_equal(cloud.point[name].numpy()[:, 0], expected, err_msg=name)
 
@@ -79,7 +79,7 @@ def test_thinning_keeps_the_most_confident_of_each_larger_voxel(most, tmp_path):
     kept = read_ply(tmp_path / "thin.ply")
     assert len(kept) == written <= most
     assert edge >= memory.voxel
-    positions = memory.records.position.astype(float)
+    positions = memory.columns.positions.astype(float)
     cells = np.floor((positions - positions.min(axis=0)) / edge)
     best: dict[tuple, float] = {}
     for cell, trust in zip(map(tuple, cells), memory.confidence, strict=True):

@@ -6,7 +6,7 @@ import pytest
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError
 from gvtools.memory.io.ply import write_ply
-from gvtools.memory.io.ply_memory import memory_from_ply
+from gvtools.memory.spatial_memory import SpatialMemory
 
 COLOR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 XYZ = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
@@ -25,7 +25,7 @@ def wall(offset: float = 0.0) -> np.ndarray:
 def test_a_wall_is_seen_where_it_stands(tmp_path, offset):
     path = tmp_path / "wall.ply"
     write_ply(path, wall(offset))
-    memory = memory_from_ply(path)
+    memory = SpatialMemory.from_ply(path)
     assert memory.voxel == pytest.approx(0.01, rel=1e-3)
     K = np.array([[[100.0, 0, 24], [0, 100, 24], [0, 0, 1]]])
     pose = np.eye(4)
@@ -40,11 +40,11 @@ def test_what_is_no_coloured_cloud_is_refused(tmp_path):
     path = tmp_path / "cloud.ply"
     write_ply(path, np.zeros(5, XYZ))
     with pytest.raises(MemoryFileError, match="red"):
-        memory_from_ply(path)
+        SpatialMemory.from_ply(path)
     write_ply(path, np.zeros(5, XYZ + COLOR))
     with pytest.raises(MemoryFileError, match="distinct"):
-        memory_from_ply(path)
+        SpatialMemory.from_ply(path)
     write_ply(path, wall())
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(MemoryFileError, match="truncated"):
-        memory_from_ply(path)
+        SpatialMemory.from_ply(path)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from memory_scenes import camera, plane_view, points, random_memory, random_points, saved_bytes
+from memory_scenes import camera, plane_view, points, random_points, saved_bytes
 
 from gvtools.errors import OptionError, ShapeError
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 
-OPTIONS = MemoryOptions(observations_per_voxel=3, same_direction=8)
+OPTIONS = MemoryOptions(observations_per_voxel=3, merge_angle_deg=8)
 
 
 def _rounds(seed: int, rounds: int) -> list[list[tuple]]:
@@ -62,28 +62,29 @@ def test_forgetting_after_loading_is_forgetting(seed, tmp_path):
 def test_forgetting_an_earlier_round_keeps_what_later_ones_stored(forgotten, tmp_path):
     memory = _fused(_rounds(4, 3))
     n = len(memory)
-    stays = memory.views.round[memory.records.view[:n]] != forgotten
+    stays = memory.views.round[memory.columns.view[:n]] != forgotten
     columns = {
-        name: getattr(memory.records, name)[:n][stays].copy()
-        for name in ("x", "y", "z", "color", "confidence", "spacing")
+        name: getattr(memory.columns, name)[stays].copy()
+        for name in ("positions", "colors", "spacing")
     }
+    own = memory.own_confidence()[stays]
     assert memory.forget(round=forgotten) == n - stays.sum()
     for name, column in columns.items():
-        np.testing.assert_array_equal(getattr(memory.records, name)[: len(memory)], column)
+        np.testing.assert_array_equal(getattr(memory.columns, name), column)
+    np.testing.assert_array_equal(memory.own_confidence(), own)
     assert forgotten not in memory.rounds
     # The confidence that other rounds added is what is left of the log.
-    added = np.zeros(len(memory), np.float32)
     for log in memory.agreements.values():
-        for rows, weights in log:
-            np.add.at(added, rows, weights)
-    np.testing.assert_array_equal(memory.records.agreement, added)
-    assert added.any()
-    runs, records = memory.runs, memory.records
+        for rows, weights, _ in log:
+            np.add.at(own, rows, weights)
+    np.testing.assert_allclose(memory.confidence, np.minimum(own, 100), rtol=1e-6)
+    assert (memory.confidence > memory.own_confidence()).any()
+    runs, records = memory.segments, memory.columns
     run = np.repeat(np.arange(runs.count), runs.length[: runs.count])
     assert len(run) == len(memory)
-    assert (records.position >= runs.box[run, :3]).all()
-    assert (records.position <= runs.box[run, 3:6]).all()
-    cells = np.floor(records.position.astype(float) * (1.0 / memory.voxel))
+    assert (records.positions >= runs.box[run, :3]).all()
+    assert (records.positions <= runs.box[run, 3:6]).all()
+    cells = np.floor(records.positions.astype(float) * (1.0 / memory.voxel))
     assert memory.voxels == len(np.unique(cells, axis=0))
     # All of it forgotten is an empty memory.
     for number in memory.rounds:
@@ -114,7 +115,7 @@ def test_fusing_in_two_parts_fills_the_same_voxels(seed, cut):
     assert parts.voxels == whole.voxels == len(whole) == len(parts)
 
     def cells(memory):
-        return np.unique(np.floor(memory.records.position.astype(float) * (1.0 / 0.2)), axis=0)
+        return np.unique(np.floor(memory.columns.positions.astype(float) * (1.0 / 0.2)), axis=0)
 
     np.testing.assert_array_equal(cells(whole), cells(parts))
 
@@ -124,7 +125,7 @@ def test_agreement_of_later_rounds_raises_confidence_and_changes_nothing_else():
     memory.fuse(points([(0.1, 0.1, 2.1)], confidence=0.5, colors=(10, 20, 30)), round=0)
     report = memory.fuse(points([(0.3, 0.3, 2.3)], confidence=0.75, colors=(90, 90, 90)), round=1)
     assert (report.agreed, report.merged, report.added) == (1, 1, 0)
-    np.testing.assert_array_equal(memory.records.color[0], (10, 20, 30))
+    np.testing.assert_array_equal(memory.columns.colors[0], (10, 20, 30))
     np.testing.assert_allclose(memory.positions, [(0.1, 0.1, 2.1)], rtol=1e-6)
     assert memory.confidence.tolist() == [1.25]
     memory.forget(round=1)
@@ -190,33 +191,12 @@ def test_an_origin_that_is_no_point_is_refused(origin):
         SpatialMemory(1, origin=origin)
 
 
-def test_the_open3d_cloud_holds_every_attribute():
-    memory = random_memory(3)
-    cloud = memory.point_cloud()
-    n = len(memory)
-    np.testing.assert_allclose(
-        cloud.point.positions.numpy().astype(float) + memory.origin, memory.positions
-    )
-    np.testing.assert_array_equal(cloud.point.colors.numpy(), memory.records.color[:n])
-    view = memory.records.view[:n]
-    for name, expected in (
-        ("confidence", memory.confidence),
-        ("spacing", memory.records.spacing[:n]),
-        ("round", memory.views.round[view]),
-        ("view", view),
-        ("generated", memory.generated),
-    ):
-        found = cloud.point[name].numpy()
-        assert found.shape == (n, 1)
-        np.testing.assert_array_equal(found[:, 0], expected)
-
-
-def test_an_observation_takes_at_most_48_bytes():
+def test_an_observation_takes_at_most_45_bytes():
     """Runs, voxels and views included, for a surface that several views saw."""
     memory = SpatialMemory(0.01)
     for x in (0, 0.3, 0.6):
         source = camera(width=200, height=150, focal=200, center=(x, 0, 0))
         memory.fuse(plane_view(source, 2.0), round=0)
     assert len(memory) > 60_000
-    assert memory.nbytes / len(memory) <= 48
+    assert memory.nbytes / len(memory) <= 45
     assert f"{len(memory):,} observations (0 generated)" in repr(memory)

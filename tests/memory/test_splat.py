@@ -18,8 +18,8 @@ from gvtools.memory.splat.api import SplatOptions
 IMAGES = ("rgb", "depth", "valid", "confidence", "generated")
 OTHERS = (
     SplatOptions(),
-    SplatOptions(nearest_views=1, band=0.2, blend_reach=0.8, support=0.2),
-    SplatOptions(proximity=0.5, depth_reach=1.0, size_cap=4.0, occluders=False),
+    SplatOptions(nearest_views=1, depth_band=0.2, blend_reach=0.8, support=0.2),
+    SplatOptions(view_weight=0.5, depth_reach=1.0, max_splat_px=4.0, occluders=False),
 )
 
 
@@ -85,10 +85,10 @@ def test_boxes_hold_their_observations_also_after_merging():
     for _ in range(4):
         where = rng.uniform((-1, -1, 2), (1, 1, 4), (500, 3))
         memory.fuse(points(where, source=source, spacing=rng.uniform(0.1, 2, 500)), round=0)
-    records, runs = memory.records, memory.runs
+    records, runs = memory.columns, memory.segments
     run = np.repeat(np.arange(runs.count), runs.length[: runs.count])
-    assert (records.position >= runs.box[run, :3]).all()
-    assert (records.position <= runs.box[run, 3:6]).all()
+    assert (records.positions >= runs.box[run, :3]).all()
+    assert (records.positions <= runs.box[run, 3:6]).all()
     assert (records.spacing[: len(memory)] <= runs.box[run, 6]).all()
 
 
@@ -182,7 +182,7 @@ def silhouette_shares(
 @pytest.mark.parametrize("move", MOVES)
 def test_silhouettes_do_not_grow_and_let_nothing_through(move, voxels):
     # The widest footprint here is that of 4-pixel voxels from 0.6 before the square: 27 pixels.
-    shares = silhouette_shares(MOVES[move], voxels, options=SplatOptions(size_cap=32))
+    shares = silhouette_shares(MOVES[move], voxels, options=SplatOptions(max_splat_px=32))
     assert shares["hole"] < 1e-3
     assert shares["bleed"] < 1e-3
     assert shares["fattening"] < 0.5
@@ -325,9 +325,9 @@ def test_cameras_of_several_sizes_are_refused():
 
 
 def test_unknown_back_ends_are_refused_by_name():
-    with pytest.raises(OptionError, match=r"'gpu'.*cpu, torch, nearest, open3d"):
+    with pytest.raises(OptionError, match=r"'gpu'; expected 'cpu', 'torch', 'nearest' or 'open3d'"):
         SplatOptions(backend="gpu")
-    with pytest.raises(OptionError, match=r"'mps'.*auto, cpu, cuda"):
+    with pytest.raises(OptionError, match=r"'mps'; expected 'auto', 'cpu' or 'cuda'"):
         SplatOptions(device="mps")
 
 
@@ -346,6 +346,6 @@ def test_one_pixel_back_ends_show_the_nearest_observation(backend):
     assert len(best) > 100
     for (r, c), i in best.items():
         assert seen.depth[0, r, c] == pytest.approx(z[0, i], rel=1e-5)
-        np.testing.assert_allclose(seen.rgb[0, r, c] * 255, memory.records.color[i], atol=1e-3)
+        np.testing.assert_allclose(seen.rgb[0, r, c] * 255, memory.columns.colors[i], atol=1e-3)
         assert seen.confidence[0, r, c] == memory.confidence[i]
         assert seen.generated[0, r, c] == memory.generated[i]

@@ -59,11 +59,9 @@ def test_voxels_are_found_again_and_stay_within_the_reserve(seed, blocks):
         block = rng.integers(0, blocks, count)
         place = rng.integers(0, 4096, count)
         index.reserve_voxels(count, np.unique(numbers[block]))
+        arrays = index.arrays
         for b, p in zip(block.tolist(), place.tolist(), strict=True):
-            slot = insert_voxel(
-                index.pool_local, index.pool_head, index.pool_state, index.block_offset,
-                index.block_log2, index.block_count, np.int32(b), np.uint16(p),
-            )  # fmt: skip
+            slot = insert_voxel(arrays, np.int32(b), np.uint16(p))
             expected = known.setdefault((b, p), len(known))
             if expected == len(known) - 1 and index.pool_head[slot] == NO_RECORD:
                 index.pool_head[slot] = expected

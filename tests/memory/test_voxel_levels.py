@@ -11,7 +11,7 @@ from gvtools.memory.store.voxel_levels import VoxelLevels
 from gvtools.memory.thinning import thinned
 from viz.run_view.point_colors import view_counts
 
-ONE_EDGE = MemoryOptions(footprints=0.0)
+ONE_EDGE = MemoryOptions(voxels_per_footprint=0.0)
 PLACE = (0.3, 0.3, 10.3)
 
 
@@ -40,10 +40,10 @@ def _walls(options: MemoryOptions) -> SpatialMemory:
 
 def test_a_far_wall_is_kept_once_and_seen_whole():
     one, levels = _walls(ONE_EDGE), _walls(MemoryOptions())
-    far = [memory.records.z[: len(memory)] > 4 for memory in (one, levels)]
+    far = [memory.columns.positions[:, 2] > 4 for memory in (one, levels)]
     assert far[1].sum() < far[0].sum() / 3
-    assert set(levels.records.level[: len(levels)][far[1]].tolist()) == {3}
-    near = [memory.records.position[~mask] for memory, mask in zip((one, levels), far, strict=True)]
+    assert set(levels.columns.level[: len(levels)][far[1]].tolist()) == {3}
+    near = [m.columns.positions[~mask] for m, mask in zip((one, levels), far, strict=True)]
     np.testing.assert_array_equal(near[0], near[1])
     for view in (one, levels):
         seen = view.project(camera(width=64, height=48, focal=60))
@@ -58,9 +58,9 @@ def test_a_coarser_look_leaves_what_was_seen_finely_as_it_is():
     aside = (PLACE[0] + 0.4, *PLACE[1:])
     far = points([aside], spacing=0.9, colors=(0, 0, 255), source=camera(name="far"))
     assert memory.fuse(far, round=0).added == 1
-    records = memory.records
+    records = memory.columns
     np.testing.assert_allclose(memory.positions[0], PLACE, rtol=1e-6)
-    assert records.color[0].tolist() == [128, 128, 128]
+    assert records.colors[0].tolist() == [128, 128, 128]
     np.testing.assert_allclose(records.spacing[:2], (0.1, 0.9), rtol=1e-6)
     assert memory.confidence.tolist() == [1.0, 1.0] and records.level[:2].tolist() == [0, 3]
 
@@ -69,7 +69,7 @@ def test_a_finer_look_stands_on_its_own():
     memory = SpatialMemory(0.1)
     memory.fuse(points([PLACE], spacing=0.9, source=camera(name="far")), round=0)
     assert memory.fuse(points([PLACE], spacing=0.1), round=0).added == 1
-    assert memory.records.level[:2].tolist() == [3, 0] and memory.voxels == 2
+    assert memory.columns.level[:2].tolist() == [3, 0] and memory.voxels == 2
 
 
 @pytest.mark.parametrize(("known", "made"), [(0.1, 0.9), (0.9, 0.1), (0.9, 0.3), (0.3, 0.9)])
@@ -91,7 +91,7 @@ def test_generated_content_does_not_get_there_by_merging_or_rounding():
     for number, x in enumerate((0.5, 2.5)):
         made = points([(x, 0.5, 0.5)], spacing=4.0, source=camera(center=(0, 0, -9), name=f"{x}"))
         assert memory.fuse(made, round=1, generated=True).merged == number
-    assert memory.records.x[:2].tolist() == [1.5, 0.5] and memory.confidence[1] == 2
+    assert memory.columns.positions[:2, 0].tolist() == [1.5, 0.5] and memory.confidence[1] == 2
     # The mean of both rounds into the observed voxel.
     rounds = points([(1 - 2.0**-24, 4.5, 0.5), (1.0, 4.5, 0.5)], spacing=4.0)
     memory = SpatialMemory(1.0)
@@ -110,8 +110,8 @@ def test_no_generated_observation_lies_where_something_was_observed(seed):
         fresh = points(where, spacing=spacing, source=source)
         memory.fuse(fresh, round=view // 6, generated=view >= 6)
     count = len(memory)
-    level = memory.records.level[:count].astype(int)
-    cell = np.floor(memory.records.position.astype(float) * 4.0).astype(int)
+    level = memory.columns.level[:count].astype(int)
+    cell = np.floor(memory.columns.positions.astype(float) * 4.0).astype(int)
     made = memory.generated
     assert made.sum() > 100
     for height in range(8):
@@ -132,7 +132,7 @@ def test_pictures_of_a_memory_are_those_of_its_file(tmp_path):
         memory.fuse(fresh, round=0)
     memory.save(tmp_path / "memory.npz")
     loaded = SpatialMemory.load(tmp_path / "memory.npz")
-    live, stored = (m.runs.group_box[: m.runs.groups] for m in (memory, loaded))
+    live, stored = (m.segments.group_box[: m.segments.groups] for m in (memory, loaded))
     np.testing.assert_array_equal(live, stored)
     one, two = memory.project(source), loaded.project(source)
     np.testing.assert_array_equal(one.rgb, two.rgb)
@@ -155,11 +155,11 @@ def test_a_view_in_parts_is_the_view():
     whole.fuse(points(where, spacing=spacing, source=second), round=0)
     for rows in (half, ~half):
         parts.fuse(points(where[rows], spacing=spacing[rows], source=second), round=0)
-    assert len(np.unique(whole.records.level[: len(whole)])) == 4
-    order = [np.lexsort(memory.records.position.T) for memory in (whole, parts)]
-    for name in ("position", "color", "confidence", "spacing", "level"):
+    assert len(np.unique(whole.columns.level[: len(whole)])) == 4
+    order = [np.lexsort(memory.columns.positions.T) for memory in (whole, parts)]
+    for name in ("positions", "colors", "confidence", "spacing", "level"):
         one, two = (
-            getattr(memory.records, name)[: len(memory)][rows]
+            getattr(memory.columns, name)[: len(memory)][rows]
             for memory, rows in zip((whole, parts), order, strict=True)
         )
         np.testing.assert_array_equal(one, two, err_msg=name)
@@ -168,7 +168,7 @@ def test_a_view_in_parts_is_the_view():
 @pytest.mark.parametrize("seed", range(4))
 def test_forgetting_and_loading_bring_every_level_back(seed, tmp_path):
     memory = random_memory(seed, voxel=0.04)
-    assert memory.records.level[: len(memory)].max() >= 2
+    assert memory.columns.level[: len(memory)].max() >= 2
     before = saved_bytes(memory, tmp_path)
     last = memory.rounds[-1]
     rng = np.random.default_rng(seed)

@@ -145,8 +145,8 @@ def test_an_unknown_option(capsys, scan, tmp_path):
 
 def test_an_unknown_setting_names_the_nearest(capsys, scan, tmp_path):
     out = tmp_path / "run"
-    line = refused(capsys, *reconstruct(scan, "--out", out), "--set", "splat.bnad=1")
-    assert "splat.band" in line
+    line = refused(capsys, *reconstruct(scan, "--out", out), "--set", "splat.depth_bnad=1")
+    assert "splat.depth_band" in line
     assert not out.exists()
 
 

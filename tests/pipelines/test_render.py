@@ -186,7 +186,7 @@ def test_sub_folders_are_made(tmp_path):
 def test_settings_of_the_projection(box, tmp_path):
     arguments = (box / "run", "--cameras", box / "project", "--views", "first:1")
     run(*arguments, "--out", tmp_path / "a")
-    run(*arguments, "--out", tmp_path / "b", "--set", "splat.size_cap=0.1", "--set",
+    run(*arguments, "--out", tmp_path / "b", "--set", "splat.max_splat_px=0.1", "--set",
         "splat.support=2")  # fmt: skip
     covered = [rendered(tmp_path / name, "view_0")[2].mean() for name in "ab"]
     assert covered[1] < covered[0]

@@ -39,9 +39,9 @@ RUN = RunSettings()
 
 
 def test_texts_are_converted_to_the_field_s_type():
-    texts = ["splat.band=0.03", "views_per_round=4", "voxel=auto", "max_side=NULL"]
+    texts = ["splat.depth_band=0.03", "views_per_round=4", "voxel=auto", "max_side=NULL"]
     config = with_texts(RUN, [*texts, "splat.occluders=false", "completer=none"])
-    assert (config.splat.band, config.views_per_round, config.voxel) == (0.03, 4, None)
+    assert (config.splat.depth_band, config.views_per_round, config.voxel) == (0.03, 4, None)
     assert (config.max_side, config.splat.occluders, config.completer) == (None, False, "none")
 
 
@@ -58,7 +58,7 @@ def test_options_of_the_completer_go_by_its_name(tmp_path):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("splat.bnad=1", "no setting 'splat.bnad'; did you mean 'splat.band'"),
+        ("splat.bnad=1", "no setting 'splat.bnad'; did you mean 'splat.depth_band'"),
         ("viewsperround=1", "did you mean 'views_per_round'"),
         ("zzzz=1", "known keys: context, "),
         ("voxel.edge=1", "voxel is a value without settings below it"),
@@ -70,7 +70,7 @@ def test_options_of_the_completer_go_by_its_name(tmp_path):
         ("fusion.voxel_scale=wide", "fusion.voxel_scale 'wide'; expected a valid number"),
         ("fusion.voxel_scale=nan", "fusion.voxel_scale nan; expected more than 0"),
         ("device=gpu", "device 'gpu'; expected 'auto', 'cpu' or 'cuda'"),
-        ("splat.band", "expected KEY=VALUE"),
+        ("splat.depth_band", "expected KEY=VALUE"),
         ("seed=", "seed ''; expected a valid integer"),
         ("profile=quick", "profile 'quick'; expected one of fast, balanced, accurate"),
         ("da3.device=tpu", "da3.device 'tpu'; expected 'auto', 'cpu' or 'cuda'"),
@@ -129,7 +129,7 @@ FIELDS = st.fixed_dictionaries(
         "completer.sweeps": st.integers() | st.text(),
         "fusion.max_psnr_drop_db": st.none() | st.floats(0, 100),
         "savings.reuse": st.booleans(),
-        "splat.band": st.floats(1e-6, 1),
+        "splat.depth_band": st.floats(1e-6, 1),
         "stereo.align": st.none() | st.booleans(),
     },
 )
@@ -160,7 +160,7 @@ def test_a_file_stands_over_its_profile_and_over_one_named_beside_it(tmp_path, p
     path.write_text('{"memory": {"observations_per_voxel": 8}, "profile": "accurate"}')
     config = with_file(RUN, path, profile=profile)
     assert config.memory.observations_per_voxel == 8
-    assert (config.profile, config.memory.same_direction) == (profile or "accurate", direction)
+    assert (config.profile, config.memory.merge_angle_deg) == (profile or "accurate", direction)
 
 
 def test_a_section_by_itself_goes_by_its_full_name():

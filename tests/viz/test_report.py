@@ -138,7 +138,7 @@ def test_settings_that_differ_come_first_and_all_are_there(page):
     everything = [row[0] for row in rows[heads[1] + 1 :]]
     assert set(changed) == {"context", "targets", "views_per_round"}
     assert len(everything) > 40
-    assert "splat.band" in everything
+    assert "splat.depth_band" in everything
 
 
 def test_an_evaluation_gives_intervals_and_estimated_poses(own):

@@ -123,7 +123,7 @@ def test_colours_say_what_is_so(run):
     memory = run.memory
     made = memory.generated
     np.testing.assert_array_equal(
-        point_colors(memory, "color").rgb, memory.records.color[: len(memory)]
+        point_colors(memory, "color").rgb, memory.columns.colors[: len(memory)]
     )
     source = point_colors(memory, "source").rgb.astype(int)
     # Blue stands out where observed, red over blue where generated.
@@ -145,8 +145,8 @@ def test_colours_say_what_is_so(run):
 
 def test_views_of_a_voxel_are_counted(run):
     memory = run.memory
-    voxel = np.floor(memory.records.position * (1.0 / memory.voxel)).astype(int)
-    view = memory.records.view[: len(memory)]
+    voxel = np.floor(memory.columns.positions * (1.0 / memory.voxel)).astype(int)
+    view = memory.columns.view[: len(memory)]
     seen: dict = {}
     for place, number in zip(map(tuple, voxel.tolist()), view.tolist(), strict=True):
         seen.setdefault(place, set()).add(number)
@@ -180,7 +180,7 @@ def test_what_is_drawn_is_even_and_does_not_change_as_the_memory_grows(run, fold
     assert 200 < len(drawn.rows) <= 800 and drawn.size >= drawn.edge > 0
     np.testing.assert_array_equal(drawn.rows, detail(memory, 800).rows)
     # Every cell of each source has its point.
-    cells = np.floor(memory.records.position / drawn.edge).astype(int)
+    cells = np.floor(memory.columns.positions / drawn.edge).astype(int)
     keys = np.column_stack([cells, memory.generated])
     assert len(np.unique(keys, axis=0)) == len(np.unique(keys[drawn.rows], axis=0))
     # The points of earlier rounds are drawn before the last round as after it.
@@ -218,7 +218,7 @@ def test_rendering_goes_back_and_forth_between_rounds_exactly(run, folder):
     assert (tinted != pictures[2]).any()
 
 
-def test_starting_a_viewer_imports_neither_torch_nor_open3d(folder):
+def test_starting_a_viewer_imports_neither_torch_nor_matplotlib(folder):
     pytest.importorskip("viser", reason="viser is not installed")
     code = (
         "import sys; from pathlib import Path\n"
@@ -228,7 +228,7 @@ def test_starting_a_viewer_imports_neither_torch_nor_open3d(folder):
         f"source = ViewSource(Path({str(folder)!r}))\n"
         "viewer = WebViewer(source.read(), port=18230)\n"
         "source.lacking(); viewer.stop()\n"
-        "print(sorted({'torch', 'open3d', 'matplotlib'} & set(sys.modules)))"
+        "print(sorted({'torch', 'matplotlib'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

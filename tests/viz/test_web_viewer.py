@@ -349,7 +349,7 @@ def test_a_cloud_without_cameras_is_seen_whole_and_upright_from_outside(tmp_path
     position, look_at = home(run, frame)
     ahead = (look_at - position) / np.linalg.norm(look_at - position)
     right = np.cross(ahead, run.up()) / np.linalg.norm(np.cross(ahead, run.up()))
-    away = frame.points(run.memory.records.position) - position
+    away = frame.points(run.memory.columns.positions) - position
     depth = away @ ahead
     assert depth.min() > 0
     reach = np.tan(FIELD_OF_VIEW / 2) * depth

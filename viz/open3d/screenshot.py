@@ -107,7 +107,7 @@ def _by_open3d(run: RunView, camera: Cameras, round: int, mode: str) -> NDArray[
         given, made = Path(folder) / "given.npz", Path(folder) / "made.npy"
         np.savez(
             given,
-            positions=memory.records.position[drawn.rows[there]],
+            positions=memory.columns.positions[drawn.rows[there]],
             rgb=colors.rgb,
             K=frame.K[0],
             cam_from_local=frame.cam_from_world[0],

@@ -136,7 +136,7 @@ class Open3dViewer:
             self._rgb = found.rgb / 255.0
             self._legend = found.legend
         there = self._rounds <= self.round
-        self._cloud.points = o3d.utility.Vector3dVector(memory.records.position[rows[there]])
+        self._cloud.points = o3d.utility.Vector3dVector(memory.columns.positions[rows[there]])
         self._cloud.colors = o3d.utility.Vector3dVector(self._rgb[there])
 
     def _refresh(self) -> None:

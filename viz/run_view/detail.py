@@ -46,7 +46,7 @@ def detail(memory: SpatialMemory, budget: int) -> Detail:
         budget: at least 1.
     """
     count = len(memory)
-    spacing = memory.records.spacing[:count][:: max(1, count // 100_000)]
+    spacing = memory.columns.spacing[:count][:: max(1, count // 100_000)]
     size = float(np.median(spacing)) if count else memory.voxel
     if count <= budget:
         return Detail(np.arange(count), 0.0, size)
@@ -75,7 +75,7 @@ def cell_keys(memory: SpatialMemory, edge: float, *, whole: bool = False) -> NDA
         whole: makes one cell of each voxel that is wider.
     """
     count = len(memory)
-    level = memory.records.level[:count] if whole else np.zeros(count, np.uint8)
+    level = memory.columns.level[:count] if whole else np.zeros(count, np.uint8)
     while True:
         above = levels_above(level, edge / memory.voxel)
         keys = above
@@ -93,5 +93,5 @@ def cell_keys(memory: SpatialMemory, edge: float, *, whole: bool = False) -> NDA
 
 def coordinates(memory: SpatialMemory) -> tuple[NDArray[np.float32], ...]:
     """x, y and z (N,) of the observations, in the memory's frame, scene units."""
-    records, count = memory.records, len(memory)
-    return records.x[:count], records.y[:count], records.z[:count]
+    x, y, z = memory.columns.positions.T
+    return x, y, z

@@ -83,7 +83,7 @@ def point_colors(
     """
     chosen = np.arange(len(memory)) if rows is None else rows
     if mode == "color":
-        return PointColors(memory.records.color[chosen], Legend("as photographed or completed"))
+        return PointColors(memory.columns.colors[chosen], Legend("as photographed or completed"))
     if mode == "round":
         return _by_round(memory, chosen)
     if mode == "source":
@@ -105,8 +105,7 @@ def view_counts(memory: SpatialMemory) -> NDArray[np.int64]:
 
     What several views agreed on counts for the one that keeps it, so this is the least number.
     """
-    records = memory.records
-    view = records.view[: len(memory)].astype(np.int64)
+    view = memory.columns.view.astype(np.int64)
     _, voxel = np.unique(cell_keys(memory, memory.voxel, whole=True), return_inverse=True)
     views = max(1, len(memory.views))
     pairs = np.unique(voxel.astype(np.int64) * views + view)
@@ -122,8 +121,8 @@ def depth_errors(
     averaging in voxels changed; of completed views and computed depth it is the error.
     """
     errors = np.full(len(rows), np.nan, np.float32)
-    records, views = memory.records, memory.views
-    view_of = records.view[rows]
+    columns, views = memory.columns, memory.views
+    view_of = columns.view[rows]
     for view in np.unique(view_of).tolist():
         camera = views[view].camera
         truth = true_depth(camera.names[0])
@@ -132,7 +131,7 @@ def depth_errors(
             continue
         mine = np.flatnonzero(view_of == view)
         at = rows[mine]
-        local = np.stack([records.x[at], records.y[at], records.z[at]], axis=1).astype(np.float64)
+        local = columns.positions[at].astype(np.float64)
         pose = views.cam_from_local[view]
         seen = local @ pose[:3, :3].T + pose[:3, 3]
         z = seen[:, 2]
@@ -159,7 +158,7 @@ def _rgb(color: str) -> tuple[int, int, int]:
 
 
 def _by_round(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
-    rounds = memory.views.round[memory.records.view[rows]]
+    rounds = memory.views.round[memory.columns.view[rows]]
     last = max(1, *memory.rounds, 1)
     rgb = viridis((rounds - 1) / max(1, last - 1))
     rgb[rounds == 0] = _rgb(GREY)
@@ -171,8 +170,8 @@ def _by_round(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
 def _by_source(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
     names = ("observed", "generated")
     tint = np.array([_rgb(COLORS[name]) for name in names], np.float32)
-    light = memory.records.color[rows] @ np.array([0.299, 0.587, 0.114], np.float32) / 255
-    kind = memory.views.generated[memory.records.view[rows]].astype(np.int64)
+    light = memory.columns.colors[rows] @ np.array([0.299, 0.587, 0.114], np.float32) / 255
+    kind = memory.views.generated[memory.columns.view[rows]].astype(np.int64)
     rgb = np.clip(tint[kind] * (0.45 + 0.75 * light)[:, None], 0, 255)
     swatches = tuple((COLORS[name], name) for name in names)
     return PointColors(rgb.round().astype(np.uint8), Legend("where a point comes from", swatches))

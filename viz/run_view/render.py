@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,8 +48,7 @@ class RunRenderer:
         memory = self._after(round)
         if self._colored is None or mode != self._mode:
             colors = point_colors(memory, mode, true_depth=self.run.recorded_depth)
-            self._colored = copy.copy(memory)
-            self._colored.records = replace(memory.records, color=colors.rgb)
+            self._colored = memory.recolored(colors.rgb)
             self._mode = mode
         return self._colored
 

@@ -99,7 +99,7 @@ class RunView:
     def round_of_points(self) -> NDArray[np.int32]:
         """(N,) int32, for each observation the round it was fused in."""
         memory = self.memory
-        return memory.views.round[memory.records.view[: len(memory)]]
+        return memory.views.round[memory.columns.view[: len(memory)]]
 
     def counts(self, round: int) -> Counts:
         """What the memory held after a round.
@@ -187,8 +187,7 @@ class RunView:
         """Rows of some observations, and where they are, (P, 3) in the memory's frame."""
         memory = self.memory
         rows = np.arange(0, len(memory), max(1, len(memory) // 100_000))
-        records = memory.records
-        return rows, np.stack([records.x[rows], records.y[rows], records.z[rows]], axis=1)
+        return rows, memory.columns.positions[rows]
 
     @cached_property
     def typical_depth(self) -> float:
@@ -196,7 +195,7 @@ class RunView:
         rows, positions = self._sample()
         if not len(rows):
             return 1.0
-        away = positions - self.memory.views.centers[self.memory.records.view[rows]]
+        away = positions - self.memory.views.centers[self.memory.columns.view[rows]]
         return float(np.median(np.linalg.norm(away, axis=1))) or 1.0
 
 

@@ -45,7 +45,7 @@ class PointNodes:
         before = {key: self.rows[places] for key, places in self._places.items()}
         same_size = drawn.size == self.size
         self.rows, self.size = drawn.rows, drawn.size
-        rounds = memory.views.round[memory.records.view[drawn.rows]]
+        rounds = memory.views.round[memory.columns.view[drawn.rows]]
         self._places = {int(key): np.flatnonzero(rounds == key) for key in np.unique(rounds)}
         for key in [k for k in self._nodes if k not in self._places]:
             self._nodes.pop(key).remove()
@@ -54,11 +54,9 @@ class PointNodes:
             if same_size and key in before and np.array_equal(before[key], rows):
                 self._recolor(key, rgb[places])
                 continue
-            records = memory.records
-            local = np.stack([records.x[rows], records.y[rows], records.z[rows]], axis=1)
             self._nodes[key] = self._server.scene.add_point_cloud(
                 f"/points/round_{key:03d}",
-                self._frame.points(local),
+                self._frame.points(memory.columns.positions[rows]),
                 rgb[places],
                 point_size=self._point_size(),
                 point_shape="square",

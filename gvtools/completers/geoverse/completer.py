@@ -133,10 +133,10 @@ class GeoVerseCompleter(Completer):
         photographs = min(self.settings.context_views or self.config.context, views - 1)
         room = views - min(photographs, len(context))
         passes = steps = 0
-        filled = self._filled(context, guidance.rows(holes)) if holes else None
+        filled = self._filled(context, guidance.select(holes)) if holes else None
         for first in range(0, len(holes), room):
             rows = holes[first : first + room]
-            part = guidance.rows(rows)
+            part = guidance.select(rows)
             fill = None if filled is None else filled.rows(range(first, first + len(rows)))
             depth = part.depth if fill is None else fill.depth
             selection = self.settings.context_selection

@@ -22,7 +22,6 @@ from gvtools.completers.base import Completion, ContextView
 from gvtools.completers.geoverse.fill import Filled, push_pull, push_pull_depth
 from gvtools.completers.inpaint import InpaintCompleter
 from gvtools.guidance import Guidance
-from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 
 # Confidence of what is averaged: below that of any plane worth fusing.
@@ -120,16 +119,16 @@ def _lifted(
         memory = SpatialMemory(
             _footprint(completion.depth[index], view.cameras), origin=view.cameras.centers[0]
         )
-    points = back_project(
+    memory.observe(
         np.rint(np.clip(completion.rgb[index], 0, 1) * 255).astype(np.uint8),
         completion.depth[index],
         view.cameras,
-        frame=memory.frame,
+        round=1,
+        generated=True,
         # Unused outside the mask, where it must still be positive.
         confidence=np.where(own, confidence, np.float32(1)),
         mask=own,
     )
-    memory.fuse(points, round=1, generated=True)
     return memory
 
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,23 +19,21 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError, MemoryFileError
 from gvtools.files import ZIP_EPOCH, replaced_when_written
+from gvtools.memory.store.store import MemoryOptions, Store
 from gvtools.memory.store.views import SourceView, ViewTable
 from gvtools.memory.store.voxel_index import MOST_LEVEL
 
-if TYPE_CHECKING:
-    from gvtools.memory.spatial_memory import SpatialMemory
+S = TypeVar("S", bound=Store)
 
 FORMAT = "gvtools memory"
-VERSION = 3
-# The version whose voxels have one edge.
-ONE_EDGE = 2
-READABLE = (ONE_EDGE, VERSION)
+VERSION = 4
 CONVENTION = "OpenCV axes (x right, y down, z forward); first pixel's centre at (0.5, 0.5)"
-_RECORD_ARRAYS = ("x", "y", "z", "color", "confidence", "spacing", "view", "level", "agreement")
-_RUN_ARRAYS = ("start", "length", "view", "box")
+# Types and shapes of an observation's arrays; ``round`` and ``generated`` follow from ``view``.
+_COLUMNS = ("positions", "colors", "confidence", "spacing", "view", "level")
+_SEGMENT_ARRAYS = ("start", "length", "view", "box")
 
 
-def save_memory(memory: SpatialMemory, path: Path) -> None:
+def save_memory(memory: Store, path: Path) -> None:
     """Write ``memory`` to ``path``; an older file stays until the new one is whole.
 
     Raises:
@@ -50,7 +47,7 @@ def save_memory(memory: SpatialMemory, path: Path) -> None:
         "voxel": memory.voxel.hex(),
         "origin": [float(x).hex() for x in memory.origin],
         "axes": [float(x).hex() for x in memory.frame.axes.ravel()],
-        "options": asdict(memory.options),
+        "options": memory.options.to_dict(),
         "names": [memory.views[i].camera.names[0] for i in range(len(memory.views))],
         "arrays": {name: [array.dtype.str, list(array.shape)] for name, array in arrays.items()},
     }
@@ -65,53 +62,56 @@ def save_memory(memory: SpatialMemory, path: Path) -> None:
             _write(archive, f"{name}.npy", buffer.getvalue())
 
 
-def load_memory(path: Path) -> SpatialMemory:
-    """Read a memory; every byte is checked.
+def load_memory(path: Path, kind: type[S]) -> S:
+    """Read a memory of a class; every byte is checked.
 
     Raises:
         MemoryFileError: absent, truncated, altered, of another kind or version.
     """
     header, arrays = _read(path)
     try:
-        return _assembled(header, arrays)
+        return _assembled(header, arrays, kind)
     except (GvError, IndexError, KeyError, TypeError, ValueError) as error:
         raise MemoryFileError(f"{path}: the memory's parts do not fit together ({error})") from None
 
 
-def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> SpatialMemory:
-    from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-
-    memory = SpatialMemory(
+def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]], kind: type[S]) -> S:
+    memory = kind(
         float.fromhex(header["voxel"]),
         origin=[float.fromhex(x) for x in header["origin"]],
         axes=np.reshape([float.fromhex(x) for x in header["axes"]], (3, 3)),
         options=MemoryOptions(**header["options"]),
     )
     _check_consistency(arrays, len(header["names"]))
-    count = len(arrays["record_view"])
-    records, runs = memory.records, memory.runs
-    records.count = count
-    for name in _RECORD_ARRAYS:
-        setattr(records, name, arrays[f"record_{name}"])
-    records.next = np.empty(count, np.int32)
-    runs.append(*(arrays[f"run_{name}"] for name in _RUN_ARRAYS))
     memory.views = ViewTable(memory.frame, _views(header["names"], arrays))
+    view = arrays["view"]
+    columns = {
+        **{name: arrays[name] for name in _COLUMNS},
+        "round": memory.views.round[view],
+        "generated": memory.views.generated[view],
+        "next": np.full(len(view), -1),
+    }
+    memory.columns.replace(len(view), columns.__getitem__)
+    memory.segments.append(*(arrays[f"segment_{name}"] for name in _SEGMENT_ARRAYS))
     start = arrays["agreement_start"]
     for i, round_ in enumerate(arrays["agreement_round"].tolist()):
         rows = slice(int(start[i]), int(start[i + 1]))
-        entry = (arrays["agreement_record"][rows].copy(), arrays["agreement_weight"][rows].copy())
-        memory.agreements.setdefault(round_, []).append(entry)
+        memory.agree(
+            arrays["agreement_row"][rows].copy(),
+            arrays["agreement_weight"][rows].copy(),
+            round=round_,
+        )
     memory.rebuild_index()
     return memory
 
 
-def _arrays(memory: SpatialMemory) -> dict[str, NDArray[Any]]:
-    records, runs, views = memory.records, memory.runs, memory.views
-    arrays: dict[str, NDArray[Any]] = {}
-    for name in _RECORD_ARRAYS:
-        arrays[f"record_{name}"] = getattr(records, name)[: records.count]
-    for name in _RUN_ARRAYS:
-        arrays[f"run_{name}"] = getattr(runs, name)[: runs.count]
+def _arrays(memory: Store) -> dict[str, NDArray[Any]]:
+    segments, views = memory.segments, memory.views
+    arrays: dict[str, NDArray[Any]] = {name: getattr(memory.columns, name) for name in _COLUMNS}
+    # Loading adds again what later rounds agreed.
+    arrays["confidence"] = memory.own_confidence()
+    for name in _SEGMENT_ARRAYS:
+        arrays[f"segment_{name}"] = getattr(segments, name)[: segments.count]
     rows = [views[i] for i in range(len(views))]
     cameras = views.cameras
     arrays["view_K"] = cameras.K if cameras else np.zeros((0, 3, 3))
@@ -128,7 +128,7 @@ def _arrays(memory: SpatialMemory) -> dict[str, NDArray[Any]]:
     lengths = [len(entry[0]) for _, entry in logs]
     arrays["agreement_start"] = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
     empty = np.zeros(0)
-    arrays["agreement_record"] = np.concatenate(
+    arrays["agreement_row"] = np.concatenate(
         [empty.astype(np.int32), *(entry[0] for _, entry in logs)]
     )
     arrays["agreement_weight"] = np.concatenate(
@@ -175,10 +175,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
             if not isinstance(header, dict) or header.get("format") != FORMAT:
                 raise MemoryFileError(f"{path}: not a gvtools memory")
             version = header.get("version")
-            if version not in READABLE:
+            if version != VERSION:
                 raise MemoryFileError(
-                    f"{path}: memory format version {version}; this gvtools reads versions "
-                    f"{READABLE[0]} to {VERSION}; write it again with a matching release"
+                    f"{path}: memory format version {version}; this gvtools reads version "
+                    f"{VERSION}; run the reconstruction again"
                 )
             arrays = {}
             for name, (dtype, shape) in header["arrays"].items():
@@ -187,9 +187,6 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
                 if array.dtype.str != dtype or list(array.shape) != shape:
                     raise MemoryFileError(f"{path}: array {name} is not what the header lists")
                 arrays[name] = array
-            if version == ONE_EDGE:
-                header["options"]["footprints"] = 0.0
-                arrays["record_level"] = np.zeros(len(arrays["record_view"]), np.uint8)
     except MemoryFileError:
         raise
     except Exception as error:  # any parser's complaint means the same to the user
@@ -201,30 +198,29 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 
 
 def _check_consistency(arrays: dict[str, NDArray[Any]], views: int) -> None:
-    count = len(arrays["record_view"])
+    count = len(arrays["view"])
     columns = {
-        "record_x": (count,), "record_y": (count,), "record_z": (count,),
-        "record_color": (count, 3), "record_confidence": (count,),
-        "record_spacing": (count,), "record_agreement": (count,), "record_level": (count,),
+        "positions": (count, 3), "colors": (count, 3), "confidence": (count,),
+        "spacing": (count,), "level": (count,),
         "view_K": (views, 3, 3), "view_cam_from_world": (views, 4, 4), "view_size": (views, 2),
         "view_round": (views,), "view_generated": (views,), "grid_shape": (views, 2),
     }  # fmt: skip
     for name, shape in columns.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")
-    rows = arrays["record_view"]
+    rows = arrays["view"]
     if count and not (rows.min() >= 0 and rows.max() < views):
         raise ValueError("an observation names a view that is not there")
-    level = arrays["record_level"]
+    level = arrays["level"]
     if level.dtype != np.uint8 or (count and level.max() > MOST_LEVEL):
         raise ValueError("an observation is of a level that is not there")
-    start, length = arrays["run_start"], arrays["run_length"].astype(np.int64)
+    start, length = arrays["segment_start"], arrays["segment_length"].astype(np.int64)
     if len(start) and not (start[0] == 0 and (start[1:] == (start + length)[:-1]).all()):
-        raise ValueError("runs are not contiguous")
+        raise ValueError("segments are not contiguous")
     if int(length.sum()) != count:
-        raise ValueError("runs do not cover the observations")
-    run_view = arrays["run_view"]
-    if len(run_view) and not (run_view.min() >= 0 and run_view.max() < views):
-        raise ValueError("a run names a view that is not there")
+        raise ValueError("segments do not cover the observations")
+    segment_view = arrays["segment_view"]
+    if len(segment_view) and not (segment_view.min() >= 0 and segment_view.max() < views):
+        raise ValueError("a segment names a view that is not there")
     if int(arrays["grid_shape"].prod(axis=1).sum()) != len(arrays["grid_depth"]):
         raise ValueError("the free-space grids do not fill their array")

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
 from gvtools.files import replaced_when_written
+from gvtools.memory.store.store import Store
 from gvtools.memory.thinning import thinned
 
 if TYPE_CHECKING:
-    from gvtools.memory.spatial_memory import SpatialMemory
+    import open3d as o3d
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4",
@@ -95,8 +96,30 @@ def _parse_header(path: Path, text: str) -> tuple[int, np.dtype[np.void]]:
     return count, np.dtype(columns)
 
 
+def read_point_cloud(path: Path) -> o3d.t.geometry.PointCloud:
+    """A binary PLY as a point cloud in its own frame, read strictly.
+
+    Raises:
+        MemoryFileError: see ``read_ply``; or without uchar colours.
+    """
+    import open3d as o3d
+
+    vertices = read_ply(path)
+    names = vertices.dtype.names or ()
+    if not {"red", "green", "blue"} <= set(names) or vertices["red"].dtype != np.uint8:
+        raise MemoryFileError(f"{path}: no uchar red, green, blue; expected a coloured point cloud")
+    tensor = o3d.core.Tensor
+    cloud = o3d.t.geometry.PointCloud()
+    cloud.point.positions = tensor(np.stack([vertices[k].astype(np.float64) for k in "xyz"], 1))
+    cloud.point.colors = tensor(np.stack([vertices[k] for k in ("red", "green", "blue")], 1))
+    for name in ("confidence", "spacing", "round", "view", "generated"):
+        if name in names:
+            cloud.point[name] = tensor(vertices[name][:, None].copy())
+    return cloud
+
+
 def export_memory_ply(
-    memory: SpatialMemory, path: Path, *, max_points: int | None = None
+    memory: Store, path: Path, *, max_points: int | None = None
 ) -> tuple[int, float]:
     """Write the observations with colour, confidence, spacing, round, view and generated.
 
@@ -119,21 +142,17 @@ def export_memory_ply(
     positions = memory.positions[rows]
     reach = float(np.abs(positions).max(initial=0))
     coordinate = "<f8" if reach * 2.0**-24 > 0.1 * memory.voxel else "<f4"
-    records, views = memory.records, memory.views
     vertices = np.empty(
         len(rows),
         [("x", coordinate), ("y", coordinate), ("z", coordinate), ("red", "u1"), ("green", "u1"),
          ("blue", "u1"), ("confidence", "<f4"), ("spacing", "<f4"), ("round", "<i4"),
          ("view", "<i4"), ("generated", "u1")],
     )  # fmt: skip
+    columns = memory.columns
     for k, (axis, color) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
         vertices[axis] = positions[:, k]
-        vertices[color] = records.color[rows, k]
-    view = records.view[rows]
-    vertices["confidence"] = memory.confidence[rows]
-    vertices["spacing"] = records.spacing[rows]
-    vertices["round"] = views.round[view]
-    vertices["view"] = view
-    vertices["generated"] = views.generated[view]
+        vertices[color] = columns.colors[rows, k]
+    for name in ("confidence", "spacing", "round", "view", "generated"):
+        vertices[name] = getattr(columns, name)[rows]
     write_ply(path, vertices, comments=("gvtools memory, input world frame, scene units",))
     return len(rows), edge

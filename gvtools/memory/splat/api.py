@@ -6,14 +6,14 @@ Which points go into which pixels is decided in ``projection``.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from gvtools.cameras import Cameras
-from gvtools.errors import OptionError
-from gvtools.options import check_range
+from gvtools.settings import Settings
 
 BACKENDS = ("cpu", "torch", "nearest", "open3d")
 # Back ends without blending.
@@ -21,59 +21,44 @@ ONE_PIXEL = ("nearest", "open3d")
 DEVICES = ("auto", "cpu", "cuda")
 
 
-@dataclass(frozen=True, kw_only=True)
-class SplatOptions:
-    """How the memory is projected.
+class SplatOptions(Settings):
+    """How the memory is projected."""
 
-    Attributes:
-        nearest_views: views in the first tier; each later tier takes twice as many.
-        proximity: weight of a view is exp(-proximity x (d - d_nearest)), see
-            ``projection.view_distance``; confidence x weight counts, and is reported, as no less
-            than 1e-36.
-        band: relative depth band inside which observations blend.
-        depth_reach: half width of the depth pass's footprint, in spacings.
-        blend_reach: radius of the blending kernel, in spacings.
-        support: kernel sum that makes a pixel valid.
-        size_cap: widest footprint, pixels; what a memory this coarse leaves open is a hole.
-        occluders: look for things in front that the first tiers did not see.
-        backend: "cpu" (compiled), "torch" (the same on ``device``), or without blending, one pixel
-            a point: "nearest" (our own) and "open3d" (``project_to_rgbd_image``).
-        device: where "torch" computes: "cpu", "cuda", or "auto" for CUDA where there is one.
-    """
+    section = "splat"
 
-    nearest_views: int = 2
-    proximity: float = 4.0
-    band: float = 0.05
-    depth_reach: float = 0.5
-    blend_reach: float = 1.4
-    support: float = 0.5
-    size_cap: float = 32.0
+    nearest_views: int = Field(2, ge=1)
+    """Views in the first tier; each later tier takes twice as many."""
+    view_weight: float = Field(4.0, ge=0)
+    """Weight of a view is exp(-view_weight x (d - d_nearest)), see ``projection.view_distance``;
+    confidence x weight counts, and is reported, as no less than 1e-36."""
+    depth_band: float = Field(0.05, gt=0)
+    """Relative depth band inside which observations blend."""
+    depth_reach: float = Field(0.5, gt=0)
+    """Half width of the depth pass's footprint, in spacings."""
+    blend_reach: float = Field(1.4, gt=0)
+    """Radius of the blending kernel, in spacings."""
+    support: float = Field(0.5, gt=0)
+    """Kernel sum that makes a pixel valid."""
+    max_splat_px: float = Field(32.0, gt=0)
+    """Widest footprint, pixels; what a memory this coarse leaves open is a hole."""
     occluders: bool = True
-    backend: str = "cpu"
-    device: str = "auto"
-
-    def __post_init__(self) -> None:
-        check_range("splat.nearest_views", self.nearest_views, least=1)
-        check_range("splat.proximity", self.proximity, least=0)
-        for key in ("band", "depth_reach", "blend_reach", "support", "size_cap"):
-            check_range(f"splat.{key}", getattr(self, key), above=0)
-        for name, value, known in (
-            ("backend", self.backend, BACKENDS),
-            ("device", self.device, DEVICES),
-        ):
-            if value not in known:
-                raise OptionError(f"splat {name} {value!r}; expected one of {', '.join(known)}")
+    """Look for things in front that the first tiers did not see."""
+    backend: Literal["cpu", "torch", "nearest", "open3d"] = "cpu"
+    """The kernels: "cpu" (compiled), "torch" (the same on ``device``), or without blending, one
+    pixel a point: "nearest" (our own) and "open3d" (``project_to_rgbd_image``)."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where "torch" computes: "cpu", "cuda", or "auto" for CUDA where there is one."""
 
 
 @dataclass(eq=False)
-class Target:
+class FrameBuffers:
     """One target camera and the images being written.
 
     Attributes:
         camera: a batch of one.
         cam_from_local: (4, 4) float64, from the memory's frame.
-        rect: (R, 4) int32, image rectangle of each run, see culling.cull_runs.
-        near: what is nearer is behind or inside the camera, scene units.
+        rect: (R, 4) int32, image rectangle of each segment, see culling.cull_segments.
+        z_near: what is nearer is behind or inside the camera, scene units.
         unit: a power of two near the typical depth, scene units, that depths are summed in.
         rgb: (H, W, 3) float32 in [0, 1].
         depth: (H, W) float32, scene units.
@@ -85,7 +70,7 @@ class Target:
     camera: Cameras
     cam_from_local: NDArray[np.float64]
     rect: NDArray[np.int32]
-    near: np.float32
+    z_near: np.float32
     unit: np.float32
     rgb: NDArray[np.float32]
     depth: NDArray[np.float32]
@@ -100,11 +85,11 @@ class Target:
 
 
 class Splatter(Protocol):
-    """A back end: splats runs of one memory, with one set of options, into targets."""
+    """A back end: splats segments of one memory, with one set of options, into targets."""
 
     def splat(
         self,
-        target: Target,
+        target: FrameBuffers,
         chosen: NDArray[np.int64],
         limit: NDArray[np.float32],
         *,
@@ -112,13 +97,13 @@ class Splatter(Protocol):
         table: NDArray[np.int32] | None,
         blend: bool,
     ) -> NDArray[np.float32]:
-        """Splat the runs ``chosen`` and keep the sums until ``resolve``.
+        """Splat the segments ``chosen`` and keep the sums until ``resolve``.
 
         Args:
             target: the camera.
-            chosen: (n,) rows of the memory's runs.
+            chosen: (n,) rows of the memory's segments.
             limit: (H, W), only what is nearer is written; 0 shuts a pixel.
-            weight: (views,) proximity.
+            weight: (views,) view weight.
             table: summed-area table of the pixels to be written, where these are few.
             blend: False stops after the depth pass.
 
@@ -126,9 +111,9 @@ class Splatter(Protocol):
             (H, W) float32 nearest depth, ``limit`` where nothing is nearer.
         """
 
-    def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
+    def resolve(self, target: FrameBuffers, open_: NDArray[np.bool_], *, generated: bool) -> None:
         """Write the last splat's pixels where ``open_`` and the support suffices.
 
-        The confidence is the mean of the observations' confidence x proximity; ``generated`` says
+        The confidence is the mean of the observations' confidence x view weight; ``generated`` says
         what kind the splatted observations are.
         """

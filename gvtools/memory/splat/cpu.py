@@ -12,21 +12,21 @@ from gvtools.memory import culling
 from gvtools.memory.splat import cpu_kernels as splat_kernels
 
 if TYPE_CHECKING:
-    from gvtools.memory.spatial_memory import SpatialMemory
-    from gvtools.memory.splat.api import SplatOptions, Target
+    from gvtools.memory.splat.api import FrameBuffers, SplatOptions
+    from gvtools.memory.store.store import Store
 
 
 class CpuSplatter:
-    """Splats runs of a memory on the processor's cores; see gvtools.memory.splat.api.Splatter."""
+    """Splats segments of a memory on the processor's cores; see splat.api.Splatter."""
 
-    def __init__(self, memory: SpatialMemory, options: SplatOptions) -> None:
-        self.memory, self.options = memory, options
+    def __init__(self, store: Store, options: SplatOptions) -> None:
+        self.store, self.options = store, options
         self.zbuffer = np.empty((0, 0), np.float32)
         self.total = np.empty((0, 0, 0), np.float32)
 
     def splat(
         self,
-        target: Target,
+        target: FrameBuffers,
         chosen: NDArray[np.int64],
         limit: NDArray[np.float32],
         *,
@@ -39,24 +39,30 @@ class CpuSplatter:
         if self.zbuffer.shape != target.shape:
             self.zbuffer = np.empty(target.shape, np.float32)
             self.total = np.empty((height, width, splat_kernels.CHANNELS), np.float32)
-        memory, options = self.memory, self.options
-        records, runs = memory.records, memory.runs
+        columns, options = self.store.columns.arrays, self.options
+        segments = self.store.segments
         reachable = np.empty(0, np.bool_) if table is None else culling.near_to(table)
-        splat_kernels.splat_runs(
-            chosen, runs.start, runs.length, runs.view, target.rect,
-            records.x, records.y, records.z, records.color, records.confidence,
-            records.agreement, records.spacing, weight,
-            target.cam_from_local.astype(np.float32), target.camera.K[0], target.near, target.unit,
-            limit.reshape(-1), reachable,
-            np.float32(options.band), np.float32(options.depth_reach),
-            np.float32(options.blend_reach), np.float32(options.size_cap),
-            np.float32(memory.options.weight_cap), numba.get_num_threads(), blend,
-            width, height, self.zbuffer.reshape(-1),
+        K, single = target.camera.K[0], np.float32
+        lens = splat_kernels.Lens(
+            target.cam_from_local.astype(single), single(K[0, 0]), single(K[1, 1]),
+            single(K[0, 1]), single(K[0, 2] - 0.5), single(K[1, 2] - 0.5),
+            single(np.sqrt(K[0, 0] * K[1, 1])), target.z_near, target.unit, width, height,
+        )  # fmt: skip
+        rules = splat_kernels.SplatRules(
+            single(options.depth_band), single(options.depth_reach),
+            single(options.blend_reach), single(options.max_splat_px),
+        )  # fmt: skip
+        table_of = splat_kernels.SegmentColumns(
+            segments.start, segments.length, segments.view, target.rect
+        )
+        splat_kernels.splat_segments(
+            chosen, table_of, columns, weight, lens, rules, limit.reshape(-1), reachable,
+            numba.get_num_threads(), blend, self.zbuffer.reshape(-1),
             self.total.reshape(-1, splat_kernels.CHANNELS),
         )  # fmt: skip
         return self.zbuffer
 
-    def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
+    def resolve(self, target: FrameBuffers, open_: NDArray[np.bool_], *, generated: bool) -> None:
         """See gvtools.memory.splat.api.Splatter."""
         splat_kernels.resolve(
             self.total, open_, np.float32(self.options.support), target.unit, generated,

@@ -1,23 +1,64 @@
 """The splatting kernels: depth pass, blending pass, resolving.
 
-The image is cut into bands of rows; each band walks the same runs in the same order, so the result
-does not depend on how many threads share the work.
+The image is cut into bands of rows; each band walks the same segments in the same order, so the
+result does not depend on how many threads share the work.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from gvtools.kernels import FAST, compiled
 from gvtools.memory.culling import REACHABLE
 
-# Channels of the accumulator: weighted rgb, weight, weighted z in Target.unit, kernel.
+# Channels of the accumulator: weighted rgb, weight, weighted z in FrameBuffers.unit, kernel.
 CHANNELS = 6
-# Confidence x proximity counts as no less: below, sums of float32 would vanish.
+# Confidence x view weight counts as no less: below, sums of float32 would vanish.
 FAINTEST = np.float32(1e-36)
 # The smallest float32 of full precision, and the least weight that a pixel is divided by.
 SMALLEST = np.finfo(np.float32).tiny
+
+
+class Lens(NamedTuple):
+    """A target camera: (3 or 4, 4) pose from the memory's frame, and its intrinsics in pixels.
+
+    ``cx`` and ``cy`` have pixel centres at integers. What is nearer than ``z_near`` is not drawn;
+    ``unit`` is a power of two near the typical depth, both scene units.
+    """
+
+    M: NDArray[np.float32]
+    fx: np.float32
+    fy: np.float32
+    skew: np.float32
+    cx: np.float32
+    cy: np.float32
+    focal: np.float32
+    z_near: np.float32
+    unit: np.float32
+    width: int
+    height: int
+
+
+class SplatRules(NamedTuple):
+    """See SplatOptions."""
+
+    depth_band: np.float32
+    depth_reach: np.float32
+    blend_reach: np.float32
+    max_splat_px: np.float32
+
+
+class SegmentColumns(NamedTuple):
+    """First observation, length and view of each segment, and its rectangle in the image."""
+
+    start: NDArray[np.int64]
+    length: NDArray[np.int32]
+    view_row: NDArray[np.int32]
+    rect: NDArray[np.int32]
 
 
 @compiled(inline="always")
@@ -31,15 +72,16 @@ def closed_off(u, v, reach, width, height, reachable):
 
 
 @compiled(fastmath=FAST)
-def _project_run(
-    x, y, z, spacing, M, fx, fy, skew, cx, cy, focal, near, factor, size_cap, width, top, bottom,
-    u, v, depth, reach, c0, c1, r0, r1,
-):  # fmt: skip
-    """Centre-of-pixel coordinates, depth, reach (pixels) and window of one run's points.
+def _project_segment(positions, spacing, lens, factor, max_splat_px, top, bottom, part):
+    """Centre-of-pixel coordinates, depth, reach (pixels) and window of one segment's points.
 
-    The window is the pixels within reach, cut to the image and to the rows ``top`` to ``bottom``;
-    it is empty behind the camera.
+    ``part`` holds scratch rows for the positions and, for these results, u, v, depth, reach and the
+    window's first and last column and row. The window is the pixels within reach, cut to the image
+    and to the rows ``top`` to ``bottom``; it is empty behind the camera.
     """
+    M, z_near, width = lens.M, lens.z_near, lens.width
+    fx, fy, skew, cx, cy, focal = lens.fx, lens.fy, lens.skew, lens.cx, lens.cy, lens.focal
+    x, y, z, u, v, depth, reach, c0, c1, r0, r1 = part
     m00, m01, m02, m03 = M[0, 0], M[0, 1], M[0, 2], M[0, 3]
     m10, m11, m12, m13 = M[1, 0], M[1, 1], M[1, 2], M[1, 3]
     m20, m21, m22, m23 = M[2, 0], M[2, 1], M[2, 2], M[2, 3]
@@ -48,15 +90,21 @@ def _project_run(
     right = np.float32(width)
     above = np.float32(top - 1)
     below = np.float32(bottom + 1)
-    for k in range(len(x)):
+    # Apart, because vector units want them so.
+    flat = positions.reshape(-1)
+    for k in range(len(positions)):
+        x[k] = flat[np.uint64(3 * k)]
+        y[k] = flat[np.uint64(3 * k + 1)]
+        z[k] = flat[np.uint64(3 * k + 2)]
+    for k in range(len(positions)):
         px = m00 * x[k] + m01 * y[k] + m02 * z[k] + m03
         py = m10 * x[k] + m11 * y[k] + m12 * z[k] + m13
         pz = m20 * x[k] + m21 * y[k] + m22 * z[k] + m23
         depth[k] = pz
-        inverse = one / max(pz, near)
+        inverse = one / max(pz, z_near)
         col = (fx * px + skew * py) * inverse + cx
         row = fy * py * inverse + cy
-        h = factor * min(max(spacing[k] * focal * inverse, one), size_cap)
+        h = factor * min(max(spacing[k] * focal * inverse, one), max_splat_px)
         u[k] = col
         v[k] = row
         reach[k] = h
@@ -68,45 +116,50 @@ def _project_run(
         c0[k] = max(first_col, np.int32(0))
         c1[k] = min(last_col, np.int32(width - 1))
         r0[k] = max(first_row, np.int32(top))
-        r1[k] = min(last_row, np.int32(bottom)) if pz > near else np.int32(-1)
+        r1[k] = min(last_row, np.int32(bottom)) if pz > z_near else np.int32(-1)
 
 
 @compiled(parallel=True, fastmath=FAST)
-def splat_runs(
-    runs, run_start, run_length, run_view, rect, x, y, z, color, confidence, agreement, spacing,
-    view_weight, M, K, near, unit, limit, reachable, band, depth_reach, blend_reach, size_cap,
-    weight_cap, threads, blend, width, height, depth, total,
+def splat_segments(
+    chosen, segments, columns, view_weight, lens, rules, limit, reachable, threads, blend, depth,
+    total,
 ):  # fmt: skip
     """Depth pass, then blending inside the depth band.
 
-    ``runs`` (n,) are added in their order. Only what is nearer than ``limit`` (H x W,) makes a
-    depth; 0 shuts a pixel. ``reachable`` (H x W,) bool holds the pixels within REACHABLE pixels of
-    one to be written; it is empty when most of the image is open. ``band`` is the relative depth
-    band that blends; ``depth_reach`` and ``blend_reach`` are the footprints' half width and the
-    kernel's radius in spacings; footprints wider than ``size_cap`` pixels are cut to it. Without
-    ``blend`` it stops after the depth pass. Depths are summed in the power of two ``unit``.
-
-    Writes ``depth`` (H x W,) float32, the nearest depth, or ``limit`` where nothing is nearer, and
-    ``total`` (H x W, CHANNELS) float32.
+    Args:
+        chosen: (n,) int64 rows of ``segments``, added in this order.
+        segments: see SegmentColumns.
+        columns: the observations, see ColumnArrays.
+        view_weight: (views,) float32.
+        lens: the camera.
+        rules: see SplatRules.
+        limit: (H x W,) float32; only what is nearer makes a depth, 0 shuts a pixel.
+        reachable: (H x W,) bool, the pixels within REACHABLE pixels of one to be written; empty
+            when most of the image is open.
+        threads: how many share the work.
+        blend: False stops after the depth pass.
+        depth: out (H x W,) float32, the nearest depth, or ``limit`` where nothing is nearer.
+        total: out (H x W, CHANNELS) float32; depths are summed in ``lens.unit``.
     """
-    fx = np.float32(K[0, 0])
-    fy = np.float32(K[1, 1])
-    skew = np.float32(K[0, 1])
-    cx = np.float32(K[0, 2] - 0.5)
-    cy = np.float32(K[1, 2] - 0.5)
-    focal = np.float32(np.sqrt(K[0, 0] * K[1, 1]))
+    width, height = lens.width, lens.height
+    rect, start, length, view = segments.rect, segments.start, segments.length, segments.view_row
+    positions, color, spacing = columns.positions, columns.colors, columns.spacing
+    confidence, depth_band = columns.confidence, rules.depth_band
     longest = 0
-    for r in runs:
-        longest = max(longest, run_length[r])
+    for r in chosen:
+        longest = max(longest, length[r])
     one = np.float32(1)
     zero = np.float32(0)
-    per_unit = one / unit
+    per_unit = one / lens.unit
     bands = max(1, min(4, height // (16 * threads)))
     for task in prange(bands * threads):
         # Neighbouring bands go to different threads: what is open tends to lie together.
         b = (task % bands) * threads + task // bands
         top = b * height // (bands * threads)
         bottom = (b + 1) * height // (bands * threads) - 1
+        x = np.empty(longest, np.float32)
+        y = np.empty(longest, np.float32)
+        z = np.empty(longest, np.float32)
         u = np.empty(longest, np.float32)
         v = np.empty(longest, np.float32)
         depths = np.empty(longest, np.float32)
@@ -115,19 +168,19 @@ def splat_runs(
         c1 = np.empty(longest, np.int32)
         r0 = np.empty(longest, np.int32)
         r1 = np.empty(longest, np.int32)
+        part = (x, y, z, u, v, depths, reach, c0, c1, r0, r1)
         for i in range(top * width, (bottom + 1) * width):
             depth[i] = limit[i]
             if blend and limit[i] > 0:
                 total[i] = 0
-        for r in runs:
+        for r in chosen:
             if rect[r, 3] < top or rect[r, 2] > bottom:
                 continue
-            first = run_start[r]
-            last = first + run_length[r]
-            _project_run(
-                x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx, fy, skew,
-                cx, cy, focal, near, depth_reach, size_cap, width, top, bottom,
-                u, v, depths, reach, c0, c1, r0, r1,
+            first = start[r]
+            last = first + length[r]
+            _project_segment(
+                positions[first:last], spacing[first:last], lens, rules.depth_reach,
+                rules.max_splat_px, top, bottom, part,
             )  # fmt: skip
             for k in range(last - first):
                 if closed_off(u[k], v[k], reach[k], width, height, reachable):
@@ -141,24 +194,23 @@ def splat_runs(
                             depth[cell] = zk
         if not blend:
             continue
-        for r in runs:
+        for r in chosen:
             if rect[r, 3] < top or rect[r, 2] > bottom:
                 continue
-            first = run_start[r]
-            last = first + run_length[r]
-            proximity = view_weight[run_view[r]]
-            _project_run(
-                x[first:last], y[first:last], z[first:last], spacing[first:last], M, fx, fy, skew,
-                cx, cy, focal, near, blend_reach, size_cap, width, top, bottom,
-                u, v, depths, reach, c0, c1, r0, r1,
+            first = start[r]
+            last = first + length[r]
+            weight = view_weight[view[r]]
+            _project_segment(
+                positions[first:last], spacing[first:last], lens, rules.blend_reach,
+                rules.max_splat_px, top, bottom, part,
             )  # fmt: skip
             for k in range(last - first):
                 if r0[k] > r1[k] or closed_off(u[k], v[k], reach[k], width, height, reachable):
                     continue
                 zk = depths[k]
                 q = one / (reach[k] * reach[k])
-                near_side = zk / (one + band)
-                scale = min(confidence[first + k] + agreement[first + k], weight_cap) * proximity
+                near_side = zk / (one + depth_band)
+                scale = confidence[first + k] * weight
                 scale = max(scale, FAINTEST)
                 red = scale * np.float32(color[first + k, 0])
                 green = scale * np.float32(color[first + k, 1])
@@ -182,7 +234,7 @@ def splat_runs(
 
 
 @compiled(parallel=True, fastmath=FAST)
-def resolve(total, open_, support, unit, made, rgb, depth, valid, confidence, generated):
+def resolve(total, open_, support, unit, is_generated, rgb, depth, valid, confidence, generated):
     """Turn accumulators into pixels where ``open_`` and the support suffices."""
     for row in prange(total.shape[0]):
         for col in range(total.shape[1]):
@@ -197,5 +249,5 @@ def resolve(total, open_, support, unit, made, rgb, depth, valid, confidence, ge
                 rgb[row, col, c] = total[row, col, c] * scale * np.float32(1 / 255)
             depth[row, col] = total[row, col, 4] * scale * unit
             confidence[row, col] = weight / kernel
-            generated[row, col] = made
+            generated[row, col] = is_generated
             valid[row, col] = True

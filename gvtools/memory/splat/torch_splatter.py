@@ -8,11 +8,11 @@ of ``index_put_``, on CUDA too: the same memory and cameras give the same bytes 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+import torch.utils.dlpack
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
@@ -21,15 +21,15 @@ from gvtools.memory.splat.cpu_kernels import CHANNELS, FAINTEST, SMALLEST
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras
     from gvtools.guidance import Guidance
-    from gvtools.memory.spatial_memory import SpatialMemory
-    from gvtools.memory.splat.api import SplatOptions, Target
+    from gvtools.memory.splat.api import FrameBuffers, SplatOptions
+    from gvtools.memory.store.store import Store
 
 # Pairs held at a time: about 120 bytes each.
 PAIRS = {"cpu": 1 << 20, "cuda": 1 << 24}
 
 
 def project_torch(
-    memory: SpatialMemory,
+    store: Store,
     cameras: Cameras,
     *,
     options: SplatOptions | None = None,
@@ -38,7 +38,7 @@ def project_torch(
     """Project the memory with torch; see gvtools.memory.projection.project.
 
     Args:
-        memory: what is projected.
+        store: what is projected.
         cameras: of one image size.
         options: see SplatOptions; its back end and device are overridden.
         device: "cpu", "cuda" or "auto".
@@ -50,8 +50,8 @@ def project_torch(
     from gvtools.memory.projection import project
     from gvtools.memory.splat.api import SplatOptions
 
-    options = replace(options or SplatOptions(), backend="torch", device=device)
-    return project(memory, cameras, options=options)
+    options = (options or SplatOptions()).replaced(backend="torch", device=device)
+    return project(store, cameras, options=options)
 
 
 def torch_device(name: str) -> torch.device:
@@ -67,27 +67,34 @@ def torch_device(name: str) -> torch.device:
 
 
 class TorchSplatter:
-    """Splats runs of a memory on one device; see gvtools.memory.splat.api.Splatter."""
+    """Splats segments of a memory on one device; see gvtools.memory.splat.api.Splatter."""
 
-    def __init__(self, memory: SpatialMemory, options: SplatOptions) -> None:
+    def __init__(self, store: Store, options: SplatOptions) -> None:
         self.options = options
         self.device = torch_device(options.device)
-        records, runs, n = memory.records, memory.runs, len(memory)
-        self.start = self._tensor(runs.start[: runs.count])
-        self.length = self._tensor(runs.length[: runs.count].astype(np.int64))
-        self.run_view = self._tensor(runs.view[: runs.count].astype(np.int64))
-        self.xyz = self._tensor(records.position)
-        self.color = self._tensor(records.color[:n])
-        self.trust = self._tensor(memory.confidence)
-        self.spacing = self._tensor(records.spacing[:n])
+        segments = store.segments
+        self.start = self._tensor(segments.start[: segments.count])
+        self.length = self._tensor(segments.length[: segments.count].astype(np.int64))
+        self.segment_view = self._tensor(segments.view[: segments.count].astype(np.int64))
+        self.xyz = self._column(store, "positions")
+        self.color = self._column(store, "colors")
+        self.confidence = self._column(store, "confidence")[:, 0]
+        self.spacing = self._column(store, "spacing")[:, 0]
         self.total = torch.empty(0)
+
+    def _column(self, store: Store, name: str) -> torch.Tensor:
+        """A column of the store; in the store's own memory where that is on this device."""
+        column = store.columns.tensor(name)
+        if not len(store):
+            return self._tensor(column.cpu().numpy())
+        return torch.utils.dlpack.from_dlpack(column.to_dlpack()).to(self.device)
 
     def _tensor(self, array: NDArray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
 
     def splat(
         self,
-        target: Target,
+        target: FrameBuffers,
         chosen: NDArray[np.int64],
         limit: NDArray[np.float32],
         *,
@@ -102,15 +109,15 @@ class TorchSplatter:
         zbuffer = limits.clone()
         rows, view = self._observations(chosen)
         u, v, z, size = self._project(target, rows)
-        ahead = z > target.near
+        ahead = z > target.z_near
         rows, view, u, v, z, size = (column[ahead] for column in (rows, view, u, v, z, size))
         for i, row, col in self._pairs(u, v, self.options.depth_reach * size, target.shape, sums):
             cell = row * width + col
             use = z[i] < limits[cell]
             zbuffer.scatter_reduce_(0, cell[use], z[i[use]], "amin")
         if blend:
-            farthest = zbuffer * (1 + self.options.band)
-            scale = self.trust[rows] * self._tensor(weight)[view]
+            farthest = zbuffer * (1 + self.options.depth_band)
+            scale = self.confidence[rows] * self._tensor(weight)[view]
             scale = scale.clamp(min=float(FAINTEST))
             self.total = torch.zeros((height * width, CHANNELS), device=self.device)
             reach = self.options.blend_reach * size
@@ -123,7 +130,7 @@ class TorchSplatter:
                 self._add(cell, kernel, scale[i], rows[i], z=z[i] / float(target.unit))
         return zbuffer.reshape(height, width).cpu().numpy()
 
-    def resolve(self, target: Target, open_: NDArray[np.bool_], *, generated: bool) -> None:
+    def resolve(self, target: FrameBuffers, open_: NDArray[np.bool_], *, generated: bool) -> None:
         """See gvtools.memory.splat.api.Splatter."""
         kernel, weight = self.total[:, 5], self.total[:, 3]
         done = self._tensor(open_.reshape(-1)) & (kernel >= self.options.support)
@@ -139,25 +146,25 @@ class TorchSplatter:
         target.valid.reshape(-1)[at] = True
 
     def _observations(self, chosen: NDArray[np.int64]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Rows of the chosen runs' observations, and the view of each."""
-        runs = self._tensor(chosen)
-        length = self.length[runs]
+        """Rows of the chosen segments' observations, and the view of each."""
+        segments = self._tensor(chosen)
+        length = self.length[segments]
         which = torch.repeat_interleave(length)
         within = torch.arange(len(which), device=self.device) - (length.cumsum(0) - length)[which]
-        return self.start[runs][which] + within, self.run_view[runs][which]
+        return self.start[segments][which] + within, self.segment_view[segments][which]
 
-    def _project(self, target: Target, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def _project(self, target: FrameBuffers, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Centre-of-pixel coordinates, depth and footprint width (pixels) of observations."""
         M = self._tensor(target.cam_from_local[:3].astype(np.float32))
         K = target.camera.K[0]
         # Component by component: a matrix product may be computed in TF32.
         x, y, w = self.xyz[rows].unbind(1)
         px, py, z = (M[k, 0] * x + M[k, 1] * y + M[k, 2] * w + M[k, 3] for k in range(3))
-        inverse = 1 / z.clamp(min=float(target.near))
+        inverse = 1 / z.clamp(min=float(target.z_near))
         u = (float(K[0, 0]) * px + float(K[0, 1]) * py) * inverse + float(K[0, 2] - 0.5)
         v = float(K[1, 1]) * py * inverse + float(K[1, 2] - 0.5)
         size = self.spacing[rows] * float(np.sqrt(K[0, 0] * K[1, 1])) * inverse
-        return u, v, z, size.clamp(1, self.options.size_cap)
+        return u, v, z, size.clamp(1, self.options.max_splat_px)
 
     def _pairs(
         self,

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras, concatenate
 from gvtools.memory.store.local_frame import LocalFrame
 
+# K (3, 3), cam_from_world (4, 4) and free-space grid (h, w) of one view (see PointSet).
+FreeGrid = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]
+
 
 @dataclass(frozen=True, eq=False)
 class SourceView:
@@ -53,9 +56,9 @@ class ViewTable:
         """All cameras, in the world frame; None when there are no views."""
         return concatenate([view.camera for view in self._views]) if self._views else None
 
-    def take(self, view: SourceView) -> int:
-        """The row of a view: the last one's where it goes on with it, else a new one."""
-        if not self._views or not _goes_on(self._views[-1], view):
+    def row_for(self, view: SourceView) -> int:
+        """The row of a view: the last one's where both are parts of one fusion, else a new one."""
+        if not self._views or not _continues(self._views[-1], view):
             return self.append(view)
         last = self._views[-1]
         if last.free_depth.shape == view.free_depth.shape:
@@ -76,8 +79,8 @@ class ViewTable:
         return len(self._views) - 1
 
 
-def _goes_on(last: SourceView, view: SourceView) -> bool:
-    """Whether both are one camera's, of one round and one kind: a fusion in parts."""
+def _continues(last: SourceView, view: SourceView) -> bool:
+    """Whether both are parts of one fusion: of one camera, round and kind."""
     one, two = last.camera, view.camera
     return (
         (last.round, last.generated, one.names) == (view.round, view.generated, two.names)

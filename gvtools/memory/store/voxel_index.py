@@ -11,6 +11,8 @@ the memory that is there, and the tables of one block lie together in the cache.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +36,19 @@ VOXEL_RANGE = (1e-25, 1e25)
 ORIGIN_STEP = 1 / 16
 SIZE_CLASSES = 16
 SMALLEST_CLASS = 2
+
+
+class IndexArrays(NamedTuple):
+    """The index as kernels take it, see VoxelIndex."""
+
+    keys: NDArray[np.int64]
+    ids: NDArray[np.int32]
+    pool_local: NDArray[np.uint16]
+    pool_head: NDArray[np.int32]
+    pool_state: NDArray[np.int64]
+    block_offset: NDArray[np.int64]
+    block_log2: NDArray[np.uint8]
+    block_count: NDArray[np.int32]
 
 
 @compiled(inline="always")
@@ -150,13 +165,15 @@ def find_voxel(pool_local, offset, log2, local):
 
 
 @compiled()
-def insert_voxel(pool_local, pool_head, pool_state, block_offset, block_log2, block_count, block,
-                 local):  # fmt: skip
+def insert_voxel(index, block, local):
     """Pool position of the voxel ``local`` of ``block``, made (with NO_RECORD) when it is new.
 
     The block's table doubles when three quarters full; tables given up are reused by size class:
     ``pool_state[0]`` is the end of the pool, ``pool_state[c]`` the first free table of 2**c.
     """
+    pool_local, pool_head, pool_state = index.pool_local, index.pool_head, index.pool_state
+    block_offset, block_log2 = index.block_offset, index.block_log2
+    block_count = index.block_count
     log2 = np.int64(block_log2[block])
     offset = block_offset[block]
     if log2 > 0:
@@ -203,6 +220,26 @@ def insert_voxel(pool_local, pool_head, pool_state, block_offset, block_log2, bl
     return offset + slot
 
 
+@compiled()
+def voxel_keys(positions, levels, inverse_edge, keys, locals_):
+    """Block key and place in the block of each point; EMPTY_KEY when it is out of reach."""
+    outside = 0
+    for i in range(len(positions)):
+        level = np.int64(levels[i])
+        keys[i], locals_[i] = voxel_key(positions[i], inverse_edge / (1 << level), level)
+        outside += keys[i] == EMPTY_KEY
+    return outside
+
+
+@compiled()
+def link_records(locals_, index, blocks, next_):
+    """Rebuild the voxel chains of records in their order (after loading or forgetting)."""
+    for i in range(len(locals_)):
+        slot = insert_voxel(index, blocks[i], locals_[i])
+        next_[i] = index.pool_head[slot]
+        index.pool_head[slot] = i
+
+
 class VoxelIndex:
     """The hash's arrays and their growth; the numba kernels of fusion write into them."""
 
@@ -210,8 +247,10 @@ class VoxelIndex:
         self.keys: NDArray[np.int64] = np.full(1024, EMPTY_KEY, np.int64)
         self.ids: NDArray[np.int32] = np.full(1024, -1, np.int32)
         self.blocks = 0
-        # Those that hold something; kept by who fills them.
+        # Voxels that hold something, as fusion counts them.
         self.voxels = 0
+        # The highest level of any voxel.
+        self.top = 0
         self.block_offset: NDArray[np.int64] = np.zeros(512, np.int64)
         self.block_log2: NDArray[np.uint8] = np.zeros(512, np.uint8)
         self.block_count: NDArray[np.int32] = np.zeros(512, np.int32)
@@ -219,6 +258,11 @@ class VoxelIndex:
         self.pool_head: NDArray[np.int32] = np.empty(4096, np.int32)
         self.pool_state: NDArray[np.int64] = np.full(SIZE_CLASSES, -1, np.int64)
         self.pool_state[0] = 0
+
+    @property
+    def arrays(self) -> IndexArrays:
+        """What kernels read and write."""
+        return IndexArrays(*(getattr(self, name) for name in IndexArrays._fields))
 
     @property
     def nbytes(self) -> int:

@@ -26,17 +26,17 @@ class VoxelLevels:
 
     Attributes:
         edge: of the finest voxels, scene units.
-        footprints: voxels are at most so many footprints of what they hold wide, or the finest
-            there are; 0 for the finest alone.
+        voxels_per_footprint: voxels are at most so many footprints of what they hold wide, or the
+            finest there are; 0 for the finest alone.
     """
 
     edge: float
-    footprints: float = 0.0
+    voxels_per_footprint: float = 0.0
 
     @property
     def per_spacing(self) -> float:
         """What spacings are multiplied with to tell their level, see ``level_of``."""
-        return self.footprints / self.edge * (1 + SLACK)
+        return self.voxels_per_footprint / self.edge * (1 + SLACK)
 
     def of(self, spacing: NDArray[np.float32]) -> NDArray[np.uint8]:
         """(N,) levels of points by their spacing (N,)."""

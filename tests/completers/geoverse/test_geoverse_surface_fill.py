@@ -73,7 +73,7 @@ def test_what_one_view_is_surer_of_is_carried_to_the_others(corner):
 def test_memory_stays_as_it_is_and_the_order_of_the_views_does_not_matter(corner):
     known = corner[0]
     fill = surface_fill([], known, shared=True)
-    turned = surface_fill([], known.rows([1, 0]), shared=True).rows([1, 0])
+    turned = surface_fill([], known.select([1, 0]), shared=True).rows([1, 0])
     for name in ("rgb", "depth", "confidence"):
         values = getattr(fill, name)
         np.testing.assert_array_equal(values, getattr(turned, name))
@@ -91,7 +91,7 @@ def test_every_call_gives_the_same_bits():
 
 def test_only_memory_is_certain_and_averages_are_the_least_so(corner):
     known = corner[0]
-    few = known.rows([0, 1])
+    few = known.select([0, 1])
     # Too few pixels for planes.
     few.valid[1] = False
     few.valid[1, 40, 60:70] = True

@@ -55,7 +55,7 @@ def test_thinning_keeps_the_most_confident_of_each_voxel(memory):
     kept = thinned(memory, None)
     cells = [
         tuple(cell)
-        for cell in np.floor(memory.records.position.astype(np.float64) * (1 / VOXEL)).astype(int)
+        for cell in np.floor(memory.columns.positions.astype(np.float64) * (1 / VOXEL)).astype(int)
     ]
     best: dict[tuple[int, ...], int] = {}
     for row, cell in enumerate(cells):
@@ -95,7 +95,7 @@ def test_ply_is_what_plyfile_reads(memory, saved, tmp_path):
 def test_an_earlier_round(memory, saved, tmp_path):
     run(saved, "--format", "ply", "--out", tmp_path / "cloud.ply", "--round", 1)
     vertex = PlyData.read(tmp_path / "cloud.ply")["vertex"]
-    rounds = memory.views.round[memory.records.view[: len(memory)]]
+    rounds = memory.views.round[memory.columns.view[: len(memory)]]
     assert vertex.count == int((rounds <= 1).sum())
     assert not vertex["generated"].any()
     with pytest.raises(OptionError, match="rounds 0, 1, 2"):
@@ -117,7 +117,7 @@ def test_colmap_reads_the_model_back(scene, memory, saved, tmp_path):
     colors = np.array([point.color for point in in_order])
     kept = thinned(memory, 1500)
     np.testing.assert_allclose(points, memory.positions[kept.rows])
-    np.testing.assert_array_equal(colors, memory.records.color[kept.rows])
+    np.testing.assert_array_equal(colors, memory.columns.colors[kept.rows])
     # Detections are those of the observations themselves: within a thinned voxel of the point.
     focal = scene.views[0].camera.K[0, 0, 0]
     model.update_point_3d_errors()
@@ -173,7 +173,7 @@ def test_glb_is_what_trimesh_reads(memory, saved, tmp_path):
     (cloud,) = scene.dump()
     kept = thinned(memory, None)
     np.testing.assert_allclose(cloud.vertices, memory.positions[kept.rows], atol=1e-6)
-    np.testing.assert_array_equal(cloud.colors[:, :3], memory.records.color[kept.rows])
+    np.testing.assert_array_equal(cloud.colors[:, :3], memory.columns.colors[kept.rows])
 
 
 def test_glb_keeps_millimetres_far_from_the_origin(scene, tmp_path):

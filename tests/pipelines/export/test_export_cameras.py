@@ -13,7 +13,6 @@ from PIL import Image
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ProjectError
-from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.views import SourceView
 from pipelines.commands import export
@@ -145,7 +144,7 @@ def test_track_elements_follow_the_renamed_views(scene, tmp_path):
         other.camera.K, other.camera.cam_from_world, other.camera.width, other.camera.height,
         ("view_0.png",),
     )  # fmt: skip
-    memory.fuse(back_project(frame.rgb, frame.depth, namesake), round=2, generated=True)
+    memory.observe(frame.rgb, frame.depth, namesake, round=2, generated=True)
     count = int(memory.generated.sum())
     assert count
     memory.save(tmp_path / "memory.npz")
@@ -176,7 +175,7 @@ def test_cameras_far_from_the_origin_are_told_apart(scene, tmp_path):
     beside[0, 0, 3] += 0.5
     near = Cameras(far[0].K, beside, far[0].width, far[0].height, ("a.png",))
     frame = scene.views[0].load()
-    memory.fuse(back_project(frame.rgb, frame.depth, far[0], frame=memory.frame), round=0)
+    memory.observe(frame.rgb, frame.depth, far[0], round=0)
     add_view(memory, near, "a.png", number=1, generated=True)
     memory.save(tmp_path / "memory.npz")
     run(tmp_path / "memory.npz", "--format", "colmap", "--out", tmp_path / "out")

@@ -214,7 +214,7 @@ def test_a_disk_that_fills_up_leaves_the_rounds_before(whole, scan, tmp_path, mo
         ("seed=-1", OptionError, "at least 0"),
         ("memory.observations_per_voxel=0", OptionError, "at least 1"),
         ("memory.weight_cap=0", OptionError, "at least 1e-20"),
-        ("memory.same_direction=-2", OptionError, "at least 0 and at most 180"),
+        ("memory.merge_angle_deg=-2", OptionError, "at least 0 and at most 180"),
         ("back_projection.edge=-5", OptionError, "more than 0"),
         ("back_projection.grazing=2", OptionError, "less than 1"),
         ("fusion.voxel_percentile=300", OptionError, "at most 100"),

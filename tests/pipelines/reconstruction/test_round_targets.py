@@ -13,7 +13,7 @@ from memory_scenes import camera, random_memory
 
 from gvtools.cameras import concatenate
 from gvtools.kernels import run_beside_each_other
-from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.reconstruction.plan import Plan
 from pipelines.reconstruction.round_targets import RoundTargets
@@ -58,10 +58,10 @@ def test_rounds_are_the_plans_whether_looked_at_ahead_or_not(memory):
 
 
 def test_an_error_comes_where_the_round_begins(memory, monkeypatch):
-    def broken(self: FollowedCamera, snapshot: Any) -> None:
+    def broken(self: CachedProjection, snapshot: Any) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(FollowedCamera, "look", broken)
+    monkeypatch.setattr(CachedProjection, "prefetch", broken)
     with RoundTargets(plan(1, 1), memory) as targets:
         targets.look_ahead(2)
         with pytest.raises(ZeroDivisionError):
@@ -69,7 +69,7 @@ def test_an_error_comes_where_the_round_begins(memory, monkeypatch):
 
 
 def test_a_run_that_is_stopped_waits_for_one_target_at_most(memory, monkeypatch):
-    monkeypatch.setattr(FollowedCamera, "look", lambda self, snapshot: time.sleep(0.5))
+    monkeypatch.setattr(CachedProjection, "prefetch", lambda self, snapshot: time.sleep(0.5))
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt), RoundTargets(plan(1, 20), memory) as targets:
         targets.look_ahead(2)

@@ -8,9 +8,8 @@ import pytest
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completer, Completion, ScaleAlignment, ScaleStatus
 from gvtools.errors import ShapeError
-from gvtools.guidance import Guidance, together
-from gvtools.memory.back_projection import back_project
-from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.guidance import Guidance, concatenate
+from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.reconstruction.rounds import Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
@@ -53,7 +52,7 @@ def memory() -> SpatialMemory:
     out = SpatialMemory(0.02)
     seen = camera("seen", (24, 32))
     rgb = np.full((24, 32, 3), 200, np.uint8)
-    out.fuse(back_project(rgb, np.full((24, 32), 2, np.float32), seen, frame=out.frame), round=0)
+    out.observe(rgb, np.full((24, 32), 2, np.float32), seen, round=0)
     return out
 
 
@@ -65,7 +64,7 @@ def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras])
         calls.append(cameras.names[0])
         return project(cameras, **options)
 
-    followed = [FollowedCamera(memory, target, reuse=False) for target in targets]
+    followed = [CachedProjection(memory, target, reuse=False) for target in targets]
     for target in followed:
         target.guidance()
     memory.project = counted  # type: ignore[method-assign]
@@ -133,12 +132,12 @@ def test_nothing_is_projected_again_while_nothing_is_fused(memory):
 
 def test_guidance_of_one_size_makes_a_batch_and_of_two_sizes_is_refused(memory):
     views = [memory.project(camera(f"t{i}", (24, 32), x=0.1 * i)) for i in range(2)]
-    both = together(views)
+    both = concatenate(views)
     assert both.cameras.names == ("t0", "t1")
     for index, view in enumerate(views):
         assert np.array_equal(both[index].rgb, view.rgb)
         assert np.array_equal(both[index].valid, view.valid)
     with pytest.raises(ShapeError, match="2 picture sizes"):
-        together([*views, memory.project(camera("t2", (32, 24)))])
+        concatenate([*views, memory.project(camera("t2", (32, 24)))])
     with pytest.raises(ShapeError, match="0 picture sizes"):
-        together([])
+        concatenate([])

@@ -99,7 +99,9 @@ def test_a_run_takes_the_measured_edge_unless_told_otherwise(scan):
     wide = make_plan(
         scene, with_texts(RunSettings(), [*texts, "fusion.max_psnr_drop_db=100"])
     ).config
-    assert wide.memory.footprints == SCALES[-1] * RunSettings().memory.footprints
+    assert (
+        wide.memory.voxels_per_footprint == SCALES[-1] * RunSettings().memory.voxels_per_footprint
+    )
     assert edges["accurate"] <= edges["balanced"] and edges["given"] == 0.0123
     with pytest.raises(OptionError, match=r"fusion\.max_psnr_drop_db"):
         with_texts(RunSettings(), ["fusion.max_psnr_drop_db=-1"])

@@ -86,7 +86,7 @@ def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
     arguments = ["tradeoff", "scan", "--out", "out", "--config", str(file)]
     args = build_parser().parse_args(arguments + [word for text in own for word in ("--set", text)])
     start = asked_for(args)
-    assert start.profile == "accurate" and start.memory.same_direction == 0
+    assert start.profile == "accurate" and start.memory.merge_angle_deg == 0
     for name in RunSettings.profiles:
         wanted = with_texts(with_profile(RunSettings(), name), ["effort.inpaint_below=0.07"])
         wanted = with_texts(wanted, [text for text in own if "profile" not in text])

@@ -194,7 +194,7 @@ def test_a_value_of_ones_own_takes_its_place_among_the_others():
     config = with_values(RunSettings(), {"savings.depth_from_memory": 0.95})
     values = axes_of("da3", config)["views explained, share of pixels"]
     assert list(values) == ["0.8", "0.9", "0.95", "as found"] and values["0.95"] == {}
-    config = with_values(RunSettings(), {"memory.footprints": 0.0})
+    config = with_values(RunSettings(), {"memory.voxels_per_footprint": 0.0})
     assert list(axes_of("recorded", config)["far voxels, footprints"]) == ["1", "0"]
 
 

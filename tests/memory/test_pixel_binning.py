@@ -23,7 +23,7 @@ def camera(width: int, height: int) -> Cameras:
 
 def blocks(width: float, footprints: float = 0.0) -> dict[str, Any]:
     """Blocks as wide as a voxel's edge."""
-    return {"levels": VoxelLevels(width, footprints), "joined": 1.0}
+    return {"levels": VoxelLevels(width, footprints), "pixel_binning": 1.0}
 
 
 def wall(width: int, height: int, z: float) -> tuple[np.ndarray, np.ndarray]:
@@ -32,23 +32,23 @@ def wall(width: int, height: int, z: float) -> tuple[np.ndarray, np.ndarray]:
     return rgb, np.full((height, width), z, np.float32)
 
 
-def test_a_joined_point_is_the_mean_of_its_four_pixels():
+def test_a_binned_point_is_the_mean_of_its_four_pixels():
     rgb, depth = wall(8, 6, NEAR)
     every = back_project(rgb, depth, camera(8, 6))
-    joined = back_project(rgb, depth, camera(8, 6), **blocks(2 * NEAR / FOCAL))
-    assert len(every) == 48 and len(joined) == 12
+    binned = back_project(rgb, depth, camera(8, 6), **blocks(2 * NEAR / FOCAL))
+    assert len(every) == 48 and len(binned) == 12
     shape = (3, 2, 4, 2)
     for name in ("positions", "colors", "confidence", "spacing"):
         values = getattr(every, name).astype(np.float64)
         mean = values.reshape(*shape, -1).mean((1, 3)).reshape(12, -1)
         tolerance = 0.5 if name == "colors" else 1e-6
-        found = getattr(joined, name).reshape(12, -1)
+        found = getattr(binned, name).reshape(12, -1)
         np.testing.assert_allclose(found, mean, atol=tolerance)
-    assert joined.dropped == every.dropped
-    np.testing.assert_array_equal(joined.free_depth, every.free_depth)
+    assert binned.dropped == every.dropped
+    np.testing.assert_array_equal(binned.free_depth, every.free_depth)
 
 
-def test_only_blocks_that_are_narrow_enough_are_joined():
+def test_only_blocks_that_are_narrow_enough_are_binned():
     rgb, depth = wall(16, 8, NEAR)
     depth[:, 8:] = FAR
     between = back_project(rgb, depth, camera(16, 8), **blocks(3 * NEAR / FOCAL))
@@ -59,7 +59,7 @@ def test_only_blocks_that_are_narrow_enough_are_joined():
     assert (~near).sum() == (every.positions[:, 2] == FAR).sum()
 
 
-def test_far_blocks_are_joined_where_voxels_widen_with_them():
+def test_far_blocks_are_binned_where_voxels_widen_with_them():
     rgb, depth = wall(16, 8, NEAR)
     depth[:, 8:] = FAR
     every = back_project(rgb, depth, camera(16, 8), options=STEEP)
@@ -77,13 +77,13 @@ def test_what_is_not_whole_is_kept_pixel_by_pixel(width: int, height: int):
     mask = np.ones(depth.shape, bool)
     mask[0, 0] = False
     lifted = len(back_project(rgb, depth, camera(width, height), mask=mask))
-    joined = back_project(rgb, depth, camera(width, height), mask=mask, **blocks(1.0))
+    binned = back_project(rgb, depth, camera(width, height), mask=mask, **blocks(1.0))
     # The corner's block is not whole, nor are those at an odd side's end.
     whole = max((width // 2) * (height // 2) - 1, 0)
-    assert len(joined) == lifted - 3 * whole
+    assert len(binned) == lifted - 3 * whole
 
 
-def test_steep_surfaces_keep_their_points_and_nothing_is_joined_across_a_step():
+def test_steep_surfaces_keep_their_points_and_nothing_is_binned_across_a_step():
     width, height, limit = 24, 16, 2.5 * NEAR / FOCAL
     x = (np.arange(width) + 0.5 - width / 2) / FOCAL
     rgb, _ = wall(width, height, NEAR)
@@ -93,16 +93,16 @@ def test_steep_surfaces_keep_their_points_and_nothing_is_joined_across_a_step():
         depth = np.tile((NEAR / (1 - slope * x)).astype(np.float32), (height, 1))
         depth[:, (depth[0] > 1.2) | (depth[0] < 0.8)] = 0
         every = back_project(rgb, depth, camera(width, height), options=STEEP)
-        joined = back_project(rgb, depth, camera(width, height), options=STEEP, **blocks(limit))
-        counts.append(len(joined) / len(every))
+        binned = back_project(rgb, depth, camera(width, height), options=STEEP, **blocks(limit))
+        counts.append(len(binned) / len(every))
     assert counts[0] < 0.5 and counts[1] == 1
     _, step = wall(width, height, 2.0)
     step[:, 11:] = 2.6
-    joined = back_project(
+    binned = back_project(
         rgb, step, camera(width, height), options=STEEP, **blocks(2.5 * 2.6 / FOCAL)
     )
-    assert np.isin(joined.positions[:, 2], np.array([2.0, 2.6], np.float32)).all()
-    assert len(joined) < width * height / 3
+    assert np.isin(binned.positions[:, 2], np.array([2.0, 2.6], np.float32)).all()
+    assert len(binned) < width * height / 3
 
 
 @pytest.mark.parametrize("confidence", [1e-45, 1.0, 3e38])
@@ -110,6 +110,6 @@ def test_any_confidence_is_kept(confidence):
     rgb, depth = wall(8, 6, NEAR)
     trust = np.full(depth.shape, confidence, np.float32)
     with np.errstate(all="raise"):
-        joined = back_project(rgb, depth, camera(8, 6), confidence=trust, **blocks(1e300))
-    assert len(joined) == 12 and np.isfinite(joined.confidence).all()
-    assert (joined.confidence > 0).all()
+        binned = back_project(rgb, depth, camera(8, 6), confidence=trust, **blocks(1e300))
+    assert len(binned) == 12 and np.isfinite(binned.confidence).all()
+    assert (binned.confidence > 0).all()

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
-from gvtools.depth.from_memory import explained_depth
-from gvtools.memory.back_projection import back_project
+from gvtools.depth.from_memory import depth_from_memory
 from gvtools.memory.spatial_memory import SpatialMemory
 
 SIZE = (60, 80)
@@ -37,14 +36,14 @@ def memory() -> SpatialMemory:
     out = SpatialMemory(0.02)
     for x in (-0.2, 0.2):
         rgb, depth = wall(x)
-        out.fuse(back_project(rgb, depth, camera(x), frame=out.frame), round=0)
+        out.observe(rgb, depth, camera(x), round=0)
     return out
 
 
 @pytest.mark.parametrize("gain", [1.0, 0.8, 1.2])
 def test_a_view_between_two_is_explained_at_any_exposure(memory, gain):
     rgb, depth = wall()
-    found = explained_depth(memory, camera(), (rgb * gain).astype(np.uint8), least=0.9)
+    found = depth_from_memory(memory, camera(), (rgb * gain).astype(np.uint8), least=0.9)
     assert found is not None and found.source == "memory"
     known = found.depth > 0
     assert known.mean() > 0.95
@@ -59,7 +58,7 @@ def test_a_dark_photograph_of_something_else_is_not_explained(what):
     smooth = np.repeat((100 + 1.5 * column).astype(np.uint8)[..., None], 3, -1)
     depth = np.full(SIZE, 2, np.float32)
     known = SpatialMemory(0.02)
-    known.fuse(back_project(smooth, depth, camera(), frame=known.frame), round=0)
+    known.observe(smooth, depth, camera(), round=0)
     pictures: dict[str, np.ndarray] = {
         "black": np.zeros_like(smooth),
         "noise": np.random.default_rng(0).integers(0, 50, smooth.shape),
@@ -67,16 +66,16 @@ def test_a_dark_photograph_of_something_else_is_not_explained(what):
         "checks": np.where((row // 8 + column // 8) % 2, 80, 20)[..., None].repeat(3, -1),
     }
     rgb = pictures[what].astype(np.uint8)
-    assert explained_depth(known, camera(), rgb, least=0.85) is None
-    assert explained_depth(known, camera(), smooth // 3, least=0.85) is not None
+    assert depth_from_memory(known, camera(), rgb, least=0.85) is None
+    assert depth_from_memory(known, camera(), smooth // 3, least=0.85) is not None
 
 
 def test_what_looks_different_is_not_explained(memory):
     rgb, _ = wall()
     rgb = rgb.copy()
     rgb[10:50, 30:60] = np.where(rgb[10:50, 30:60] > 120, 0, 255)
-    assert explained_depth(memory, camera(), rgb, least=0.9) is None
-    found = explained_depth(memory, camera(), rgb, least=0.5)
+    assert depth_from_memory(memory, camera(), rgb, least=0.9) is None
+    found = depth_from_memory(memory, camera(), rgb, least=0.5)
     assert found is not None
     assert (found.depth[14:46, 34:56] == 0).mean() > 0.9
     assert (found.depth[:, :26] > 0).mean() > 0.9
@@ -84,13 +83,12 @@ def test_what_looks_different_is_not_explained(memory):
 
 def test_a_view_of_elsewhere_is_not_explained(memory):
     rgb, _ = wall(1.0)
-    assert explained_depth(memory, camera(1.0), rgb, least=0.9) is None
-    assert explained_depth(SpatialMemory(0.02), camera(), rgb, least=0.1) is None
+    assert depth_from_memory(memory, camera(1.0), rgb, least=0.9) is None
+    assert depth_from_memory(SpatialMemory(0.02), camera(), rgb, least=0.1) is None
 
 
 def test_what_was_generated_explains_nothing():
     memory = SpatialMemory(0.02)
     rgb, depth = wall()
-    points = back_project(rgb, depth, camera(), frame=memory.frame)
-    memory.fuse(points, round=1, generated=True)
-    assert explained_depth(memory, camera(), rgb, least=0.1) is None
+    memory.observe(rgb, depth, camera(), round=1, generated=True)
+    assert depth_from_memory(memory, camera(), rgb, least=0.1) is None

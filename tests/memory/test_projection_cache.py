@@ -12,7 +12,7 @@ from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.projection import _Projection
-from gvtools.memory.projection_cache import FollowedCamera
+from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.cpu import CpuSplatter
@@ -55,7 +55,7 @@ def memory() -> SpatialMemory:
 @pytest.mark.parametrize("backend", ["cpu", "torch", "nearest"])
 def test_the_picture_is_that_of_a_whole_projection_after_every_change(memory, backend):
     options = SplatOptions(backend=backend)
-    target = FollowedCamera(memory, camera(-1.2, -0.3), options=options)
+    target = CachedProjection(memory, camera(-1.2, -0.3), options=options)
     seen = [target.guidance()]
 
     def check() -> None:
@@ -77,7 +77,7 @@ def test_the_picture_is_that_of_a_whole_projection_after_every_change(memory, ba
 
 
 def test_an_unchanged_memory_gives_the_same_guidance(memory):
-    target = FollowedCamera(memory, camera(0.2))
+    target = CachedProjection(memory, camera(0.2))
     assert target.guidance() is target.guidance()
 
 
@@ -86,13 +86,13 @@ def test_observed_views_are_splatted_once(memory, monkeypatch):
     original = CpuSplatter.splat
 
     def counted(self, target, chosen, limit, **options):
-        splatted.append(int((~memory.views.generated[memory.runs.view[chosen]]).sum()))
+        splatted.append(int((~memory.views.generated[memory.segments.view[chosen]]).sum()))
         return original(self, target, chosen, limit, **options)
 
     monkeypatch.setattr(CpuSplatter, "splat", counted)
     options = SplatOptions(occluders=False)
     for reuse in (True, False):
-        target = FollowedCamera(memory, camera(-1.2, -0.3), options=options, reuse=reuse)
+        target = CachedProjection(memory, camera(-1.2, -0.3), options=options, reuse=reuse)
         target.guidance()
         assert sum(splatted) > 0
         splatted.clear()
@@ -104,7 +104,7 @@ def test_observed_views_are_splatted_once(memory, monkeypatch):
 
 
 def test_a_camera_that_sees_nothing_sees_what_comes(memory):
-    away = FollowedCamera(memory, camera(0.0, np.pi))
+    away = CachedProjection(memory, camera(0.0, np.pi))
     assert not away.guidance().valid.any()
     fuse(memory, camera(0.0, np.pi), 5, generated=True, round=1)
     assert same(away.guidance(), memory.project(away.camera))
@@ -114,17 +114,17 @@ def test_a_camera_that_sees_nothing_sees_what_comes(memory):
 def test_looking_ahead_beside_fusions_gives_the_picture_of_a_whole_projection(memory):
     """As a run does: generated content of a round arrives while the next round is looked at."""
     fuse(memory, camera(-0.6, -0.2), 3, generated=True, round=1)
-    targets = [FollowedCamera(memory, camera(x, -0.2)) for x in np.linspace(-1.5, 1.5, 12)]
+    targets = [CachedProjection(memory, camera(x, -0.2)) for x in np.linspace(-1.5, 1.5, 12)]
     snapshot = memory.snapshot()
 
     def look() -> None:
         for target in targets:
-            target.look(snapshot)
+            target.prefetch(snapshot)
 
     with ThreadPoolExecutor(1) as pool:
         looked = pool.submit(look)
         for number in range(8):
-            # Into the runs that are there, and into new ones.
+            # Into the segments that are there, and into new ones.
             fuse(memory, camera(0.2 * number - 0.8, -0.2), 4 + number, generated=True, round=1)
         looked.result()
 
@@ -137,7 +137,7 @@ def test_looking_ahead_beside_fusions_gives_the_picture_of_a_whole_projection(me
     for target, guidance in zip(targets, seen, strict=True):
         assert same(guidance, memory.project(target.camera))
     # What was observed since makes a look worthless.
-    targets[0].look(memory.snapshot())
+    targets[0].prefetch(memory.snapshot())
     fuse(memory, camera(-1.5, -0.2), 99, generated=False, round=2)
     assert same(targets[0].guidance(), memory.project(targets[0].camera))
 

@@ -1,0 +1,277 @@
+"""What a memory keeps: observations, their segments, the views and the voxel index."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from copy import copy
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from gvtools.errors import OptionError
+from gvtools.memory.store.columns import Columns, Segments
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.memory.store.views import FreeGrid, ViewTable
+from gvtools.memory.store.voxel_index import (
+    MAX_VOXEL,
+    VoxelIndex,
+    check_grid,
+    link_records,
+    voxel_keys,
+)
+from gvtools.memory.store.voxel_levels import VoxelLevels
+from gvtools.settings import Settings
+
+if TYPE_CHECKING:
+    import open3d as o3d
+
+S = TypeVar("S", bound="Store")
+
+
+class MemoryOptions(Settings):
+    """How observations are kept."""
+
+    section = "memory"
+
+    merge_angle_deg: float = Field(2.0, ge=0, le=180)
+    """Observations of one voxel seen from directions closer than this merge when the new one is no
+    finer, degrees."""
+    min_detail_ratio: float = Field(0.7, ge=0, le=1)
+    """A new observation whose spacing is below this share of the old one's stands on its own, so
+    that a close-up is not averaged into a distant view."""
+    observations_per_voxel: int = Field(12, ge=1)
+    """Longest chain; beyond it the most similar observation takes the new one in."""
+    weight_cap: float = Field(100.0, ge=1e-20, le=1e20)
+    """Confidence saturates here; so it does where what a view adds is below 2⁻²⁴ of what is
+    there."""
+    voxels_per_footprint: float = Field(1.0, ge=0)
+    """An observation goes into a voxel at most so many times as wide as its spacing where that is
+    wider than the memory's edge: twice, four times, ... to 128 times that edge. 0 has one edge
+    throughout."""
+    free_space_tolerance: float = Field(0.03, ge=0, lt=1)
+    """Share of depth that a generated point may stand in front of an observed surface."""
+
+
+class Store:
+    """Observations in voxels, the views that they come from, and what rounds added to others.
+
+    It grows, forgets and rebuilds its index; it knows nothing of fusion, projection or files.
+
+    Args:
+        voxel: edge of the finest voxels, scene units.
+        origin: (3,) float64 world point that positions are held relative to, so that float32
+            keeps millimetres in a georeferenced scene.
+        axes: (3, 3) rotation whose columns are the voxel grid's axes in the world frame; None for
+            the world's own. See LocalFrame.
+        options: see MemoryOptions.
+        device: where the tensors live, "cpu" or "cuda:0". Memories grow on the CPU; on another
+            device they can be projected by the torch back end and used by Open3D, see ``to``.
+
+    Attributes:
+        columns: the observations.
+        segments: contiguous observations of one block and view.
+        views: from where they were seen.
+        index: which voxel holds which.
+        agreements: per round and fusion, (rows, confidence that it added to these observations of
+            earlier rounds, their confidence before).
+        changes: how often something was fused or forgotten.
+        observed_changes: how often that touched observed content.
+    """
+
+    def __init__(
+        self,
+        voxel: float,
+        *,
+        origin: ArrayLike = (0.0, 0.0, 0.0),
+        axes: ArrayLike | None = None,
+        options: MemoryOptions | None = None,
+        device: str = "cpu",
+    ) -> None:
+        self.voxel = float(voxel)
+        self.frame = LocalFrame.at(origin, axes)
+        check_grid(self.voxel, self.origin)
+        self.options = options or MemoryOptions()
+        self.columns = Columns(device)
+        self.segments = Segments()
+        self.views = ViewTable(self.frame)
+        self.levels = VoxelLevels(self.voxel, self.options.voxels_per_footprint)
+        self.index = VoxelIndex()
+        self.agreements: dict[
+            int, list[tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]]
+        ] = {}
+        self.changes = self.observed_changes = 0
+
+    @property
+    def origin(self) -> NDArray[np.float64]:
+        """(3,) world point that positions are held relative to."""
+        return self.frame.origin
+
+    @property
+    def reach(self) -> float:
+        """How far from the origin, along each axis, the finest voxels go, scene units."""
+        return MAX_VOXEL * self.voxel
+
+    @property
+    def rounds(self) -> tuple[int, ...]:
+        """The rounds that views were fused in, in order."""
+        return tuple(sorted(set(self.views.round.tolist())))
+
+    @property
+    def voxels(self) -> int:
+        """Number of occupied voxels."""
+        return self.index.voxels
+
+    @property
+    def cloud(self) -> o3d.t.geometry.PointCloud:
+        """The observations: a point cloud whose attributes lie in the store's own memory.
+
+        ``positions`` (N, 3) float32 in the memory's frame (``frame.to_world`` gives the world's),
+        ``colors`` (N, 3) uint8 and, (N, 1) each, ``confidence`` and ``spacing`` float32, ``round``
+        uint16, ``view`` int32, ``generated`` and ``level`` uint8. It is the slice in use at the
+        time; after a fusion take it anew. What changes it in place changes the memory, whose voxel
+        index does not follow: ``clone`` it before moving points.
+        """
+        return self.columns.cloud()
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(N, 3) float64, world frame, scene units."""
+        return self.frame.to_world(self.columns.positions)
+
+    @property
+    def confidence(self) -> NDArray[np.float32]:
+        """(N,) float32: own confidence and what later rounds added, capped."""
+        return self.columns.confidence
+
+    @property
+    def generated(self) -> NDArray[np.bool_]:
+        """(N,) bool."""
+        return self.columns.generated.view(np.bool_)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of everything that is kept, without spare capacity."""
+        grids = sum(self.views[i].free_depth.nbytes for i in range(len(self.views)))
+        agreed = sum(array.nbytes for log in self.agreements.values() for e in log for array in e)
+        return self.columns.nbytes + self.segments.nbytes + self.index.nbytes + grids + agreed
+
+    def __len__(self) -> int:
+        """Number of stored observations."""
+        return self.columns.count
+
+    def __repr__(self) -> str:
+        generated = int(self.generated.sum())
+        where = "" if self.columns.device == "cpu" else f" on {self.columns.device}"
+        return (
+            f"{type(self).__name__}({len(self):,} observations ({generated:,} generated) in "
+            f"{self.voxels:,} voxels of {self.voxel:g}, {len(self.views)} views, "
+            f"rounds {self.rounds!r}, {self.nbytes / 2**20:.1f} MiB{where})"
+        )
+
+    def observed_grids(self, rows: Iterable[int]) -> list[FreeGrid]:
+        """K, cam_from_local and free-space grid of the observed views among ``rows``."""
+        views = self.views
+        return [
+            (views[i].camera.K[0], views.cam_from_local[i], views[i].free_depth)
+            for i in rows
+            if not views.generated[i]
+        ]
+
+    def agree(self, rows: NDArray[np.int32], weights: NDArray[np.float32], *, round: int) -> None:
+        """Raise the confidence of ``rows``, each once, up to the cap; ``forget`` can undo it."""
+        confidence = self.columns.arrays.confidence
+        before = confidence[rows]
+        with np.errstate(over="ignore"):
+            confidence[rows] = np.minimum(before + weights, np.float32(self.options.weight_cap))
+        self.agreements.setdefault(round, []).append((rows, weights, before))
+
+    def own_confidence(self) -> NDArray[np.float32]:
+        """(N,) float32, a copy: confidence without what later rounds added."""
+        own = self.columns.confidence.copy()
+        for round_ in sorted(self.agreements, reverse=True):
+            for rows, _, before in reversed(self.agreements[round_]):
+                own[rows] = before
+        return own
+
+    def forget(self, *, round: int) -> int:
+        """Undo a round: its views, its observations and the confidence it added elsewhere.
+
+        After the last round is forgotten, the memory is bit for bit what it was before it. When an
+        earlier round is forgotten, later ones keep what they stored.
+
+        Returns:
+            How many observations were removed.
+
+        Raises:
+            OptionError: no view was fused in that round.
+        """
+        if round not in self.rounds:
+            raise OptionError(f"round {round} is not in the memory; it has rounds {self.rounds}")
+        self.changes += 1
+        self.observed_changes += 1
+        columns, views, count = self.columns, self.views, len(self)
+        keep_view = views.round != round
+        new_view = (np.cumsum(keep_view) - 1).astype(np.int32)
+        keep = keep_view[columns.view]
+        new_row = (np.cumsum(keep) - 1).astype(np.int32)
+        columns.arrays.confidence[:count] = self.own_confidence()
+        logs, self.agreements = self.agreements, {}
+        columns.replace(int(keep.sum()), lambda name: getattr(columns, name)[keep])
+        columns.view[:] = new_view[columns.view]
+        self.views = ViewTable(self.frame, [views[int(i)] for i in np.flatnonzero(keep_view)])
+        for number in sorted(set(logs) - {round}):
+            for rows, weights, _ in logs[number]:
+                self.agree(new_row[rows[keep[rows]]], weights[keep[rows]], round=number)
+        # A segment holds one view's observations, so it stays or goes as a whole.
+        segments, n = self.segments, self.segments.count
+        stays = keep_view[segments.view[:n]]
+        self.segments = Segments()
+        self.segments.append(
+            new_row[segments.start[:n][stays]], segments.length[:n][stays],
+            new_view[segments.view[:n][stays]], segments.box[:n][stays],
+        )  # fmt: skip
+        self.rebuild_index()
+        return count - len(self)
+
+    def rebuild_index(self) -> None:
+        """Make the voxel index anew from the observations (after loading or forgetting)."""
+        count, columns = len(self), self.columns
+        keys, locals_ = np.empty(count, np.int64), np.empty(count, np.uint16)
+        inverse = 1.0 / self.voxel
+        if voxel_keys(columns.positions, columns.level, inverse, keys, locals_):
+            raise OptionError(f"observations lie beyond the reach of voxels of {self.voxel:g}")
+        self.index = VoxelIndex()
+        self.index.top = int(columns.level.max(initial=0))
+        blocks = self.index.block_numbers(keys)
+        self.index.reserve_voxels(count, np.unique(blocks))
+        link_records(locals_, self.index.arrays, blocks, columns.arrays.next)
+        self.index.voxels = int(self.index.block_count[: self.index.blocks].sum())
+
+    def snapshot(self: S) -> S:
+        """This memory as it is now, for looking at what was observed beside later fusions.
+
+        The arrays are shared, so generated observations may still change in it. Neither of the two
+        must be fused into or forgotten from but for generated content in the original.
+        """
+        other = copy(self)
+        other.columns, other.segments = copy(self.columns), copy(self.segments)
+        other.views = ViewTable(self.frame, [self.views[i] for i in range(len(self.views))])
+        return other
+
+    def recolored(self: S, colors: NDArray[np.uint8]) -> S:
+        """A snapshot with other colours (N, 3); nothing else is copied."""
+        other = self.snapshot()
+        other.columns = self.columns.with_colors(colors)
+        return other
+
+    def to(self: S, device: str) -> S:
+        """A snapshot whose tensors are a copy on a device.
+
+        Raises:
+            OptionError: Open3D has no such device here.
+        """
+        other = self.snapshot()
+        other.columns = self.columns.to(device)
+        return other

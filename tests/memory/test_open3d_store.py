@@ -1,0 +1,213 @@
+"""The store is an Open3D point cloud: shared memory, growth, and Open3D's operations on it."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import open3d as o3d
+import pytest
+import torch
+from memory_scenes import camera, plane_view, points, random_memory
+
+from gvtools.errors import DegenerateError, OptionError, ShapeError
+from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+from gvtools.memory.splat.api import SplatOptions
+from gvtools.memory.splat.torch_splatter import TorchSplatter
+from gvtools.memory.store.columns import ATTRIBUTES, Columns
+
+SIZE = {"width": 40, "height": 30, "focal": 40}
+
+
+def _attribute(memory: SpatialMemory, name: str) -> np.ndarray:
+    return memory.cloud.point[name].numpy()
+
+
+def test_the_cloud_holds_every_attribute_in_the_memory_that_kernels_write():
+    memory = random_memory(3)
+    arrays = memory.columns.arrays
+    for name in ATTRIBUTES:
+        found = _attribute(memory, name)
+        ours = arrays.view_row if name == "view" else getattr(arrays, name)
+        assert np.shares_memory(found, ours), name
+        assert found.shape == (len(memory), 3 if name in ("positions", "colors") else 1)
+    world = memory.frame.to_world(_attribute(memory, "positions"))
+    np.testing.assert_array_equal(world, memory.positions)
+    view = _attribute(memory, "view")[:, 0]
+    np.testing.assert_array_equal(_attribute(memory, "round")[:, 0], memory.views.round[view])
+    for expected in (memory.generated, memory.views.generated[view]):
+        np.testing.assert_array_equal(_attribute(memory, "generated")[:, 0], expected)
+
+
+def test_an_agreement_shows_in_a_cloud_that_was_taken_before():
+    memory = SpatialMemory(0.5)
+    memory.fuse(points([(0.1, 0.1, 2.1)], confidence=0.5), round=0)
+    memory.columns.reserve(10)
+    cloud = memory.cloud
+    memory.fuse(points([(0.3, 0.3, 2.3)], confidence=0.75), round=1)
+    assert cloud.point.confidence.numpy().tolist() == [[1.25]]
+
+
+def test_growth_keeps_what_is_there_and_a_cloud_of_before_stays_whole():
+    memory = SpatialMemory(0.02)
+    memory.observe(*_frame(2.0), round=0)
+    cloud, count = memory.cloud, len(memory)
+    before = cloud.point.positions.numpy().copy()
+    for number in range(1, 4):
+        memory.observe(*_frame(2.0 + number), round=number)
+    assert len(memory) == 4 * count
+    np.testing.assert_array_equal(_attribute(memory, "positions")[:count], before)
+    np.testing.assert_array_equal(cloud.point.positions.numpy(), before)
+    for number in (3, 1):
+        memory.forget(round=number)
+    assert set(_attribute(memory, "round")[:, 0].tolist()) == {0, 2}
+    assert np.shares_memory(_attribute(memory, "spacing"), memory.columns.arrays.spacing)
+
+
+def _frame(depth: float):
+    rgb = np.full((30, 40, 3), 90, np.uint8)
+    return rgb, np.full((30, 40), depth, np.float32), camera(**SIZE)
+
+
+def test_reserving_doubles_and_leaves_spare_rows():
+    columns = Columns()
+    for _ in range(100):
+        columns.reserve(7)
+        columns.count += 7
+    assert len(columns.positions) == 700 <= len(columns.arrays.positions) <= 1400
+
+
+def test_the_torch_back_end_reads_the_store_in_place():
+    memory = random_memory(2)
+    splatter = TorchSplatter(memory, SplatOptions(backend="torch", device="cpu"))
+    for tensor, name in ((splatter.xyz, "positions"), (splatter.confidence, "confidence")):
+        assert np.shares_memory(tensor.numpy(), getattr(memory.columns.arrays, name))
+
+
+def test_observing_is_lifting_and_fusing():
+    one, two = SpatialMemory(0.05), SpatialMemory(0.05)
+    report = one.observe(*_frame(2.0), round=0, mask=np.arange(1200).reshape(30, 40) % 2 == 0)
+    assert report.dropped["masked"] == 600 and report.added == len(one) > 0
+    assert one.observe(*_frame(3.0), round=1, generated=True).rejected_free == 0
+    whole = two.observe(*_frame(2.0), round=0)
+    lifted = plane_view(camera(**SIZE), 2.0)
+    assert whole.points == len(lifted) and not whole.dropped["masked"]
+    assert (report + whole).dropped["masked"] == 600
+
+
+def test_open3d_works_on_the_cloud_as_on_any():
+    memory = random_memory(3, most=200)
+    cloud, positions = memory.cloud, memory.columns.positions
+    low, high = np.percentile(positions, 30, axis=0), np.percentile(positions, 70, axis=0)
+    inside = ((positions >= low) & (positions <= high)).all(axis=1)
+    box = o3d.t.geometry.AxisAlignedBoundingBox(
+        o3d.core.Tensor(low.astype(np.float32)), o3d.core.Tensor(high.astype(np.float32))
+    )
+    assert len(cloud.crop(box).point.positions) == inside.sum() > 0
+    made = cloud.select_by_mask(o3d.core.Tensor(memory.generated))
+    np.testing.assert_array_equal(
+        made.point.confidence.numpy()[:, 0], memory.confidence[memory.generated]
+    )
+    coarse = cloud.voxel_down_sample(0.5)
+    assert 0 < len(coarse.point.positions) < len(memory)
+    copy = cloud.clone()
+    copy.estimate_normals(10)
+    assert copy.point.normals.shape == [len(memory), 3] and "normals" not in memory.cloud.point
+
+
+def test_open3d_projects_the_cloud_as_we_do():
+    """Its projection reads the rows one after the other, whatever their stride is."""
+    memory = random_memory(3, most=300)
+    target = camera(width=64, height=48, focal=50)
+    ours = memory.project(target, options=SplatOptions(backend="nearest"))
+    K = target.K[0].copy()
+    K[:2, 2] -= 0.5
+    seen = memory.frame.cam_from_local(target.cam_from_world)[0]
+    image = memory.cloud.project_to_depth_image(
+        int(target.width[0]), int(target.height[0]), o3d.core.Tensor(K), o3d.core.Tensor(seen),
+        1.0, 1e6,
+    )  # fmt: skip
+    depth = image.as_tensor().numpy()[..., 0]
+    assert ours.valid.any()
+    assert np.isclose(depth, ours.depth[0], rtol=1e-5).mean() > 0.99
+
+
+@pytest.mark.parametrize("kind", ["ply", "pcd"])
+def test_open3d_writes_every_attribute(kind, tmp_path):
+    memory, path = random_memory(3), tmp_path / f"cloud.{kind}"
+    assert o3d.t.io.write_point_cloud(str(path), memory.cloud)
+    read = o3d.t.io.read_point_cloud(str(path))
+    for name in ATTRIBUTES:
+        np.testing.assert_array_equal(read.point[name].numpy(), _attribute(memory, name))
+
+
+def test_a_memory_of_its_own_cloud_is_the_same_memory():
+    memory = random_memory(4, options=MemoryOptions(observations_per_voxel=1))
+    again = SpatialMemory.from_point_cloud(
+        memory.cloud, voxel=memory.voxel, frame=memory.frame, options=memory.options
+    )
+    assert again.voxels <= memory.voxels and again.rounds == memory.rounds
+    place = {tuple(p): i for i, p in enumerate(memory.columns.positions.tolist())}
+    rows = [place.get(tuple(p), -1) for p in again.columns.positions.tolist()]
+    assert np.mean(np.array(rows) >= 0) > 0.8
+    found = [i for i, row in enumerate(rows) if row >= 0]
+    for name in ("colors", "round", "generated"):
+        np.testing.assert_array_equal(
+            getattr(again.columns, name)[found],
+            getattr(memory.columns, name)[[rows[i] for i in found]],
+        )
+
+
+def test_a_bare_cloud_takes_its_spacing_from_its_neighbours():
+    x, y = np.meshgrid(np.arange(30) * 0.1, np.arange(20) * 0.1)
+    where = np.stack([x.ravel() + 1e6, y.ravel(), np.full(600, 2.0)], axis=1)
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(where))
+    with pytest.raises(ShapeError, match="no colours"):
+        SpatialMemory.from_point_cloud(cloud)
+    cloud.point.colors = o3d.core.Tensor(np.full((600, 3), 0.5, np.float32))
+    assert SpatialMemory.from_point_cloud(cloud).voxel == pytest.approx(0.1)
+    memory = SpatialMemory.from_point_cloud(cloud, voxel=0.04)
+    assert len(memory) == 600
+    np.testing.assert_allclose(memory.columns.spacing, 0.1, rtol=1e-6)
+    assert set(memory.columns.colors.ravel().tolist()) == {128}
+    np.testing.assert_allclose(memory.positions[:, 2], 2, atol=1e-6)
+    one = o3d.t.geometry.PointCloud(o3d.core.Tensor(where[:1]))
+    one.point.colors = o3d.core.Tensor(np.zeros((1, 3), np.uint8))
+    with pytest.raises(DegenerateError, match="1 distinct points"):
+        SpatialMemory.from_point_cloud(one)
+
+
+def test_a_device_that_is_not_there_is_refused():
+    with pytest.raises(OptionError, match=r"memory device 'moon'; expected 'cpu'"):
+        SpatialMemory(0.1, device="moon")
+    if not torch.cuda.is_available():
+        with pytest.raises(OptionError, match="where Open3D finds CUDA"):
+            random_memory(1).to("cuda:0")
+
+
+def test_a_copy_on_a_device_is_projected_and_shares_nothing():
+    memory = random_memory(1)
+    other = memory.to("cpu")
+    assert repr(other) == repr(memory)
+    assert not np.shares_memory(other.columns.positions, memory.columns.positions)
+    target = memory.views[0].camera
+    np.testing.assert_array_equal(other.project(target).rgb, memory.project(target).rgb)
+
+
+@pytest.mark.parametrize("number", [-1, 65536])
+def test_a_round_out_of_range_is_refused(number):
+    with pytest.raises(OptionError, match="expected 0 to 65535"):
+        SpatialMemory(0.1).fuse(points([(0, 0, 1)]), round=number)
+
+
+def test_a_deep_copy_and_a_recoloured_one_leave_the_memory_alone():
+    memory = random_memory(3)
+    colors = memory.columns.colors.copy()
+    whole = copy.deepcopy(memory)
+    painted = memory.recolored(np.zeros_like(colors))
+    assert not painted.columns.colors.any()
+    assert np.shares_memory(painted.columns.positions, memory.columns.positions)
+    whole.forget(round=memory.rounds[-1])
+    whole.columns.arrays.positions[:] = 0
+    np.testing.assert_array_equal(memory.columns.colors, colors)
+    assert len(whole) < len(memory) and memory.columns.positions.any()
