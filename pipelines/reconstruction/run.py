@@ -52,6 +52,7 @@ def reconstruct(
     Raises:
         GvError: wrong input or options; nothing of an earlier run is lost.
     """
+    _compile_kernels(config, console)
     plan = make_plan(scene, config, say=console.line)
     describe(plan, console)
     directory = RunDirectory(out)
@@ -66,6 +67,15 @@ def reconstruct(
         _run_rounds(plan, memory, directory, done, console)
         _finish(plan, memory, directory, console, draw)
     return out
+
+
+def _compile_kernels(config: RunSettings, console: Console) -> None:
+    """A step of its own, so that no round is charged with it; later runs load what it left."""
+    from gvtools.memory.compile_kernels import compile_kernels
+
+    seconds = compile_kernels(config.splat.backend)
+    if seconds > 1:
+        console.line(f"kernels compiled in {seconds:.0f} s, once per installation")
 
 
 def _empty_memory(plan: Plan) -> SpatialMemory:

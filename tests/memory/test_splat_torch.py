@@ -11,9 +11,15 @@ from gvtools.cameras import concatenate
 from gvtools.errors import OptionError
 from gvtools.memory.projection import project
 from gvtools.memory.splat import torch_splatter as splat_torch
-from gvtools.memory.splat.torch_splatter import project_torch, torch_device
+from gvtools.memory.splat.api import SplatOptions
+from gvtools.memory.splat.torch_splatter import torch_device
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
+
+
+def project_torch(memory, cameras, *, options=None, device="auto"):
+    options = (options or SplatOptions()).replaced(backend="torch", device=device)
+    return project(memory, cameras, options=options)
 
 
 def _target(seed: int):

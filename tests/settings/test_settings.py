@@ -58,7 +58,7 @@ def test_options_of_the_completer_go_by_its_name(tmp_path):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("splat.bnad=1", "no setting 'splat.bnad'; did you mean 'splat.depth_band'"),
+        ("splat.depth_bnad=1", "no setting 'splat.depth_bnad'; did you mean 'splat.depth_band'"),
         ("viewsperround=1", "did you mean 'views_per_round'"),
         ("zzzz=1", "known keys: context, "),
         ("voxel.edge=1", "voxel is a value without settings below it"),

@@ -157,7 +157,7 @@ class GeoVerseCompleter(Completer):
         if self.config.hints.fill != "surfaces":
             return None
         # It needs more than torch and numpy.
-        from gvtools.completers.geoverse.surface_fill import surface_fill
+        from gvtools.completers.surface_fill import surface_fill
 
         return surface_fill(context, guidance, shared=self.settings.shared_fill)
 

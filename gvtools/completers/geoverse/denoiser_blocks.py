@@ -10,9 +10,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.attention import attend
 from gvtools.completers.geoverse.projective import Projective
 from gvtools.completers.geoverse.shared_attention import VideoKeys
+from gvtools.networks.attention import attend
 
 
 class PixelEmbed(nn.Module):

@@ -14,8 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from gvtools.completers.geoverse.attention import attend
 from gvtools.errors import ShapeError
+from gvtools.networks.attention import attend
 from gvtools.networks.depth_anything.encoder import IMAGENET_MEAN, IMAGENET_STD
 
 SINE_BASE = 10000.0

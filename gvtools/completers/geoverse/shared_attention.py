@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.attention import attend
 from gvtools.completers.geoverse.projective import Projective
+from gvtools.networks.attention import attend
 
 
 @dataclass(frozen=True)

@@ -19,39 +19,11 @@ from gvtools.errors import OptionError
 from gvtools.memory.splat.cpu_kernels import CHANNELS, FAINTEST, SMALLEST
 
 if TYPE_CHECKING:
-    from gvtools.cameras import Cameras
-    from gvtools.guidance import Guidance
     from gvtools.memory.splat.api import FrameBuffers, SplatOptions
     from gvtools.memory.store.store import Store
 
 # Pairs held at a time: about 120 bytes each.
 PAIRS = {"cpu": 1 << 20, "cuda": 1 << 24}
-
-
-def project_torch(
-    store: Store,
-    cameras: Cameras,
-    *,
-    options: SplatOptions | None = None,
-    device: str = "auto",
-) -> Guidance:
-    """Project the memory with torch; see gvtools.memory.projection.project.
-
-    Args:
-        store: what is projected.
-        cameras: of one image size.
-        options: see SplatOptions; its back end and device are overridden.
-        device: "cpu", "cuda" or "auto".
-
-    Raises:
-        OptionError: CUDA is asked for and torch sees none.
-        ShapeError: the cameras have images of several sizes, or there is none.
-    """
-    from gvtools.memory.projection import project
-    from gvtools.memory.splat.api import SplatOptions
-
-    options = (options or SplatOptions()).replaced(backend="torch", device=device)
-    return project(store, cameras, options=options)
 
 
 def torch_device(name: str) -> torch.device:

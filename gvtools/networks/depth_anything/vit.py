@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.attention import attend
+from gvtools.networks.attention import attend
 
 
 @dataclass(frozen=True)

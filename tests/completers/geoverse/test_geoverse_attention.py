@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gvtools.completers.geoverse.attention import attend
 from gvtools.errors import ShapeError
+from gvtools.networks.attention import attend
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 

@@ -22,7 +22,7 @@ from gvtools.completers.geoverse.correction import (
 )
 from gvtools.completers.geoverse.passes import Decoded, Generated
 from gvtools.completers.geoverse.postprocess import DOUBTED, depth_ratios
-from gvtools.completers.geoverse.surface_fill import surface_fill
+from gvtools.completers.surface_fill import surface_fill
 from gvtools.errors import OptionError
 
 pytest.importorskip("safetensors", reason="weights are read with safetensors")

@@ -5,9 +5,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from gvtools.completers.geoverse.attention import attend
 from gvtools.completers.geoverse.projective import Projective, projection_matrices
 from gvtools.errors import ShapeError
+from gvtools.networks.attention import attend
 
 SIZE = (84, 112)
 GRID = (3, 4)

@@ -6,7 +6,7 @@ import pytest
 from walls import blotches, camera_at, cast, photograph
 
 from gvtools.cameras import concatenate
-from gvtools.completers.geoverse.surface_fill import AVERAGED, CARRIED, surface_fill
+from gvtools.completers.surface_fill import AVERAGED, CARRIED, surface_fill
 from gvtools.guidance import Guidance
 
 pytestmark = pytest.mark.usefixtures("one_thread")

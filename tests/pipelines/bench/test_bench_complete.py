@@ -13,13 +13,13 @@ import torch
 from torch import nn
 
 from gvtools.completers.geoverse import denoiser_blocks, shared_attention
-from gvtools.completers.geoverse.attention import attend
 from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.denoiser_blocks import CameraAttention
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.projective import Projective
 from gvtools.completers.geoverse.stages import LEVEL0, LEVEL1
 from gvtools.errors import OptionError
+from gvtools.networks.attention import attend
 from gvtools.networks.depth_anything.network import DepthAnything3
 from pipelines.bench import side_by_side
 from pipelines.bench import timing as completion_timing
