@@ -59,23 +59,18 @@ def _fill(positions, first, last, M, fx, skew, fy, cx, cy, depth_max, width, hei
     m00, m01, m02, m03 = M[0, 0], M[0, 1], M[0, 2], M[0, 3]
     m10, m11, m12, m13 = M[1, 0], M[1, 1], M[1, 2], M[1, 3]
     m20, m21, m22, m23 = M[2, 0], M[2, 1], M[2, 2], M[2, 3]
-    xs = np.empty(CHUNK, np.float32)
-    ys = np.empty(CHUNK, np.float32)
-    zs = np.empty(CHUNK, np.float32)
     flat = positions.reshape(-1)
     for start in range(first, last, CHUNK):
         n = min(CHUNK, last - start)
         # Slices indexed from 0: the compiler then knows that no index is negative.
         at = flat[3 * start : 3 * (start + n)]
-        # Apart, because vector units want them so.
         for k in range(n):
-            xs[k] = at[np.uint64(3 * k)]
-            ys[k] = at[np.uint64(3 * k + 1)]
-            zs[k] = at[np.uint64(3 * k + 2)]
-        for k in range(n):
-            pz = m20 * xs[k] + m21 * ys[k] + m22 * zs[k] + m23
-            px = m00 * xs[k] + m01 * ys[k] + m02 * zs[k] + m03
-            py = m10 * xs[k] + m11 * ys[k] + m12 * zs[k] + m13
+            x = at[np.uint64(3 * k)]
+            y = at[np.uint64(3 * k + 1)]
+            z = at[np.uint64(3 * k + 2)]
+            pz = m20 * x + m21 * y + m22 * z + m23
+            px = m00 * x + m01 * y + m02 * z + m03
+            py = m10 * x + m11 * y + m12 * z + m13
             inverse = np.float32(1) / pz
             u = (fx * px + skew * py) * inverse + cx + half
             v = fy * py * inverse + cy + half
