@@ -39,8 +39,6 @@ def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
 
 
 def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not hasattr(gvtools.SpatialMemory, "observe"):
-        pytest.skip("SpatialMemory has no observe yet")
     code = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)[0]
     write_scan(tmp_path / "my" / "scan")
     monkeypatch.chdir(tmp_path)

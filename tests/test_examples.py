@@ -49,11 +49,6 @@ def test_an_example_runs(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    source = script.read_text(encoding="utf-8")
-    if re.search(r"memory\.(observe|cloud)", source):
-        for name in ("observe", "cloud"):
-            if not hasattr(gvtools.SpatialMemory, name):
-                pytest.skip(f"SpatialMemory has no {name} yet")
     arguments = [] if script.stem.startswith("05") else [str(room), str(tmp_path)]
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.setattr(sys, "argv", [str(script), *arguments])

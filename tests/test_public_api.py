@@ -92,8 +92,6 @@ def test_only_the_front_points_upwards_and_nothing_imports_it() -> None:
 
 @pytest.mark.parametrize("module", DOCTESTED)
 def test_the_examples_in_docstrings_run(module: str) -> None:
-    if module == "gvtools" and not hasattr(gvtools.SpatialMemory, "observe"):
-        pytest.skip("SpatialMemory has no observe yet")
     options = doctest.NORMALIZE_WHITESPACE | doctest.IGNORE_EXCEPTION_DETAIL
     failed, tried = doctest.testmod(import_module(module), optionflags=options)
     assert tried > 0
