@@ -96,6 +96,10 @@ class Columns:
 
         dtype, width = LAYOUT[name]
         kind = getattr(o3d.core, np.dtype(dtype).name)
+        if self.device == "cpu":
+            # In memory that numpy gives: Open3D ends a process with status 1 where tensors of its
+            # own are still alive, such as those that a viewer's window holds.
+            return o3d.core.Tensor.from_numpy(np.empty((rows, width), dtype))
         return o3d.core.Tensor.empty((rows, width), kind, o3d.core.Device(self.device))
 
     @property
@@ -150,7 +154,9 @@ class Columns:
         other = Columns(device)
         other.count = self.count
         there = o3d.core.Device(device)
-        other._tensors = {name: self.tensor(name).to(there, copy=True) for name in LAYOUT}
+        other._tensors = {name: other._empty(name, self.count) for name in LAYOUT}
+        for name, tensor in other._tensors.items():
+            tensor[:] = self.tensor(name).to(there)
         return other
 
     def __deepcopy__(self, _: dict[int, Any]) -> Columns:
@@ -163,8 +169,8 @@ class Columns:
         other = Columns(self.device)
         other.count = self.count
         other._tensors = {name: self.tensor(name) for name in LAYOUT}
-        there = o3d.core.Device(self.device)
-        other._tensors["colors"] = o3d.core.Tensor(np.ascontiguousarray(colors), device=there)
+        other._tensors["colors"] = other._empty("colors", self.count)
+        other._tensors["colors"][:] = o3d.core.Tensor.from_numpy(np.ascontiguousarray(colors))
         return other
 
     def cloud(self) -> o3d.t.geometry.PointCloud:
