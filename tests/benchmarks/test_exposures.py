@@ -18,16 +18,16 @@ from gvtools.scenes.scene import Frame, Scene
 GAINS = np.array([[1.0, 1.0, 1.0], [0.7, 0.75, 0.8], [1.2, 1.1, 1.0], [0.9, 1.0, 1.1], [1, 0.8, 1]])
 
 
-def exposed(gains: np.ndarray = GAINS, *, spoilt: float = 0.0):
+def exposed(gains: np.ndarray = GAINS, *, damaged: float = 0.0):
     """Five views of a plane, each times its factors, and their true depth.
 
-    ``spoilt`` is the share of each picture that shows something else altogether.
+    ``damaged`` is the share of each picture that shows something else altogether.
     """
     made = plane_scene(slope=(0.2, 0.1))
     views, depths = [], {}
     for i, (view, gain) in enumerate(zip(made.scene, gains, strict=True)):
         rgb = 40 + 0.5 * view.load().rgb.astype(float)
-        rgb[:, : round(spoilt * rgb.shape[1])] = 50 + 30 * i
+        rgb[:, : round(damaged * rgb.shape[1])] = 50 + 30 * i
         shown = np.clip(np.round(rgb * gain), 0, 255).astype(np.uint8)
         views.append(replace(view, load=partial(Frame, shown)))
         depth = made.depths[i].astype(np.float32)
@@ -39,9 +39,9 @@ def normalised(gains: np.ndarray) -> np.ndarray:
     return gains / np.exp(np.log(gains).mean(axis=0))
 
 
-@pytest.mark.parametrize("spoilt", [0.0, 0.15])
-def test_gains_are_found(spoilt):
-    scene, depths = exposed(spoilt=spoilt)
+@pytest.mark.parametrize("damaged", [0.0, 0.15])
+def test_gains_are_found(damaged):
+    scene, depths = exposed(damaged=damaged)
     found = estimate_exposures(scene, depths)
     np.testing.assert_allclose(found.gain, normalised(1 / GAINS), rtol=0.02)
 

@@ -148,10 +148,10 @@ def test_memory_that_is_not_finite_is_refused_and_named_and_holes_may_hold_it(
     known = micro.guidance(1, size=SIZE)
     context = micro.context_views(2)
     row, column = np.argwhere(known.valid[0])[5]
-    spoilt = {what: getattr(known, what).copy()}
-    spoilt[what][0, row, column] = bad
+    damaged = {what: getattr(known, what).copy()}
+    damaged[what][0, row, column] = bad
     with pytest.raises(ShapeError, match=r"view target_1_0: 1 pixel\(s\) hold NaN"):
-        complete(folders, name, context, replace(known, **spoilt))
+        complete(folders, name, context, replace(known, **damaged))
     holes = {what: getattr(known, what).copy()}
     holes[what][~known.valid] = bad
     made = complete(folders, name, context, replace(known, **holes))
@@ -174,9 +174,9 @@ def test_photographs_that_are_not_finite_are_refused_and_named(folders, name, ba
 def test_depth_of_a_photograph_that_is_none_counts_as_none(folders, name, bad):
     known = micro.guidance(1, size=SIZE)
     views = micro.context_views(2)
-    spoilt = [replace(v, depth=np.full(v.rgb.shape[:2], bad, np.float32)) for v in views]
+    damaged = [replace(v, depth=np.full(v.rgb.shape[:2], bad, np.float32)) for v in views]
     without = [replace(v, depth=None) for v in views]
-    made, plain = (complete(folders, name, context, known) for context in (spoilt, without))
+    made, plain = (complete(folders, name, context, known) for context in (damaged, without))
     np.testing.assert_array_equal(made.rgb, plain.rgb)
     np.testing.assert_array_equal(made.depth, plain.depth)
 

@@ -72,11 +72,11 @@ def test_masks_of_nothing_and_of_one_pixel_leave_no_trace_of_the_rest(poison):
 def test_reference_pixels_that_are_not_finite_count_as_absent_in_the_losses(loss, poison):
     reference = pictures()
     predicted = (reference + 0.1).requires_grad_()
-    spoilt = reference.clone()
-    spoilt[0, 0, 1, 2:5, 3:6] = poison
+    damaged = reference.clone()
+    damaged[0, 0, 1, 2:5, 3:6] = poison
     masked = everywhere(reference)
     masked[0, 0, 2:5, 3:6] = False
-    found = loss(predicted, spoilt)
+    found = loss(predicted, damaged)
     assert found.item() == pytest.approx(loss(predicted, reference, valid=masked).item())
     (gradient,) = torch.autograd.grad(found.sum(), predicted)
     assert gradient.isfinite().all() and not gradient[0, 0, :, 2:5, 3:6].any()

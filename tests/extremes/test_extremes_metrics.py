@@ -52,9 +52,9 @@ def test_two_constant_pictures_have_their_closed_form(first, second):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 255.0, -1.01])
 @pytest.mark.parametrize("call", [psnr, ssim, lambda a, b: image_figures(a, b, {"": None})])
 def test_values_that_are_no_colours_are_refused_wherever_they_stand(call, bad):
-    spoilt = NOISE.copy()
-    spoilt[0, 0, 1] = bad
-    for pair in ((spoilt, NOISE), (NOISE, spoilt)):
+    damaged = NOISE.copy()
+    damaged[0, 0, 1] = bad
+    for pair in ((damaged, NOISE), (NOISE, damaged)):
         with pytest.raises(ShapeError, match=r"expected floats in \[0, 1\]"):
             call(*pair)
 
@@ -97,9 +97,9 @@ def test_relative_depth_errors_have_no_unit(power, factor):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 0.0, -1.0])
 def test_depth_that_is_none_is_not_compared(bad):
-    spoilt = DEPTH.copy()
-    spoilt[:15] = bad
-    for pair in ((spoilt, DEPTH * 2), (DEPTH, np.where(spoilt == DEPTH, 2 * DEPTH, bad))):
+    damaged = DEPTH.copy()
+    damaged[:15] = bad
+    for pair in ((damaged, DEPTH * 2), (DEPTH, np.where(damaged == DEPTH, 2 * DEPTH, bad))):
         assert relative_depth_error(*pair) == pytest.approx(0.5)
         assert relative_depth_error(*pair, mask=np.arange(20)[:, None] + 0 * DEPTH < 15) is None
     assert relative_depth_error(np.full_like(DEPTH, bad), DEPTH) is None

@@ -98,10 +98,10 @@ def test_the_middle_of_any_turn_is_half_of_it(angle, seed):
 
 def test_poses_that_are_not_finite_are_named():
     for bad in (np.nan, np.inf):
-        spoilt = keys([(0, 0, 0), (1, bad, 0), (2, 0, 1)], [(0, 0, 0), (0, 0.3, 0), (0.2, 0, 0)])
+        damaged = keys([(0, 0, 0), (1, bad, 0), (2, 0, 1)], [(0, 0, 0), (0, 0.3, 0), (0.2, 0, 0)])
         for make in MAKERS:
             with pytest.raises(DegenerateError, match="camera 000001 holds"):
-                make(spoilt, 3)
+                make(damaged, 3)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

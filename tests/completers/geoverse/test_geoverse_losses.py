@@ -67,15 +67,15 @@ def test_absent_views_do_not_count_even_with_nan():
     predicted, target = _normal(rng, B, V, 3, 2, 2), _normal(rng, B, V, 3, 2, 2)
     views = torch.tensor([[True, False, True, True, False], [False] * V])
     shown = views[:, :, None, None, None]
-    spoilt = _outside(predicted, shown, np.nan).requires_grad_()
+    damaged = _outside(predicted, shown, np.nan).requires_grad_()
     for reduction in ("mean", "sum"):
         found = flow_matching_loss(
-            spoilt, _outside(target, shown, np.inf), context=2, views=views, reduction=reduction
+            damaged, _outside(target, shown, np.inf), context=2, views=views, reduction=reduction
         )
         kept = predicted[:1, [0, 2, 3]], target[:1, [0, 2, 3]]
         expected = flow_matching_loss(*kept, context=1, reduction=reduction)
         torch.testing.assert_close(found, torch.cat([expected, torch.zeros(1)]).double())
-        (gradient,) = torch.autograd.grad(found.sum(), spoilt)
+        (gradient,) = torch.autograd.grad(found.sum(), damaged)
         assert bool(gradient.isfinite().all())
         assert not bool(gradient[~views].any()) and bool(gradient[views].all())
 
@@ -127,12 +127,12 @@ def test_what_lies_outside_the_mask_poisons_neither_picture_loss_nor_gradient(lo
     valid = torch.tensor(rng.random((B, T, H, W)) < 0.6)
     shown = valid[:, :, None].expand_as(image)
     expected = loss(predicted, image, valid=valid)
-    spoilt = _outside(predicted, shown, poison).requires_grad_()
-    found = loss(spoilt, _outside(image, shown, poison), valid=valid)
+    damaged = _outside(predicted, shown, poison).requires_grad_()
+    found = loss(damaged, _outside(image, shown, poison), valid=valid)
     torch.testing.assert_close(found, expected)
     found.sum().backward()
-    assert spoilt.grad is not None and bool(spoilt.grad.isfinite().all())
-    assert not bool(spoilt.grad[~shown].any()) and bool(spoilt.grad[shown].any())
+    assert damaged.grad is not None and bool(damaged.grad.isfinite().all())
+    assert not bool(damaged.grad[~shown].any()) and bool(damaged.grad[shown].any())
 
 
 def test_a_diverged_prediction_is_not_hidden():
@@ -264,17 +264,17 @@ def test_samples_without_a_scale_are_dropped_or_taken_as_they_are():
 def test_what_lies_outside_the_mask_poisons_neither_depth_loss_nor_gradient(poison, scale_gradient):
     predicted, reference, found_centers, centers = _depths(np.random.default_rng(2))
     known = reference.isfinite() & (reference > 0)
-    spoilt = _outside(predicted, known, poison).requires_grad_()
+    damaged = _outside(predicted, known, poison).requires_grad_()
     found_centers = found_centers.requires_grad_()
     options = {
         "similarity": center_similarity(found_centers, centers),
         "scale_gradient": scale_gradient,
     }
-    found = depth_loss(spoilt, reference, **options)
+    found = depth_loss(damaged, reference, **options)
     torch.testing.assert_close(found, depth_loss(predicted, reference, **options))
     found.sum().backward()
-    assert spoilt.grad is not None and bool(spoilt.grad.isfinite().all())
-    assert not bool(spoilt.grad[~known].any()) and bool(spoilt.grad[known].all())
+    assert damaged.grad is not None and bool(damaged.grad.isfinite().all())
+    assert not bool(damaged.grad[~known].any()) and bool(damaged.grad[known].all())
     if scale_gradient:
         assert found_centers.grad is not None and bool(found_centers.grad.isfinite().all())
         assert bool(found_centers.grad.any())

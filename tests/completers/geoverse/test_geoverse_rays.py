@@ -111,13 +111,13 @@ def test_wrong_rays_are_left_out():
     ray = noisy(ray_map(pose, K), 1e-3)
     rng = np.random.default_rng(4)
     wrong = torch.from_numpy(rng.random(ray.shape[:-1]) < 0.3)
-    spoilt = ray.clone()
-    spoilt[..., :3][wrong] = torch.from_numpy(rng.normal(size=(int(wrong.sum()), 3)))
-    robust = poses_ransac(spoilt, size=SIZE, threshold=0.05)
+    damaged = ray.clone()
+    damaged[..., :3][wrong] = torch.from_numpy(rng.normal(size=(int(wrong.sum()), 3)))
+    robust = poses_ransac(damaged, size=SIZE, threshold=0.05)
     np.testing.assert_allclose(robust.world_from_cam[:, :3, :3], pose[:, :3, :3], atol=5e-3)
-    plain = poses_least_squares(spoilt, size=SIZE)
+    plain = poses_least_squares(damaged, size=SIZE)
     assert np.abs(plain.world_from_cam.numpy() - pose)[:, :3, :3].max() > 0.02
-    confident = poses_least_squares(spoilt, (~wrong).double(), size=SIZE)
+    confident = poses_least_squares(damaged, (~wrong).double(), size=SIZE)
     np.testing.assert_allclose(confident.world_from_cam[:, :3, :3], pose[:, :3, :3], atol=5e-3)
 
 

@@ -113,10 +113,10 @@ def test_samples_are_fitted_one_by_one_from_their_valid_centres():
     reference = np.array([2.0, 3.0, 5.0])[:, None, None] * predicted + rng.normal(size=(3, 1, 3))
     valid = np.ones((3, 6), bool)
     valid[0, 4:] = valid[1, 0] = False
-    spoilt = reference.copy()
-    spoilt[0, 4:], spoilt[1, 0], predicted[2, 3] = 99, np.nan, np.inf
+    damaged = reference.copy()
+    damaged[0, 4:], damaged[1, 0], predicted[2, 3] = 99, np.nan, np.inf
     fit = center_similarity(
-        torch.tensor(predicted), torch.tensor(spoilt), valid=torch.tensor(valid)
+        torch.tensor(predicted), torch.tensor(damaged), valid=torch.tensor(valid)
     )
     np.testing.assert_allclose(fit.scale, [2, 3, 5])
     assert fit.used.tolist() == [4, 5, 5]

@@ -110,16 +110,16 @@ def test_a_pose_beyond_the_limit_shows_in_the_triangulated_share(
 
 
 @pytest.mark.parametrize("change", ["blur", "noise"])
-def test_spoilt_pictures_lose_matches(
+def test_damaged_pictures_lose_matches(
     right: GeometricVerification, views: list[PosedPicture], change: str
 ) -> None:
     counts = [right.mean_verified or 0]
     for strength in (1, 2):
-        spoilt = [
+        damaged = [
             blurred(view, 1.2 * strength) if change == "blur" else noisy(view, 15 * strength)
             for view in views[:3]
         ]
-        counts.append(verify_geometry(spoilt).mean_verified or 0)
+        counts.append(verify_geometry(damaged).mean_verified or 0)
     assert counts[0] > 1.1 * counts[1] > 1.2 * counts[2] > 0
 
 
