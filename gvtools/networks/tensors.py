@@ -1,4 +1,4 @@
-"""Tensors of weights files: read without running code, compared by name, shape and type, saved.
+"""Tensors of a network: compared by name, shape and type, loaded into it, saved.
 
 A missing, unexpected or wrongly shaped tensor is always an error, and so is one that holds no
 finite floating-point numbers.
@@ -7,13 +7,9 @@ finite floating-point numbers.
 from __future__ import annotations
 
 import os
-import pickle
-import re
-import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -29,8 +25,6 @@ DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.
 
 # Bytes to a multiple of which torch allocates.
 _ALIGNMENT = 64
-_ZIP, _PICKLE = b"PK\x03\x04", b"\x80"
-_PLACEHOLDER = b"version https://git-lfs"
 
 
 @dataclass(frozen=True)
@@ -107,20 +101,20 @@ def shapes(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
-def read_tensors(path: Path) -> dict[str, Tensor]:
-    """All tensors of a .safetensors, .pt or .pth file, mapped from disk, by their stored names.
+def check_fit(stored: Mapping[str, Tensor], expected: Shapes, *, where: object) -> None:
+    """Refuse tensors that are not the expected ones, by name, shape and type.
+
+    Args:
+        stored: what is there; may be on the meta device.
+        expected: name to shape.
+        where: what the message names.
 
     Raises:
-        CheckpointError: the file is absent, damaged, or holds more than tensors and plain values.
+        CheckpointError: a tensor is missing, unexpected, of another shape, or not of numbers.
     """
-    if path.suffix == ".safetensors":
-        return _read_safetensors(path)[0]
-    return plain_tensors(read_pickled(path), path)
-
-
-def read_about(path: Path) -> str:
-    """What ``save_tensors`` was told about a .safetensors file; empty for others' files."""
-    return _read_safetensors(path)[1].get("about", "")
+    found = fit(stored, expected)
+    if not found.ok:
+        raise CheckpointError(f"{where}: {found}; the file is of another network or version")
 
 
 def load(
@@ -139,11 +133,9 @@ def load(
         device: of the module afterwards.
 
     Raises:
-        CheckpointError: a tensor is missing, unexpected, of another shape, or not of numbers.
+        CheckpointError: see ``check_fit``.
     """
-    found = fit(tensors, shapes(module.state_dict()))
-    if not found.ok:
-        raise CheckpointError(f"{where}: {found}; the file is of another network or version")
+    check_fit(tensors, shapes(module.state_dict()), where=where)
     module.load_state_dict(
         {name: _placed(tensor, device) for name, tensor in tensors.items()}, assign=True
     )
@@ -154,13 +146,6 @@ def _placed(tensor: Tensor, device: torch.device | str) -> Tensor:
     placed = tensor.to(device, torch.float32).contiguous()
     # Products depend on the alignment in their last bit, and that of a file's tensors is by chance.
     return placed.clone() if placed.data_ptr() % _ALIGNMENT else placed
-
-
-def check_finite(tensors: Mapping[str, Tensor], *, where: object) -> None:
-    """Raises CheckpointError on the first tensor that holds a NaN or an infinity."""
-    name = not_finite(tensors)
-    if name is not None:
-        raise CheckpointError(f"{where}: {name} holds values that are not finite")
 
 
 def not_finite(tensors: Mapping[str, Tensor]) -> str | None:
@@ -174,29 +159,13 @@ def not_finite(tensors: Mapping[str, Tensor]) -> str | None:
     return None
 
 
-def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors, mapped from disk, and the metadata."""
-    from safetensors import safe_open
-
-    check_not_placeholder(path)
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            names = list(file.keys())
-            return {name: file.get_tensor(name) for name in names}, file.metadata() or {}
-    except Exception as error:
-        raise CheckpointError(
-            f"{path}: cannot be read ({first_line(error)}); expected a whole safetensors file; "
-            "download it again"
-        ) from None
-
-
 def share_tied(
     tensors: dict[str, Tensor], tied: tuple[tuple[str, ...], ...], *, where: object
 ) -> None:
     """Give tied names their common tensor where a file has it under some of them, in place.
 
     Args:
-        tensors: by name.
+        tensors: by name; may be on the meta device.
         tied: groups of names that are one tensor in the publisher's network.
         where: what the message names.
 
@@ -209,100 +178,12 @@ def share_tied(
             continue
         first = tensors[present[0]]
         for name in present[1:]:
-            if not torch.equal(tensors[name], first):
+            if not first.is_meta and not torch.equal(tensors[name], first):
                 raise CheckpointError(
                     f"{where}: {name} differs from {present[0]}; expected one tensor of all of "
                     f"{names[0]} to {names[-1]}, or every one of them"
                 )
         tensors |= dict.fromkeys(names, first)
-
-
-def plain_tensors(content: Mapping[Any, Any], path: Path) -> dict[str, Tensor]:
-    """The tensors of a dictionary; scalars beside them are ignored, other objects are refused."""
-    tensors = {}
-    for name, value in content.items():
-        if not isinstance(name, str) or not isinstance(
-            value, (Tensor, int, float, str, bool, type(None))
-        ):
-            raise CheckpointError(
-                f"{path}: {name!r} is a {type(value).__name__}; expected tensors by name"
-            )
-        if isinstance(value, Tensor):
-            tensors[name] = value
-    return tensors
-
-
-def read_pickled(path: Path) -> dict[str, Any]:
-    """The dictionary of a .pt file, its tensors mapped from disk.
-
-    Raises:
-        CheckpointError: the file is absent, damaged, of another kind, or asks for code to be run.
-    """
-    check_not_placeholder(path)
-    with path.open("rb") as file:
-        start = file.read(len(_ZIP))
-    if start != _ZIP:
-        found = "a bare pickle, which may hold code" if start[:1] == _PICKLE else "no PyTorch file"
-        raise CheckpointError(
-            f"{path}: {found}; expected the zip form that torch.save writes since PyTorch 1.6, "
-            "with tensors alone; download it again"
-        )
-    try:
-        with warnings.catch_warnings():
-            # About the protocol and deprecated classes of damaged files; what follows says more.
-            warnings.simplefilter("ignore")
-            content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except pickle.UnpicklingError as error:
-        raise CheckpointError(f"{path}: {_refused(error)}; nothing of it was run") from None
-    except Exception as error:
-        # What torch's reader stumbles upon in a damaged file, it raises as it comes.
-        raise CheckpointError(
-            f"{path}: cannot be read ({first_line(error)}); expected a whole PyTorch file of "
-            "tensors; download it again"
-        ) from None
-    if not isinstance(content, dict):
-        raise CheckpointError(
-            f"{path}: holds a {type(content).__name__}; expected a dictionary of tensors by name"
-        )
-    return content
-
-
-def check_not_placeholder(path: Path) -> None:
-    """The file is there, and is more than what git leaves where a large file belongs.
-
-    Raises:
-        CheckpointError: it is absent, empty, or git's placeholder.
-    """
-    try:
-        with path.open("rb") as file:
-            start = file.read(len(_PLACEHOLDER))
-    except FileNotFoundError:
-        raise CheckpointError(f"no {path}; download it, see gvtools weights list") from None
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
-    if not start:
-        raise CheckpointError(f"{path}: is empty; download it again")
-    if start == _PLACEHOLDER:
-        raise CheckpointError(
-            f"{path}: is Git LFS's placeholder of {path.stat().st_size} bytes, not the file "
-            "itself; fetch that with git lfs pull"
-        )
-
-
-def _refused(error: Exception) -> str:
-    """What a pickle asks for that is not loaded."""
-    asked = re.search(r"GLOBAL ([\w.]+)|WeightsUnpickler error: ([^\n]+)", str(error))
-    if asked is None:
-        return f"is refused ({first_line(error)}); expected tensors and plain values alone"
-    if asked[1]:
-        return f"asks for {asked[1]}; expected tensors and plain values alone, without code"
-    return f"cannot be read ({asked[2].strip()}); expected a whole file of tensors alone"
-
-
-def first_line(error: Exception) -> str:
-    """An error's first line, at most one sentence of it."""
-    text = str(error).strip().splitlines()
-    return text[0].split(". ")[0] if text else type(error).__name__
 
 
 def save_tensors(

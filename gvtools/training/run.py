@@ -15,8 +15,7 @@ from torch import nn
 from gvtools.completers.geoverse.config import FlowConfig, GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior
-from gvtools.completers.geoverse.weights.checks import config_of
-from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pretrained
+from gvtools.completers.geoverse.weights.folder import config_of, from_pretrained, save_pretrained
 from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER, WHOLE_FILE
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text

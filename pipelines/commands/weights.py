@@ -23,15 +23,13 @@ EXAMPLES = ("gvtools weights list base", "gvtools weights check weights/base --j
 
 # Seconds between two lines of progress where there is no terminal.
 _INTERVAL = 10.0
+_Add = Callable[..., Any]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's actions and their options."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-
-    def action(
-        name: str, run: Callable[..., None], summary: str, *examples: str
-    ) -> argparse.ArgumentParser:
+    for name, (run_action, add_options, summary, *examples) in _ACTIONS.items():
         lines = "\n".join(f"  gvtools weights {name} {example}".rstrip() for example in examples)
         added = actions.add_parser(
             name,
@@ -40,73 +38,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
-        added.set_defaults(act=run)
+        added.set_defaults(act=run_action)
         # As of every command; given before the action they hold as well.
         for option, text in (("quiet", "print nothing but warnings"), ("debug", "tracebacks")):
             added.add_argument(
                 f"--{option}", action="store_true", default=argparse.SUPPRESS, help=text
             )
-        return added
+        add_options(added.add_argument)
 
-    lists = action("list", _list, "files, publishers, licences, sizes", "", "base --json list.json")
-    lists.add_argument(
-        "config", nargs="?", metavar="CONFIG", help="base, tiny or a config.json; all by default"
-    )
-    check = action(
-        "check", _check, "say precisely what does not fit", "weights/base", "DIR --config tiny"
-    )
-    check.add_argument("folder", type=Path, metavar="DIR", help="a weights folder")
-    check.add_argument(
-        "--config", metavar="NAME|FILE", help="instead of the folder's own config.json"
-    )
-    for parser_ in (lists, check):
-        parser_.add_argument("--json", type=Path, metavar="FILE", help="write the report there")
-    create = action(
-        "create",
-        _create,
-        "write an untrained model, for tests and as a start of training",
-        "tiny weights/untrained",
-        "tiny weights/other --seed 1",
-    )
-    create.add_argument("config", metavar="NAME", help="base, tiny or a config.json")
-    create.add_argument("folder", type=Path, metavar="DIR", help="the folder to make")
-    create.add_argument("--seed", type=int, default=0, metavar="N", help="of the numbers (0)")
-    pack = action(
-        "pack",
-        _pack,
-        "write a trained model in half precision, with its training's record",
-        "training/tiny weights/tiny",
-    )
-    pack.add_argument("source", type=Path, metavar="TRAINING", help="of gvtools train --out")
-    pack.add_argument("folder", type=Path, metavar="DIR", help="the folder to make or to renew")
-    truncate = action(
-        "truncate-wan",
-        _truncate,
-        "make the video prior's folder from published Wan2.2-VACE weights",
-        "Wan2.2-VACE-Fun-A14B weights/base/video --vae Wan2.1-VACE-diffusers/vae",
-        "Wan2.2-VACE-Fun-14B-diffusers weights/base/video",
-    )
-    truncate.add_argument(
-        "source", type=Path, metavar="SOURCE", help="the published folder, or its one safetensors"
-    )
-    truncate.add_argument("folder", type=Path, metavar="DIR", help="the folder to make")
-    truncate.add_argument(
-        "--vae", type=Path, metavar="DIR", help="of diffusers; found beside the transformer else"
-    )
-    truncate.add_argument(
-        "--blocks", type=int, default=16, metavar="N", help="backbone blocks to keep (16)"
-    )
-    prompt = action(
-        "empty-prompt",
-        _empty_prompt,
-        "add the empty prompt's embedding to the video prior's folder",
-        "Wan2.2-VACE-Fun-14B-diffusers/text_encoder weights/base/video",
-        "text_encoder weights/base/video",
-    )
-    prompt.add_argument(
-        "source", type=Path, metavar="SOURCE", help="folder of Wan's text encoder (transformers)"
-    )
-    prompt.add_argument("folder", type=Path, metavar="DIR", help="the video prior's folder")
+
+def _list_options(option: _Add) -> None:
+    option("config", nargs="?", metavar="CONFIG", help="base, tiny or a config.json; all else")
+
+
+def _check_options(option: _Add) -> None:
+    option("folder", type=Path, metavar="DIR", help="a weights folder")
+    option("--config", metavar="NAME|FILE", help="instead of the folder's own config.json")
+    option("--json", type=Path, metavar="FILE", help="write the report there")
+
+
+def _create_options(option: _Add) -> None:
+    option("config", metavar="NAME", help="base, tiny or a config.json")
+    option("folder", type=Path, metavar="DIR", help="the folder to make")
+    option("--seed", type=int, default=0, metavar="N", help="of the numbers (0)")
+
+
+def _pack_options(option: _Add) -> None:
+    option("source", type=Path, metavar="TRAINING", help="of gvtools train --out")
+    option("folder", type=Path, metavar="DIR", help="the folder to make or to renew")
+
+
+def _truncate_options(option: _Add) -> None:
+    option("source", type=Path, metavar="SOURCE", help="the published folder or safetensors file")
+    option("folder", type=Path, metavar="DIR", help="the folder to make")
+    option("--vae", type=Path, metavar="DIR", help="of diffusers; else beside the transformer")
+    option("--blocks", type=int, default=16, metavar="N", help="backbone blocks to keep (16)")
+
+
+def _prompt_options(option: _Add) -> None:
+    option("source", type=Path, metavar="SOURCE", help="Wan's text encoder (transformers)")
+    option("folder", type=Path, metavar="DIR", help="the video prior's folder")
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
@@ -120,21 +91,13 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 def _list(args: argparse.Namespace, console: Console) -> None:
     from gvtools.completers.geoverse.config import NAMES
-    from gvtools.files import write_json
-    from pipelines.weights.report import needed_files, print_needed
+    from pipelines.weights.report import print_needed
 
     names = NAMES if args.config is None else (args.config,)
-    listed = [needed_files(_config(name)) for name in names]
-    if args.json is not None:
-        sizes = "bytes are approximate: of the numbers, without headers; published files: float32"
-        data = {"configs": [entry.to_dict() for entry in listed], "notes": [sizes]}
-        write_json(args.json, data)
-        console.line(f"{len(listed)} configurations written to {args.json}")
-        return
-    for number, entry in enumerate(listed):
+    for number, name in enumerate(names):
         if number:
             console.line("")
-        print_needed(entry, console)
+        print_needed(_config(name), console)
 
 
 def _pack(args: argparse.Namespace, console: Console) -> None:
@@ -146,7 +109,7 @@ def _pack(args: argparse.Namespace, console: Console) -> None:
 
 
 def _check(args: argparse.Namespace, console: Console) -> None:
-    from gvtools.completers.geoverse.weights.checks import (
+    from gvtools.completers.geoverse.weights.folder import (
         check_folder,
         check_is_folder,
         config_of,
@@ -221,14 +184,8 @@ def _truncate(args: argparse.Namespace, console: Console) -> None:
     from gvtools.completers.geoverse.video_prior.wan_checkpoint import truncate
     from gvtools.completers.geoverse.video_prior.wan_folder import EMPTY_PROMPT
 
-    truncate(
-        args.source,
-        args.folder,
-        blocks=args.blocks,
-        vace_blocks=None,
-        vae=args.vae,
-        progress=_progress(console),
-    )
+    progress = _progress(console)
+    truncate(args.source, args.folder, blocks=args.blocks, vae=args.vae, progress=progress)
     console.line(
         f"{args.folder} is written; it still needs {EMPTY_PROMPT}: gvtools weights empty-prompt "
         f"TEXT_ENCODER {args.folder}"
@@ -282,3 +239,43 @@ def _config(name: str) -> GeoVerseConfig:
     if path.is_file():
         return read(path)
     raise OptionError(f"no configuration {name!r}; expected {' or '.join(NAMES)}, or a config.json")
+
+
+# Name: what it does, its options, a summary, examples.
+_ACTIONS: dict[str, tuple[Any, ...]] = {
+    "list": (_list, _list_options, "files, publishers, licences, sizes", "", "base"),
+    "check": (
+        _check,
+        _check_options,
+        "say precisely what does not fit",
+        "weights/base",
+        "DIR --config tiny",
+    ),
+    "create": (
+        _create,
+        _create_options,
+        "write an untrained model, for tests and as a start of training",
+        "tiny weights/untrained",
+        "tiny weights/other --seed 1",
+    ),
+    "pack": (
+        _pack,
+        _pack_options,
+        "write a trained model in half precision, with its training's record",
+        "training/tiny weights/tiny",
+    ),
+    "truncate-wan": (
+        _truncate,
+        _truncate_options,
+        "make the video prior's folder from published Wan2.2-VACE weights",
+        "Wan2.2-VACE-Fun-A14B weights/base/video --vae Wan2.1-VACE-diffusers/vae",
+        "Wan2.2-VACE-Fun-14B-diffusers weights/base/video",
+    ),
+    "empty-prompt": (
+        _empty_prompt,
+        _prompt_options,
+        "add the empty prompt's embedding to the video prior's folder",
+        "Wan2.2-VACE-Fun-14B-diffusers/text_encoder weights/base/video",
+        "text_encoder weights/base/video",
+    ),
+}

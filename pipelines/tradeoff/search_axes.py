@@ -89,7 +89,7 @@ def longest_side(plan: Plan) -> int:
 def _core_axes(config: RunSettings) -> list[SearchAxis]:
     """Of a run that the generative core completes."""
     from gvtools.completers.geoverse.completer import GeoVerseCompleter
-    from gvtools.completers.geoverse.weights.checks import config_of
+    from gvtools.completers.geoverse.weights.folder import config_of
 
     given = config.completer_options
     completer = create("geoverse", **given)

@@ -3,210 +3,98 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from functools import lru_cache
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gvtools.completers.geoverse import config as configs
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse, empty_model
 from gvtools.completers.geoverse.video_prior.config import VideoPriorConfig
-from gvtools.completers.geoverse.weights.checks import PartReport
+from gvtools.completers.geoverse.weights.folder import PartReport
 from gvtools.completers.geoverse.weights.published import (
     CONFIG_FILE,
-    EXTENSION_FILE,
     VIDEO_FOLDER,
     VIDEO_SIZES,
     VIDEO_SOURCE,
     VIDEO_TERMS,
-    WHOLE_FILE,
+    WHOLE,
     Part,
     expected_of,
-    is_extension,
     parts_of,
 )
-from gvtools.networks.tensors import Shapes, shapes
+from gvtools.networks.tensors import Shapes
 
 if TYPE_CHECKING:
     from pipelines.console import Console
 
 _FLOAT32 = 4
-_OWN = "one's own: gvtools train, or gvtools weights create for an untrained one"
 
 
-@dataclass(frozen=True)
-class NeededFile:
-    """One file, or the folder of the video prior.
+def print_needed(config: GeoVerseConfig, console: Console) -> None:
+    """The files of a configuration, published ones and one's own.
 
-    Attributes:
-        name: of the part.
-        path: where it belongs in a weights folder.
-        source: who publishes it.
-        licence: its terms; empty for what one makes oneself.
-        needed: False for what the model can do without.
-        tensors: that it has to hold.
-        parameters: numbers in them.
-        bytes: about as many: of the numbers as they are published or written, without headers;
-            None where they are not known.
-        note: what it is for.
-    """
-
-    name: str
-    path: str
-    source: str
-    licence: str
-    needed: bool
-    tensors: int | None
-    parameters: int | None
-    bytes: int | None
-    note: str
-
-
-@dataclass(frozen=True)
-class NeededFiles:
-    """What a weights folder of a configuration holds.
-
-    Attributes:
-        config: its name.
-        published: files as they are downloaded; empty where nothing of this size is published.
-        own: the file that takes their place in a folder of one's own, beside ``config.json``.
-        beside: what either of the two may have or has to have beside it.
-    """
-
-    config: str
-    published: tuple[NeededFile, ...]
-    own: NeededFile
-    beside: tuple[NeededFile, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """For a JSON file."""
-        return asdict(self)
-
-
-def needed_files(config: GeoVerseConfig) -> NeededFiles:
-    """What a folder of ``config`` holds; sizes by our own lists of names and shapes.
+    Sizes are approximate: of our own lists of names and shapes, without headers.
 
     Raises:
         CheckpointError: no network comes of the configuration.
     """
     model = empty_model(config, where="the configuration")
-    whole = shapes(model.state_dict())
-    own = NeededFile(
-        "geoverse",
-        WHOLE_FILE,
-        _OWN,
-        "",
-        True,
-        len(whole),
-        _numbers(whole),
-        _FLOAT32 * _numbers(whole),
-        f"every tensor, beside {CONFIG_FILE}; half as large in float16 or bfloat16",
-    )
-    published = _published(model)
-    beside = []
-    added = {name: shape for name, shape in whole.items() if is_extension(name)}
-    if added and published:
-        beside.append(
-            NeededFile(
-                "extension",
-                EXTENSION_FILE,
-                "one's own, of a model trained on published files: save_extension",
-                "",
-                False,
-                len(added),
-                _numbers(added),
-                _FLOAT32 * _numbers(added),
-                "what GeoVerse adds to the published networks; untrained where it is absent",
-            )
-        )
-    if config.video is not None:
-        beside.append(_video(config.video))
-    return NeededFiles(config.name, published, own, tuple(beside))
-
-
-def _published(model: GeoVerse) -> tuple[NeededFile, ...]:
-    """The published files, if they are of the model's sizes."""
+    published = {part: expected_of(model, part) for part in parts_of(config)}
     known = _published_shapes()
-    expected = {part: expected_of(model, part) for part in parts_of(model.config)}
-    if any(found != known[part.name] for part, found in expected.items()):
-        return ()
-    return tuple(_file(part, found) for part, found in expected.items())
+    if all(shapes == known[part.name] for part, shapes in published.items()):
+        console.line(f"{config.name}, from published files (sizes are approximate):")
+        for part, shapes in published.items():
+            _print_part(part, shapes, console)
+        console.line(f"{config.name}, in a folder of one's own, instead of the published files:")
+    else:
+        console.line(f"{config.name}: nothing of its size is published; a folder of one's own:")
+    _print_part(WHOLE, expected_of(model, WHOLE), console)
+    if config.video is not None:
+        console.line(f"{config.name}, beside either of the two:")
+        _print_video(config.video, console)
 
 
 @lru_cache(maxsize=1)
 def _published_shapes() -> dict[str, Shapes]:
     """What the published files hold, by part: they are of the base configuration."""
     base = configs.named("base")
-    model = empty_model(base, where="base")
+    model: GeoVerse = empty_model(base, where="base")
     return {part.name: expected_of(model, part) for part in parts_of(base)}
 
 
-def _file(part: Part, expected: Shapes) -> NeededFile:
+def _print_part(part: Part, expected: Shapes, console: Console) -> None:
     twice = {name for names in part.tied for name in names[1:]}
     stored = {name: shape for name, shape in expected.items() if name not in twice}
-    numbers = _numbers(stored)
-    return NeededFile(
-        part.name,
-        part.files[0],
-        part.source,
-        part.licence,
-        not part.optional,
-        len(stored),
-        numbers,
-        part.stated_bytes or _FLOAT32 * numbers,
-        part.note,
-    )
+    numbers = sum(prod(shape) for shape in stored.values())
+    figures = ["optional"] if part.optional else []
+    figures += [size_text(part.stated_bytes or _FLOAT32 * numbers)]
+    figures += [f"{len(stored)} tensors", f"{numbers:,} numbers", part.licence]
+    note = part.note
+    if part is WHOLE:
+        note = f"every tensor, beside {CONFIG_FILE}; half as large in float16 or bfloat16"
+    _print_file(part.files[0], figures, (note, f"from {part.source}"), console)
 
 
-def _video(config: VideoPriorConfig) -> NeededFile:
-    usual = VideoPriorConfig()
-    known = (config.taps, config.channels) == (usual.taps, usual.channels)
-    tensors, numbers, size = (sum(column) for column in zip(*VIDEO_SIZES.values(), strict=True))
-    return NeededFile(
-        "video",
-        f"{VIDEO_FOLDER}/",
-        VIDEO_SOURCE if known else "a Wan VACE model of the configuration's width",
-        VIDEO_TERMS if known else "",
-        True,
-        tensors if known else None,
-        numbers if known else None,
-        size if known else None,
+def _print_video(config: VideoPriorConfig, console: Console) -> None:
+    default = VideoPriorConfig()
+    figures, source = [], "a Wan VACE model of the configuration's width"
+    if (config.taps, config.channels) == (default.taps, default.channels):
+        tensors, numbers, size = (sum(column) for column in zip(*VIDEO_SIZES.values(), strict=True))
+        figures = [size_text(size), f"{tensors} tensors", f"{numbers:,} numbers", VIDEO_TERMS]
+        source = VIDEO_SOURCE
+    note = (
         "the video prior, made by gvtools weights truncate-wan and empty-prompt; needs diffusers "
-        "(pip install 'gvtools[wan]')",
+        "(pip install 'gvtools[wan]')"
     )
+    _print_file(f"{VIDEO_FOLDER}/", figures, (note, f"from {source}"), console)
 
 
-def _numbers(tensors: Shapes) -> int:
-    return sum(prod(shape) for shape in tensors.values())
-
-
-def print_needed(entry: NeededFiles, console: Console) -> None:
-    """The files of a configuration, published ones and one's own."""
-    if entry.published:
-        console.line(f"{entry.config}, from published files (sizes are approximate):")
-        _print_files((*entry.published, *entry.beside), console)
-        console.line(f"{entry.config}, in a folder of one's own, instead of the published files:")
-        _print_files((entry.own,), console)
-    else:
-        console.line(f"{entry.config}: nothing of its size is published; a folder of one's own:")
-        _print_files((entry.own, *entry.beside), console)
-
-
-def _print_files(files: Sequence[NeededFile], console: Console) -> None:
-    for file in files:
-        figures = [
-            "" if file.needed else "optional",
-            "" if file.bytes is None else size_text(file.bytes),
-            "" if file.tensors is None else f"{file.tensors} tensors",
-            "" if file.parameters is None else f"{file.parameters:,} numbers",
-            file.licence,
-        ]
-        console.line(f"  {file.path}")
-        console.line(f"      {', '.join(filter(None, figures))}")
-        console.line(f"      {file.note}")
-        console.line(f"      from {file.source}")
+def _print_file(path: str, figures: Sequence[str], notes: Sequence[str], console: Console) -> None:
+    console.line(f"  {path}")
+    for line in (", ".join(filter(None, figures)), *notes):
+        console.line(f"      {line}")
 
 
 def print_parts(

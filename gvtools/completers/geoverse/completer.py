@@ -37,8 +37,7 @@ from gvtools.completers.geoverse.postprocess import (
     to_scene_scale,
 )
 from gvtools.completers.geoverse.resampling import model_size
-from gvtools.completers.geoverse.weights.checks import check_headers
-from gvtools.completers.geoverse.weights.folder import from_pretrained
+from gvtools.completers.geoverse.weights.folder import check_headers, from_pretrained
 from gvtools.completers.holes import hole_radius
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance

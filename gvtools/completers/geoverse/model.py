@@ -31,7 +31,7 @@ from gvtools.completers.geoverse.passes import Decoded, Generated, Prepared
 from gvtools.completers.geoverse.stages import Clock, no_clock
 from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
 from gvtools.errors import CheckpointError, GvError
-from gvtools.networks.tensors import first_line
+from gvtools.networks.tensor_files import first_line
 
 __all__ = ["Decoded", "Generated", "GeoVerse", "Prepared"]
 

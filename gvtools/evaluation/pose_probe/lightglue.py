@@ -128,7 +128,7 @@ def _load(network: Any, path: Path) -> None:
     Raises:
         CheckpointError: the file is absent, damaged, or of another network.
     """
-    from gvtools.networks.tensors import read_tensors
+    from gvtools.networks.tensor_files import read_tensors
 
     stored = read_tensors(path)
     try:

@@ -13,7 +13,8 @@ from gvtools.networks.config_json import from_json
 from gvtools.networks.depth_anything.encoder import EncoderConfig
 from gvtools.networks.depth_anything.geometry_head import GeometryHeadConfig
 from gvtools.networks.depth_anything.network import DepthAnything3, DepthAnythingConfig
-from gvtools.networks.tensors import check_finite, load, read_tensors, share_tied
+from gvtools.networks.tensor_files import TensorFiles, read_tensors
+from gvtools.networks.tensors import load, not_finite, share_tied
 
 # Released models by the width of their tokens.
 RELEASED = {
@@ -79,9 +80,10 @@ def load_depth_anything(
     path = find_weights(folder)
     if path.name == GEOVERSE_FILE:
         config = _geoverse_config(path.with_name(GEOVERSE_CONFIG))
+        files = TensorFiles.find(path)
         tensors = {
-            name.removeprefix(GEOVERSE_PREFIX): tensor
-            for name, tensor in read_tensors(path).items()
+            name.removeprefix(GEOVERSE_PREFIX): files.read(name)
+            for name in files.places
             if name.startswith(GEOVERSE_PREFIX)
         }
     else:
@@ -98,7 +100,9 @@ def load_depth_anything(
         config = RELEASED[width]
     with torch.device("meta"):
         network = DepthAnything3(config)
-    check_finite(tensors, where=path)
+    bad = not_finite(tensors)
+    if bad is not None:
+        raise CheckpointError(f"{path}: {bad} holds values that are not finite")
     load(network, tensors, where=path)
     return network.requires_grad_(False).eval().to(device)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +21,6 @@ from geoverse_folders import (
     output,
     refused,
     report,
-    write_source,
 )
 from oracle import ABSENT, ORACLE
 from published_folder import CASCADE, GEOMETRY, LEVEL1, RGB_HEAD
@@ -31,24 +29,12 @@ from safetensors.torch import load_file, save_file
 from gvtools.completers.geoverse import GeoVerse, named
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import empty_model
-from gvtools.completers.geoverse.weights.folder import save_extension, save_pretrained
+from gvtools.completers.geoverse.weights.folder import save_pretrained
 from gvtools.completers.geoverse.weights.published import PARTS, expected_of
-from gvtools.errors import CheckpointError
 from gvtools.networks.tensors import READABLE
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of published files."""
-    return write_source(tmp_path_factory.mktemp("published"))
-
-
-@pytest.fixture
-def folder(source: Path, tmp_path: Path) -> Path:
-    """Published files to be damaged."""
-    return Path(shutil.copytree(source, tmp_path / "published"))
+pytest_plugins = ("geoverse_folder_fixtures",)
 
 
 @pytest.mark.parametrize("config", [PLAIN, CONTROL, SHARED], ids=lambda c: c.injection)
@@ -80,42 +66,6 @@ def test_a_fresh_extension_changes_no_bit_and_is_the_same_each_time(
     state = torch.get_rng_state()
     assert equal(fresh, load(source, config))
     assert torch.equal(torch.get_rng_state(), state)
-    said = report(source, "extension", config)
-    assert said.ok
-    assert not said.needed
-    assert "untrained" in said.summary
-
-
-@pytest.mark.parametrize("config", [CONTROL, SHARED], ids=lambda c: c.injection)
-def test_a_trained_extension_is_read_beside_the_published_files(
-    folder: Path, config: GeoVerseConfig
-) -> None:
-    trained = load(folder, config)
-    with torch.no_grad():
-        for name, parameter in trained.named_parameters():
-            if name.startswith(("level1.depth_embedder.", "control.", "shared.")):
-                parameter.add_(torch.randn_like(parameter), alpha=0.1)
-    path = save_extension(trained, folder)
-    assert path.stat().st_size < (folder / LEVEL1).stat().st_size
-    again = load(folder, config)
-    assert equal(trained, again)
-    aside = path.rename(folder / "aside")
-    assert not torch.equal(output(again)[0], output(load(folder, config))[0])
-    aside.rename(path)
-    tensors = load_file(path)
-    save_file({**tensors, "level1.blocks.0.norm1.weight": torch.ones(32)}, path)
-    refused(folder, r"unexpected: level1\.blocks\.0\.norm1\.weight", config)
-    name = next(iter(tensors))
-    save_file({n: t for n, t in tensors.items() if n != name}, path)
-    refused(folder, f"missing: {name}", config)
-    save_file({**tensors, name: tensors[name] + float("nan")}, path)
-    refused(folder, f"{name} holds values that are not finite", config)
-
-
-def test_a_model_without_extension_has_none_to_save(source: Path, tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="adds nothing"):
-        save_extension(load(source), tmp_path)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("start", ["", "module."])
@@ -151,7 +101,7 @@ def test_a_shared_tensor_may_have_any_of_its_names(folder: Path, source: Path) -
 def test_the_publishers_other_geometry_head_takes_the_place_of_the_first(
     folder: Path, source: Path
 ) -> None:
-    assert not report(folder, "geometry_head").needed
+    assert report(folder, "geometry_head").ok
     head = published.write_dpt_head(micro.model(BARE), folder)
     state, before = load(folder).state_dict(), load(source).state_dict()
     for name, tensor in before.items():

@@ -19,7 +19,7 @@ from published_folder import CASCADE, GEOMETRY, LEVEL1, RGB_HEAD, STATISTICS
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from gvtools.completers.geoverse.weights.checks import check_folder
+from gvtools.completers.geoverse.weights.folder import check_folder
 from gvtools.completers.geoverse.weights.published import WHOLE_FILE
 from gvtools.errors import CheckpointError
 
@@ -93,8 +93,8 @@ def test_what_does_not_fit_is_listed_in_full(folder: Path) -> None:
     tensors_changed(folder / LEVEL1, DAMAGES["missing"][0])
     tensors_changed(folder / LEVEL1, lambda t: t.update(a=torch.zeros(1), b=torch.zeros(1)))
     found = report(folder, "level1").to_dict()
-    assert found["missing"] == [LAYER, "blocks.1.attn.qkv.bias"]
-    assert found["unexpected"] == ["a", "b"]
+    assert found["missing"] == (LAYER, "blocks.1.attn.qkv.bias")
+    assert found["unexpected"] == ("a", "b")
     assert (
         "missing: blocks.1.attn.qkv.weight and 1 more; unexpected: a and 1 more" in found["summary"]
     )
@@ -204,7 +204,7 @@ def test_other_contents_of_a_pytorch_file_are_refused(folder: Path) -> None:
 @pytest.mark.parametrize("file", [STATISTICS[0], Path("a.safetensors")], ids=lambda f: f.suffix)
 def test_no_damage_ends_in_another_error(folder: Path, file: Path) -> None:
     """Every ending, and random bytes: either it is read, or the error is our own."""
-    from gvtools.networks.tensors import read_tensors
+    from gvtools.networks.tensor_files import read_tensors
 
     path = folder / file
     if file.suffix == ".safetensors":

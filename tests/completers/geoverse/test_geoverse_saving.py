@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,18 +18,7 @@ from gvtools.errors import CheckpointError, GvError, ProjectError
 from gvtools.networks.tensors import save_tensors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module")
-def own_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of one's own."""
-    return micro.weights_folder(tmp_path_factory.mktemp("own"), PLAIN)
-
-
-@pytest.fixture
-def own(own_source: Path, tmp_path: Path) -> Path:
-    """A folder of one's own to be damaged."""
-    return Path(shutil.copytree(own_source, tmp_path / "own"))
+pytest_plugins = ("geoverse_folder_fixtures",)
 
 
 @pytest.mark.parametrize("dtype", ["float16", "bfloat16"])

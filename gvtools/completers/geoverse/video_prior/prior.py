@@ -113,6 +113,11 @@ class VideoPrior:
     ) -> VideoPrior:
         """From a folder that ``wan_checkpoint.truncate`` made, strictly.
 
+        Args:
+            folder: see ``wan_folder``.
+            config: how features are taken.
+            device: of the weights; "meta" compares everything and reads no weights.
+
         Raises:
             CheckpointError: diffusers, a file or a tensor is absent or does not fit.
         """
@@ -122,6 +127,13 @@ class VideoPrior:
         transformer = load_network(Path(folder), "transformer", dtype=dtype, device=str(device))
         vae = load_network(Path(folder), "vae", device=str(device))
         return cls(transformer, vae, prompt, config=config)
+
+    @property
+    def summary(self) -> str:
+        """What was loaded, in a line."""
+        networks, prompt = self.networks, tuple(self.networks.prompt.shape)
+        counts = (len(n.state_dict()) for n in (networks.transformer, networks.vae))
+        return "transformer: {} tensors, vae: {} tensors, prompt: {}".format(*counts, prompt)
 
     def to(self, device: torch.device | str) -> VideoPrior:
         """Move the weights; their dtype stays, since some are float32 on purpose."""

@@ -8,38 +8,35 @@ bit for bit.
 from __future__ import annotations
 
 import json
+import re
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from gvtools.completers.geoverse.video_prior.wan_files import (
-    INDEX,
-    TensorFiles,
-    check_present,
-    check_tensors,
-)
 from gvtools.completers.geoverse.video_prior.wan_folder import (
     COMPONENTS,
     EMPTY_PROMPT,
     cast,
     dtype_of,
     expected_tensors,
+    network_class,
     read_config,
 )
-from gvtools.completers.geoverse.video_prior.wan_names import by_diffusers_name, config_of_tensors
 from gvtools.errors import CheckpointError, OptionError, ProjectError
-
-__all__ = ["expected_tensors", "truncate", "write_empty_prompt"]
+from gvtools.files import replaced_when_written
+from gvtools.networks.tensor_files import INDEX, TensorFiles
+from gvtools.networks.tensors import check_fit
 
 _WEIGHTS = "diffusion_pytorch_model"
 # Bytes of tensors held in memory at a time, and of one file.
 _PART = 2 * 1024**3
 _MARGIN = 64 * 1024**2
+# Every published Wan has heads of this width; the tensors do not show it.
+_HEAD_WIDTH = 128
 
 
 def write_empty_prompt(text_encoder: Path | str, out: Path | str) -> None:
@@ -48,7 +45,7 @@ def write_empty_prompt(text_encoder: Path | str, out: Path | str) -> None:
     Args:
         text_encoder: folder of the UMT5 encoder in transformers' form (``text_encoder`` of a Wan
             folder of diffusers); 11.4 GB in bfloat16 for the published one.
-        out: the file to write, or the truncated folder that it belongs into.
+        out: the truncated folder that it belongs into.
 
     Raises:
         CheckpointError: transformers or the text encoder is absent.
@@ -70,11 +67,8 @@ def write_empty_prompt(text_encoder: Path | str, out: Path | str) -> None:
     tokens = torch.tensor([[encoder.config.eos_token_id]])
     with torch.no_grad():
         embedding = encoder(tokens, attention_mask=torch.ones_like(tokens)).last_hidden_state[0]
-    path = Path(out) / EMPTY_PROMPT if Path(out).is_dir() else Path(out)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    save_file({"embedding": embedding.float().contiguous()}, temporary)
-    temporary.replace(path)
+    with replaced_when_written(Path(out) / EMPTY_PROMPT) as path:
+        save_file({"embedding": embedding.float().contiguous()}, path)
 
 
 def truncate(
@@ -82,10 +76,9 @@ def truncate(
     out: Path | str,
     *,
     blocks: int = 16,
-    vace_blocks: int | None = 4,
     dtype: torch.dtype = torch.bfloat16,
     vae: Path | str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Write a ``wan_folder`` from published weights; only what is needed is read.
 
@@ -97,8 +90,7 @@ def truncate(
             is taken), Wan's own folder (``low_noise_model``), a transformer's own folder, or its
             one safetensors file. Of several files only those that hold needed tensors are opened.
         out: the folder to make; it must not be there.
-        blocks: backbone blocks to keep.
-        vace_blocks: VACE blocks to keep: those that act on the kept blocks. None counts them.
+        blocks: backbone blocks to keep, and with them the VACE blocks that act on them.
         dtype: of the result, except for what diffusers keeps in float32.
         vae: folder of the VAE in diffusers' form; None looks beside the transformer.
         progress: called with bytes done and in all.
@@ -111,24 +103,26 @@ def truncate(
     """
     from safetensors import SafetensorError
 
-    found, out = find_source(Path(source), None if vae is None else Path(vae)), Path(out)
+    place, out = _transformer(Path(source)), Path(out)
     if out.exists():
         raise ProjectError(f"{out} is there already; remove it, or choose another folder")
-    config = _truncated(found.config, blocks, vace_blocks)
-    sizes = _sizes(found, config, dtype)
-    copied = _vae_files(found.vae)
+    files, config = _network(place)
+    config = _truncated(config, blocks)
+    expected = expected_tensors(config)
+    check_fit(files.empty(expected), expected, where=place)
+    sizes = {n: prod(shape) * dtype_of(n, dtype).itemsize for n, shape in expected.items()}
+    copied = _vae_files(_vae(place, None if vae is None else Path(vae)))
     needed = sum(sizes.values()) + sum(path.stat().st_size for path in copied)
     _check_space(out, needed + _MARGIN)
-    report = progress or (lambda done, total: None)
 
     temporary = out.with_name(f".{out.name}.part")
     try:
         shutil.rmtree(temporary, ignore_errors=True)
-        for component in ("transformer", "vae"):
+        for component in COMPONENTS:
             (temporary / component).mkdir(parents=True)
         _write_json(temporary / "transformer" / "config.json", config)
-        for done in _written(temporary / "transformer", found, sizes, dtype=dtype):
-            report(done, needed)
+        for done in _written(temporary / "transformer", files, sizes, dtype=dtype):
+            progress(done, needed)
         for path in copied:
             shutil.copyfile(path, temporary / "vae" / path.name)
         temporary.replace(out)
@@ -138,50 +132,27 @@ def truncate(
         ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    report(needed, needed)
+    progress(needed, needed)
 
 
-def _sizes(source: Source, config: Mapping[str, Any], dtype: torch.dtype) -> dict[str, int]:
-    """Bytes of every tensor to be written; headers alone are read.
-
-    Raises:
-        CheckpointError: the source has not what the configuration asks for.
-    """
-    expected = expected_tensors(config)
-    check_present(expected, source.names, where=source.place)
-    for name, shape in expected.items():
-        if source.shape(name) != shape:
-            raise CheckpointError(
-                f"{source.place}: {name} is {source.shape(name)}; expected {shape}; the "
-                "configuration belongs to other weights"
-            )
-    return {name: source.numbers(name) * dtype_of(name, dtype).itemsize for name in expected}
+def _truncated(config: Mapping[str, Any], blocks: int) -> dict[str, Any]:
+    if not 0 < blocks <= config["num_layers"]:
+        raise OptionError(
+            f"blocks {blocks}; expected 1 to {config['num_layers']}, what the source has"
+        )
+    hints = [layer for layer in config["vace_layers"] if layer < blocks]
+    return {**config, "num_layers": blocks, "vace_layers": hints}
 
 
 def _vae_files(folder: Path) -> list[Path]:
     """What is copied of the VAE's folder, after a check of names and shapes."""
     files = TensorFiles.find(folder)
-    expected = expected_tensors(read_config(folder), component="vae")
-    check_tensors(files, expected, where=folder)
-    return sorted({folder / "config.json", *files.files.values(), *folder.glob(f"*{INDEX}")})
-
-
-def _truncated(config: Mapping[str, Any], blocks: int, vace_blocks: int | None) -> dict[str, Any]:
-    layers = [layer for layer in config["vace_layers"] if layer < blocks]
-    if not 0 < blocks <= config["num_layers"]:
-        raise OptionError(
-            f"blocks {blocks}; expected 1 to {config['num_layers']}, what the source has"
-        )
-    if vace_blocks is not None and vace_blocks != len(layers):
-        raise OptionError(
-            f"vace_blocks {vace_blocks}; expected {len(layers)}: blocks 0 to {blocks - 1} of the "
-            f"source get hints at {layers}, and without one of them the features change"
-        )
-    return {**config, "num_layers": blocks, "vace_layers": layers}
+    check_fit(files.empty(), expected_tensors(read_config(folder), component="vae"), where=folder)
+    return sorted({folder / "config.json", *files.paths, *folder.glob(f"*{INDEX}")})
 
 
 def _written(
-    folder: Path, source: Source, sizes: Mapping[str, int], *, dtype: torch.dtype
+    folder: Path, source: TensorFiles, sizes: Mapping[str, int], *, dtype: torch.dtype
 ) -> Iterator[int]:
     """Writes the tensors, part by part, and gives the bytes that are done."""
     from safetensors.torch import save_file
@@ -222,66 +193,95 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-@dataclass(frozen=True)
-class Source:
-    """A transformer's tensors by their diffusers names, whatever they are called on disk.
-
-    Attributes:
-        place: folder or file.
-        config: the transformer's diffusers config.
-        vae: folder of the VAE in diffusers' form.
-        files: where the tensors are.
-        stored: the name on disk of each diffusers name.
-    """
-
-    place: Path
-    config: dict[str, Any]
-    vae: Path
-    files: TensorFiles
-    stored: dict[str, str]
-
-    @property
-    def names(self) -> Collection[str]:
-        """Diffusers names of all tensors."""
-        return self.stored.keys()
-
-    def shape(self, name: str) -> tuple[int, ...]:
-        """Of one tensor."""
-        return self.files.shape(self.stored[name])
-
-    def numbers(self, name: str) -> int:
-        """How many numbers a tensor holds; see ``TensorFiles.numbers``."""
-        return self.files.numbers(self.stored[name])
-
-    def read(self, name: str) -> Tensor:
-        """One tensor, as stored."""
-        return self.files.read(self.stored[name])
-
-
-def find_source(place: Path, vae: Path | None) -> Source:
-    """The low-noise transformer in ``place``, and its VAE.
-
-    Args:
-        place: folder or file, see ``wan_checkpoint.truncate``.
-        vae: folder of the VAE; None looks beside the transformer.
+def _network(folder: Path) -> tuple[TensorFiles, dict[str, Any]]:
+    """A transformer's tensors by diffusers' names, and its diffusers config.
 
     Raises:
-        CheckpointError: neither form is found, or the transformer is not a Wan VACE one.
+        CheckpointError: not a Wan VACE transformer.
     """
-    folder = _transformer(place)
     files = TensorFiles.find(folder)
-    stored = by_diffusers_name(files.files)
+    files = files.renamed(by_diffusers_name(files.places))
     beside = folder if folder.is_dir() else folder.parent
     config = read_config(beside) if (beside / "config.json").is_file() else {}
     if "num_attention_heads" not in config:
-        config = config_of_tensors(stored, lambda n: files.shape(stored[n]), stated=config)
+        config = _config_of_tensors(files, stated=config)
     name = config.get("_class_name", COMPONENTS["transformer"])
     if name != COMPONENTS["transformer"]:
         raise CheckpointError(
             f"{folder}: a {name}; expected a {COMPONENTS['transformer']}, such as "
             "Wan2.2-VACE-Fun-A14B's low-noise expert"
         )
-    return Source(folder, config, _vae(folder, vae), files, stored)
+    return files, config
+
+
+def by_diffusers_name(names: Iterable[str]) -> dict[str, str]:
+    """Stored names by diffusers name; names that are diffusers' already stay as they are."""
+    stored = {name: name for name in names}
+    if not any(".self_attn." in name for name in stored):
+        return stored
+    network_class("transformer")  # diffusers, or an error that says what is absent
+    from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
+
+    # It renames the keys of a dictionary of tensors, and looks at no tensor of this network.
+    plain = {name.removeprefix("model.diffusion_model."): name for name in stored}
+    converted: dict[str, str] = convert_wan_transformer_to_diffusers(plain)
+    return converted
+
+
+def _config_of_tensors(files: TensorFiles, *, stated: Mapping[str, Any]) -> dict[str, Any]:
+    """The transformer's diffusers config, of its tensors.
+
+    Args:
+        files: by diffusers' names.
+        stated: Wan's own config.json where there is one; of it ``num_heads``, ``eps`` and
+            ``vace_layers`` are taken, which no shape shows. Without it they are what all
+            published Wan VACE networks have: heads of 128, 1e-6, evenly spread.
+
+    Raises:
+        CheckpointError: these are not the tensors of a Wan VACE transformer.
+    """
+    sides = {
+        "ffn_dim": ("blocks.0.ffn.net.0.proj.weight", 0),
+        "freq_dim": ("condition_embedder.time_embedder.linear_1.weight", 1),
+        "in_channels": ("patch_embedding.weight", 1),
+        "text_dim": ("condition_embedder.text_embedder.linear_1.weight", 1),
+        "vace_in_channels": ("vace_patch_embedding.weight", 1),
+        "width": ("patch_embedding.weight", 0),
+    }
+    found = files.empty(name for name, _ in sides.values())
+    for name, _ in sides.values():
+        if name not in found or found[name].ndim < 2:
+            raise CheckpointError(
+                f"not a whole Wan VACE transformer: no {name}; expected Wan2.2-VACE-Fun-A14B's "
+                "low-noise weights, or those of another Wan VACE"
+            )
+    config = {key: found[name].shape[side] for key, (name, side) in sides.items()}
+    width = config.pop("width")
+    heads = stated.get("num_heads") or max(1, width // _HEAD_WIDTH)
+    layers, hints = (_count(group, files.places) for group in ("blocks", "vace_blocks"))
+    vace_layers = stated.get("vace_layers")
+    if vace_layers is None:
+        if hints == 0 or layers % hints:
+            raise CheckpointError(
+                f"{layers} blocks and {hints} VACE blocks, which cannot be spread evenly; put the "
+                "config.json that names vace_layers beside the weights"
+            )
+        vace_layers = list(range(0, layers, layers // hints))
+    return {
+        "_class_name": COMPONENTS["transformer"],
+        **config,
+        "out_channels": config["in_channels"],
+        "num_layers": layers,
+        "num_attention_heads": heads,
+        "attention_head_dim": width // heads,
+        "eps": stated.get("eps", 1e-6),
+        "vace_layers": vace_layers,
+    }
+
+
+def _count(group: str, names: Iterable[str]) -> int:
+    found = [int(match[1]) for match in (re.match(rf"{group}\.(\d+)\.", n) for n in names) if match]
+    return 1 + max(found, default=-1)
 
 
 def _transformer(place: Path) -> Path:

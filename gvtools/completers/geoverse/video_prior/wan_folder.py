@@ -17,27 +17,21 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.video_prior.wan_files import (
-    TensorFiles,
-    check_present,
-    check_tensors,
-)
-from gvtools.completers.geoverse.video_prior.wan_names import kept_in_float32
 from gvtools.errors import CheckpointError
+from gvtools.networks.tensor_files import TensorFiles
+from gvtools.networks.tensors import Shapes, check_fit, shapes
 
 COMPONENTS = {"transformer": "WanVACETransformer3DModel", "vae": "AutoencoderKLWan"}
 EMPTY_PROMPT = "empty_prompt.safetensors"
-_MAKER = "gvtools.completers.geoverse.video_prior.wan_checkpoint"
+_FLOAT32 = frozenset({"time_embedder", "scale_shift_table", "norm1", "norm2", "norm3"})
 
 
-def expected_tensors(
-    config: Mapping[str, Any], *, component: str = "transformer"
-) -> dict[str, tuple[int, ...]]:
+def expected_tensors(config: Mapping[str, Any], *, component: str = "transformer") -> Shapes:
     """Name and shape of every tensor that a network's weights have to hold; nothing is allocated.
 
     Args:
@@ -47,43 +41,7 @@ def expected_tensors(
     Raises:
         CheckpointError: diffusers is absent, or makes no network of the config.
     """
-    network = empty_network(component, config)
-    return {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-
-
-class FolderReport(NamedTuple):
-    """A folder in which nothing is amiss.
-
-    Attributes:
-        bytes: of its weights.
-        summary: what it holds, in a line.
-    """
-
-    bytes: int
-    summary: str
-
-
-def check_folder(folder: Path, *, prompt: bool = True) -> FolderReport:
-    """Config, names and shapes of a truncated folder, and its prompt; reads headers alone.
-
-    Args:
-        folder: see the module.
-        prompt: whether the empty prompt has to be there.
-
-    Raises:
-        CheckpointError: what is absent or does not fit.
-    """
-    size, found = 0, []
-    for component in ("transformer", "vae"):
-        place = Path(folder) / component
-        expected = expected_tensors(read_config(place), component=component)
-        files = TensorFiles.find(place)
-        check_tensors(files, expected, where=place)
-        size += sum(path.stat().st_size for path in set(files.files.values()))
-        found.append(f"{component}: {len(expected)} tensors")
-    if prompt:
-        found.append(f"empty prompt: {tuple(read_empty_prompt(folder).shape)}")
-    return FolderReport(size, ", ".join(found))
+    return shapes(empty_network(component, config).state_dict())
 
 
 def load_network(
@@ -96,25 +54,25 @@ def load_network(
         component: "transformer" or "vae".
         dtype: None keeps what is stored. Otherwise what diffusers keeps in float32 is float32 and
             the rest is this.
-        device: where to.
+        device: where to; "meta" checks names, shapes and types by headers alone.
 
     Raises:
         CheckpointError: diffusers, the folder, or a tensor is absent or does not fit.
     """
     place = Path(folder) / component
     network: Any = empty_network(component, read_config(place))
-    files = TensorFiles.find(place)
-    expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    check_tensors(files, expected, where=place)
-    state = {n: cast(n, files.read(n, device=device), dtype) for n in expected}
-    network.load_state_dict(state, assign=True)
-    if component == "transformer":
-        # Its tables are computed, not stored, and so still on the meta device.
-        sizes = network.config
-        table = type(network.rope)(
-            sizes.attention_head_dim, sizes.patch_size, sizes.rope_max_seq_len
-        )
-        network.rope = table.to(device)
+    files, expected = TensorFiles.find(place), shapes(network.state_dict())
+    check_fit(files.empty(), expected, where=place)
+    if device != "meta":
+        state = {n: cast(n, files.read(n, device=device), dtype) for n in expected}
+        network.load_state_dict(state, assign=True)
+        if component == "transformer":
+            # Its tables are computed, not stored, and so still on the meta device.
+            sizes = network.config
+            table = type(network.rope)(
+                sizes.attention_head_dim, sizes.patch_size, sizes.rope_max_seq_len
+            )
+            network.rope = table.to(device)
     return network.requires_grad_(False).eval()
 
 
@@ -128,12 +86,10 @@ def read_empty_prompt(folder: Path) -> Tensor:
     if not path.is_file():
         raise CheckpointError(
             f"{path} is absent; make it once, where Wan's text encoder is (11 GB, needs pip "
-            f'install transformers): python -c "from {_MAKER} import write_empty_prompt; '
-            f"write_empty_prompt('WAN/text_encoder', '{path}')\""
+            f"install transformers): gvtools weights empty-prompt WAN/text_encoder {folder}"
         )
     files = TensorFiles.find(path)
-    check_present(["embedding"], files.files, where=path)
-    embedding = files.read("embedding")
+    embedding = files.read("embedding") if "embedding" in files.places else torch.zeros(())
     if embedding.ndim != 2:
         raise CheckpointError(
             f"{path}: embedding {tuple(embedding.shape)}; expected (tokens, channels)"
@@ -147,8 +103,8 @@ def cast(name: str, tensor: Tensor, dtype: torch.dtype | None) -> Tensor:
 
 
 def dtype_of(name: str, dtype: torch.dtype) -> torch.dtype:
-    """``dtype``, or float32 where diffusers keeps that beside smaller types."""
-    return torch.float32 if kept_in_float32(name) else dtype
+    """``dtype``, or float32 for tensors (by diffusers' names) that diffusers keeps in that."""
+    return dtype if _FLOAT32.isdisjoint(name.split(".")) else torch.float32
 
 
 def network_class(component: str) -> Any:

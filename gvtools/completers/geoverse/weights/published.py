@@ -9,17 +9,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.errors import CheckpointError
 from gvtools.networks.depth_anything import weights as da3
-from gvtools.networks.tensors import plain_tensors, read_pickled, read_tensors, share_tied
+from gvtools.networks.tensor_files import (
+    TensorFiles,
+    plain_tensors,
+    read_pickled,
+    read_tensors,
+)
+from gvtools.networks.tensors import share_tied
 
-# What GeoVerse adds to published networks; fresh where a folder has no trained extension.
+# What GeoVerse adds to published networks.
 EXTENSION = ("level1.depth_embedder.", "control.", "shared.")
-EXTENSION_FILE = "geoverse_extension.safetensors"
 WHOLE_FILE = da3.GEOVERSE_FILE
 CONFIG_FILE = da3.GEOVERSE_CONFIG
 VIDEO_FOLDER = "video"
@@ -35,10 +41,10 @@ class Part:
         files: where it may lie in a weights folder, the publisher's own place first.
         source: who publishes it.
         licence: its terms.
-        nested: dictionaries in which the tensors may lie, the first that is there.
         strip: prefix that is taken off every key that has it.
         only: keys with none of these prefixes belong to other networks and are ignored; the
             prefix is taken off as well.
+        names: keys other than these are no tensors of the module and are ignored.
         tied: names that are one tensor in the publisher's network; a file may hold any of them.
         optional: the model can do without it; where the file is there it has to fit all the same.
         stated_bytes: the file's size as published, where it holds other networks, too.
@@ -50,9 +56,9 @@ class Part:
     files: tuple[str, ...]
     source: str
     licence: str
-    nested: tuple[str, ...] = ()
-    strip: str = ""
+    strip: str = "module."
     only: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
     tied: tuple[tuple[str, ...], ...] = ()
     optional: bool = False
     stated_bytes: int | None = None
@@ -66,13 +72,19 @@ class Part:
         """A stored key by the name of our module, without its prefix; None if it is another's."""
         key = key.removeprefix(self.strip)
         if not self.only:
-            return key
+            return None if self.names and key not in self.names else key
         start = next((start for start in self.only if key.startswith(start)), None)
         return None if start is None else key.removeprefix(start)
 
 
 GLD = "SeonghuJeon/GLD (Geometric Latent Diffusion)"
 GLD_TERMS = "Apache-2.0 (model card); code MIT"
+
+# Dictionaries in which the tensors of a PyTorch file may lie; the first that is there counts.
+NESTED = ("ema", "model")
+
+# A file of one's own, instead of all others.
+WHOLE = Part("geoverse", "", (WHOLE_FILE,), "gvtools train or gvtools weights create", "", strip="")
 
 PARTS = (
     Part(
@@ -91,8 +103,6 @@ PARTS = (
         ("checkpoints/da3_level1.pt", "da3_level1.pt"),
         GLD,
         GLD_TERMS,
-        nested=("ema", "model"),
-        strip="module.",
         note="the level-1 denoiser; GeoVerse's additions to it start at zero",
     ),
     Part(
@@ -101,8 +111,6 @@ PARTS = (
         ("checkpoints/da3_cascade.pt", "da3_cascade.pt"),
         GLD,
         GLD_TERMS,
-        nested=("ema", "model"),
-        strip="module.",
         note="the level-0 cascade",
     ),
     Part(
@@ -111,8 +119,6 @@ PARTS = (
         ("pretrained_models/mae_decoder.pt", "mae_decoder.pt"),
         GLD,
         GLD_TERMS,
-        nested=("ema", "model"),
-        strip="module.",
         only=("decoder.",),
         note="the RGB head",
     ),
@@ -126,6 +132,7 @@ PARTS = (
             ),
             "cvlab-kaist/Geometric-Latent-Diffusion, in the code repository",
             "MIT",
+            names=("mean", "var"),
             note=f"mean and variance of the level-{level} channels",
         )
         for level in (0, 1)
@@ -140,8 +147,6 @@ GEOMETRY_HEAD = Part(
     ("pretrained_models/da3/dpt_decoder.pt", "da3/dpt_decoder.pt"),
     GLD,
     GLD_TERMS,
-    nested=("model",),
-    strip="module.",
     only=("decoder.", "pred."),
     tied=da3.tied_norms(""),
     optional=True,
@@ -170,7 +175,7 @@ def expected_of(module: nn.Module, part: Part) -> dict[str, tuple[int, ...]]:
     return {
         name.removeprefix(part.module): tuple(tensor.shape)
         for name, tensor in module.state_dict().items()
-        if name.startswith(part.module) and not is_extension(name)
+        if name.startswith(part.module) and (part is WHOLE or not is_extension(name))
     }
 
 
@@ -179,33 +184,26 @@ def is_extension(name: str) -> bool:
     return name.startswith(EXTENSION)
 
 
-@dataclass(frozen=True)
-class Stored:
-    """What a file holds for a part.
+def read_part(
+    path: Path, part: Part, *, numbers: bool = True
+) -> tuple[dict[str, Tensor], tuple[str, ...]]:
+    """A part's tensors by the names of our module, and the names of what else its file holds.
 
-    Attributes:
-        tensors: by the names of our module, without its prefix.
-        ignored: names in the file that belong to other networks or are no weights.
-    """
-
-    tensors: dict[str, Tensor]
-    ignored: tuple[str, ...] = ()
-
-
-def read_stored(path: Path, part: Part) -> Stored:
-    """A part's tensors by the names of our module, and what else its file holds.
+    Args:
+        path: the file.
+        part: what it is.
+        numbers: False reads the headers of a safetensors file alone.
 
     Raises:
         CheckpointError: see ``read_tensors``; or two stored tensors claim one name.
     """
+    content: dict[str, Any] = {}
     if path.suffix == ".safetensors":
-        stored = read_tensors(path)
+        stored = read_tensors(path) if numbers else TensorFiles.find(path).empty()
     else:
         content = read_pickled(path)
-        inner = next((k for k in part.nested if isinstance(content.get(k), Mapping)), None)
-        stored = plain_tensors(content if inner is None else content[inner], path)
-        if part.name.startswith("statistics"):
-            return _statistics(content, stored, path, part)
+        inner = next((content[k] for k in NESTED if isinstance(content.get(k), dict)), content)
+        stored = plain_tensors(inner, path)
     found: dict[str, Tensor] = {}
     ignored = []
     for key, tensor in stored.items():
@@ -216,21 +214,21 @@ def read_stored(path: Path, part: Part) -> Stored:
             raise CheckpointError(f"{path}: holds {name} twice, also as {key}; expected it once")
         else:
             found[name] = tensor
+    if part.name.startswith("statistics"):
+        _check_statistics(content, found, path, part)
+        found = {name: tensor.reshape(-1) for name, tensor in found.items()}
     share_tied(found, part.tied, where=path)
-    return Stored(found, tuple(ignored))
+    return found, tuple(ignored)
 
 
-def _statistics(
-    content: Mapping[str, object], stored: dict[str, Tensor], path: Path, part: Part
-) -> Stored:
-    """Mean and variance of a level, (C,); that level is checked where the file names one."""
+def _check_statistics(
+    content: Mapping[str, Any], found: Mapping[str, Tensor], path: Path, part: Part
+) -> None:
+    """Refuse the statistics of another level, where the file names one, and no variances."""
     expected = int(part.name.removeprefix("statistics"))
     level = content.get("level")
     # Of the four levels the last may be called -1.
     if isinstance(level, int) and -4 <= level < 4 and level % 4 != expected:
         raise CheckpointError(f"{path}: statistics of level {level}; expected level {expected}")
-    known: tuple[str, ...] = ("mean", "var")
-    found = {name: stored[name].reshape(-1) for name in known if name in stored}
     if "var" in found and bool((found["var"] < 0).any()):
         raise CheckpointError(f"{path}: var is negative in places; expected variances")
-    return Stored(found, tuple(name for name in stored if name not in found))
