@@ -16,7 +16,6 @@ from gvtools.completers.geoverse.objective.losses import (
     view_errors,
 )
 from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
-from gvtools.errors import OptionError, ShapeError
 
 B, V, CONTEXT, H, W = 2, 5, 2, 5, 6
 T = V - CONTEXT
@@ -40,56 +39,24 @@ def _outside(values: Tensor, mask: Tensor, poison: float) -> Tensor:
 
 @settings(deadline=None)
 @given(SEEDS, st.integers(0, V), st.floats(0, 2))
-def test_the_sum_is_the_papers_formula_and_the_mean_a_constant_factor_of_it(seed, context, alpha):
+def test_the_flow_loss_is_a_constant_factor_of_the_papers_formula(seed, context, alpha):
     rng = np.random.default_rng(seed)
     predicted, clean, noise = (_normal(rng, B, V, 3, 2, 2) for _ in range(3))
     options = {"context": context, "context_weight": alpha}
-    found = flow_matching_loss(predicted, noise - clean, reduction="sum", **options)
+    found = flow_matching_loss(predicted, noise - clean, **options)
     for b in range(B):
         weights = [alpha] * context + [1.0] * (V - context)
         expected = formula.flow_matching(
             predicted[b].numpy(), clean[b].numpy(), noise[b].numpy(), weights
         )
-        assert float(found[b]) == pytest.approx(expected)
-    mean = flow_matching_loss(predicted, noise - clean, reduction="mean", **options)
-    torch.testing.assert_close(mean * (3 * 2 * 2 * V), found)
+        assert float(found[b]) * (3 * 2 * 2 * V) == pytest.approx(expected)
 
 
 def test_context_views_weigh_a_quarter():
     predicted = torch.zeros(1, 2, 1, 1, 1)
     target = torch.tensor([3.0, 5.0]).reshape(1, 2, 1, 1, 1)
-    found = flow_matching_loss(predicted, target, context=1, reduction="sum")
-    assert float(found) == 0.25 * 9 + 25
-
-
-def test_absent_views_do_not_count_even_with_nan():
-    rng = np.random.default_rng(0)
-    predicted, target = _normal(rng, B, V, 3, 2, 2), _normal(rng, B, V, 3, 2, 2)
-    views = torch.tensor([[True, False, True, True, False], [False] * V])
-    shown = views[:, :, None, None, None]
-    damaged = _outside(predicted, shown, np.nan).requires_grad_()
-    for reduction in ("mean", "sum"):
-        found = flow_matching_loss(
-            damaged, _outside(target, shown, np.inf), context=2, views=views, reduction=reduction
-        )
-        kept = predicted[:1, [0, 2, 3]], target[:1, [0, 2, 3]]
-        expected = flow_matching_loss(*kept, context=1, reduction=reduction)
-        torch.testing.assert_close(found, torch.cat([expected, torch.zeros(1)]).double())
-        (gradient,) = torch.autograd.grad(found.sum(), damaged)
-        assert bool(gradient.isfinite().all())
-        assert not bool(gradient[~views].any()) and bool(gradient[views].all())
-
-
-def test_wrong_options_of_the_flow_loss_are_refused():
-    x = torch.zeros(1, 2, 1, 1, 1)
-    with pytest.raises(OptionError, match="reduction"):
-        flow_matching_loss(x, x, context=1, reduction="max")  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="context 3"):
-        flow_matching_loss(x, x, context=3)
-    with pytest.raises(ShapeError, match="velocity"):
-        flow_matching_loss(x, x[:, :1], context=1)
-    with pytest.raises(ShapeError, match="views"):
-        flow_matching_loss(x, x, context=1, views=torch.ones(1, 2))
+    found = flow_matching_loss(predicted, target, context=1)
+    assert float(found) == (0.25 * 9 + 25) / 2
 
 
 # --- pictures -----------------------------------------------------------------------------------
@@ -100,12 +67,11 @@ def test_wrong_options_of_the_flow_loss_are_refused():
 def test_picture_losses_are_the_papers_formulas(seed):
     rng = np.random.default_rng(seed)
     predicted, image = _normal(rng, B, T, 3, H, W), _normal(rng, B, T, 3, H, W)
-    valid, views = _mask(rng, B, T, H, W), _mask(rng, B, T)
-    rgb = rgb_loss(predicted, image, valid=valid, views=views)
-    hf = high_gradient_loss(predicted, image, valid=valid, views=views)
-    used = (valid & views[:, :, None, None]).numpy()
+    valid = _mask(rng, B, T, H, W)
+    rgb = rgb_loss(predicted, image, valid=valid)
+    hf = high_gradient_loss(predicted, image, valid=valid)
     for b in range(B):
-        sample = predicted[b].numpy(), image[b].numpy(), used[b]
+        sample = predicted[b].numpy(), image[b].numpy(), valid[b].numpy()
         assert float(rgb[b]) == pytest.approx(formula.rgb(*sample), rel=1e-9)
         assert float(hf[b]) == pytest.approx(formula.high_gradient(*sample), rel=1e-9)
 
@@ -215,13 +181,14 @@ def _depths(rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def test_the_depth_loss_is_the_papers_formula(seed):
     rng = np.random.default_rng(seed)
     predicted, reference, found_centers, centers = _depths(rng)
-    valid, views = _mask(rng, B, T, H, W), _mask(rng, B, T)
+    valid = _mask(rng, B, T, H, W)
     similarity = center_similarity(found_centers, centers)
-    found = depth_loss(predicted, reference, similarity=similarity, valid=valid, views=views)
-    used = (valid & views[:, :, None, None]).numpy()
+    found = depth_loss(predicted, reference, similarity=similarity, valid=valid)
     for b in range(B):
         scale = formula.scale_of(found_centers[b].numpy(), centers[b].numpy())
-        expected = formula.depth(predicted[b].numpy(), reference[b].numpy(), scale, used[b])
+        expected = formula.depth(
+            predicted[b].numpy(), reference[b].numpy(), scale, valid[b].numpy()
+        )
         assert float(found[b]) == pytest.approx(expected, rel=1e-9)
 
 
@@ -237,49 +204,30 @@ def test_a_scene_of_another_unit_and_frame_has_no_depth_loss():
     torch.testing.assert_close(found, torch.zeros(B, dtype=torch.float64), atol=1e-9, rtol=0)
 
 
-def test_samples_without_a_scale_are_dropped_or_taken_as_they_are():
+def test_samples_without_a_scale_are_dropped():
     predicted, reference, found_centers, centers = _depths(np.random.default_rng(1))
     found_centers[1] = 0.5
     similarity = center_similarity(found_centers, centers)
     assert similarity.status == ("aligned", "coincident predicted centres")
     predicted.requires_grad_()
     dropped = depth_loss(predicted, reference, similarity=similarity)
-    kept = depth_loss(predicted, reference, similarity=similarity, without_scale="one")
-    assert dropped[1].item() == 0 and dropped[0].item() == kept[0].item() > 0
-    expected = formula.depth(predicted[1].detach().numpy(), reference[1].numpy(), 1.0)
-    assert kept[1].item() == pytest.approx(expected)
-    for scale_gradient in (False, True):
-        (gradient,) = torch.autograd.grad(
-            depth_loss(
-                predicted, reference, similarity=similarity, scale_gradient=scale_gradient
-            ).sum(),
-            predicted,
-        )
-        assert not bool(gradient[1].any()) and bool(gradient[0].any())
-        assert bool(gradient.isfinite().all())
+    assert dropped[1].item() == 0 < dropped[0].item()
+    (gradient,) = torch.autograd.grad(dropped.sum(), predicted)
+    assert not bool(gradient[1].any()) and bool(gradient[0].any())
+    assert bool(gradient.isfinite().all())
 
 
-@pytest.mark.parametrize("scale_gradient", [False, True])
 @pytest.mark.parametrize("poison", [np.nan, np.inf])
-def test_what_lies_outside_the_mask_poisons_neither_depth_loss_nor_gradient(poison, scale_gradient):
+def test_what_lies_outside_the_mask_poisons_neither_depth_loss_nor_gradient(poison):
     predicted, reference, found_centers, centers = _depths(np.random.default_rng(2))
     known = reference.isfinite() & (reference > 0)
     damaged = _outside(predicted, known, poison).requires_grad_()
-    found_centers = found_centers.requires_grad_()
-    options = {
-        "similarity": center_similarity(found_centers, centers),
-        "scale_gradient": scale_gradient,
-    }
-    found = depth_loss(damaged, reference, **options)
-    torch.testing.assert_close(found, depth_loss(predicted, reference, **options))
+    similarity = center_similarity(found_centers, centers)
+    found = depth_loss(damaged, reference, similarity=similarity)
+    torch.testing.assert_close(found, depth_loss(predicted, reference, similarity=similarity))
     found.sum().backward()
     assert damaged.grad is not None and bool(damaged.grad.isfinite().all())
     assert not bool(damaged.grad[~known].any()) and bool(damaged.grad[known].all())
-    if scale_gradient:
-        assert found_centers.grad is not None and bool(found_centers.grad.isfinite().all())
-        assert bool(found_centers.grad.any())
-    else:
-        assert found_centers.grad is None
 
 
 def test_a_batch_without_any_depth_gives_zero_within_the_graph():
@@ -291,40 +239,21 @@ def test_a_batch_without_any_depth_gives_zero_within_the_graph():
     assert predicted.grad is not None and not bool(predicted.grad.any())
 
 
-def test_wrong_options_of_the_depth_loss_are_refused():
-    depth = torch.ones(1, 1, 2, 2)
-    similarity = center_similarity(torch.eye(3)[None], torch.eye(3)[None])
-    with pytest.raises(OptionError, match="without_scale"):
-        depth_loss(depth, depth, similarity=similarity, without_scale="two")  # type: ignore[arg-type]
-    with pytest.raises(ShapeError, match="expected 2"):
-        two = torch.ones(2, 1, 2, 2)
-        depth_loss(two, two, similarity=similarity)
-    with pytest.raises(ShapeError, match="valid"):
-        depth_loss(depth, depth, similarity=similarity, valid=torch.ones(1, 2, 2) > 0)
-
-
 # --- gradients ----------------------------------------------------------------------------------
 
 
 def test_gradients_are_those_of_finite_differences():
     rng = np.random.default_rng(4)
     predicted, target = _normal(rng, 2, 3, 2, 2, 2).requires_grad_(), _normal(rng, 2, 3, 2, 2, 2)
-    for reduction in ("sum", "mean"):
-        assert torch.autograd.gradcheck(
-            lambda x, r=reduction: flow_matching_loss(x, target, context=1, reduction=r), predicted
-        )
+    assert torch.autograd.gradcheck(lambda x: flow_matching_loss(x, target, context=1), predicted)
     image, reference = _normal(rng, 2, 2, 3, 3, 4).requires_grad_(), _normal(rng, 2, 2, 3, 3, 4)
     valid = torch.tensor(rng.random((2, 2, 3, 4)) < 0.7)
     for loss in (rgb_loss, high_gradient_loss):
         assert torch.autograd.gradcheck(lambda x, f=loss: f(x, reference, valid=valid), image)
-    depth, wanted, found_centers, centers = _depths(rng)
-
-    def through_scale(depth: Tensor, found: Tensor) -> Tensor:
-        similarity = center_similarity(found, centers)
-        return depth_loss(depth, wanted, similarity=similarity, scale_gradient=True)
-
+    depth, wanted, *centers = _depths(rng)
+    similarity = center_similarity(*centers)
     assert torch.autograd.gradcheck(
-        through_scale, (depth.requires_grad_(), found_centers.requires_grad_())
+        lambda x: depth_loss(x, wanted, similarity=similarity), depth.requires_grad_()
     )
 
 
@@ -332,20 +261,18 @@ def test_references_receive_no_gradient():
     predicted, target = (torch.randn(1, 3, 3, 4, 4, requires_grad=True) for _ in range(2))
     depth, wanted = (torch.rand(1, 3, 4, 4, requires_grad=True) for _ in range(2))
     found, centers = (torch.randn(1, 4, 3, requires_grad=True) for _ in range(2))
-    similarity = center_similarity(found, centers)
     total = (
         flow_matching_loss(predicted, target, context=1)
         + rgb_loss(predicted, target)
         + high_gradient_loss(predicted, target)
-        + depth_loss(depth, wanted, similarity=similarity, scale_gradient=True)
+        + depth_loss(depth, wanted, similarity=center_similarity(found, centers))
     )
     total.sum().backward()
-    assert all(x.grad is not None for x in (predicted, depth, found))
-    assert all(x.grad is None for x in (target, wanted, centers))
+    assert all(x.grad is not None for x in (predicted, depth))
+    assert all(x.grad is None for x in (target, wanted, found, centers))
 
 
 def test_view_errors_tell_the_views_apart():
     predicted = torch.zeros(1, 2, 1, 2, 2)
     target = torch.tensor([1.0, 2.0]).reshape(1, 2, 1, 1, 1).expand(1, 2, 1, 2, 2)
     assert view_errors(predicted, target).tolist() == [[1.0, 4.0]]
-    assert view_errors(predicted, target, reduction="sum").tolist() == [[4.0, 16.0]]

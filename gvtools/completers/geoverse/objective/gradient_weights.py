@@ -6,38 +6,30 @@ picture, the quantiles taken over all valid pixels of a sample's views (appendix
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gvtools.errors import ShapeError
-from gvtools.networks.config_json import check_range
-
 DELTA = 1e-6
 # ITU-R BT.601; the paper says "grayscale" only.
 LUMA = (0.299, 0.587, 0.114)
+QUANTILES = (0.50, 0.98)
 
 
 @torch.no_grad()
-def gradient_weights(
-    reference: Tensor, valid: Tensor, *, low: float = 0.50, high: float = 0.98
-) -> Tensor:
+def gradient_weights(reference: Tensor, valid: Tensor) -> Tensor:
     """Weights (B, T, H, W) of the reference pictures' gradients; no gradient flows through them.
 
     Args:
         reference: (B, T, 3, H, W), in the normalisation that the loss compares.
         valid: (B, T, H, W) bool; other pixels have weight 0 and may hold anything.
-        low: quantile of weight 0.
-        high: quantile of weight 1.
     """
     magnitude = sobel_magnitude(grayscale(reference), valid)
     weights = torch.zeros_like(magnitude)
     for b in range(len(magnitude)):
         values = magnitude[b][valid[b]]
         if values.numel():
-            bottom, top = linear_quantiles(values, (low, high))
+            bottom, top = torch.quantile(values, values.new_tensor(QUANTILES))
             share = (magnitude[b] - bottom) / (top - bottom + DELTA)
             weights[b] = torch.where(valid[b], share.clamp(0, 1), 0.0)
     return weights
@@ -45,8 +37,6 @@ def gradient_weights(
 
 def grayscale(image: Tensor) -> Tensor:
     """Luma (..., H, W) of (..., 3, H, W), float32 at least."""
-    if image.ndim < 3 or image.shape[-3] != 3:
-        raise ShapeError(f"picture {tuple(image.shape)}; expected (..., 3, H, W)")
     red, green, blue = image.to(torch.promote_types(image.dtype, torch.float32)).unbind(-3)
     return LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
 
@@ -74,21 +64,3 @@ def sobel_magnitude(gray: Tensor, valid: Tensor) -> Tensor:
     x = sum(k * (step(d, 1) - step(d, -1)) for d, k in ((-1, 1), (0, 2), (1, 1)))
     y = sum(k * (step(1, d) - step(-1, d)) for d, k in ((-1, 1), (0, 2), (1, 1)))
     return torch.where(valid, torch.hypot(torch.as_tensor(x), torch.as_tensor(y)), 0.0)
-
-
-def linear_quantiles(values: Tensor, shares: Sequence[float]) -> list[Tensor]:
-    """Quantiles () of values (N,), N >= 1, linear between ranks as in ``torch.quantile``.
-
-    That function refuses more than 2^24 values and rounds the ranks of many; this one sorts.
-    """
-    if values.ndim != 1 or not values.numel():
-        raise ShapeError(f"quantiles of {tuple(values.shape)}; expected (N,) with N >= 1")
-    ordered = values.sort().values
-    found = []
-    for share in shares:
-        check_range("quantile", share, ge=0, le=1)
-        rank = share * (len(ordered) - 1)
-        below = min(int(rank), len(ordered) - 1)
-        above = min(below + 1, len(ordered) - 1)
-        found.append(torch.lerp(ordered[below], ordered[above], rank - below))
-    return found

@@ -16,8 +16,6 @@ import torch
 from torch import Tensor
 
 from gvtools.completers.geoverse.objective.losses import (
-    Reduction,
-    WithoutScale,
     depth_loss,
     depth_mask,
     flow_matching_loss,
@@ -32,7 +30,7 @@ from gvtools.networks.config_json import check_range
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Coefficients of the terms. The paper gives none; 1 suits the reduction "mean".
+    """Coefficients of the terms; the paper gives none.
 
     Attributes:
         level1: of L_FM^1.
@@ -84,8 +82,6 @@ class Reference:
         centers: scene units.
         image_valid: (B, T, H, W) bool, None = all.
         depth_valid: (B, T, H, W) bool, None = all.
-        centers_valid: (B, V) bool, None = all.
-        views: (B, V) bool, views that exist; None = all.
     """
 
     level1: Tensor | None = None
@@ -95,8 +91,6 @@ class Reference:
     centers: Tensor | None = None
     image_valid: Tensor | None = None
     depth_valid: Tensor | None = None
-    centers_valid: Tensor | None = None
-    views: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +125,6 @@ def objective(
     context: int,
     weights: LossWeights | None = None,
     context_weight: float = 0.25,
-    reduction: Reduction = "mean",
-    scale_gradient: bool = False,
-    without_scale: WithoutScale = "drop",
 ) -> Objective:
     """Every term that has a prediction, their weighted sum, and their counts.
 
@@ -143,60 +134,14 @@ def objective(
         context: number of context views, which come first.
         weights: None is ``LossWeights()``.
         context_weight: see ``flow_matching_loss``.
-        reduction: see ``flow_matching_loss``.
-        scale_gradient: see ``depth_loss``.
-        without_scale: see ``depth_loss``.
 
     Raises:
         OptionError: nothing was predicted, or a prediction has no reference.
     """
     weights = weights or LossWeights()
-    parts: dict[str, Callable[[], Tensor]] = {}
-    counts: dict[str, Tensor] = {}
-    views = reference.views
-    targets = None if views is None else views[:, context:]
-
-    for level in ("level1", "level0"):
-        if (found := getattr(prediction, level)) is not None:
-            parts[level] = partial(
-                flow_matching_loss,
-                found,
-                _wanted(reference, level),
-                context=context,
-                context_weight=context_weight,
-                reduction=reduction,
-                views=views,
-            )
-    if (image := prediction.image) is not None:
-        image_wanted = _wanted(reference, "image")
-        masks = {"valid": reference.image_valid, "views": targets}
-        parts["rgb"] = lambda: rgb_loss(image, image_wanted, **masks)
-        parts["hf"] = lambda: high_gradient_loss(image, image_wanted, **masks)
-        _count(counts, "rgb", rgb_mask(image_wanted, **masks))
-    if (depth := prediction.depth) is not None:
-        depth_wanted = _wanted(reference, "depth")
-        if prediction.centers is None:
-            raise OptionError("predicted depth without predicted camera centres; give both")
-        valid = reference.centers_valid
-        if views is not None:
-            valid = views if valid is None else views & valid
-        similarity = center_similarity(
-            prediction.centers, _wanted(reference, "centers"), valid=valid
-        )
-        depth_masks = {"valid": reference.depth_valid, "views": targets}
-        parts["depth"] = lambda: depth_loss(
-            depth,
-            depth_wanted,
-            similarity=similarity,
-            scale_gradient=scale_gradient,
-            without_scale=without_scale,
-            **depth_masks,
-        )
-        _count(counts, "depth", depth_mask(depth_wanted, **depth_masks))
-        counts["depth_without_scale"] = (~similarity.ok).sum()
+    parts, counts = _parts(prediction, reference, context, context_weight)
     if not parts:
         raise OptionError("objective: nothing was predicted; give at least one term")
-
     terms, total = {}, None
     for name, part in parts.items():
         weight = getattr(weights, name)
@@ -207,6 +152,37 @@ def objective(
     if total is None:
         total = torch.zeros_like(next(iter(terms.values())))
     return Objective(total, terms, counts)
+
+
+def _parts(
+    prediction: Prediction, reference: Reference, context: int, context_weight: float
+) -> tuple[dict[str, Callable[[], Tensor]], dict[str, Tensor]]:
+    """The terms, not yet computed, and what they stand on."""
+    parts: dict[str, Callable[[], Tensor]] = {}
+    counts: dict[str, Tensor] = {}
+    for level in ("level1", "level0"):
+        if (found := getattr(prediction, level)) is not None:
+            parts[level] = partial(
+                flow_matching_loss,
+                found,
+                _wanted(reference, level),
+                context=context,
+                context_weight=context_weight,
+            )
+    if (image := prediction.image) is not None:
+        wanted, valid = _wanted(reference, "image"), reference.image_valid
+        parts["rgb"] = partial(rgb_loss, image, wanted, valid=valid)
+        parts["hf"] = partial(high_gradient_loss, image, wanted, valid=valid)
+        _count(counts, "rgb", rgb_mask(wanted, valid))
+    if (depth := prediction.depth) is not None:
+        wanted, valid = _wanted(reference, "depth"), reference.depth_valid
+        if prediction.centers is None:
+            raise OptionError("predicted depth without predicted camera centres; give both")
+        similarity = center_similarity(prediction.centers, _wanted(reference, "centers"))
+        parts["depth"] = partial(depth_loss, depth, wanted, similarity=similarity, valid=valid)
+        _count(counts, "depth", depth_mask(wanted, valid))
+        counts["depth_without_scale"] = (~similarity.ok).sum()
+    return parts, counts
 
 
 def _wanted(reference: Reference, name: str) -> Tensor:
