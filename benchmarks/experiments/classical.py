@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from gvtools.completers.base import Completer, Completion, ContextView
-from gvtools.completers.geoverse.fill import push_pull
+from gvtools.completers.push_pull import push_pull
 from gvtools.guidance import Guidance
 
 Float32 = NDArray[np.float32]

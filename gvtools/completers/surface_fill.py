@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completion, ContextView
-from gvtools.completers.geoverse.fill import Filled, push_pull, push_pull_depth
 from gvtools.completers.inpaint import InpaintCompleter
+from gvtools.completers.push_pull import Filled, push_pull, push_pull_depth
 from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory
 

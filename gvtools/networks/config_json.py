@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import types
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -48,6 +48,17 @@ def check_range(
         ends = {"at least": ge, "more than": gt, "at most": le, "less than": lt}
         wanted = " and ".join(f"{word} {end:g}" for word, end in ends.items() if end is not None)
         raise OptionError(f"{name} {value}; expected {wanted or 'a number'}")
+
+
+def check_choice(name: str, value: object, known: Collection[object]) -> None:
+    """Refuse a value that is not one of the known ones.
+
+    Raises:
+        OptionError: names the known ones.
+    """
+    if value not in known:
+        choices = " or ".join(repr(choice) for choice in known)
+        raise OptionError(f"{name} = {value!r}; expected {choices}")
 
 
 def to_json(value: Any) -> Any:

@@ -11,7 +11,7 @@ import torch
 
 from gvtools.completers import Completion, ContextView, create
 from gvtools.completers.geoverse.correction import MOST, corrected_color, corrected_depth
-from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
+from gvtools.completers.push_pull import push_pull, push_pull_depth
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 

@@ -26,7 +26,6 @@ from gvtools.completers.base import (
 from gvtools.completers.geoverse.completer_settings import GeoVerseSettings
 from gvtools.completers.geoverse.context_views import chosen_views
 from gvtools.completers.geoverse.correction import seamless
-from gvtools.completers.geoverse.fill import Filled
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.model_views import context_depth, view_batch
@@ -39,6 +38,7 @@ from gvtools.completers.geoverse.postprocess import (
 from gvtools.completers.geoverse.resampling import model_size
 from gvtools.completers.geoverse.weights.folder import check_headers, from_pretrained
 from gvtools.completers.holes import hole_radius
+from gvtools.completers.push_pull import Filled
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 

@@ -16,14 +16,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gvtools.completers.geoverse.fill import push_pull, push_pull_depth
 from gvtools.completers.geoverse.plucker import normalised_poses
 from gvtools.completers.geoverse.statistics import LatentStatistics
-from gvtools.errors import OptionError, ShapeError
+from gvtools.completers.push_pull import push_pull, push_pull_depth
+from gvtools.errors import ShapeError
+from gvtools.networks.config_json import check_choice, check_range
 from gvtools.networks.depth_anything.network import DepthAnything3, relative_cameras
 
 LOG_DEPTH_LIMIT = 6.0
-FILLS = ("none", "push-pull", "surfaces")
 
 
 @dataclass(frozen=True)
@@ -55,19 +55,12 @@ class HintConfig:
     token: str = "first-context"
 
     def __post_init__(self) -> None:
-        for name, known in (
-            ("fill", FILLS),
-            ("encode", ("jointly", "alone")),
-            ("camera_unit", ("median", "depth")),
-            ("cascade_context", ("alone", "jointly")),
-            ("token", ("first-context", "own")),
-        ):
-            if getattr(self, name) not in known:
-                raise OptionError(
-                    f"hints.{name} = {getattr(self, name)!r}; expected one of {', '.join(known)}"
-                )
-        if not 0 <= self.mask <= 1:
-            raise OptionError(f"hints.mask = {self.mask}; expected a share from 0 to 1")
+        check_choice("hints.fill", self.fill, ("none", "push-pull", "surfaces"))
+        check_choice("hints.encode", self.encode, ("jointly", "alone"))
+        check_choice("hints.camera_unit", self.camera_unit, ("median", "depth"))
+        check_choice("hints.cascade_context", self.cascade_context, ("alone", "jointly"))
+        check_choice("hints.token", self.token, ("first-context", "own"))
+        check_range("hints.mask", self.mask, ge=0, le=1)
 
 
 @dataclass(frozen=True)
@@ -200,53 +193,66 @@ def encode_hints(
         batch: its holes filled already where they should be (``filled``).
         config: see ``HintConfig``.
     """
-    grid = network.encoder.grid(*batch.size)
+    grid, context = network.encoder.grid(*batch.size), batch.context
     mask = feature_mask(batch.valid, grid, config.mask)
-    mask[:, : batch.context] = 1
+    mask[:, :context] = 1
     # With a share of 0 all tokens count, but a view without a valid pixel still tells nothing.
-    told = mask.flatten(2).any(2) & batch.valid.flatten(2).any(2)
-    context = batch.context
-    told[:, :context] = True
+    informative = mask.flatten(2).any(2) & batch.valid.flatten(2).any(2)
+    informative[:, :context] = True
     # Only where it is asked for: with everything encoded jointly it is not.
     alone = cache(lambda: encode_views(network, batch, slice(0, context), config))
-    shape = (*batch.images.shape[:2], 1 + grid[0] * grid[1], network.config.encoder.channels)
-    dtype = network.encoder.cls_token.dtype
-    joint = [batch.images.new_zeros(shape, dtype=dtype) for _ in range(2)]
-    for pattern in torch.unique(told, dim=0):
-        samples = (told == pattern).all(1).nonzero()[:, 0]
-        if not bool(pattern[context:].any()):
-            for level, features in zip(joint, alone(), strict=True):
-                level[samples, :context] = features[samples]
-            continue
-        views = pattern.nonzero()[:, 0]
-        part = encode_views(network, batch.samples(samples), views, config)
-        for level, features in zip(joint, part, strict=True):
-            level[samples[:, None], views] = features
+    joint = _encode_jointly(network, batch, informative, config, alone=alone)
     if config.encode == "alone":
         for level, features in zip(joint, alone(), strict=True):
             level[:, :context] = features
+    token = joint[1][:, :, 0]
     if config.token == "own":
-        token = joint[1][:, :, 0].clone()
-        silent = ~told
-        if bool(silent.any()):
-            token[silent] = _silent_tokens(token, context)[silent]
+        # A view that was not encoded gets the mean of the context's.
+        mean = token[:, :context].mean(1, keepdim=True)
+        token = torch.where(informative[:, :, None], token, mean)
     else:
-        single = slice(0, 1)
-        first = alone() if context == 1 else encode_views(network, batch, single, config)
-        token = first[1][:, :, 0].expand(-1, shape[1], -1)
+        one = slice(0, 1)
+        first = alone() if context == 1 else encode_views(network, batch, one, config)
+        token = first[1][:, :, 0].expand_as(token)
 
-    features = level1.normalise(_maps(joint[1], grid))
-    features = features * told[:, :, None, None, None]
+    features = level1.normalise(_maps(joint[1], grid)) * informative[:, :, None, None, None]
     source = alone()[0] if config.cascade_context == "alone" else joint[0][:, :context]
     shallow = torch.zeros_like(features)
     shallow[:, :context] = level0.normalise(_maps(source, grid))
-    return Hints(
-        level1=features * mask.to(features.dtype),
-        unmasked=features,
-        level0=shallow,
-        token=token,
-        mask=mask,
-    )
+    return Hints(features * mask.to(features.dtype), features, shallow, token, mask)
+
+
+def _encode_jointly(
+    network: DepthAnything3,
+    batch: ViewBatch,
+    informative: Tensor,
+    config: HintConfig,
+    *,
+    alone: Callable[[], list[Tensor]],
+) -> list[Tensor]:
+    """Raw levels 0 and 1, token 0 included, of each sample's ``informative`` (B, V) views; else 0.
+
+    Args:
+        network: the frozen encoder.
+        batch: all views.
+        informative: which views are encoded; samples that agree in it share a pass.
+        config: see ``HintConfig``.
+        alone: the context's levels where nothing else is encoded.
+    """
+    rows, columns = network.encoder.grid(*batch.size)
+    shape = (*informative.shape, 1 + rows * columns, network.config.encoder.channels)
+    dtype = network.encoder.cls_token.dtype
+    joint = [batch.images.new_zeros(shape, dtype=dtype) for _ in range(2)]
+    for pattern in torch.unique(informative, dim=0):
+        samples = (informative == pattern).all(1).nonzero()[:, 0]
+        views = pattern.nonzero()[:, 0]
+        if len(views) == batch.context:
+            part = [features[samples] for features in alone()]
+        else:
+            part = encode_views(network, batch.samples(samples), views, config)
+        for level, features in zip(joint, part, strict=True):
+            level[samples[:, None], views] = features
+    return joint
 
 
 @torch.no_grad()
@@ -288,11 +294,11 @@ def encode_views(
     images = batch.images[:, views]
     if not config.cameras:
         return network.encode(images, levels=2)
-    cameras = _told_cameras(batch, config.camera_unit)
+    cameras = _relative_cameras(batch, config.camera_unit)
     return network.encode(images, levels=2, cam_from_world=cameras[:, views], K=batch.K[:, views])
 
 
-def _told_cameras(batch: ViewBatch, unit: str) -> Tensor:
+def _relative_cameras(batch: ViewBatch, unit: str) -> Tensor:
     """(B, V, 4, 4) cameras relative to the first view, as the encoder is told them."""
     # The camera encoder's unit has a floor, a tenth of a scene unit: in shares of the views' extent
     # it means the same in every scene.
@@ -306,13 +312,8 @@ def _told_cameras(batch: ViewBatch, unit: str) -> Tensor:
     mean = torch.where(known, depth, 0.0).sum(1) / known.sum(1).clamp_min(1)
     in_depths = normalised.clone()
     in_depths[..., :3, 3] /= (scale * mean).clamp_min(torch.finfo(mean.dtype).tiny)[:, None, None]
-    told = (mean > 0)[:, None, None, None]
-    return torch.where(told, in_depths, cameras.to(in_depths.dtype)).to(cameras.dtype)
-
-
-def _silent_tokens(token: Tensor, context: int) -> Tensor:
-    """Stand-ins for views that were not encoded: the mean over the context views."""
-    return token[:, :context].mean(1, keepdim=True).expand_as(token)
+    known_unit = (mean > 0)[:, None, None, None]
+    return torch.where(known_unit, in_depths, cameras.to(in_depths.dtype)).to(cameras.dtype)
 
 
 def _maps(level: Tensor, grid: tuple[int, int]) -> Tensor:

@@ -15,7 +15,7 @@ from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
 from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
 from gvtools.completers.geoverse.video_prior.prior import VideoPriorConfig
 from gvtools.errors import CheckpointError, OptionError
-from gvtools.networks.config_json import check_range, from_json, to_json
+from gvtools.networks.config_json import check_choice, check_range, from_json, to_json
 from gvtools.networks.depth_anything.network import DepthAnythingConfig
 
 NAMES = ("base", "tiny")
@@ -51,10 +51,7 @@ class FlowConfig:
     temperature: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.prediction not in ("velocity", "clean"):
-            raise OptionError(
-                f"flow.prediction = {self.prediction!r}; expected 'velocity' or 'clean'"
-            )
+        check_choice("flow.prediction", self.prediction, ("velocity", "clean"))
         if self.skip and self.prediction != "clean":
             raise OptionError("flow.skip needs flow.prediction = 'clean'")
         check_range("flow.least_time", self.least_time, gt=0, le=1)
@@ -103,8 +100,8 @@ class GeoVerseConfig:
             paper), "hint" or "field".
         composition: the completion is the model's "decoded" pictures and depth (the paper), or a
             "correction" of the filled projection, see ``correction``; it needs ``hints.fill``.
-        color_alignment: whether generated colours follow the memory's, see ``color_field``: "none"
-            (the paper) or "field".
+        color_alignment: whether generated colours follow the memory's, "none" (the paper)
+            or by a "field", see ``postprocess.aligned_color``.
         video: the video prior; None for a model without one.
         injection: how video features enter: "control", "shared" (MoT) or "none".
         control: of the control branch.
@@ -141,24 +138,12 @@ class GeoVerseConfig:
         encoder = self.geometry.encoder
         channels = encoder.channels
         levels = len(encoder.taps)
-        if self.injection not in ("control", "shared", "none"):
-            raise OptionError(
-                f"injection = {self.injection!r}; expected 'control', 'shared' or 'none'"
-            )
-        if self.composition not in ("decoded", "correction"):
-            raise OptionError(
-                f"composition = {self.composition!r}; expected 'decoded' or 'correction'"
-            )
+        check_choice("injection", self.injection, ("control", "shared", "none"))
+        check_choice("composition", self.composition, ("decoded", "correction"))
+        check_choice("color_alignment", self.color_alignment, ("none", "field"))
+        check_choice("alignment", self.alignment, ("centres", "hint", "field"))
         if self.composition == "correction" and self.hints.fill == "none":
             raise OptionError("composition = 'correction' needs filled hints; set hints.fill")
-        if self.color_alignment not in ("none", "field"):
-            raise OptionError(
-                f"color_alignment = {self.color_alignment!r}; expected 'none' or 'field'"
-            )
-        if self.alignment not in ("centres", "hint", "field"):
-            raise OptionError(
-                f"alignment = {self.alignment!r}; expected 'centres', 'hint' or 'field'"
-            )
         if (self.injection == "none") != (self.video is None):
             raise OptionError(
                 "a video prior needs injection = 'control' or 'shared', and 'none' goes without one"

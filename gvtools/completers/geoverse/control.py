@@ -70,11 +70,6 @@ class ControlBranch(nn.Module):
         for parameter in self.outputs.parameters():
             nn.init.zeros_(parameter)
 
-    def copy_from(self, denoiser: Denoiser) -> None:
-        """Start the branch's blocks from the denoiser's, after that has loaded its weights."""
-        for block, layer in zip(self.blocks, self.config.layers, strict=True):
-            block.load_state_dict(denoiser.blocks[layer].state_dict())
-
     def adapted(self, features: Sequence[Tensor], grid: tuple[int, int]) -> list[Tensor]:
         """A[l](F_W[l]) of all levels; does not depend on the step, so compute it once."""
         return [

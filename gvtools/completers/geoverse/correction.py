@@ -18,8 +18,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.fill import push_pull
 from gvtools.completers.geoverse.passes import Decoded, Generated
+from gvtools.completers.push_pull import push_pull
 
 # Depth is corrected by at most this factor.
 MOST = 1.5

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gvtools.completers.base import ScaleAlignment, ScaleStatus
-from gvtools.completers.geoverse.fill import push_pull
 from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
-from gvtools.errors import DegenerateError, OptionError
+from gvtools.completers.push_pull import push_pull
+from gvtools.errors import DegenerateError
 from gvtools.networks.depth_anything.geometry_head import Geometry
 from gvtools.networks.depth_anything.rays import camera_centres
 from gvtools.similarity import ScaleFit, align_depth_scale
 
-ALIGNMENTS = ("centres", "hint", "field")
 # Fewer centres fit each other by chance: of four at random, one set in a hundred correlates by more
 # than 0.956, of three by 0.998, of two by 1.
 MIN_CENTRES, MIN_CORRELATION = 4, 0.97
@@ -135,13 +134,8 @@ def scaled_depth(
         hint: (T, H, W) the memory's depth, scene units.
         valid: (T, H, W) where it is known.
         whole: the scale of the pass.
-        alignment: one of ``ALIGNMENTS``.
-
-    Raises:
-        OptionError: another alignment.
+        alignment: "centres", "hint" or "field".
     """
-    if alignment not in ALIGNMENTS:
-        raise OptionError(f"alignment {alignment!r}; expected one of {', '.join(ALIGNMENTS)}")
     unscaled = depth.float().cpu().numpy().astype(np.float32)
     result = np.zeros_like(unscaled)
     scale = np.full(len(unscaled), np.nan)
@@ -225,12 +219,20 @@ def _deviation(
 
     The median is NaN below ``MIN_SUPPORT`` pixels.
     """
-    with np.errstate(invalid="ignore"):
-        both = valid & (hint > 0) & (depth > 0) & np.isfinite(hint) & np.isfinite(depth)
+    both = both_known(depth, hint, valid)
     overlap = int(both.sum())
     if overlap < MIN_SUPPORT:
         return float("nan"), overlap
     return float(np.median(np.abs(np.log(hint[both] / depth[both])))), overlap
+
+
+def both_known(
+    depth: NDArray[np.floating[Any]], hint: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Pixels on which generated depth and the memory's, valid where it is, are both depths."""
+    with np.errstate(invalid="ignore"):
+        positive = (hint > 0) & (depth > 0)
+    return np.asarray(valid & positive & np.isfinite(hint) & np.isfinite(depth))
 
 
 def _contradicts(deviation: tuple[float, int]) -> bool:
@@ -242,7 +244,7 @@ def _field(
     depth: NDArray[np.float32], hint: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Exponential of the push-pull of log(hint / depth) over valid pixels, within ``MAX_FIELD``."""
-    known = valid & (hint > 0) & (depth > 0) & np.isfinite(hint) & np.isfinite(depth)
+    known = both_known(depth, hint, valid)
     limit = np.log(MAX_FIELD)
     ratio = np.zeros_like(depth)
     ratio[known] = np.clip(np.log(hint[known] / depth[known]), -limit, limit)

@@ -181,11 +181,11 @@ def guided(velocity: Velocity, unconditional: Velocity | None, scale: float) -> 
     Raises:
         OptionError: a scale other than 1 without an unconditional branch.
     """
-    check_range("guidance scale", scale, ge=0, lt=math.inf)
+    check_range("cfg_scale", scale, ge=0, lt=math.inf)
     if scale == 1:
         return velocity
     if unconditional is None:
-        raise OptionError(f"guidance scale {scale:g} needs an unconditional velocity; set it to 1")
+        raise OptionError(f"cfg_scale {scale:g} needs an unconditional velocity; set it to 1")
     without = unconditional
 
     def combined(state: Tensor, t: Tensor) -> Tensor:

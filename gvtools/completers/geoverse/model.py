@@ -160,11 +160,17 @@ class GeoVerse(GeoVerseNetworks):
             decoded = self.decode(
                 prepared, level0, level1, targets_alone=targets_alone, clock=clock
             )
-            hint = None
-            if self.config.composition == "correction":
-                unmasked = prepared.hints.unmasked
-                hint = self.decode(prepared, level0, unmasked, targets_alone=True, clock=clock)
+            hint = self.decoded_hint(prepared, level0, clock=clock)
         return Generated(level1, level0, decoded, hint)
+
+    def decoded_hint(
+        self, prepared: Prepared, level0: Tensor, *, clock: Clock = no_clock
+    ) -> Decoded | None:
+        """What the filled projections' own features decode to, where completions correct that."""
+        if self.config.composition != "correction":
+            return None
+        unmasked = prepared.hints.unmasked
+        return self.decode(prepared, level0, unmasked, targets_alone=True, clock=clock)
 
 
 def empty_model(config: GeoVerseConfig, *, where: object) -> GeoVerse:

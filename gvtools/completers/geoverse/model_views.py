@@ -19,8 +19,8 @@ from torch import Tensor
 from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.base import ContextView
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.fill import Filled
 from gvtools.completers.geoverse.resampling import resampled
+from gvtools.completers.push_pull import Filled
 from gvtools.guidance import Guidance
 
 # A cell of the model's grid counts as valid from this share of valid pixels on.

@@ -15,12 +15,11 @@ from torch import Tensor
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import ScaleAlignment, ScaleStatus
-from gvtools.completers.geoverse.color_field import aligned_color
 from gvtools.completers.geoverse.correction import corrected_color, corrected_depth
-from gvtools.completers.geoverse.depth_scale import MAX_FACTOR, pass_scale, scaled_depth
-from gvtools.completers.geoverse.fill import Filled, push_pull, push_pull_depth
+from gvtools.completers.geoverse.depth_scale import MAX_FACTOR, both_known, pass_scale, scaled_depth
 from gvtools.completers.geoverse.passes import Generated
 from gvtools.completers.geoverse.resampling import resampled, resampled_depth
+from gvtools.completers.push_pull import Filled, push_pull, push_pull_depth
 from gvtools.guidance import Guidance
 
 # Confidence of a generated pixel at most: below what was observed.
@@ -72,7 +71,7 @@ def to_scene_scale(
         cameras: of all views, at the model's size.
         known: (C, h, w) depth of the context at the model's size.
         alignment: see ``depth_scale``.
-        color_alignment: see ``color_field``.
+        color_alignment: "field" for ``aligned_color``, or "none".
     """
     geometry, context = generated.decoded.geometry, len(known)
     full = (guidance.depth.shape[1], guidance.depth.shape[2])
@@ -94,6 +93,21 @@ def to_scene_scale(
         rays = _plucker(geometry.ray[0, context:], world_from_cam[0], float(np.median(found)), full)
     picture = rgb.nan_to_num().permute(0, 2, 3, 1).numpy()
     return Completed(picture, scaled.depth, confidence, rays, scaled.scale, scaled.alignment)
+
+
+def aligned_color(rgb: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
+    """Pictures with the push-pull of ``hint - rgb`` over valid pixels added, in [0, 1].
+
+    What a small network decodes is off by a little all over, and a hole's fill then shows its rim.
+
+    Args:
+        rgb: (T, 3, H, W) of the model; a pixel that is not finite stays so.
+        hint: (T, 3, H, W) the memory's colour.
+        valid: (T, 1, H, W) where it is known.
+    """
+    known = valid & torch.isfinite(rgb).all(1, keepdim=True)
+    offset = push_pull(torch.where(known, hint - rgb, 0.0), known)
+    return (rgb + offset).clamp(0, 1)
 
 
 def corrected(
@@ -166,7 +180,7 @@ def depth_ratios(guidance: Guidance, generated: NDArray[np.float32]) -> NDArray[
     for index, (view, known, valid) in enumerate(
         zip(generated, guidance.depth, guidance.valid, strict=True)
     ):
-        both = valid & (known > 0) & (view > 0) & np.isfinite(known) & np.isfinite(view)
+        both = both_known(view, known, valid)
         ratio = np.log(known[both] / view[both])[:: max(1, int(both.sum()) // LOOKED_AT)]
         if len(ratio) < LEAST:
             continue

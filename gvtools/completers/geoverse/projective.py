@@ -17,8 +17,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gvtools.errors import ShapeError
-
 GROUP = 4
 # Half of the channels in groups of four, and two rotary quarters of pairs.
 HEAD_MULTIPLE = 8
@@ -44,9 +42,6 @@ class Projective:
     Attributes:
         matrix: (B, V, 4, 4), P.
         key_matrix: (B, V, 4, 4), by which keys and values are multiplied.
-
-    Raises:
-        ShapeError: shapes that do not match, or a ``head_dim`` that cannot be divided.
     """
 
     def __init__(
@@ -61,20 +56,6 @@ class Projective:
         position_scale: tuple[float, float] = (1.0, 1.0),
         invert_K: bool = True,
     ) -> None:
-        if not (
-            cam_from_world.ndim == K.ndim == 4
-            and cam_from_world.shape[-2:] == (4, 4)
-            and K.shape == (*cam_from_world.shape[:2], 3, 3)
-        ):
-            raise ShapeError(
-                f"projective encoding: cam_from_world {tuple(cam_from_world.shape)} and K "
-                f"{tuple(K.shape)}; expected (B, V, 4, 4) and (B, V, 3, 3)"
-            )
-        if head_dim % HEAD_MULTIPLE:
-            raise ShapeError(
-                f"projective encoding: heads of {head_dim} channels; expected a multiple of "
-                f"{HEAD_MULTIPLE}"
-            )
         dtype = torch.promote_types(cam_from_world.dtype, torch.float32)
         self.grid = grid
         self.views = cam_from_world.shape[1]
@@ -113,11 +94,6 @@ class Projective:
     def _apply(self, x: Tensor, blocks: Tensor, turn: int) -> Tensor:
         """Half a head times ``blocks`` (B, V, half, half), the other half rotated by +-1 turn."""
         tokens = self.grid[0] * self.grid[1]
-        if x.ndim != 4 or x.shape[2:] != (self.views * tokens, self.head_dim):
-            raise ShapeError(
-                f"projective encoding: tokens {tuple(x.shape)}; expected (B, heads, "
-                f"{self.views * tokens}, {self.head_dim}) for {self.views} views of {self.grid}"
-            )
         dtype = torch.promote_types(x.dtype, blocks.dtype)
         # Under autocast the products would be rounded to half precision, and P P⁻¹ with them.
         with torch.autocast(x.device.type, enabled=False):

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from gvtools.errors import ShapeError
 from gvtools.networks.attention import attend
@@ -63,12 +62,7 @@ class RGBHead(nn.Module):
         self.decoder_pred = nn.Linear(width, config.patch**2 * 3)
 
     def forward(
-        self,
-        features: Tensor,
-        grid: tuple[int, int],
-        *,
-        chunk: int | None = None,
-        recompute: bool = False,
+        self, features: Tensor, grid: tuple[int, int], *, chunk: int | None = None
     ) -> Tensor:
         """Pictures, not clipped.
 
@@ -76,7 +70,6 @@ class RGBHead(nn.Module):
             features: (B', N, in_channels), N = h * w tokens row-major, levels 0 to 3 concatenated.
             grid: (h, w) in patches.
             chunk: views at a time, which bounds the memory; None for all. The result is the same.
-            recompute: keep no activations of a chunk for the backward pass, compute them again.
 
         Returns:
             (B', 3, h * patch, w * patch) RGB, in [0, 1] but for overshoot.
@@ -84,16 +77,10 @@ class RGBHead(nn.Module):
         Raises:
             ShapeError: features that do not fit the grid or the configuration.
         """
-        logits = self.logits(features, grid, chunk=chunk, recompute=recompute)
-        return self.image(logits, grid)
+        return self.image(self.logits(features, grid, chunk=chunk), grid)
 
     def logits(
-        self,
-        features: Tensor,
-        grid: tuple[int, int],
-        *,
-        chunk: int | None = None,
-        recompute: bool = False,
+        self, features: Tensor, grid: tuple[int, int], *, chunk: int | None = None
     ) -> Tensor:
         """(B', N, patch² · 3) pixels of the patches, ImageNet-normalised RGB; see ``forward``."""
         tokens = grid[0] * grid[1]
@@ -103,14 +90,9 @@ class RGBHead(nn.Module):
                 f"{self.config.in_channels}) for a grid of {grid}"
             )
         position = self.positions(grid)
-        if not recompute or not torch.is_grad_enabled():
-            parts = [self._views(part, position) for part in _chunks(features, chunk)]
-        else:
-            parts = [
-                checkpoint(self._views, part, position, use_reentrant=False)
-                for part in _chunks(features, chunk)
-            ]
-        return parts[0] if len(parts) == 1 else torch.cat(parts)
+        parts = features.split(max(chunk or len(features), 1))
+        done = [self._views(part, position) for part in parts]
+        return done[0] if len(done) == 1 else torch.cat(done)
 
     def image(self, logits: Tensor, grid: tuple[int, int]) -> Tensor:
         """(B', h·w, patch² · 3) logits as (B', 3, h * patch, w * patch) RGB, not clipped."""
@@ -185,10 +167,6 @@ class _Dense(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return self.dense(x)
-
-
-def _chunks(features: Tensor, chunk: int | None) -> tuple[Tensor, ...]:
-    return (features,) if chunk is None else features.split(max(chunk, 1))
 
 
 def sine_table(width: int, grid: tuple[int, int]) -> Tensor:

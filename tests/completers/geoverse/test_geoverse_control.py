@@ -127,14 +127,6 @@ def test_blocks_are_copies_that_live_on_their_own():
         ):
             assert torch.equal(own, other), name
             assert own.data_ptr() != other.data_ptr()
-    changed: Any = micro.denoiser(seed=5)
-    case.branch.copy_from(changed)
-    assert torch.equal(
-        case.branch.blocks[-1].attn.qkv.weight, changed.blocks[LAYERS[-1]].attn.qkv.weight
-    )
-    assert not torch.equal(
-        case.branch.blocks[-1].attn.qkv.weight, case.net.blocks[LAYERS[-1]].attn.qkv.weight
-    )
 
 
 @torch.no_grad()

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from gvtools.completers import Completion, ScaleStatus, create
-from gvtools.completers.geoverse.color_field import aligned_color
 from gvtools.completers.geoverse.correction import (
     CERTAIN,
     MOST,
@@ -21,7 +20,7 @@ from gvtools.completers.geoverse.correction import (
     without_seams,
 )
 from gvtools.completers.geoverse.passes import Decoded, Generated
-from gvtools.completers.geoverse.postprocess import DOUBTED, depth_ratios
+from gvtools.completers.geoverse.postprocess import DOUBTED, aligned_color, depth_ratios
 from gvtools.completers.surface_fill import surface_fill
 from gvtools.errors import OptionError
 

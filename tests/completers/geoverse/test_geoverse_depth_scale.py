@@ -9,7 +9,6 @@ import torch
 
 from gvtools.completers.base import ScaleStatus
 from gvtools.completers.geoverse.depth_scale import (
-    ALIGNMENTS,
     MAX_FIELD,
     PassScale,
     ScaledDepth,
@@ -18,9 +17,9 @@ from gvtools.completers.geoverse.depth_scale import (
     scaled_depth,
 )
 from gvtools.completers.geoverse.resampling import EDGE, resampled, resampled_depth
-from gvtools.errors import OptionError
 from gvtools.networks.depth_anything.geometry_head import Geometry
 
+ALIGNMENTS = ("centres", "hint", "field")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SIZE = (30, 40)
@@ -248,12 +247,6 @@ def test_damaged_depth_does_no_harm_around_it(alignment):
     intact[8:11, 8:11] = False
     np.testing.assert_allclose(found.depth[0][intact], truth[0][intact], rtol=0.01)
     assert np.isfinite(found.depth).all()
-
-
-def test_another_alignment_is_refused():
-    made, truth, valid = scene(views=1)
-    with pytest.raises(OptionError, match="expected one of centres, hint, field"):
-        scaled_depth(made, truth, valid, whole=PassScale(1.0), alignment="best")
 
 
 @pytest.mark.parametrize("size", [(60, 80), (31, 47), (24, 33), (24, 90)])

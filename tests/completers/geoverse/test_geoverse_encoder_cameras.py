@@ -75,6 +75,6 @@ def test_without_any_depth_the_unit_is_that_of_the_centres(batch):
 
 
 def test_an_unknown_unit_is_refused():
-    with pytest.raises(OptionError, match="expected one of median, depth"):
+    with pytest.raises(OptionError, match="expected 'median' or 'depth'"):
         HintConfig(camera_unit="metres")
     assert not EncoderConfig().rays and not DepthAnythingConfig().encoder.rays

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -124,6 +123,7 @@ def test_a_term_of_coefficient_zero_is_logged_but_pulls_at_nothing():
 
 def test_missing_targets_are_counted_and_give_zero_within_the_graph():
     prediction, reference = _batch()
+    assert reference.centers is not None
     found = objective(
         prediction,
         replace(

@@ -6,7 +6,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gvtools.completers.geoverse.projective import Projective, projection_matrices
-from gvtools.errors import ShapeError
 from gvtools.networks.attention import attend
 
 SIZE = (84, 112)
@@ -202,13 +201,3 @@ def test_cuda_agrees(dtype):
             getattr(there, name)(x.cuda()).cpu(), getattr(here, name)(x),
             rtol=tolerance, atol=tolerance,
         )  # fmt: skip
-
-
-def test_shapes_that_do_not_match():
-    pose, K = cameras()
-    with pytest.raises(ShapeError, match=r"expected \(B, V, 4, 4\)"):
-        Projective(pose, K[:, :2], SIZE, GRID, 8)
-    with pytest.raises(ShapeError, match="multiple of 8"):
-        Projective(pose, K, SIZE, GRID, 12)
-    with pytest.raises(ShapeError, match="3 views"):
-        Projective(pose, K, SIZE, GRID, 8).query(tokens(8, views=2))

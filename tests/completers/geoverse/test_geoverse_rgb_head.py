@@ -124,11 +124,10 @@ def test_the_table_is_the_constructors_and_is_saved_but_not_trained():
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 5])
-@pytest.mark.parametrize("recompute", [False, True])
-def test_chunks_and_recomputing_change_neither_pictures_nor_gradients(chunk, recompute):
+def test_chunks_change_neither_pictures_nor_gradients(chunk):
     module, grid = head(), (4, 3)
     results = []
-    for options in ({}, {"chunk": chunk, "recompute": recompute}):
+    for options in ({}, {"chunk": chunk}):
         x = features(3, grid).requires_grad_()
         image = module(x, grid, **options)
         image.square().sum().backward()

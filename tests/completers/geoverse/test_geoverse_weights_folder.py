@@ -55,7 +55,7 @@ def changed_config(**changes: Any) -> str:
         (changed_config(flow={"shift": "no"}), r"flow\.shift = 'no'; expected float"),
         (changed_config(flow={"level1": 3}), r"flow\.level1 = 3; expected a list"),
         (changed_config(camera={"pixel_offset": [1.0]}), "expected 2 entries"),
-        (changed_config(hints={"fill": "all"}), r"hints\.fill = 'all'; expected one of"),
+        (changed_config(hints={"fill": "all"}), r"hints\.fill = 'all'; expected"),
         (changed_config(flow={"cfg_scale": float("nan")}), "cfg_scale = nan; expected a finite"),
         (changed_config(geometry=None), r"config\.geometry = None; expected an object"),
         (changed_config(rgb={"width": 30}), "config.json|expected"),

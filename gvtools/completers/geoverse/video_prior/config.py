@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gvtools.completers.geoverse.video_prior.layouts import LAYOUTS
 from gvtools.errors import OptionError
-from gvtools.networks.config_json import check_range
+from gvtools.networks.config_json import check_choice, check_range
 
 _DTYPES = ("float32", "bfloat16", "float16")
 
@@ -47,13 +47,9 @@ class VideoPriorConfig:
     prompt_rows: int = 512
 
     def __post_init__(self) -> None:
-        for name, value, known in (
-            ("layout", self.layout, LAYOUTS),
-            ("prompt", self.prompt, ("empty", "zeros")),
-            ("dtype", self.dtype, (None, *_DTYPES)),
-        ):
-            if value not in known:
-                raise OptionError(f"video.{name} = {value!r}; expected one of {known}")
+        check_choice("video.layout", self.layout, LAYOUTS)
+        check_choice("video.prompt", self.prompt, ("empty", "zeros"))
+        check_choice("video.dtype", self.dtype, (None, *_DTYPES))
         if not self.taps or list(self.taps) != sorted({*self.taps}) or self.taps[0] < 0:
             raise OptionError(f"video.taps = {self.taps}; expected ascending block numbers")
         if self.multiple < 1 or self.multiple % 16:

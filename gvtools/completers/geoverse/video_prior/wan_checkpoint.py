@@ -96,8 +96,7 @@ def truncate(
         progress: called with bytes done and in all.
 
     Raises:
-        CheckpointError: the source lacks something, or is of another kind; the first missing
-            tensor is named.
+        CheckpointError: the source lacks something, or is of another kind.
         OptionError: numbers of blocks that the source does not have.
         ProjectError: ``out`` is there already, or cannot be written, or the disk is too full.
     """
@@ -106,12 +105,11 @@ def truncate(
     place, out = _transformer(Path(source)), Path(out)
     if out.exists():
         raise ProjectError(f"{out} is there already; remove it, or choose another folder")
-    files, config = _network(place)
-    config = _truncated(config, blocks)
+    files, config = _network(place, blocks)
     expected = expected_tensors(config)
     check_fit(files.empty(expected), expected, where=place)
     sizes = {n: prod(shape) * dtype_of(n, dtype).itemsize for n, shape in expected.items()}
-    copied = _vae_files(_vae(place, None if vae is None else Path(vae)))
+    copied = _vae_files(_vae(place, vae))
     needed = sum(sizes.values()) + sum(path.stat().st_size for path in copied)
     _check_space(out, needed + _MARGIN)
 
@@ -133,15 +131,6 @@ def truncate(
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     progress(needed, needed)
-
-
-def _truncated(config: Mapping[str, Any], blocks: int) -> dict[str, Any]:
-    if not 0 < blocks <= config["num_layers"]:
-        raise OptionError(
-            f"blocks {blocks}; expected 1 to {config['num_layers']}, what the source has"
-        )
-    hints = [layer for layer in config["vace_layers"] if layer < blocks]
-    return {**config, "num_layers": blocks, "vace_layers": hints}
 
 
 def _vae_files(folder: Path) -> list[Path]:
@@ -193,11 +182,12 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def _network(folder: Path) -> tuple[TensorFiles, dict[str, Any]]:
-    """A transformer's tensors by diffusers' names, and its diffusers config.
+def _network(folder: Path, blocks: int) -> tuple[TensorFiles, dict[str, Any]]:
+    """A transformer's tensors by diffusers' names, and its config cut to its first blocks.
 
     Raises:
         CheckpointError: not a Wan VACE transformer.
+        OptionError: numbers of blocks that it does not have.
     """
     files = TensorFiles.find(folder)
     files = files.renamed(by_diffusers_name(files.places))
@@ -211,7 +201,12 @@ def _network(folder: Path) -> tuple[TensorFiles, dict[str, Any]]:
             f"{folder}: a {name}; expected a {COMPONENTS['transformer']}, such as "
             "Wan2.2-VACE-Fun-A14B's low-noise expert"
         )
-    return files, config
+    if not 0 < blocks <= config["num_layers"]:
+        raise OptionError(
+            f"blocks {blocks}; expected 1 to {config['num_layers']}, what the source has"
+        )
+    hints = [layer for layer in config["vace_layers"] if layer < blocks]
+    return files, {**config, "num_layers": blocks, "vace_layers": hints}
 
 
 def by_diffusers_name(names: Iterable[str]) -> dict[str, str]:
@@ -315,9 +310,9 @@ def _has_two_experts(place: Path) -> bool:
         raise CheckpointError(f"{index}: cannot be read ({error}); download it again") from error
 
 
-def _vae(transformer: Path, named: Path | None) -> Path:
+def _vae(transformer: Path, named: Path | str | None) -> Path:
     places = [transformer / "vae", transformer.parent / "vae", transformer.parent.parent / "vae"]
-    places = [named] if named is not None else places
+    places = [Path(named)] if named is not None else places
     for place in places:
         if (place / "config.json").is_file():
             return place
