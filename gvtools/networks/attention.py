@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor
 
-from gvtools.errors import ShapeError
-
 # CUDA's fused kernels ask for heads of a multiple of this size; others would get N x M scores.
 FUSED_MULTIPLE = 8
 
@@ -31,15 +29,7 @@ def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
 
     Returns:
         (B, heads, N, d).
-
-    Raises:
-        ShapeError: not four dimensions, or dimensions that do not match.
     """
-    if not (q.ndim == 4 and k.shape == v.shape == (*q.shape[:2], *k.shape[2:3], q.shape[3])):
-        raise ShapeError(
-            f"attention: q {tuple(q.shape)}, k {tuple(k.shape)}, v {tuple(v.shape)}; expected "
-            "(B, heads, N, d), (B, heads, M, d) and (B, heads, M, d)"
-        )
     size = q.shape[-1]
     lacking = -size % FUSED_MULTIPLE
     if not lacking or q.device.type != "cuda":

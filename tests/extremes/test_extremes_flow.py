@@ -28,7 +28,7 @@ from gvtools.completers.geoverse.reflow import (
     reflow_pair,
     teacher_times,
 )
-from gvtools.errors import OptionError, ShapeError
+from gvtools.errors import OptionError
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.filterwarnings("error")]
 
@@ -156,12 +156,6 @@ def test_bounds_that_are_none_reach_no_network(bounds):
         interval_times(torch.zeros(1), torch.zeros(1), bounds)
 
 
-@pytest.mark.parametrize("times", [(), (1.0, math.nan, 0.0), (math.inf, 0.0)])
-def test_times_that_are_not_finite_are_refused(times):
-    with pytest.raises(ShapeError, match="times"):
-        integrate(lambda x, t: x, torch.ones(1, 2), times)
-
-
 def test_one_time_and_no_sample_change_nothing():
     state = torch.ones(1, 2)
     assert torch.equal(integrate(lambda x, t: x, state, (1.0,)), state)
@@ -200,15 +194,6 @@ def test_times_drawn_from_the_shortest_intervals_are_learnt_from(lower, width, s
     torch.testing.assert_close(pair.state, t[:, None].expand(1, 2), atol=2e-7, rtol=0)
     # A difference of states, rounded, over the interval.
     torch.testing.assert_close(pair.velocity, torch.ones(1, 2), atol=4e-7 / (upper - lower), rtol=0)
-
-
-@pytest.mark.parametrize("t", [math.nan, math.inf, 0.49, 1.01])
-def test_a_time_that_is_none_of_its_interval_is_refused(t):
-    with pytest.raises(OptionError, match="outside"):
-        reflow_pair(
-            lambda state, t: state, torch.zeros(1, 2), torch.ones(1, 2),
-            intervals=torch.tensor([0]), t=torch.tensor([t]), bounds=(1, 0.5, 0), steps=1,
-        )  # fmt: skip
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

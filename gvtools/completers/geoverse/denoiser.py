@@ -216,7 +216,6 @@ class Denoiser(nn.Module):
             (B, V, C, h, w).
         """
         grid = (noisy.shape[-2], noisy.shape[-1])
-        self._check(noisy, t, conditions)
         positions = positions or Positions(self.config, conditions.camera, grid)
         s, x = self.embed(noisy, conditions)
         time = self.time(t, noisy.shape[1]).to(s.dtype)
@@ -238,35 +237,6 @@ class Denoiser(nn.Module):
         reference = _tokens(getattr(self, f"{stream}_embedder_ref"), x[:, :context])
         target = _tokens(getattr(self, f"{stream}_embedder_tgt"), x[:, context:])
         return torch.cat((reference, target), dim=1)
-
-    def _check(self, noisy: Tensor, t: Tensor, conditions: Conditions) -> None:
-        height, width = conditions.camera.size
-        patch, (rows, columns) = self.config.camera_patch, noisy.shape[-2:]
-        if noisy.ndim != 5 or noisy.shape[2] != self.config.channels:
-            raise ShapeError(
-                f"latents {tuple(noisy.shape)}; expected (B, V, {self.config.channels}, h, w)"
-            )
-        if (rows * patch, columns * patch) != (height, width):
-            raise ShapeError(
-                f"latents {tuple(noisy.shape)} of {columns}x{rows} tokens with cameras of "
-                f"{width}x{height} pixels; expected {patch} pixels a token"
-            )
-        batch, views = noisy.shape[:2]
-        if tuple(t.shape) not in ((batch,), (batch, views)):
-            raise ShapeError(
-                f"time {tuple(t.shape)}; expected {(batch,)}, or {(batch, views)} for views of "
-                "different times"
-            )
-        whole, pixels = tuple(noisy.shape), conditions.camera.size
-        for what, value, expected in (
-            ("latents of the conditions", conditions.latents, whole),
-            ("source latents", conditions.source, whole),
-            ("depth condition", conditions.depth, (batch, views, DEPTH_CHANNELS, *pixels)),
-            ("camera map", conditions.camera.map, (batch, views, CAMERA_CHANNELS, *pixels)),
-            ("cam_from_world", conditions.camera.cam_from_world, (batch, views, 4, 4)),
-        ):
-            if value is not None and tuple(value.shape) != expected:
-                raise ShapeError(f"{what} {tuple(value.shape)}; expected {expected}")
 
 
 def _tokens(embed: nn.Module, x: Tensor) -> Tensor:

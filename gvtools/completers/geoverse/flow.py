@@ -15,7 +15,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from gvtools.errors import OptionError, ShapeError
+from gvtools.errors import OptionError
 from gvtools.networks.config_json import check_range
 
 Time = TypeVar("Time", float, Tensor)
@@ -137,10 +137,6 @@ def over_state(t: float | Tensor, state: Tensor) -> float | Tensor:
     """A time (B,) in the shape that multiplies ``state`` (B, ...); a number stays a number."""
     if not isinstance(t, Tensor):
         return t
-    if t.shape != state.shape[: t.ndim]:
-        raise ShapeError(
-            f"time {tuple(t.shape)} for a state {tuple(state.shape)}; expected one a sample"
-        )
     return t.reshape(t.shape + (1,) * (state.ndim - t.ndim))
 
 
@@ -216,26 +212,15 @@ def integrate(
     Returns:
         The state at the last time, dtype of ``state``; infinite where that dtype ends (float16 at
         65504).
-
-    Raises:
-        ShapeError: no times, times that are not finite, or shapes that do not fit.
     """
     wide = torch.promote_types(state.dtype, torch.float32)
     grid = torch.as_tensor(times, dtype=torch.float64, device="cpu")
-    if grid.ndim not in (1, 2) or not len(grid) or (grid.ndim == 2 and grid.shape[1] != len(state)):
-        raise ShapeError(
-            f"times {tuple(grid.shape)}; expected (S + 1,) or (S + 1, {len(state)}), one a sample"
-        )
-    if not bool(grid.isfinite().all()):
-        raise ShapeError(f"times {grid.flatten()[:8].tolist()}; expected finite ones")
     grid = grid.reshape(len(grid), -1).expand(-1, len(state))
     strides = grid.diff(dim=0).to(wide).to(state.device)
     at = grid.to(wide).to(state.device)
     current = state.to(wide)
     for step in range(len(strides)):
         u = velocity(current.to(state.dtype), at[step])
-        if u.shape != state.shape:
-            raise ShapeError(f"velocity {tuple(u.shape)} of a state {tuple(state.shape)}")
         current = current + over_state(strides[step], current) * u.to(wide)
         if callback is not None:
             callback(step + 1, at[step + 1], current)

@@ -27,7 +27,7 @@ from gvtools.completers.geoverse.flow import (
     over_state,
     velocity_from_clean,
 )
-from gvtools.completers.geoverse.injection import check_features, video_keys
+from gvtools.completers.geoverse.injection import video_keys
 from gvtools.completers.geoverse.passes import Decoded, Prepared
 from gvtools.completers.geoverse.plucker import camera_condition
 from gvtools.completers.geoverse.rgb_head import RGBHead
@@ -149,14 +149,9 @@ class GeoVerseNetworks(nn.Module):
         return encode_latents(self.geometry, level0, level1, batch, self.config.hints)
 
     def with_video(self, prepared: Prepared, features: VideoFeatures) -> Prepared:
-        """``prepared`` with video features; gradients reach the adapters.
-
-        Raises:
-            ShapeError: features of other views, channels or taps.
-        """
+        """``prepared`` with video features; gradients reach the adapters."""
         latents = prepared.hints.level1
         grid = (latents.shape[-2], latents.shape[-1])
-        check_features(features, self.config.video, tuple(latents.shape[:2]))
         if self.control is not None:
             return replace(prepared, adapted=self.control.adapted(features.tensors, grid))
         keys = video_keys(self.shared, self.config.level1, prepared.level1.camera, features, grid)

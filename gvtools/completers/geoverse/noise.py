@@ -12,8 +12,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gvtools.errors import ShapeError
-
 
 def view_seed(seed: int, *names: int | str) -> int:
     """A seed in [0, 2^63) of a run's seed and the draw's names, such as ("level1", "frame_7")."""
@@ -35,15 +33,7 @@ def seeded_noise(
         seeds: B rows of V seeds, see ``view_seed``.
         device: of the result.
         dtype: of the result.
-
-    Raises:
-        ShapeError: not one seed a view.
     """
-    if len(shape) < 2 or [len(row) for row in seeds] != [shape[1]] * shape[0]:
-        raise ShapeError(
-            f"noise {tuple(shape)}: {[len(row) for row in seeds]} seeds in the rows; expected "
-            "shape (B, V, ...) and B rows of V seeds"
-        )
     views = [
         torch.randn(tuple(shape[2:]), generator=torch.Generator().manual_seed(value))
         for row in seeds

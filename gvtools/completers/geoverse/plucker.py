@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gvtools.errors import DegenerateError, OptionError, ShapeError
-
 # (x, y) added to column and row. The half pixel to the left is an oddity of the published weights.
 GLD_PIXEL_OFFSET = (-0.5, 0.5)
 CENTRED = (0.5, 0.5)
@@ -53,13 +51,8 @@ class CameraCondition:
         "old"        identity        kept           cascade, as its evaluation runs it
         "old_train"  kept            identity       cascade, as its training configuration
         ===========  ==============  =============  =======================================
-
-        Raises:
-            OptionError: another mode.
         """
         dropped = {"new": (True, True), "old": (True, False), "old_train": (False, True)}
-        if mode not in dropped:
-            raise OptionError(f"unconditional mode {mode!r}; expected one of {sorted(dropped)}")
         no_poses, no_K = dropped[mode]
         pose, K = self.cam_from_world, self.K
         return replace(
@@ -88,15 +81,9 @@ def camera_condition(
         context: number of context views.
         reference: view whose frame the map is in.
         pixel_offset: (x, y) added to column and row.
-
-    Raises:
-        ShapeError: shapes that do not match, more context views than views, or not finite.
-        DegenerateError: a K without a focal length.
     """
     rebased, scale = normalised_poses(world_from_cam, reference=reference)
     views = rebased.shape[1]
-    if not 0 <= context <= views:
-        raise ShapeError(f"camera condition: {context} context views of {views}")
     rays = plucker_map(rebased, K, size, pixel_offset=pixel_offset)
     mask = (torch.arange(views, device=rays.device) >= context).to(rays.dtype)
     mask = mask.view(1, views, 1, 1, 1).expand(len(rays), views, 1, *size)
@@ -120,14 +107,7 @@ def normalised_poses(world_from_cam: Tensor, *, reference: int = -1) -> tuple[Te
 
     Returns:
         world_from_cam (B, V, 4, 4), re-based and scaled, and the scale (B,).
-
-    Raises:
-        ShapeError: not (B, V, 4, 4), no such view, or not finite.
     """
-    _check(world_from_cam, "world_from_cam", 4)
-    views = world_from_cam.shape[1]
-    if not -views <= reference < views:
-        raise ShapeError(f"poses: reference view {reference} of {views}")
     world_from_cam = world_from_cam.to(_precise(world_from_cam))
     rotation, centre = world_from_cam[..., :3, :3], world_from_cam[..., :3, 3:]
     base = rotation[:, reference, None].mT
@@ -157,19 +137,7 @@ def plucker_map(
 
     Returns:
         (B, V, 6, H, W).
-
-    Raises:
-        ShapeError: shapes that do not match, or not finite.
-        DegenerateError: a K without a focal length.
     """
-    _check(world_from_cam, "world_from_cam", 4)
-    _check(K, "K", 3)
-    if not bool((K[..., 0, 0] * K[..., 1, 1] > 0).all()):
-        raise DegenerateError("K with a focal length that is not above 0; give it in pixels")
-    if K.shape[:2] != world_from_cam.shape[:2]:
-        raise ShapeError(
-            f"Plücker map: K {tuple(K.shape)} for world_from_cam {tuple(world_from_cam.shape)}"
-        )
     dtype = torch.promote_types(_precise(world_from_cam), K.dtype)
     world_from_cam, K = world_from_cam.to(dtype), K.to(dtype)
     height, width = size
@@ -184,13 +152,6 @@ def plucker_map(
     direction = (direction / direction.square().sum(dim=2, keepdim=True).sqrt()).unflatten(-1, size)
     centre = world_from_cam[..., :3, 3, None, None].expand_as(direction)
     return torch.cat((direction, torch.linalg.cross(centre, direction, dim=2)), dim=2)
-
-
-def _check(matrices: Tensor, name: str, size: int) -> None:
-    if matrices.ndim != 4 or matrices.shape[-2:] != (size, size):
-        raise ShapeError(f"{name} {tuple(matrices.shape)}; expected (B, V, {size}, {size})")
-    if not bool(torch.isfinite(matrices).all()):
-        raise ShapeError(f"{name} holds NaN or infinity; mend it or drop the view")
 
 
 def _pose(rotation: Tensor, translation: Tensor) -> Tensor:

@@ -13,7 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gvtools.errors import ShapeError
 from gvtools.networks.attention import attend
 from gvtools.networks.depth_anything.encoder import IMAGENET_MEAN, IMAGENET_STD
 
@@ -73,9 +72,6 @@ class RGBHead(nn.Module):
 
         Returns:
             (B', 3, h * patch, w * patch) RGB, in [0, 1] but for overshoot.
-
-        Raises:
-            ShapeError: features that do not fit the grid or the configuration.
         """
         return self.image(self.logits(features, grid, chunk=chunk), grid)
 
@@ -83,12 +79,6 @@ class RGBHead(nn.Module):
         self, features: Tensor, grid: tuple[int, int], *, chunk: int | None = None
     ) -> Tensor:
         """(B', N, patch² · 3) pixels of the patches, ImageNet-normalised RGB; see ``forward``."""
-        tokens = grid[0] * grid[1]
-        if features.ndim != 3 or features.shape[1:] != (tokens, self.config.in_channels):
-            raise ShapeError(
-                f"RGB head: features {tuple(features.shape)}; expected (B', {tokens}, "
-                f"{self.config.in_channels}) for a grid of {grid}"
-            )
         position = self.positions(grid)
         parts = features.split(max(chunk or len(features), 1))
         done = [self._views(part, position) for part in parts]
@@ -174,12 +164,7 @@ def sine_table(width: int, grid: tuple[int, int]) -> Tensor:
 
     The first half of the channels encodes the column, the second the row; each is the sines of
     width / 4 frequencies, then their cosines.
-
-    Raises:
-        ShapeError: a width that is no multiple of 4.
     """
-    if width % 4:
-        raise ShapeError(f"position table of {width} channels; expected a multiple of 4")
     count = width // 4
     frequency = SINE_BASE ** -(torch.arange(count, dtype=torch.float64) / count)
     rows, columns = (torch.arange(edge, dtype=torch.float64) for edge in grid)

@@ -27,18 +27,16 @@ class LatentStatistics(nn.Module):
         self.register_buffer("mean", torch.zeros(channels))
         self.register_buffer("var", torch.ones(channels))
 
-    def normalise(self, raw: Tensor, *, dim: int = -3) -> Tensor:
-        """Raw features, channels on ``dim`` (-3: (..., C, h, w)), to latents."""
-        mean, std = self._shaped(raw, dim)
+    def normalise(self, raw: Tensor) -> Tensor:
+        """Raw features (..., C, h, w) to latents."""
+        mean, std = self._shaped(raw)
         return (raw - mean) / std
 
-    def denormalise(self, latent: Tensor, *, dim: int = -3) -> Tensor:
+    def denormalise(self, latent: Tensor) -> Tensor:
         """The inverse of ``normalise``."""
-        mean, std = self._shaped(latent, dim)
+        mean, std = self._shaped(latent)
         return latent * std + mean
 
-    def _shaped(self, like: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-        shape = [1] * like.ndim
-        shape[dim] = -1
+    def _shaped(self, like: Tensor) -> tuple[Tensor, Tensor]:
         std = (self.var + self.eps).sqrt()
-        return self.mean.to(like.dtype).view(shape), std.to(like.dtype).view(shape)
+        return self.mean.to(like.dtype)[:, None, None], std.to(like.dtype)[:, None, None]

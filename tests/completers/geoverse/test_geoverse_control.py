@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gvtools.completers.geoverse.control import ControlBranch, ControlConfig
 from gvtools.completers.geoverse.denoiser import Conditions, Positions
-from gvtools.errors import OptionError, ShapeError
+from gvtools.errors import OptionError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -170,10 +170,3 @@ def test_layers_that_the_denoiser_does_not_have_are_refused(injection, layers):
     kind = replace(getattr(micro.CONFIG, injection), layers=layers)
     with pytest.raises(OptionError, match=rf"{injection}\.layers = .*expected 4 ascending"):
         micro.config(injection=injection, **{injection: kind})
-
-
-def test_features_of_other_views_are_refused():
-    model = micro.model(micro.config(injection="control"))
-    batch = micro.batch(1, context=1, targets=2)
-    with pytest.raises(ShapeError, match=r"video features.*expected"):
-        model.prepare(batch, video=micro.video_features(1, 4))

@@ -247,29 +247,3 @@ def test_only_the_encoder_is_conditioned_on_the_source():
     assert torch.equal(head, head2) and not torch.equal(s, s2)
     with pytest.raises(ShapeError, match="give the level-1 latents"):
         cascade(x, t, known)
-
-
-def wrong(x: Tensor, t: Tensor, known: Conditions) -> dict[str, tuple[Tensor, Tensor, Conditions]]:
-    assert known.depth is not None
-    short = replace(known.camera, cam_from_world=known.camera.cam_from_world[:, :3])
-    return {
-        "channels": (x[:, :, :5], t, known),
-        "latents": (x, t, replace(known, latents=known.latents[:, :3])),
-        "grid": (x[..., :2], t, replace(known, latents=known.latents[..., :2])),
-        "time": (x, torch.ones(3), known),
-        "time per view": (x, torch.ones(2, 4), known),
-        "no time": (x, torch.tensor(0.5), known),
-        "depth": (x, t, replace(known, depth=known.depth[:, :, :1])),
-        "depth size": (x, t, replace(known, depth=known.depth[..., :8])),
-        "source": (x, t, replace(known, source=x[:, :3])),
-        "cameras": (x, t, replace(known, camera=short)),
-    }
-
-
-@pytest.mark.parametrize("what", list(wrong(*micro.conditions())))
-def test_a_wrong_shape_is_said_with_what_was_expected(what):
-    config = micro.config().cascade if what == "source" else micro.DENOISER
-    assert config is not None
-    net = micro.denoiser(config)
-    with pytest.raises(ShapeError, match=r"\(2, .*expected|expected .*\(2,"):
-        net(*wrong(*micro.conditions())[what])

@@ -30,7 +30,7 @@ from gvtools.completers.geoverse.flow import (
     velocity_from_clean,
     velocity_target,
 )
-from gvtools.errors import OptionError, ShapeError
+from gvtools.errors import OptionError
 
 SHAPE = (2, 3, 4, 2, 3)
 SHIFTS = st.floats(0.05, 100)
@@ -187,8 +187,6 @@ def test_each_sample_has_its_own_time():
     state = interpolate(clean, noise, t)
     for b in range(2):
         torch.testing.assert_close(state[b], interpolate(clean[b], noise[b], float(t[b])))
-    with pytest.raises(ShapeError, match="one a sample"):
-        interpolate(clean, noise, torch.zeros(3))
 
 
 def test_half_precision_states_keep_their_dtype_and_a_fine_time():
@@ -279,8 +277,6 @@ def test_samples_may_run_over_times_of_their_own():
     for b in range(2):
         alone = integrate(velocity, state[b : b + 1], times[:, b].tolist())
         torch.testing.assert_close(both[b : b + 1], alone)
-    with pytest.raises(ShapeError, match="times"):
-        integrate(velocity, state, times.T)
 
 
 def test_guidance_moves_away_from_the_unconditional_velocity():
@@ -319,8 +315,3 @@ def test_gradients_pass_through_sampling():
     sample(lambda x, t: gain * x, noise, [1, 0.5, 0]).sum().backward()
     torch.testing.assert_close(noise.grad, torch.full_like(noise, 0.75**2))
     assert gain.grad is not None and bool(gain.grad.isfinite())
-
-
-def test_a_velocity_of_another_shape_is_refused():
-    with pytest.raises(ShapeError, match="velocity"):
-        sample(lambda x, t: x[:, :1], _pair()[1], [1, 0])

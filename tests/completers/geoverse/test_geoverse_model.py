@@ -19,7 +19,7 @@ from gvtools.completers.geoverse.objective.losses import depth_loss, rgb_loss
 from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
-from gvtools.errors import CheckpointError, OptionError, ShapeError
+from gvtools.errors import CheckpointError, ShapeError
 from gvtools.networks.depth_anything.network import DepthAnything3
 from gvtools.networks.depth_anything.rays import camera_centres
 
@@ -148,9 +148,6 @@ def test_one_evaluation_an_interval_and_everything_else_once(monkeypatch):
 def test_a_configuration_with_a_video_prior_asks_for_it():
     with pytest.raises(CheckpointError, match=r"needs the video prior.*injection = 'none'"):
         built("control").generate(micro.batch(1))
-    with pytest.raises(OptionError, match="without a video prior"):
-        model = built()
-        model.with_video(model.prepare(micro.batch(1)), micro.video_features(1, 4))
 
 
 @pytest.mark.parametrize("injection", INJECTIONS)

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvtools.completers.geoverse.noise import seeded_noise, view_seed
-from gvtools.errors import ShapeError
 
 NAMES = ["a", "b", "c", "d"]
 GRID = (5, 4, 6)
@@ -66,9 +65,3 @@ def test_the_global_generator_is_left_alone():
     torch.manual_seed(0)
     _noise(NAMES)
     assert torch.equal(torch.rand(3), expected)
-
-
-@pytest.mark.parametrize("seeds", [[[1]], [[1, 2], [3]], [[1, 2]]])
-def test_not_one_seed_a_view_is_refused(seeds):
-    with pytest.raises(ShapeError, match="seeds"):
-        seeded_noise((2, 2, 1, 1, 1), seeds)

@@ -19,7 +19,7 @@ from gvtools.completers.geoverse.noise import view_seed
 from gvtools.completers.geoverse.video_prior.layouts import packed_mask, view_layout
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior, VideoPriorConfig
 from gvtools.completers.geoverse.video_prior.views import resized
-from gvtools.errors import CheckpointError, OptionError, ShapeError
+from gvtools.errors import CheckpointError, OptionError
 
 LAYOUTS = ("per_view", "video9", "repeat4")
 
@@ -405,19 +405,6 @@ def test_a_configuration_that_does_not_fit_the_weights_is_refused(network: Any) 
 def test_options_out_of_range_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match=f"video.{next(iter(options))}"):
         VideoPriorConfig(**options)
-
-
-def test_shapes_that_do_not_fit_are_refused(network: Any) -> None:
-    prior = tiny.prior(network)
-    images, valid = tiny.views(3)
-    with pytest.raises(ShapeError, match=r"expected \(B, V, 3, H, W\)"):
-        prior.features(images[0], valid[0], 1)
-    with pytest.raises(ShapeError, match="valid"):
-        prior.features(images, valid[:, :2], 1)
-    with pytest.raises(ShapeError, match="4 context views of 3"):
-        prior.features(images, valid, 4)
-    with pytest.raises(ShapeError, match="1 rows of 3"):
-        prior.features(images, valid, 1, seed=[[1, 2]])
 
 
 def test_importing_the_module_leaves_diffusers_alone() -> None:

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gvtools.errors import ShapeError
-
 DEFECTS = (
     "aligned",
     "fewer than 2 valid centres",
@@ -65,11 +63,6 @@ def center_similarity(predicted: Tensor, reference: Tensor) -> CenterSimilarity:
         predicted: (B, V, 3) camera centres o^; those that are not finite are left out.
         reference: (B, V, 3) camera centres o, any other frame and unit; likewise.
     """
-    if predicted.ndim != 3 or predicted.shape[-1] != 3 or predicted.shape != reference.shape:
-        raise ShapeError(
-            f"camera centres: predicted {tuple(predicted.shape)}, reference "
-            f"{tuple(reference.shape)}; expected both (B, V, 3)"
-        )
     x, y = (z.to("cpu").to(torch.float64) for z in (predicted, reference))
     use = (x.isfinite() & y.isfinite()).all(-1)
     count = use.sum(1)

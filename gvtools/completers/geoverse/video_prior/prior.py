@@ -24,7 +24,7 @@ from gvtools.completers.geoverse.video_prior.layouts import (
     packed_mask,
     view_layout,
 )
-from gvtools.completers.geoverse.video_prior.views import check_views, resized, seed_rows
+from gvtools.completers.geoverse.video_prior.views import resized, seed_rows
 from gvtools.completers.geoverse.video_prior.wan_folder import load_network, read_empty_prompt
 from gvtools.completers.geoverse.video_prior.wan_networks import STRIDE, WanNetworks
 from gvtools.errors import CheckpointError
@@ -158,11 +158,7 @@ class VideoPrior:
             context: how many views, the first ones, are photographs: they get no noise.
             seed: one number, or B rows of V of them (see ``noise.view_seed``): a view's noise
                 depends on its own alone.
-
-        Raises:
-            ShapeError: shapes that do not fit.
         """
-        check_views(images, valid, context)
         seeds = seed_rows(seed, *images.shape[:2])
         layout = view_layout(self.config.layout, images.shape[1])
         device = self.networks.device

@@ -9,29 +9,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gvtools.completers.geoverse.noise import view_seed
-from gvtools.errors import ShapeError
-
-
-def check_views(images: Tensor, valid: Tensor, context: int) -> None:
-    """The shapes that ``VideoPrior.features`` expects.
-
-    Args:
-        images: (B, V, 3, H, W).
-        valid: (B, V, 1, H, W).
-        context: 0 to V.
-
-    Raises:
-        ShapeError: they are others.
-    """
-    shape = tuple(images.shape)
-    expected = (*shape[:2], 1, *shape[3:])
-    if len(shape) != 5 or shape[2] != 3 or 0 in shape or tuple(valid.shape) != expected:
-        raise ShapeError(
-            f"video prior: images {shape}, valid {tuple(valid.shape)}; expected (B, V, 3, H, W) "
-            "and (B, V, 1, H, W)"
-        )
-    if not 0 <= context <= shape[1]:
-        raise ShapeError(f"video prior: {context} context views of {shape[1]} views")
 
 
 def resized(images: Tensor, valid: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -67,16 +44,7 @@ def seed_rows(seed: int | Sequence[Sequence[int]], batch: int, views: int) -> li
         seed: one number for all, or the rows themselves.
         batch: B.
         views: V.
-
-    Raises:
-        ShapeError: rows of another shape.
     """
     if isinstance(seed, int):
         return [[view_seed(seed, item, view) for view in range(views)] for item in range(batch)]
-    rows = [list(row) for row in seed]
-    if [len(row) for row in rows] != [views] * batch:
-        raise ShapeError(
-            f"video prior: seeds {[len(row) for row in rows]} in rows; expected {batch} rows of "
-            f"{views}"
-        )
-    return rows
+    return [list(row) for row in seed]
