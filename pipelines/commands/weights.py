@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 SUMMARY = "tell which weights the generative core needs, and whether a folder of them fits"
 EXAMPLES = ("gvtools weights list base", "gvtools weights check weights/base --json check.json")
 
-# Seconds between two lines of progress where there is no terminal.
+# Seconds between two lines of progress.
 _INTERVAL = 10.0
 _Add = Callable[..., Any]
 
@@ -206,18 +206,15 @@ def _empty_prompt(args: argparse.Namespace, console: Console) -> None:
 
 
 def _progress(console: Console) -> Callable[[int, int], None]:
-    """Bytes done of all: a line that is rewritten on a terminal, one now and then elsewhere."""
+    """Bytes done of all, now and then."""
     from pipelines.weights.report import size_text
 
     last = [time.monotonic()]
 
     def report(done: int, total: int) -> None:
-        text = f"{size_text(done)} of {size_text(total)} written"
-        if console.interactive:
-            print(f"\r{text}", end="\n" if done >= total else "", flush=True)
-        elif done >= total or time.monotonic() - last[0] > _INTERVAL:
+        if done >= total or time.monotonic() - last[0] > _INTERVAL:
             last[0] = time.monotonic()
-            console.line(text)
+            console.line(f"{size_text(done)} of {size_text(total)} written")
 
     return report
 

@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
-from math import prod
 from pathlib import Path
 
 import geoverse_models as micro
@@ -14,11 +13,9 @@ from safetensors.torch import load_file, save_file
 
 from gvtools.completers.geoverse import from_pretrained, named
 from gvtools.completers.geoverse.weights.folder import save_pretrained
-from gvtools.completers.geoverse.weights.published import VIDEO_SIZES, WHOLE_FILE
+from gvtools.completers.geoverse.weights.published import WHOLE_FILE
 from gvtools.networks.config_json import to_json
 from pipelines.cli import build_parser, main
-from pipelines.commands.weights import _progress
-from pipelines.console import Console
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -81,28 +78,6 @@ def test_published_files_have_their_published_numbers(capsys: pytest.CaptureFixt
         assert lines[place + 3].startswith("      from ")
     assert f"  {WHOLE_FILE}" in lines
     assert "  video/" in lines
-
-
-def test_the_video_prior_has_the_size_of_its_networks() -> None:
-    pytest.importorskip("diffusers", reason="the extra wan is not installed")
-    from gvtools.completers.geoverse.video_prior.wan_folder import dtype_of, expected_tensors
-
-    sizes = {
-        "num_layers": 16,
-        "num_attention_heads": 40,
-        "attention_head_dim": 128,
-        "ffn_dim": 13824,
-        "text_dim": 4096,
-        "vace_layers": [0, 5, 10, 15],
-    }
-    for component, config in (("transformer", sizes), ("vae", {})):
-        tensors = expected_tensors(config, component=component)
-        numbers = {name: prod(shape) for name, shape in tensors.items()}
-        size = sum(
-            n * (4 if component == "vae" else dtype_of(name, torch.bfloat16).itemsize)
-            for name, n in numbers.items()
-        )
-        assert VIDEO_SIZES[component] == (len(tensors), sum(numbers.values()), size)
 
 
 def test_the_list_is_readable(capsys: pytest.CaptureFixture[str], micro_file: Path) -> None:
@@ -269,22 +244,6 @@ def test_the_video_prior_is_cut_and_completed(
     assert from_pretrained(folder).video is not None
     shutil.rmtree(video / "vae")
     assert "vae" in refused(capsys, "check", folder, "--quiet")
-
-
-def test_progress_on_and_off_a_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for quiet, interactive, wanted in (
-        (False, False, "2 MB of 2 MB written\n"),
-        (False, True, "\r1 MB of 2 MB written\r2 MB of 2 MB written\n"),
-        (True, False, ""),
-    ):
-        console = Console(quiet=quiet)
-        monkeypatch.setattr(console, "interactive", interactive)
-        report = _progress(console)
-        report(1_000_000, 2_000_000)
-        report(2_000_000, 2_000_000)
-        assert capsys.readouterr().out == wanted
 
 
 # the command itself

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +29,7 @@ from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import empty_model
 from gvtools.completers.geoverse.weights.folder import save_pretrained
 from gvtools.completers.geoverse.weights.published import PARTS, expected_of
-from gvtools.networks.tensors import READABLE
+from gvtools.networks.tensor_files import STORED_TYPES, TensorFiles
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 pytest_plugins = ("geoverse_folder_fixtures",)
@@ -159,14 +157,15 @@ def base() -> GeoVerse:
     return empty_model(named("base"), where="base")
 
 
-def test_the_core_does_without_safetensors_until_a_file_is_read() -> None:
-    code = (
-        "import sys, gvtools.completers.geoverse;"
-        "print([m for m in ('safetensors', 'diffusers', 'open3d') if m in sys.modules])"
-    )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "[]"
-
-
-def test_readable_types_are_floating_point() -> None:
-    assert all(dtype.is_floating_point and dtype.itemsize >= 2 for dtype in READABLE)
+def test_files_are_read_as_the_library_reads_them(tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(0)
+    numbers = torch.randn(3, 4, 2, generator=generator)
+    tensors = {str(d): (numbers * 9).to(d) for d in STORED_TYPES.values()}
+    tensors |= {"scalar": torch.tensor(2.5), "empty": torch.zeros(0, 3)}
+    save_file(tensors, tmp_path / "a.safetensors", metadata={"format": "pt"})
+    files = TensorFiles.find(tmp_path)
+    assert files.places.keys() == tensors.keys()
+    for name, tensor in load_file(tmp_path / "a.safetensors").items():
+        found = files.read(name)
+        assert (found.dtype, found.shape) == (tensor.dtype, tensor.shape)
+        assert torch.equal(found, tensor)

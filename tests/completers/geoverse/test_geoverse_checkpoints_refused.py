@@ -55,6 +55,7 @@ DAMAGES: dict[str, tuple[Callable[[dict[str, Tensor]], Any], str]] = {
         lambda t: t.update({LAYER: t[LAYER].to(torch.float8_e4m3fn)}),
         "is float8_e4m3fn, expected float32",
     ),
+    "sparse": (lambda t: t.update({LAYER: t[LAYER].to_sparse()}), f"{LAYER} is sparse"),
     "complex": (lambda t: t.update({LAYER: t[LAYER] + 0j}), "is complex64"),
 }
 
@@ -82,11 +83,6 @@ def test_a_folder_of_ones_own_with_wrong_tensors_is_refused(own: Path, damage: s
     tensors_changed(own / WHOLE_FILE, changed)
     message = message.removesuffix("$").replace(LAYER, f"level1.{LAYER}")
     assert WHOLE_FILE in refused(own, message.replace(": extra", ": level1.extra"))
-
-
-def test_sparse_tensors_are_refused(folder: Path) -> None:
-    tensors_changed(folder / LEVEL1, lambda t: t.update({LAYER: t[LAYER].to_sparse()}))
-    refused(folder, f"{LAYER} is sparse")
 
 
 def test_what_does_not_fit_is_listed_in_full(folder: Path) -> None:

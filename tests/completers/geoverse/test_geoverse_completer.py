@@ -115,6 +115,10 @@ def test_more_targets_than_a_pass_takes_go_through_several(weights, monkeypatch)
     for index in range(5):
         hole = ~known.valid[index]
         assert (result.depth[index][hole] > 0).all()
+    # Without these options it is the model's own numbers that count.
+    seen.clear()
+    complete(weights, micro.context_views(5), micro.guidance(1))
+    assert seen[0][0].context == micro.CONFIG.context == 2
     # The context leaves room for one target at least.
     seen.clear()
     complete(weights, context, known, context_views=3, views=2)
@@ -149,13 +153,6 @@ def test_context_pictures_may_have_any_size_and_aspect(weights, size, monkeypatc
     result = complete(weights, context, micro.guidance(1))
     assert (result.depth[0] > 0).all()
     assert seen[0][0].images.shape == (1, 3, 3, *micro.SIZE)
-
-
-def test_one_photograph_is_enough_and_none_is_said(weights):
-    known = micro.guidance(2)
-    assert (complete(weights, micro.context_views(1), known).depth > 0).all()
-    with pytest.raises(OptionError, match="needs at least one context view, and got none"):
-        complete(weights, [], known)
 
 
 def test_a_photograph_and_a_target_of_one_name_start_from_different_noise(weights, monkeypatch):
@@ -207,18 +204,6 @@ def test_cameras_that_only_turn_have_no_unit_but_that_of_depth(weights):
     for found, scale in zip(results[1:], (1e3, 1.0), strict=True):
         np.testing.assert_allclose(found.rgb, results[0].rgb, atol=2e-4)
         np.testing.assert_allclose(found.depth, results[0].depth * scale, rtol=5e-4)
-
-
-def test_what_stands_in_holes_does_not_matter(weights):
-    context, known = micro.context_views(1), micro.guidance(1)
-    hole = ~known.valid
-    damaged = replace(known, rgb=known.rgb.copy(), depth=known.depth.copy(),
-                      confidence=known.confidence.copy())  # fmt: skip
-    for name in ("rgb", "depth", "confidence"):
-        getattr(damaged, name)[hole] = np.nan
-    expected, found = (complete(weights, context, g) for g in (known, damaged))
-    for name in ("rgb", "depth", "confidence"):
-        assert getattr(found, name).tobytes() == getattr(expected, name).tobytes()
 
 
 def test_a_pass_that_went_wrong_leaves_holes_and_says_so(weights, monkeypatch):
@@ -293,27 +278,7 @@ def test_predicted_rays_come_back_to_the_world(weights, monkeypatch, world):
         np.testing.assert_allclose(result.rays[view][4:-4, 4:-4], expected, rtol=1e-3, atol=2e-3)
 
 
-@pytest.mark.parametrize("size", [(30, 40), (61, 83), (20, 30)])
-def test_generated_depth_is_never_averaged_between_two_surfaces(weights, monkeypatch, size):
-    generate = GeoVerse.generate
-
-    def stepped(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
-        made = generate(self, batch, **options)
-        depth = made.decoded.geometry.depth
-        near = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) < 0.5
-        depth.copy_(torch.where(near, 1.0, 1.5))
-        return made
-
-    monkeypatch.setattr(GeoVerse, "generate", stepped)
-    monkeypatch.setattr(
-        "gvtools.completers.geoverse.postprocess.pass_scale", lambda *a: PassScale(2.0)
-    )
-    known = micro.guidance(1, size=size, share=-1.0)
-    result = complete(weights, micro.context_views(1), known, alignment="centres")
-    np.testing.assert_allclose(np.unique(result.depth[~known.valid].round(4)), [2, 3])
-
-
-def test_steps_and_guidance_are_the_options(weights, monkeypatch):
+def test_steps_and_the_scale_of_guidance_are_the_options(weights, monkeypatch):
     calls: list[float] = []
     velocity = GeoVerse.velocity1
 
@@ -366,37 +331,16 @@ def test_half_precision_gives_nearly_the_same(weights):
     np.testing.assert_allclose(half.depth, full.depth, rtol=0.05)
 
 
-def test_photographs_beyond_the_models_are_left_out(weights, monkeypatch):
-    seen = watched(monkeypatch)
-    complete(weights, micro.context_views(5), micro.guidance(1))
-    assert seen[0][0].context == micro.CONFIG.context == 2
-
-
-def folders(root: Path) -> dict[str, tuple[str | None, str]]:
-    (root / "empty").mkdir()
-    (root / "damaged").mkdir()
-    (root / "damaged" / "config.json").write_text("{")
-    (root / "unknown").mkdir()
-    (root / "unknown" / "config.json").write_text('{"image_sizes": 96}')
-    (root / "patchless").mkdir()
-    (root / "patchless" / "config.json").write_text('{"geometry": {"encoder": {"patch": 0}}}')
-    return {
-        "none": (None, "completer.weights=DIR"),
-        "absent": (str(root / "absent"), "gvtools weights list"),
-        "empty": (str(root / "empty"), "gvtools weights list"),
-        "damaged": (str(root / "damaged"), "config.json"),
-        "unknown": (str(root / "unknown"), "did you mean 'image_size'"),
-        "patchless": (str(root / "patchless"), "config.json"),
-    }
-
-
-@pytest.mark.parametrize("what", ["none", "absent", "empty", "damaged", "unknown", "patchless"])
-def test_a_folder_that_is_no_model_is_refused_in_one_line_at_creation(what, tmp_path, monkeypatch):
-    folder, said = folders(tmp_path)[what]
+@pytest.mark.parametrize(
+    ("folder", "said"), [(None, "completer.weights=DIR"), ("absent", "gvtools weights list")]
+)
+def test_a_folder_that_is_not_there_is_refused_in_one_line_at_creation(
+    folder, said, tmp_path, monkeypatch
+):
     # As in an installation that was stripped of its weights.
     monkeypatch.setattr(completer_module, "SHIPPED", tmp_path / "nothing")
     with pytest.raises((OptionError, CheckpointError)) as refused:
-        create("geoverse", weights=folder)
+        create("geoverse", weights=folder and str(tmp_path / folder))
     assert said in str(refused.value) and "\n" not in str(refused.value)
 
 

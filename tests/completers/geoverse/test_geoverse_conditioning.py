@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import geoverse_models as micro
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -22,7 +21,6 @@ from gvtools.completers.geoverse.conditioning import (
     filled,
 )
 from gvtools.completers.geoverse.statistics import LatentStatistics
-from gvtools.completers.push_pull import push_pull, push_pull_depth
 from gvtools.errors import OptionError, ShapeError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -306,99 +304,6 @@ def test_what_stands_in_the_holes_of_depth_does_not_matter(fill):
     assert bool(holes.any()) is (fill == "push-pull")
 
 
-def windows_of_two(values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted means and mean weights of 2 x 2 windows, fewer at an odd edge."""
-    rows, columns = (-(-side // 2) for side in weight.shape)
-    mean = np.zeros((len(values), rows, columns))
-    share = np.zeros((rows, columns))
-    for i, j in np.ndindex(rows, columns):
-        window = np.s_[2 * i : 2 * i + 2, 2 * j : 2 * j + 2]
-        share[i, j] = weight[window].mean()
-        if weight[window].sum() > 0:
-            sums = (values * weight)[(slice(None), *window)].sum((1, 2))
-            mean[:, i, j] = sums / weight[window].sum()
-    return mean, share
-
-
-def between(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Bilinear, pixel by pixel."""
-    found = np.zeros((len(values), *size))
-    for i, j in np.ndindex(*size):
-        places = []
-        for index, side, full in ((i, values.shape[1], size[0]), (j, values.shape[2], size[1])):
-            place = min(max((index + 0.5) * side / full - 0.5, 0), side - 1)
-            low = int(place)
-            places.append((low, min(low + 1, side - 1), place - low))
-        (top, bottom, v), (left, right, u) = places
-        found[:, i, j] = (1 - v) * ((1 - u) * values[:, top, left] + u * values[:, top, right])
-        found[:, i, j] += v * ((1 - u) * values[:, bottom, left] + u * values[:, bottom, right])
-    return found
-
-
-def plain_push_pull(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """The definition, for one (C, H, W) image."""
-    known = np.where(valid, values, 0.0)
-    if valid.shape == (1, 1):
-        return known
-    coarse, share = windows_of_two(known, valid.astype(float))
-    return np.where(valid, values, between(_pulled(coarse, share), valid.shape))
-
-
-def _pulled(values: np.ndarray, share: np.ndarray) -> np.ndarray:
-    weight = np.minimum(4 * share, 1)
-    if share.shape == (1, 1):
-        return values
-    coarse, coarser = windows_of_two(values, weight)
-    return weight * values + (1 - weight) * between(_pulled(coarse, coarser), share.shape)
-
-
-@pytest.mark.parametrize(
-    "size", [(1, 1), (1, 2), (1, 9), (7, 1), (2, 2), (3, 3), (5, 8), (13, 6), (16, 16), (17, 11)]
-)
-@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
-def test_holes_are_filled_as_the_plain_algorithm_fills_them(size, share):
-    rng = np.random.default_rng(size[0] * 100 + size[1])
-    values = rng.normal(size=(2, 3, *size))
-    valid = rng.random((2, 1, *size)) < share
-    given = torch.from_numpy(np.where(valid, values, np.nan))
-    found = push_pull(given, torch.from_numpy(valid))
-    for index in range(2):
-        expected = plain_push_pull(values[index], valid[index, 0])
-        if not valid[index].any():
-            expected = np.zeros_like(expected)
-        np.testing.assert_allclose(found[index].numpy(), expected, rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 6), (9, 14), (33, 20)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_known_pixels_and_constants_stay(size, dtype):
-    generator = torch.Generator().manual_seed(0)
-    values = torch.randn(1, 3, *size, generator=generator).to(dtype)
-    valid = torch.rand(1, 1, *size, generator=generator) < 0.2
-    valid[..., -1, -1] = True
-    found = push_pull(values, valid)
-    assert torch.equal(found[valid.expand_as(found)], values[valid.expand_as(found)])
-    assert found.dtype == dtype
-    low, high = values.min(), values.max()
-    assert bool(((found >= low - 1e-2) & (found <= high + 1e-2)).all())
-    constant = push_pull(torch.full_like(values, 0.7), valid)
-    torch.testing.assert_close(constant, torch.full_like(values, 0.7))
-    assert not push_pull(values, torch.zeros_like(valid)).any()
-
-
-def test_depth_is_filled_in_its_logarithm():
-    depth = torch.zeros(3, 1, 4, 8)
-    depth[0, :, :, :4], depth[0, :, :, 6:] = 1.0, 4.0
-    depth[1, 0, 2, 2] = 7.0
-    depth[0, 0, 0, 0] = torch.nan
-    found = push_pull_depth(depth, torch.ones_like(depth, dtype=torch.bool))
-    log = push_pull(depth.nan_to_num(1).clamp_min(0.5).log(), depth > 0)
-    torch.testing.assert_close(found[0], log[0].exp())
-    assert found[0].min() >= 1 - 1e-6 and found[0].max() <= 4 + 1e-5
-    torch.testing.assert_close(found[1], torch.full_like(found[1], 7.0))
-    assert not found[2].any()
-
-
 def test_filling_leaves_the_context_and_the_validity_alone():
     batch = micro.batch(2)
     assert filled(batch, PAPER) is batch
@@ -427,7 +332,8 @@ def test_statistics_there_and_back():
 
 
 @pytest.mark.parametrize(
-    "change", [{"fill": "black"}, {"encode": "both"}, {"token": "none"}, {"mask": 1.5}]
+    "change",
+    [{"fill": "black"}, {"encode": "both"}, {"token": "none"}, {"camera_unit": "m"}, {"mask": 1.5}],
 )
 def test_unknown_ways_are_refused(change):
     name = next(iter(change))

@@ -14,37 +14,44 @@ from gvtools.errors import OptionError
 from gvtools.networks.config_json import from_json, to_json
 
 
-@pytest.mark.parametrize("value", [0.0, -3.0, float("nan")])
-def test_a_shift_that_is_none_is_refused(value):
-    with pytest.raises(OptionError, match=r"flow\.shift .*more than 0"):
-        FlowConfig(shift=value)
+@pytest.mark.parametrize(
+    ("field", "refused", "taken", "said"),
+    [
+        ("shift", (0.0, -3.0, float("nan")), (1.0,), "more than 0"),
+        ("least_time", (0.0, -0.1, 1.5, float("nan")), (1.0,), "more than 0 and at most 1"),
+        ("cfg_scale", (-1.0,), (0.0,), "at least 0"),
+        ("temperature", (-0.1,), (0.0,), "at least 0"),
+    ],
+)
+def test_flow_settings_outside_their_range_are_refused(field, refused, taken, said):
+    for value in refused:
+        with pytest.raises(OptionError, match=rf"flow\.{field} .*{said}"):
+            FlowConfig(**{field: value})
+    for value in taken:
+        assert getattr(FlowConfig(**{field: value}), field) == value
 
 
-@pytest.mark.parametrize("value", [0.0, -0.1, 1.5, float("nan")])
-def test_a_least_time_outside_the_path_is_refused(value):
-    with pytest.raises(OptionError, match=r"flow\.least_time .*more than 0 and at most 1"):
-        FlowConfig(least_time=value)
-    assert FlowConfig(least_time=1.0).least_time == 1
+@pytest.mark.parametrize(
+    ("field", "refused", "taken", "said"),
+    [
+        ("camera.reference", (-6, 5), (-5, 0, 4), "at least -5 and at most 4"),
+        ("decode_views", (0, -1), (1,), "at least 1"),
+    ],
+)
+def test_settings_of_a_pass_outside_their_range_are_refused(field, refused, taken, said):
+    def built(value: int) -> GeoVerseConfig:
+        camera = field == "camera.reference"
+        return micro.config(
+            views=5,
+            camera=CameraConfig(reference=value if camera else -1),
+            decode_views=2 if camera else value,
+        )
 
-
-def test_negative_guidance_is_refused():
-    with pytest.raises(OptionError, match=r"flow\.cfg_scale .*at least 0"):
-        FlowConfig(cfg_scale=-1.0)
-    assert FlowConfig(cfg_scale=0.0).cfg_scale == 0
-
-
-def test_a_negative_temperature_is_refused():
-    with pytest.raises(OptionError, match=r"flow\.temperature .*at least 0"):
-        FlowConfig(temperature=-0.1)
-    assert FlowConfig().temperature == 1 and named("base").flow.temperature == 1
-
-
-@pytest.mark.parametrize("index", [-6, 5])
-def test_a_reference_that_is_no_view_is_refused(index):
-    with pytest.raises(OptionError, match=r"camera\.reference .*at least -5 and at most 4"):
-        micro.config(views=5, camera=CameraConfig(reference=index))
-    for known in (-5, 0, 4):
-        micro.config(views=5, camera=CameraConfig(reference=known))
+    for value in refused:
+        with pytest.raises(OptionError, match=rf"{field} .*{said}"):
+            built(value)
+    for value in taken:
+        built(value)
 
 
 def test_wrong_ranges_in_a_file_are_refused():
@@ -60,12 +67,6 @@ def test_the_files_say_how_many_views_are_decoded_at_once(name):
     folder = resources.files("gvtools.completers.geoverse") / "configs"
     stored = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
     assert stored["decode_views"] == named(name).decode_views == 8
-
-
-@pytest.mark.parametrize("value", [0, -1])
-def test_no_views_at_once_are_refused(value):
-    with pytest.raises(OptionError, match=r"decode_views .*at least 1"):
-        micro.config(decode_views=value)
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from gvtools.completers.geoverse.conditioning import HintConfig, ViewBatch, encode_views
-from gvtools.errors import OptionError
-from gvtools.networks.depth_anything.encoder import EncoderConfig, patch_rays
-from gvtools.networks.depth_anything.network import DepthAnything3, DepthAnythingConfig
+from gvtools.networks.depth_anything.encoder import patch_rays
+from gvtools.networks.depth_anything.network import DepthAnything3
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 TOLD = HintConfig(cameras=True, camera_unit="depth")
@@ -72,9 +71,3 @@ def test_without_any_depth_the_unit_is_that_of_the_centres(batch):
         median = encode_views(told, blind, slice(None), HintConfig(cameras=True))[1]
     assert torch.isfinite(first).all()
     assert torch.equal(first, median)
-
-
-def test_an_unknown_unit_is_refused():
-    with pytest.raises(OptionError, match="expected 'median' or 'depth'"):
-        HintConfig(camera_unit="metres")
-    assert not EncoderConfig().rays and not DepthAnythingConfig().encoder.rays

@@ -18,6 +18,7 @@ pytest.importorskip("diffusers", reason="the extra wan is not installed")
 
 import tiny_wan as tiny
 from safetensors.torch import load_file, save_file
+from tiny_wan import FILE, original_name, save_original
 
 from gvtools.completers.geoverse.video_prior import wan_checkpoint, wan_folder
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior
@@ -28,16 +29,18 @@ from gvtools.completers.geoverse.video_prior.wan_checkpoint import (
 )
 from gvtools.completers.geoverse.video_prior.wan_folder import (
     EMPTY_PROMPT,
+    dtype_of,
     expected_tensors,
     network_class,
 )
+from gvtools.completers.geoverse.weights.published import VIDEO_SIZES
 from gvtools.errors import CheckpointError, OptionError, ProjectError
-from gvtools.networks.tensor_files import STORED_TYPES, TensorFiles
+from gvtools.networks.tensor_files import TensorFiles
 
 # Of a Wan with six blocks and hints at 0, 2 and 4, the first four blocks and two hints.
 LAYERS, HINTS = 6, (0, 2, 4)
 KEPT: dict[str, Any] = {"blocks": 4}
-FILE = "diffusion_pytorch_model.safetensors"
+QUANTISED = "blocks.1.ffn.2.weight"
 A14B = {
     "num_layers": 40,
     "num_attention_heads": 40,
@@ -51,49 +54,6 @@ A14B = {
 @pytest.fixture(scope="module")
 def network() -> Any:
     return tiny.transformer(LAYERS, HINTS)
-
-
-def original_name(name: str) -> str:
-    """Wan's own name of a diffusers tensor, part by part."""
-    top = {
-        "condition_embedder.text_embedder.linear_1": "text_embedding.0",
-        "condition_embedder.text_embedder.linear_2": "text_embedding.2",
-        "condition_embedder.time_embedder.linear_1": "time_embedding.0",
-        "condition_embedder.time_embedder.linear_2": "time_embedding.2",
-        "condition_embedder.time_proj": "time_projection.1",
-    }
-    for new, old in top.items():
-        name = name.replace(new, old)
-    if name == "scale_shift_table":
-        return "head.modulation"
-    if name.startswith("proj_out."):
-        return f"head.head.{name.removeprefix('proj_out.')}"
-    inner = {
-        ".attn1.": ".self_attn.",
-        ".attn2.": ".cross_attn.",
-        ".to_q.": ".q.",
-        ".to_k.": ".k.",
-        ".to_v.": ".v.",
-        ".to_out.0.": ".o.",
-        ".norm2.": ".norm3.",
-        ".ffn.net.0.proj.": ".ffn.0.",
-        ".ffn.net.2.": ".ffn.2.",
-        ".scale_shift_table": ".modulation",
-        ".proj_in.": ".before_proj.",
-        ".proj_out.": ".after_proj.",
-    }
-    for new, old in inner.items():
-        name = name.replace(new, old)
-    return name
-
-
-def save_original(network: Any, folder: Path, *, wrapper: str = "") -> Path:
-    folder.mkdir(parents=True)
-    tensors = {f"{wrapper}{original_name(n)}": t for n, t in network.state_dict().items()}
-    save_file(tensors, folder / FILE)
-    config = {"num_heads": 2, "eps": 1e-6, "vace_layers": list(HINTS), "dim": 48}
-    (folder / "config.json").write_text(json.dumps(config))
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -188,9 +148,8 @@ def test_bfloat16_is_what_diffusers_makes_of_it(diffusers_source: Path, tmp_path
         assert found.dtype == tensor.dtype, name
         assert torch.equal(found, tensor)
         assert torch.equal(also.state_dict()[name], tensor.float())
-    tables = (dict(n.named_buffers()) for n in (loaded, wanted))
-    for (_, a), (_, b) in zip(*(t.items() for t in tables), strict=True):
-        assert torch.equal(a, b)
+    for found, table in zip(loaded.buffers(), wanted.buffers(), strict=True):
+        assert torch.equal(found, table)
     assert {t.dtype for t in wanted.state_dict().values()} == {torch.bfloat16, torch.float32}
     prior = VideoPrior(loaded, tiny.vae(), tiny.prompt(), config=tiny.CONFIG)
     direct = VideoPrior(wanted, tiny.vae(), tiny.prompt(), config=tiny.CONFIG)
@@ -221,29 +180,6 @@ def test_nothing_is_read_that_is_not_needed(
     assert sorted(reads) == sorted(needed)
 
 
-def test_files_are_read_as_the_library_reads_them(tmp_path: Path) -> None:
-    generator = torch.Generator().manual_seed(0)
-    numbers = torch.randn(3, 4, 2, generator=generator)
-    tensors = {str(d): (numbers * 9).to(d) for d in STORED_TYPES.values()}
-    tensors |= {"scalar": torch.tensor(2.5), "empty": torch.zeros(0, 3)}
-    save_file(tensors, tmp_path / "a.safetensors", metadata={"format": "pt"})
-    files = TensorFiles.find(tmp_path)
-    assert files.places.keys() == tensors.keys()
-    for name, tensor in load_file(tmp_path / "a.safetensors").items():
-        found = files.read(name)
-        assert (found.dtype, found.shape) == (tensor.dtype, tensor.shape)
-        assert torch.equal(found, tensor)
-
-
-@pytest.mark.parametrize(
-    "content", [b"PK\3\4 a zip file", b"\2\0\0\0\0\0\0\0{}more", b"\2\0\0\0\0\0\0\0[]"]
-)
-def test_what_is_no_safetensors_file_is_refused(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "a.safetensors").write_bytes(content)
-    with pytest.raises(CheckpointError, match=r"a\.safetensors: cannot be read"):
-        TensorFiles.find(tmp_path)
-
-
 def test_several_files_are_written_where_one_would_be_large(
     diffusers_source: Path, truncated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -256,12 +192,9 @@ def test_several_files_are_written_where_one_would_be_large(
     files = sorted((out / "transformer").glob("*.safetensors"))
     assert len(files) > 2
     assert all(f.stat().st_size < 320_000 for f in files)
-    for name in ("load", "diffusers"):
-        if name == "load":
-            network = wan_folder.load_network(out, "transformer")
-        else:
-            network = network_class("transformer").from_pretrained(out / "transformer")
-        wanted = load_file(truncated / "transformer" / FILE)
+    theirs = network_class("transformer").from_pretrained(out / "transformer")
+    wanted = load_file(truncated / "transformer" / FILE)
+    for network in (theirs, wan_folder.load_network(out, "transformer")):
         assert network.state_dict().keys() == wanted.keys()
         assert all(torch.equal(network.state_dict()[n], wanted[n]) for n in wanted)
     done, totals = zip(*steps, strict=True)
@@ -272,18 +205,19 @@ def test_several_files_are_written_where_one_would_be_large(
 
 
 def test_published_sizes() -> None:
-    def numbers(config: Mapping[str, Any]) -> int:
-        return sum(map(prod, expected_tensors(config).values()))
+    def numbers(tensors: Mapping[str, tuple[int, ...]]) -> int:
+        return sum(map(prod, tensors.values()))
 
     # The published low-noise file is 34.7 GB in bfloat16.
-    assert 2 * numbers(A14B) / 1e9 == pytest.approx(34.68, abs=0.01)
-    kept = {**A14B, "num_layers": 16, "vace_layers": [0, 5, 10, 15]}
-    assert numbers(kept) / 1e9 == pytest.approx(7.394, abs=0.001)
-    tensors = expected_tensors(kept)
+    assert 2 * numbers(expected_tensors(A14B)) / 1e9 == pytest.approx(34.68, abs=0.01)
+    tensors = expected_tensors({**A14B, "num_layers": 16, "vace_layers": [0, 5, 10, 15]})
     assert tensors["blocks.15.attn2.to_out.0.weight"] == (5120, 5120)
     assert tensors["vace_patch_embedding.weight"] == (5120, 96, 1, 2, 2)
     assert "vace_blocks.4.proj_out.weight" not in tensors
-    assert sum(map(prod, expected_tensors({}, component="vae").values())) == 126_892_531
+    size = sum(prod(s) * dtype_of(n, torch.bfloat16).itemsize for n, s in tensors.items())
+    assert VIDEO_SIZES["transformer"] == (len(tensors), numbers(tensors), size)
+    tensors = expected_tensors({}, component="vae")
+    assert VIDEO_SIZES["vae"] == (len(tensors), numbers(tensors), 4 * numbers(tensors))
 
 
 def damage(path: Path, change: Any) -> None:
@@ -299,45 +233,37 @@ def original_with(network: Any, tmp_path: Path, change: Any) -> Path:
     return folder
 
 
-def test_the_first_missing_tensor_is_named_and_nothing_is_left(
-    network: Any, tmp_path: Path
+def without(*starts: str) -> Any:
+    """Takes tensors away."""
+    return lambda tensors: [tensors.pop(n) for n in list(tensors) if n.startswith(starts)]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            without("blocks.2.cross_attn.k.weight", "blocks.3.ffn.0.bias"),
+            r"missing: blocks\.2\.attn2\.to_k\.weight and 1 more",
+        ),
+        (without("vace"), "vace_patch_embedding"),
+        (
+            lambda t: t.update({"blocks.1.ffn.2.bias": torch.zeros(7)}),
+            r"blocks\.1\.ffn\.net\.2\.bias is \(7,\), expected",
+        ),
+        (
+            lambda t: t.update({QUANTISED: t[QUANTISED].to(torch.float8_e4m3fn)}),
+            "is float8_e4m3fn, expected float32",
+        ),
+    ],
+    ids=["missing", "no vace branch", "shape", "quantised"],
+)
+def test_a_source_that_does_not_fit_is_refused_and_nothing_is_left(
+    network: Any, tmp_path: Path, change: Any, message: str
 ) -> None:
-    place = original_with(
-        network,
-        tmp_path,
-        lambda t: [t.pop("blocks.2.cross_attn.k.weight"), t.pop("blocks.3.ffn.0.bias")],
-    )
-    with pytest.raises(
-        CheckpointError, match=r"missing: blocks\.2\.attn2\.to_k\.weight and 1 more"
-    ):
+    place = original_with(network, tmp_path, change)
+    with pytest.raises(CheckpointError, match=message):
         truncate(place, tmp_path / "out", **KEPT)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["own", "vae"]
-
-
-def test_another_shape_is_refused(network: Any, tmp_path: Path) -> None:
-    place = original_with(
-        network, tmp_path, lambda t: t.update({"blocks.1.ffn.2.bias": torch.zeros(7)})
-    )
-    with pytest.raises(CheckpointError, match=r"blocks\.1\.ffn\.net\.2\.bias is \(7,\), expected"):
-        truncate(place, tmp_path / "out", **KEPT)
-
-
-def test_quantised_weights_are_refused(network: Any, tmp_path: Path) -> None:
-    name = "blocks.1.ffn.2.weight"
-    place = original_with(
-        network, tmp_path, lambda t: t.update({name: t[name].to(torch.float8_e4m3fn)})
-    )
-    with pytest.raises(CheckpointError, match="is float8_e4m3fn, expected float32"):
-        truncate(place, tmp_path / "out", **KEPT)
-
-
-def test_weights_without_a_vace_branch_are_refused(network: Any, tmp_path: Path) -> None:
-    def drop(tensors: dict[str, Tensor]) -> None:
-        for name in [n for n in tensors if n.startswith("vace")]:
-            del tensors[name]
-
-    with pytest.raises(CheckpointError, match="vace_patch_embedding"):
-        truncate(original_with(network, tmp_path, drop), tmp_path / "out", **KEPT)
 
 
 def test_a_torn_or_absent_file_is_named(source: Path, tmp_path: Path) -> None:
@@ -373,12 +299,10 @@ def test_sources_of_another_kind_are_refused(source: Path, tmp_path: Path) -> No
         truncate(source, tmp_path / "other", vae=tmp_path / "elsewhere", **KEPT)
 
 
-@pytest.mark.parametrize("blocks", [0, 7])
-def test_impossible_numbers_of_blocks_are_refused(
-    diffusers_source: Path, tmp_path: Path, blocks: int
-) -> None:
-    with pytest.raises(OptionError, match=f"blocks {blocks}; expected 1 to 6"):
-        truncate(diffusers_source, tmp_path / "out", blocks=blocks)
+def test_impossible_numbers_of_blocks_are_refused(diffusers_source: Path, tmp_path: Path) -> None:
+    for blocks in (0, 7):
+        with pytest.raises(OptionError, match=f"blocks {blocks}; expected 1 to 6"):
+            truncate(diffusers_source, tmp_path / "out", blocks=blocks)
 
 
 def test_a_full_disk_is_noticed_before_anything_is_written(
@@ -449,12 +373,6 @@ def test_without_diffusers_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "diffusers", None)
     with pytest.raises(CheckpointError, match=r"pip install 'gvtools\[wan\]'"):
         VideoPrior.from_pretrained(truncated, config=tiny.CONFIG)
-
-
-def test_without_transformers_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(CheckpointError, match="pip install transformers"):
-        write_empty_prompt(tmp_path, tmp_path / "out")
 
 
 def test_the_empty_prompt_is_the_encoding_of_the_end_token(tmp_path: Path) -> None:
