@@ -145,8 +145,8 @@ class ReflowStageOptions(Settings):
     """Of the teacher in each interval."""
     bounds: tuple[float, ...] | None = None
     """Interval bounds tau_0 .. tau_K; none for the model's own."""
-    guidance: float = Field(1.0, ge=0)
-    """Of the teacher; 1 for none."""
+    cfg_scale: float = Field(1.0, ge=0)
+    """Of the teacher's classifier-free guidance; 1 for none."""
     context_weight: float = Field(0.25, ge=0)
     """Of context views."""
 

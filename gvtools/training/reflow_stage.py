@@ -71,12 +71,12 @@ class ReflowStage(nn.Module):
             # As in sampling: with the floor, short last steps would leave noise behind.
             return teacher.velocity1(conditions, state, time, least=LEAST)
 
-        without = teacher.without_cameras(known) if options.guidance != 1 else known
+        without = teacher.without_cameras(known) if options.cfg_scale != 1 else known
         pair = reflow_pair(
             guided(
                 lambda state, time: taught(known, state, time),
                 lambda state, time: taught(without, state, time),
-                options.guidance,
+                options.cfg_scale,
             ),
             clean,
             noise,

@@ -286,7 +286,7 @@ def _sampled_as(config: GeoVerseConfig, flow: FlowConfig) -> GeoVerseConfig:
 def _distilled(config: GeoVerseConfig, options: ReflowStageOptions) -> GeoVerseConfig:
     """The student's configuration: it takes one step an interval, and its guidance is inside it."""
     flow = replace(config.flow, level1=options.bounds or config.flow.level1)
-    if options.guidance != 1:
+    if options.cfg_scale != 1:
         flow = replace(flow, cfg_scale=1.0)
     return replace(config, flow=flow)
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from gvtools.completers.geoverse import from_pretrained, named
+from gvtools.completers.geoverse import from_pretrained
 from gvtools.completers.geoverse.weights.folder import save_pretrained
 from gvtools.completers.geoverse.weights.published import WHOLE_FILE
 from gvtools.networks.config_json import to_json
@@ -270,8 +270,3 @@ def test_a_wrong_action_or_option_is_one_line(capsys: pytest.CaptureFixture[str]
 def test_debug_shows_where(tmp_path: Path) -> None:
     with pytest.raises(Exception, match="does not exist"):
         weights("check", tmp_path / "absent", "--debug")
-
-
-def test_the_shipped_configurations_are_their_classes() -> None:
-    assert named("base").video is not None
-    assert named("tiny").video is None

@@ -189,7 +189,7 @@ def test_all_stages_until_a_step_end_there(tmp_path):
 
 def test_a_student_is_sampled_by_the_bounds_that_it_was_distilled_for(trained, tmp_path):
     shutil.copytree(trained / "denoiser", tmp_path / "denoiser")
-    bounds = ["--set", "reflow.bounds=[1,0.4,0]", "--set", "reflow.guidance=1.5"]
+    bounds = ["--set", "reflow.bounds=[1,0.4,0]", "--set", "reflow.cfg_scale=1.5"]
     assert train(tmp_path, "reflow", *steps("reflow", 1), *bounds) == 0
     assert train(tmp_path, "heads", *steps("heads", 1), *bounds) == 0
     for stage in ("reflow", "heads"):

@@ -223,7 +223,7 @@ def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
     (tmp_path / "model.json").write_text(json.dumps(to_json(config)))
     data = json.loads((SHIPPED / "micro.json").read_text())
     data["model"] = "model.json"
-    data["reflow"]["guidance"] = 1.5
+    data["reflow"]["cfg_scale"] = 1.5
     stages = ("denoiser", "reflow", "heads")
     for stage in stages:
         data[stage]["optimizer"]["steps"] = 1

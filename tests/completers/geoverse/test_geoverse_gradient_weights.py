@@ -22,9 +22,7 @@ def _pictures(seed: int, shape: tuple[int, ...]) -> np.ndarray:
 @pytest.mark.parametrize("size", [(9, 7), (1, 5), (5, 1), (1, 1), (2, 2)])
 def test_whole_pictures_have_scipys_sobel_gradient(size):
     gray = _pictures(0, (2, 3, *size))
-    expected = np.hypot(
-        ndimage.sobel(gray, axis=3, mode="nearest"), ndimage.sobel(gray, axis=2, mode="nearest")
-    )
+    expected = np.zeros_like(gray)
     # scipy's filter differentiates along one axis and smooths along all others: one picture a call
     for index in np.ndindex(2, 3):
         one = gray[index]

@@ -151,10 +151,9 @@ def test_bfloat16_is_what_diffusers_makes_of_it(diffusers_source: Path, tmp_path
     for found, table in zip(loaded.buffers(), wanted.buffers(), strict=True):
         assert torch.equal(found, table)
     assert {t.dtype for t in wanted.state_dict().values()} == {torch.bfloat16, torch.float32}
-    prior = VideoPrior(loaded, tiny.vae(), tiny.prompt(), config=tiny.CONFIG)
-    direct = VideoPrior(wanted, tiny.vae(), tiny.prompt(), config=tiny.CONFIG)
-    assert all(map(torch.equal, features(prior), features(direct)))
-    assert features(prior)[0].dtype == torch.bfloat16
+    found, expected = (features(tiny.prior(network)) for network in (loaded, wanted))
+    assert all(map(torch.equal, found, expected))
+    assert found[0].dtype == torch.bfloat16
 
 
 def test_nothing_is_read_that_is_not_needed(
@@ -268,12 +267,10 @@ def test_a_source_that_does_not_fit_is_refused_and_nothing_is_left(
 
 def test_a_torn_or_absent_file_is_named(source: Path, tmp_path: Path) -> None:
     file = sorted((source / "transformer_2").glob("*.safetensors"))[0]
-    file.write_bytes(file.read_bytes()[:-100])
-    with pytest.raises(CheckpointError, match=file.name):
-        truncate(source, tmp_path / "out", **KEPT)
-    file.unlink()
-    with pytest.raises(CheckpointError, match=file.name):
-        truncate(source, tmp_path / "out", **KEPT)
+    for damage_file in (lambda: file.write_bytes(file.read_bytes()[:-100]), file.unlink):
+        damage_file()
+        with pytest.raises(CheckpointError, match=file.name):
+            truncate(source, tmp_path / "out", **KEPT)
 
 
 def test_what_is_not_the_low_noise_expert_is_not_taken_for_it(source: Path, tmp_path: Path) -> None:

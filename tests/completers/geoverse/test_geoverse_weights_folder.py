@@ -42,6 +42,10 @@ def changed_config(**changes: Any) -> str:
     return json.dumps({**to_json(PLAIN), **changes})
 
 
+def with_level1(**changes: Any) -> str:
+    return changed_config(level1={**to_json(PLAIN)["level1"], **changes})
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -59,6 +63,8 @@ def changed_config(**changes: Any) -> str:
         (changed_config(flow={"cfg_scale": float("nan")}), "cfg_scale = nan; expected a finite"),
         (changed_config(geometry=None), r"config\.geometry = None; expected an object"),
         (changed_config(rgb={"width": 30}), "config.json|expected"),
+        (with_level1(width=-32), "no network comes of"),
+        (with_level1(frequencies=-1), "no network comes of"),
     ],
 )
 def test_a_damaged_configuration_is_refused(own: Path, text: str, message: str) -> None:
@@ -69,19 +75,8 @@ def test_a_damaged_configuration_is_refused(own: Path, text: str, message: str) 
         assert "\n" not in str(caught.value)
 
 
-def test_dimensions_that_make_no_network_are_refused(own: Path) -> None:
-    for changes in ({"width": -32}, {"frequencies": -1}):
-        level1 = {**to_json(PLAIN)["level1"], **changes}
-        (own / "config.json").write_text(changed_config(level1=level1))
-        for read in (load, check_folder):
-            with pytest.raises(CheckpointError, match="no network comes of") as caught:
-                read(own)
-            assert "\n" not in str(caught.value)
-
-
 def test_a_configuration_of_another_size_does_not_fit(own: Path) -> None:
-    level1 = {**to_json(PLAIN)["level1"], "head_depth": 2}
-    (own / "config.json").write_text(changed_config(level1=level1))
+    (own / "config.json").write_text(with_level1(head_depth=2))
     refused(own, r"missing: level1\.blocks\.6\.")
 
 
