@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from test_cli import refused
+from command_line import refused
 from walks import disturbed, line, moved, path
 
 from gvtools.cameras import Cameras, invert_rigid

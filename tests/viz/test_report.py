@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Browser, open_browser
+from command_line import refused
 from PIL import Image
-from test_cli import refused
 from tiny_scan import write_scan
 
 from gvtools.scenes.project import open_project
