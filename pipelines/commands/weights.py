@@ -48,7 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _list_options(option: _Add) -> None:
-    option("config", nargs="?", metavar="CONFIG", help="base, tiny or a config.json; all else")
+    option(
+        "config", nargs="?", metavar="CONFIG", help="base, tiny or a config.json; all by default"
+    )
 
 
 def _check_options(option: _Add) -> None:
@@ -71,7 +73,9 @@ def _pack_options(option: _Add) -> None:
 def _truncate_options(option: _Add) -> None:
     option("source", type=Path, metavar="SOURCE", help="the published folder or safetensors file")
     option("folder", type=Path, metavar="DIR", help="the folder to make")
-    option("--vae", type=Path, metavar="DIR", help="of diffusers; else beside the transformer")
+    option(
+        "--vae", type=Path, metavar="DIR", help="of diffusers; by default beside the transformer"
+    )
     option("--blocks", type=int, default=16, metavar="N", help="backbone blocks to keep (16)")
 
 

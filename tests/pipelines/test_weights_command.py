@@ -265,8 +265,3 @@ def test_every_help_of_an_action_starts_with_two_examples(
 def test_a_wrong_action_or_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in ((), ("lst",), ("check",), ("list", "--jsn", "x"), ("create", "tiny")):
         refused(capsys, *arguments)
-
-
-def test_debug_shows_where(tmp_path: Path) -> None:
-    with pytest.raises(Exception, match="does not exist"):
-        weights("check", tmp_path / "absent", "--debug")

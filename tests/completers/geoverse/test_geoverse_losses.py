@@ -76,15 +76,6 @@ def test_picture_losses_are_the_papers_formulas(seed):
         assert float(hf[b]) == pytest.approx(formula.high_gradient(*sample), rel=1e-9)
 
 
-def test_masks_default_to_every_finite_reference_pixel():
-    rng = np.random.default_rng(0)
-    predicted, image = _normal(rng, 1, T, 3, H, W), _normal(rng, 1, T, 3, H, W)
-    image[0, 1, 2, 3, 3] = np.nan
-    used = image.isfinite().all(2)
-    for loss in (rgb_loss, high_gradient_loss):
-        torch.testing.assert_close(loss(predicted, image), loss(predicted, image, valid=used))
-
-
 @pytest.mark.parametrize("loss", [rgb_loss, high_gradient_loss])
 @pytest.mark.parametrize("poison", [np.nan, np.inf])
 def test_what_lies_outside_the_mask_poisons_neither_picture_loss_nor_gradient(loss, poison):
