@@ -27,6 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--web", action="store_true", help="serve a web page (default)")
     how.add_argument("--open3d", action="store_true", help="open Open3D's window instead")
+    how.add_argument(
+        "--screenshot", type=Path, metavar="FILE", help="write a PNG and end; needs no display"
+    )
     parser.add_argument(
         "--live", action="store_true", help="follow a run that is at work, from before its start"
     )
@@ -40,13 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=MAX_POINTS,
         metavar="N",
         help="draw at most so many points on the page, spread evenly (%(default)s)",
-    )
-    parser.add_argument(
-        "--screenshot",
-        type=Path,
-        metavar="FILE",
-        help="write a PNG and end; needs no display. With --open3d, Open3D renders it where there "
-        "is EGL or X",
     )
     parser.add_argument("--color", choices=COLORS, help="what colours show (default color)")
     parser.add_argument("--round", type=int, metavar="R", help="begin with it (default the last)")
@@ -78,16 +74,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
         return
     shown, number = read_round(source, args.round)
     if args.screenshot is not None:
-        from viz.open3d.screenshot import chosen_camera, take_screenshot, write_screenshot
+        from viz.run_view.screenshot import chosen_camera, write_screenshot
 
         camera = chosen_camera(shown, args.camera)
-        taken = take_screenshot(shown, camera.camera, round=number, mode=mode, open3d=args.open3d)
-        write_screenshot(args.screenshot, taken.rgb)
-        by = "Open3D" if taken.by == "open3d" else "the project's own splatter"
-        reason = f" ({taken.why})" if taken.why else ""
-        console.line(
-            f"{args.screenshot}: round {number} from {camera.name}, rendered by {by}{reason}"
-        )
+        write_screenshot(args.screenshot, shown, camera, round=number, mode=mode)
+        console.line(f"{args.screenshot}: round {number} from {camera.name}")
     else:
         from viz.open3d.window import Open3dViewer
 

@@ -172,13 +172,7 @@ def trade_off(report: RunReport) -> str:
         return ""
     drawn = [
         _drawn(
-            draw_pareto(
-                found.trials,
-                front=found.front,
-                recommended=found.recommended,
-                budget=found.budget,
-                panels=[name],
-            ),
+            draw_pareto(found, panels=[name]),
             f"PSNR over {name}, trial by trial",
         )
         for name in ("seconds", "bytes")
