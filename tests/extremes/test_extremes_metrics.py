@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from gvtools.errors import ShapeError
 from gvtools.evaluation.images import image_figures, psnr, relative_depth_error, ssim
 from gvtools.evaluation.intervals import mean_interval
-from gvtools.evaluation.lpips_backbones import BACKBONES
-from gvtools.evaluation.lpips_distance import distance, load_model
+from gvtools.evaluation.lpips_distance import BACKBONES, distance, load_model
 
 pytestmark = pytest.mark.filterwarnings("error")
 
