@@ -21,7 +21,6 @@ class EvaluationOptions:
         name: of the measured row.
         parts: of run_evaluation.PARTS.
         matcher: of the pose probe, "sift" or "lightglue".
-        features: network of feature consistency as MODULE:NAME; None takes "dense-gradient".
         control: measure the true pictures of the targets as well.
         seed: of resampling, matching and robust estimates.
         data_set: that the runs are scenes of; None ranks nothing.
@@ -32,7 +31,6 @@ class EvaluationOptions:
     name: str
     parts: tuple[str, ...]
     matcher: str
-    features: str | None
     control: bool
     seed: int
     data_set: str | None
@@ -147,7 +145,6 @@ def joined(
             "seed": options.seed,
             "parts": list(options.parts),
             "matcher": options.matcher,
-            "features": options.features or "dense-gradient",
             "lpips_net": options.lpips_net,
             "control": options.control,
             "bootstrap": {"level": LEVEL, "resamples": RESAMPLES},

@@ -18,7 +18,6 @@ from gvtools.runs.memory_file import load_memory
 from gvtools.runs.run import Run
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.consistency.feature_consistency import FeatureNetwork
     from gvtools.evaluation.lpips_distance import Lpips
     from gvtools.evaluation.pose_probe.features import FeatureMatcher
     from gvtools.scenes.scene import Frame
@@ -72,7 +71,6 @@ def evaluate_run(
     lpips: Lpips | None,
     no_lpips: str | None,
     matcher: FeatureMatcher | None = None,
-    network: FeatureNetwork | None = None,
     control: bool = True,
     seed: int = 0,
     console: Console,
@@ -85,7 +83,6 @@ def evaluate_run(
         lpips: the network, or None.
         no_lpips: why there is none.
         matcher: of the pose probe; None is SIFT.
-        network: of the feature consistency; None is "dense-gradient".
         control: measure the true pictures of the targets as well, to read the figures by.
         seed: of resampling, matching and robust estimates.
         console: for progress.
@@ -112,7 +109,7 @@ def evaluate_run(
             out.figures["images"] = _images(targets, lpips, no_lpips, seed, console)
     if "consistency" in parts:
         with out.timed("consistency"):
-            out.figures["consistency"] = _consistency(targets, network, control, seed, console)
+            out.figures["consistency"] = _consistency(targets, control, seed, console)
     if "poses" in parts:
         with out.timed("poses"):
             out.figures["poses"] = _poses(run, targets, matcher, control, seed, console)
@@ -183,17 +180,16 @@ def _images(
 
 def _consistency(
     targets: Sequence[_Target],
-    network: FeatureNetwork | None,
     control: bool,
     seed: int,
     console: Console,
 ) -> dict[str, Any]:
     pictures = [target.picture for target in targets]
-    out = {"generated": _consistent(pictures, network, seed, console, "consistency")}
+    out = {"generated": _consistent(pictures, seed, console, "consistency")}
     true = _true_pictures(targets)
     if control and len(true) > 1:
         label = "consistency of the true pictures"
-        out["true_pictures"] = _consistent(true, network, seed, console, label)
+        out["true_pictures"] = _consistent(true, seed, console, label)
     return out
 
 
@@ -213,7 +209,6 @@ def _true_pictures(targets: Sequence[_Target]) -> list[PosedPicture]:
 
 def _consistent(
     pictures: Sequence[PosedPicture],
-    network: FeatureNetwork | None,
     seed: int,
     console: Console,
     label: str,
@@ -227,9 +222,9 @@ def _consistent(
     )
     from gvtools.evaluation.consistency.geometric_verification import verify_geometry
 
-    depth = asdict(depth_reprojection_of_views(pictures, pairs="consecutive"))
+    depth = asdict(depth_reprojection_of_views(pictures))
     features = [
-        feature_consistency(first, second, network=network)
+        feature_consistency(first, second)
         for first, second in console.track(list(pairwise(pictures)), f"{label}: pairs")
     ]
     matched = _sampled(pictures, MOST_MATCHED)
@@ -242,7 +237,6 @@ def _consistent(
         "feature_consistency": {
             "network": features[0].network if features else None,
             "score": _interval([pair.score for pair in features], seed),
-            "same_image": _mean([pair.same_image for pair in features]),
             "unrelated": _mean([pair.unrelated for pair in features]),
             "overlap": _mean([pair.overlap for pair in features]),
             "pairs": [asdict(pair) for pair in features],
@@ -251,7 +245,7 @@ def _consistent(
     metric, status = load_met3r()
     scores = []
     if metric is not None:
-        scores = [met3r_score(a, b, metric=metric) for a, b in pairwise(pictures)]
+        scores = [met3r_score(a, b, metric) for a, b in pairwise(pictures)]
         measured = sum(pair.score is not None for pair in scores)
         status = "measured" if measured else "empty: no pair with overlap"
     out["met3r"] = {

@@ -87,8 +87,8 @@ def scalars(evaluation: Mapping[str, Any]) -> list[Scalar]:
         for label, (value, low, high, n) in ours.items():
             out.append((label, value, low, high, n, true.get(label, (None,))[0]))
         features = consistency["generated"]["feature_consistency"]
-        for key, label in (("unrelated", "of unrelated content"), ("same_image", "of one image")):
-            out.append((f"feature consistency {label}", features[key], None, None, None, None))
+        label = "feature consistency of unrelated content"
+        out.append((label, features["unrelated"], None, None, None, None))
     poses = evaluation.get("poses", {})
     parts = [_pose_figures(poses), _pose_figures(poses.get("true_pictures"))]
     for label, (value, n) in parts[0].items():

@@ -83,8 +83,7 @@ def test_constant_pictures_agree_in_depth_and_tell_nothing_by_features(value):
 
 
 @pytest.mark.parametrize("pictures", [[], [wall()]])
-@pytest.mark.parametrize("pairs", ["all", "consecutive"])
-def test_no_view_and_one_view_have_a_status(pictures, pairs):
-    found = depth_reprojection_of_views(pictures, pairs=pairs)
+def test_no_view_and_one_view_have_a_status(pictures):
+    found = depth_reprojection_of_views(pictures)
     assert found.status == f"empty: {len(pictures)} view(s); at least 2 are needed"
     assert found.mean_pixels is found.covisible_share is None
