@@ -19,7 +19,7 @@ from walls import (
 )
 
 from gvtools.cameras import Cameras
-from gvtools.errors import CheckpointError, DegenerateError, OptionError, ShapeError
+from gvtools.errors import CheckpointError, DegenerateError, OptionError
 from gvtools.evaluation.pose_probe import (
     PoseProbe,
     PoseProbeOptions,
@@ -75,29 +75,13 @@ def test_no_half_pixel_between_keypoints_and_cameras(probe: PoseProbe, take: Tak
 
 def test_the_claim_is_not_used_to_locate(probe: PoseProbe, take: Take) -> None:
     camera = camera_at((0.1, 0.0, 0.2), turn=(0, 3, 0))
-    honest = probe.locate(take(camera))
+    honest, again = probe.locate(take(camera)), probe.locate(take(camera))
     wrong = probe.locate(take(camera, camera_at((5.0, 5.0, -9.0), turn=(70, 20, 160))))
     assert honest.cam_from_world is not None and wrong.cam_from_world is not None
     np.testing.assert_array_equal(honest.cam_from_world, wrong.cam_from_world)
+    # The same seed gives the same answer.
+    np.testing.assert_array_equal(honest.cam_from_world, again.cam_from_world)
     assert wrong.center_error is not None and wrong.center_error > 5
-
-
-def test_the_same_seed_gives_the_same_answer(context: list[PosedPicture], take: Take) -> None:
-    camera = camera_at((0.1, 0.0, 0.2))
-    picture = take(camera)
-    first, second = (PoseProbe(context[:2], seed=3).locate(picture) for _ in range(2))
-    assert first.cam_from_world is not None and second.cam_from_world is not None
-    np.testing.assert_array_equal(first.cam_from_world, second.cam_from_world)
-
-
-def test_other_intrinsics_are_solved_with(probe: PoseProbe, take: Take) -> None:
-    camera = camera_at((0.1, 0.0, 0.2))
-    picture = take(camera)
-    zoomed = picture.camera.K[0] * np.array([[1.2], [1.2], [1]])
-    longer = probe.locate(picture, K=zoomed)
-    assert not longer.ok or (longer.center_error is not None and longer.center_error > 0.05)
-    with pytest.raises(ShapeError, match="expected \\(3, 3\\)"):
-        probe.locate(picture, K=np.eye(4))
 
 
 def test_views_are_chosen_by_the_picture_alone(context: list[PosedPicture], take: Take) -> None:

@@ -110,13 +110,13 @@ def test_absolute_pose_of_exact_matches_with_skew_and_outliers() -> None:
     K[0, 0, 1] = 15.0
     xy = dataclasses.replace(camera, K=K).project(points)[0][0]
     xy[:60] = rng.uniform([0, 0], [WIDTH, HEIGHT], (60, 2))
-    pose = absolute_pose(xy, points, K[0], width=WIDTH, height=HEIGHT, max_error=2.0)
+    pose = absolute_pose(xy, points, K[0], max_error=2.0)
     assert pose is not None
     truth = camera.cam_from_world[0]
     assert angle_deg(pose.cam_from_world[:3, :3], truth[:3, :3]) < 1e-4
     assert center_distance(pose.cam_from_world, truth) < 1e-5
     assert pose.inliers[60:].all() and pose.inliers[:60].sum() <= 2
-    assert absolute_pose(xy[:3], points[:3], K[0], width=9, height=9, max_error=2.0) is None
+    assert absolute_pose(xy[:3], points[:3], K[0], max_error=2.0) is None
 
 
 @given(st.floats(1e-9, 179.9), st.integers(0, 1000))
@@ -160,7 +160,6 @@ def test_a_summary_counts_failures_as_failures() -> None:
     assert summary.center_error.rmse == pytest.approx(np.sqrt(0.05))
     # Share of all pictures below x degrees: 0 to 1, a third to 3, two thirds to 5.
     assert summary.rotation_auc[5.0] == pytest.approx((2 / 3 + 4 / 3) / 5, abs=2e-3)
-    assert str(summary).startswith("2 of 3 located")
 
 
 def test_a_summary_without_support_has_no_figures() -> None:
@@ -168,6 +167,5 @@ def test_a_summary_without_support_has_no_figures() -> None:
     assert none.success_share == 0
     assert none.rotation_error_deg is None and none.center_error is None and none.inliers is None
     assert none.rotation_auc[5.0] == 0
-    assert str(none) == "0 of 1 located"
     nothing = summarise([])
     assert nothing.success_share is None and nothing.rotation_auc[5.0] is None

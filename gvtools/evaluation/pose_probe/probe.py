@@ -10,11 +10,11 @@ from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 
 from gvtools.cameras import Cameras, Float64, concatenate
-from gvtools.errors import DegenerateError, OptionError, ShapeError
+from gvtools.errors import DegenerateError, OptionError
 from gvtools.evaluation.pose_probe.absolute_pose import (
     AbsolutePose,
     absolute_pose,
@@ -129,31 +129,18 @@ class PoseProbe:
             )
         self.extent = _extent([picture.camera for picture in self._context])
 
-    def locate(
-        self,
-        picture: PosedPicture,
-        *,
-        K: ArrayLike | None = None,
-        leave_out: Collection[str] = (),
-    ) -> Located:
+    def locate(self, picture: PosedPicture, *, leave_out: Collection[str] = ()) -> Located:
         """Where ``picture`` looks from, by its pixels alone.
 
         Args:
             picture: its mask limits the keypoints; its camera's pose is only compared with.
-            K: (3, 3) intrinsics to solve with, pixels; None takes those of the picture's camera.
             leave_out: names of context views not to match; other names mean nothing.
-
-        Raises:
-            ShapeError: K of another shape.
         """
-        intrinsics = np.asarray(picture.camera.K[0] if K is None else K, np.float64)
-        if intrinsics.shape != (3, 3):
-            raise ShapeError(f"pose probe: K {intrinsics.shape}; expected (3, 3)")
         features = self._matcher.extract(picture.rgb)
         features = features[_inside(features.xy, picture.mask)]
         views = self._promising(features, leave_out)
         keypoint, points = self._correspondences(features, views)
-        pose, counts = self._solved(features, keypoint, points, intrinsics)
+        pose, counts = self._solved(features, keypoint, points, picture.camera.K[0])
         reason = self._reason(counts)
         return self._located(
             picture,
@@ -228,7 +215,7 @@ class PoseProbe:
         place = place.reshape(-1)
         size = {"width": features.width, "height": features.height}
         error = self.options.max_error or max(2.0, max(size.values()) / 160)
-        pose = absolute_pose(xy, points, K, **size, max_error=error, seed=self.seed)
+        pose = absolute_pose(xy, points, K, max_error=error, seed=self.seed)
         if pose is None:
             return None, _Counts(len(features), len(places), 0, 0, 0)
         agreed = np.unique(place[pose.inliers])
@@ -237,7 +224,6 @@ class PoseProbe:
             points,
             K,
             pose=pose,
-            **size,
             max_error=error,
             share=self.options.max_rival,
             seed=self.seed,
