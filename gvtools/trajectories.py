@@ -136,17 +136,17 @@ def look_at(centers: ArrayLike, target: ArrayLike, *, up: ArrayLike) -> Float64:
         DegenerateError: a centre lies on the target, or the view is along ``up``.
     """
     centers, target = np.asarray(centers, np.float64), np.asarray(target, np.float64)
-    up = np.asarray(up, np.float64)
-    if not np.linalg.norm(up) > 0:
-        raise OptionError(f"up {up.tolist()}; expected three numbers, not all 0")
-    up = up / np.linalg.norm(up)
+    axis = np.asarray(up, np.float64)
+    if not np.linalg.norm(axis) > 0:
+        raise OptionError(f"up {axis.tolist()}; expected three numbers, not all 0")
+    axis = axis / np.linalg.norm(axis)
     magnitude = float(np.abs(np.concatenate([centers.ravel(), target.ravel()])).max())
     forward = target - centers
     distance = np.linalg.norm(forward, axis=1, keepdims=True)
     if (distance <= 1e-12 * magnitude).any():
         raise DegenerateError("look at: a camera centre lies on the point that it looks at")
     forward = forward / distance
-    right = np.cross(forward, up)
+    right = np.cross(forward, axis)
     norm = np.linalg.norm(right, axis=1, keepdims=True)
     if (norm < 1e-6).any():
         raise DegenerateError("look at: a camera looks along the up vector; choose another up")

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
 
 EVALUATION = "evaluation/evaluation.json"
-# What reading a file of another version, or one that was changed by hand, comes upon.
-MALFORMED = (KeyError, TypeError, ValueError, AttributeError)
 
 
 @dataclass(frozen=True)
@@ -51,105 +48,51 @@ class Measures:
 
 def read_measures(run: Run) -> Measures:
     """Of evaluation/evaluation.json where it is of this run as it stands, else of metrics.json."""
-    path, record = run.path, run.record
     names = [view.name for view in run.views]
     warnings: list[str] = []
-    evaluation = _read(path / EVALUATION, warnings)
-    found: Measures | None = None
+    evaluation, entry = _read(run.path / EVALUATION, warnings), None
     if evaluation is not None:
-        try:
-            found = _evaluated(evaluation, record, names)
-        except MALFORMED as error:
-            warnings.append(f"{EVALUATION} is of another version ({error!r}); evaluate again")
-        else:
-            if found is None:
-                warnings.append(
-                    f"{EVALUATION} is of another state of this run; gvtools evaluate renews it"
-                )
-    if found is not None and found.source is not None:
-        return replace(found, warnings=warnings)
-    poses = None if found is None else found.poses
-    metrics = _read(path / METRICS, warnings)
+        entry = _of_this_run(evaluation, run.record, names)
+        if entry is None:
+            warnings.append(
+                f"{EVALUATION} is of another state of this run; gvtools evaluate renews it"
+            )
+    poses = None if entry is None else entry.get("poses")
+    if entry is not None and "images" in entry:
+        images = entry["images"]
+        means = {name: images["mean"][name] for name in FIGURES}
+        return Measures(
+            EVALUATION,
+            {name: mean["mean"] for name, mean in means.items()},
+            {
+                name: (mean["low"], mean["high"])
+                for name, mean in means.items()
+                if mean["low"] is not None and mean["high"] is not None
+            },
+            images["views"],
+            list(images["notes"].values()),
+            poses,
+            warnings,
+        )
+    metrics = _read(run.path / METRICS, warnings)
     if metrics is None:
         note = (
             f"There is no {METRICS} yet; a run writes it at its end, gvtools evaluate at any time"
         )
         return Measures(notes=[note], poses=poses, warnings=warnings)
-    try:
-        if _measured(metrics, names):
-            return replace(_of_metrics(metrics), poses=poses, warnings=warnings)
+    if not _measured(metrics, names):
         warnings.append(f"{METRICS} is of another state of this run; gvtools evaluate renews it")
-    except MALFORMED as error:
-        warnings.append(f"{METRICS} is of another version ({error!r}); gvtools evaluate renews it")
-    return Measures(poses=poses, warnings=warnings)
-
-
-def _evaluated(
-    evaluation: Mapping[str, Any], record: Mapping[str, Any], names: Sequence[str]
-) -> Measures | None:
-    """Of an evaluation: without a source where it has poses alone, None where it is not of this."""
-    entry = _of_this_run(evaluation, record, names)
-    if entry is None:
-        return None
-    poses = entry.get("poses")
-    if poses is not None:
-        _poses_of(poses)
-        _errors(poses)
-    if "images" not in entry:
-        return Measures(poses=poses)
-    images = entry["images"]
-    means = {name: images["mean"].get(name) or {} for name in FIGURES}
-    return _checked(
-        Measures(
-            EVALUATION,
-            {name: mean.get("mean") for name, mean in means.items()},
-            {
-                name: (mean["low"], mean["high"])
-                for name, mean in means.items()
-                if mean.get("low") is not None and mean.get("high") is not None
-            },
-            images["views"],
-            list(images["notes"].values()),
-            poses,
-        )
-    )
-
-
-def _of_metrics(metrics: Mapping[str, Any]) -> Measures:
+        return Measures(poses=poses, warnings=warnings)
     figures = {name: metrics.get(name) for name in FIGURES}
-    return _checked(Measures(METRICS, figures, {}, metrics["views"], metrics.get("notes", ())))
-
-
-def _checked(found: Measures) -> Measures:
-    """The same.
-
-    Raises:
-        TypeError: a figure is none.
-        KeyError: a target lacks what every target has.
-    """
-    numbers = [*found.figures.values(), *(end for ends in found.intervals.values() for end in ends)]
-    for view in found.views:
-        numbers += [view.get(name) for name in FIGURES]
-        numbers += [view["coverage"], view["coverage_after"]]
-        if not isinstance(view["round"], int):
-            raise TypeError(f"{view['round']!r} is no round")
-    for number in numbers:
-        if not isinstance(number, (int, float, NoneType)):
-            raise TypeError(f"{number!r} is no figure")
-    for note in found.notes:
-        if not isinstance(note, str):
-            raise TypeError(f"{note!r} is no note")
-    return found
+    notes = metrics.get("notes", ())
+    return Measures(METRICS, figures, {}, metrics["views"], notes, poses, warnings)
 
 
 def _read(file: Path, warnings: list[str]) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     try:
-        found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        if not isinstance(found, dict):
-            raise ValueError("no JSON object")
-        return found
+        return dict(json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         warnings.append(f"{file.name} cannot be read ({error})")
         return None

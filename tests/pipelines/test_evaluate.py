@@ -24,15 +24,13 @@ def reconstruct(scan, out, *more: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def scan(tmp_path_factory):
-    return write_scan(tmp_path_factory.mktemp("scan"), views=7)
+def scan(small_run):
+    return small_run.parent / "scan"
 
 
 @pytest.fixture(scope="module")
-def finished(scan, tmp_path_factory):
-    out = tmp_path_factory.mktemp("runs") / "held-out"
-    reconstruct(scan, out, "--targets", "range:3-6")
-    return out
+def finished(small_run):
+    return small_run
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +105,7 @@ def test_what_was_measured_is_written_beside_the_scores(measured, scan):
     run = figures["runs"][0]
     names = open_project(scan).names
     assert run["split"]["context"] == list(names[:3])
-    assert run["split"]["rounds"] == [list(names[3:5]), list(names[5:])]
+    assert run["split"]["rounds"] == [list(names[4:6]), list(names[6:])]
     assert run["seed"] == 0
     assert run["versions"]["gvtools"]
     assert run["settings"]["completer"] == "inpaint"
@@ -147,9 +145,8 @@ def test_several_runs_are_scenes(finished, scan, tmp_path):
 
 
 def test_the_protocol_splits_runs_and_measures(scan, tmp_path):
-    wide = write_scan(tmp_path / "wide", views=9)
     out = tmp_path / "out"
-    words = ["evaluate", str(wide), "--protocol", "pass", "--out", str(out), "--quiet"]
+    words = ["evaluate", str(scan), "--protocol", "pass", "--out", str(out), "--quiet"]
     assert main([*words, "--parts", "images", "--completer", "none"]) == 0
     split = json.loads((out / "split.json").read_text())
     assert len(split["context"]) == 2
@@ -255,8 +252,6 @@ def test_damage_and_contradictions_end_in_one_line(damage, finished, scan, tmp_p
     told = {"seed": "at least 0", "report": "no readable report", "record": "schedule",
             "view": "no report of this version", "twice": "given twice",
             "decided": "decided by --protocol"}  # fmt: skip
-    if damage == "decided":
-        words[1] = write_scan(tmp_path / "wide", views=9)
     assert told[damage] in refused(capsys, *words)
     assert not (tmp_path / "p" / "split.json").exists()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from test_cli import refused
 from test_growth import rounds
-from tiny_scan import write_scan
 
 from gvtools.errors import OptionError
 from pipelines.cli import main
@@ -192,18 +190,9 @@ def test_a_panel_that_is_not_there():
     assert Image.open(io.BytesIO(png(draw_growth(rounds(), panels=["time"])))).size == (564, 408)
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
-    scan = write_scan(tmp_path_factory.mktemp("scan"), views=5)
-    out = tmp_path_factory.mktemp("runs") / "wall"
-    assert main(["reconstruct", str(scan), "--out", str(out), "--context", "first:3",
-                 "--targets", "range:3-4", "--quiet"]) == 0  # fmt: skip
-    return out
-
-
 @pytest.mark.parametrize("kind", ["growth", "coverage", "timing", "trajectories"])
-def test_each_figure_of_a_run_from_the_command_line(finished, tmp_path, kind):
-    assert main(["plot", kind, str(finished), "--out", str(tmp_path / "f.png"), "--quiet"]) == 0
+def test_each_figure_of_a_run_from_the_command_line(small_run, tmp_path, kind):
+    assert main(["plot", kind, str(small_run), "--out", str(tmp_path / "f.png"), "--quiet"]) == 0
     assert np.asarray(Image.open(tmp_path / "f.png").convert("L")).std() > 10
 
 
@@ -219,10 +208,10 @@ def test_losses_of_a_training_and_of_one_stage(tmp_path):
         assert out.read_bytes().startswith(start)
 
 
-def test_what_cannot_be_drawn_is_refused(finished, tmp_path, capsys):
+def test_what_cannot_be_drawn_is_refused(small_run, tmp_path, capsys):
     out = tmp_path / "f.png"
     assert "log.jsonl" in refused(capsys, "plot", "losses", tmp_path, "--out", out)
-    assert "tradeoff.json" in refused(capsys, "plot", "pareto", finished, "--out", out)
+    assert "tradeoff.json" in refused(capsys, "plot", "pareto", small_run, "--out", out)
     assert "run.json" in refused(capsys, "plot", "growth", tmp_path, "--out", out)
-    assert ".svg" in refused(capsys, "plot", "growth", finished, "--out", tmp_path / "f.bmp")
+    assert ".svg" in refused(capsys, "plot", "growth", small_run, "--out", tmp_path / "f.bmp")
     assert not list(tmp_path.iterdir())

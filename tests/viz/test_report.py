@@ -11,9 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Browser, open_browser
-from PIL import Image
 from test_cli import refused
-from tiny_scan import write_scan
 
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
@@ -26,7 +24,6 @@ from viz.report.contact_sheet import TargetPictures, contact_row
 from viz.report.content import SheetRow
 from viz.report.page import report_html
 
-RUN = ("--context", "first:3", "--targets", "range:3-6", "--views-per-round", "2", "--quiet")
 LABELS = ["context", "hint", "validity", "completion", "truth", "error"]
 
 
@@ -67,15 +64,13 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def scan(tmp_path_factory):
-    return write_scan(tmp_path_factory.mktemp("scan"), views=7)
+def scan(small_run):
+    return small_run.parent / "scan"
 
 
 @pytest.fixture(scope="module")
-def finished(scan, tmp_path_factory):
-    out = tmp_path_factory.mktemp("runs") / "wall"
-    assert main(["reconstruct", str(scan), "--out", str(out), *RUN]) == 0
-    return out
+def finished(small_run):
+    return small_run
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +81,7 @@ def page(finished):
 @pytest.fixture
 def own(finished, tmp_path):
     """A copy to spoil."""
-    return Path(shutil.copytree(finished, tmp_path / "wall"))
+    return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
 def written(run: Path, *more: object) -> Page:
@@ -128,7 +123,7 @@ def test_each_target_has_its_six_pictures(own, page):
     page = written(own, "--pictures", 3)
     assert page.captions == LABELS * 3
     assert "3 of 4 targets" in page.said
-    assert "the other 1 lie in wall/round_*" in page.said
+    assert "the other 1 lie in run/round_*" in page.said
 
 
 def test_settings_that_differ_come_first_and_all_are_there(page):
@@ -192,7 +187,7 @@ def test_a_project_that_is_gone(own, scan, capsys):
 
 
 def test_a_run_that_has_its_project_open_writes_the_same_page(own, scan, page):
-    config = RunSettings(context="first:3", targets="range:3-6", views_per_round=2)
+    config = RunSettings(context="first:3", targets="range:4-7", views_per_round=2)
     before = (own / "report.html").read_bytes()
     (own / "report.html").unlink()
     write_report(make_plan(open_project(scan), config), own)
@@ -200,17 +195,15 @@ def test_a_run_that_has_its_project_open_writes_the_same_page(own, scan, page):
 
 
 def test_pictures_that_are_damaged_are_named(own):
-    (own / "round_001" / "generated_frame-000003.color.png").write_bytes(b"no picture")
+    (own / "round_001" / "generated_frame-000004.color.png").write_bytes(b"no picture")
     page = written(own)
     assert page.captions == LABELS * 3
-    assert "frame-000003.color.png (round 1) cannot be shown" in page.said
+    assert "frame-000004.color.png (round 1) cannot be shown" in page.said
 
 
 @pytest.mark.parametrize(
     "change",
     [lambda report: [1, 2], lambda report: {**report, "observed": None},
-     lambda report: {k: v for k, v in report.items() if k != "observed"},
-     lambda report: {**report, "views": [1]}, lambda report: {**report, "seconds": 3},
      lambda report: {**report, "views": [{**report["views"][0], "camera": {}}]}],
 )  # fmt: skip
 def test_a_damaged_report_is_one_line(own, capsys, change):
@@ -219,14 +212,14 @@ def test_a_damaged_report_is_one_line(own, capsys, change):
     assert "round_001/report.json: no report of this version" in refused(capsys, "report", own)
 
 
-@pytest.mark.parametrize("key", ["schedule", "context", "settings", "derived", "project"])
+@pytest.mark.parametrize("key", ["schedule", "settings"])
 def test_a_damaged_record_is_one_line(own, capsys, key):
     record = json.loads((own / "run.json").read_text())
     (own / "run.json").write_text(json.dumps({**record, key: None}))
     assert "no record of a run of this version" in refused(capsys, "report", own)
 
 
-@pytest.mark.parametrize("content", ['{"runs": [1]}', '{"runs": 3}', "[1, 2]", '{"runs": [{}]}'])
+@pytest.mark.parametrize("content", ["{", '{"runs": [{}]}'])
 def test_a_damaged_evaluation_leaves_the_runs_own_figures(own, content):
     (own / "evaluation").mkdir()
     (own / "evaluation" / "evaluation.json").write_text(content)
@@ -235,25 +228,9 @@ def test_a_damaged_evaluation_leaves_the_runs_own_figures(own, content):
     assert len(report.warnings) == 1 and "evaluation.json" in report.warnings[0]
 
 
-def test_damaged_metrics_are_left_out(own):
-    metrics = json.loads((own / "metrics.json").read_text())
-    for change in ({"views": 3}, {"psnr": "high"}, {"notes": [3]}):
-        (own / "metrics.json").write_text(json.dumps({**metrics, **change}))
-        report = collect(own)
-        assert report.figures_from is None
-        assert any("metrics.json" in warning for warning in report.warnings)
-
-
-def test_a_picture_of_another_kind_costs_no_more_than_its_target(own):
-    Image.new("RGB", (96, 72)).save(own / "round_001" / "valid_frame-000003.color.png")
-    page = written(own)
-    assert page.captions == LABELS * 3
-    assert "frame-000003.color.png (round 1) cannot be shown" in page.said
-
-
 def test_no_picture_outside_the_run_is_shown(own, tmp_path):
     for kind in ("guidance", "valid", "generated"):
-        inside = own / "round_001" / f"{kind}_frame-000003.color.png"
+        inside = own / "round_001" / f"{kind}_frame-000004.color.png"
         outside = tmp_path / f"{kind}.png"
         inside.rename(outside)
         inside.symlink_to(outside)
