@@ -89,7 +89,7 @@ def evaluate_runs(
         console.line(f"{run.path}: {len(run.rounds) - 1} rounds")
         if not run.complete:
             console.warn(f"{run.path}: not every round is done; measured are those that are")
-        evaluation = evaluate_run(
+        figures = evaluate_run(
             run,
             parts=options.parts,
             lpips=lpips,
@@ -99,7 +99,7 @@ def evaluate_runs(
             seed=options.seed,
             console=console,
         )
-        evaluations.append(described(run, evaluation.figures))
+        evaluations.append(described(run, figures))
     name_apart(evaluations)
     return evaluations
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -42,28 +40,6 @@ class _Target:
     truth: Frame | None
 
 
-@dataclass
-class Evaluation:
-    """What a run came to; ``figures`` is JSON-ready.
-
-    Attributes:
-        figures: by part; what could not be measured is None, with the reason under ``notes``.
-        seconds: what each part took.
-    """
-
-    figures: dict[str, Any] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        """Add the block's time to a part."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - start
-
-
 def evaluate_run(
     run: Run,
     *,
@@ -74,8 +50,11 @@ def evaluate_run(
     control: bool = True,
     seed: int = 0,
     console: Console,
-) -> Evaluation:
+) -> dict[str, Any]:
     """Measure one run.
+
+    The figures are JSON-ready, by part; what could not be measured is None, with the reason under
+    ``notes``.
 
     Args:
         run: with at least one round of targets.
@@ -87,33 +66,29 @@ def evaluate_run(
         seed: of resampling, matching and robust estimates.
         console: for progress.
     """
-    out = Evaluation()
-    with out.timed("reading"):
-        targets = [
-            _Target(
-                view.round,
-                dict(view.report),
-                PosedPicture(files.name, files.camera, files.picture, files.depth),
-                files.observed,
-                files.generated,
-                None if truth is None else truth.load(),
-            )
-            for view, files, truth in run.targets()
-        ]
-    out.figures["rounds"] = len(run.rounds) - 1
-    out.figures["views"] = len(targets)
-    out.figures["coverage"] = _mean([target.entry["coverage"] for target in targets])
-    out.figures["seconds_per_view"] = _seconds_per_view(run)
+    targets = [
+        _Target(
+            view.round,
+            dict(view.report),
+            PosedPicture(files.name, files.camera, files.picture, files.depth),
+            files.observed,
+            files.generated,
+            None if truth is None else truth.load(),
+        )
+        for view, files, truth in run.targets()
+    ]
+    out: dict[str, Any] = {
+        "rounds": len(run.rounds) - 1,
+        "views": len(targets),
+        "coverage": _mean([target.entry["coverage"] for target in targets]),
+        "seconds_per_view": _seconds_per_view(run),
+    }
     if "images" in parts:
-        with out.timed("images"):
-            out.figures["images"] = _images(targets, lpips, no_lpips, seed, console)
+        out["images"] = _images(targets, lpips, no_lpips, seed, console)
     if "consistency" in parts:
-        with out.timed("consistency"):
-            out.figures["consistency"] = _consistency(targets, control, seed, console)
+        out["consistency"] = _consistency(targets, control, seed, console)
     if "poses" in parts:
-        with out.timed("poses"):
-            out.figures["poses"] = _poses(run, targets, matcher, control, seed, console)
-    out.figures["evaluation_seconds"] = dict(out.seconds)
+        out["poses"] = _poses(run, targets, matcher, control, seed, console)
     return out
 
 

@@ -92,7 +92,6 @@ class PoseProbe:
     Attributes:
         options: see PoseProbeOptions.
         extent: twice the largest distance of a context centre from their mean, scene units.
-        dropped: context keypoints without a 3D point, by reason.
 
     Args:
         context: views with depth from any source (measured, or the memory's projection); those
@@ -120,12 +119,11 @@ class PoseProbe:
         self._context = tuple(context)
         if len({picture.name for picture in self._context}) != len(self._context):
             raise OptionError("pose probe: two context views have one name; names must differ")
-        self.dropped = {"view without depth": 0, "no depth": 0, "depth edge": 0, "masked": 0}
         self._views = [self._lifted(picture) for picture in self._context]
         if not any(len(view.points) for view in self._views):
             raise DegenerateError(
-                f"pose probe: none of {len(self._context)} context views has keypoints with depth "
-                f"({self.dropped}); give views with texture and depth"
+                f"pose probe: none of {len(self._context)} context views has keypoints with depth; "
+                "give views with texture and depth"
             )
         self.extent = _extent([picture.camera for picture in self._context])
 
@@ -170,16 +168,12 @@ class PoseProbe:
 
     def _lifted(self, picture: PosedPicture) -> _ContextView:
         features = self._matcher.extract(picture.rgb)
-        inside = _inside(features.xy, picture.mask)
-        self.dropped["masked"] += int((~inside).sum())
-        features = features[inside]
+        features = features[_inside(features.xy, picture.mask)]
         if picture.depth is None:
-            self.dropped["view without depth"] += len(features)
             return _ContextView(picture.name, features[:0], np.zeros((0, 3)))
-        lifted = lift_keypoints(features.xy, picture.depth, picture.camera, edge=self.options.edge)
-        self.dropped["no depth"] += lifted.without_depth
-        self.dropped["depth edge"] += lifted.at_edges
-        return _ContextView(picture.name, features[lifted.ok], lifted.points[lifted.ok])
+        edge = self.options.edge
+        points, ok = lift_keypoints(features.xy, picture.depth, picture.camera, edge=edge)
+        return _ContextView(picture.name, features[ok], points[ok])
 
     def _promising(self, features: Features, leave_out: Collection[str]) -> list[_ContextView]:
         """The views whose most prominent keypoints match those of the picture most often."""
