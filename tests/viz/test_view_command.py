@@ -13,6 +13,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from browser import free_port
 from PIL import Image
 
 from gvtools.errors import OptionError
@@ -172,12 +173,6 @@ def test_a_run_that_fails_at_once_says_no_more_than_why(tmp_path, capfd):
         raise OptionError("no such project")
     said = capfd.readouterr()
     assert "Traceback" not in said.err and "KeyboardInterrupt" not in said.err
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_a_round_that_came_while_the_viewer_started_is_shown(folder, tmp_path, capsys):
