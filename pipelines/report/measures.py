@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,9 @@ import numpy as np
 
 from gvtools.evaluation.view_figures import FIGURES
 from gvtools.runs.layout import METRICS
+from pipelines.evaluation.nested import nested
 from viz.plots.trajectories import Trajectories
+from viz.report.content import Measures, Poses
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,29 +22,6 @@ if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
 
 EVALUATION = "evaluation/evaluation.json"
-
-
-@dataclass(frozen=True)
-class Measures:
-    """What was read, as viz.report.page.RunReport has it.
-
-    Attributes:
-        source: the file; None where nothing was measured.
-        figures: means by name.
-        intervals: 95 % intervals by name.
-        views: figures of each target.
-        notes: why figures are absent.
-        poses: what the pose probe found; None where it was not asked.
-        warnings: files that belong to another state of the run, or cannot be read.
-    """
-
-    source: str | None = None
-    figures: Mapping[str, float | None] = field(default_factory=dict)
-    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    views: Sequence[Mapping[str, Any]] = ()
-    notes: Sequence[str] = ()
-    poses: Mapping[str, Any] | None = None
-    warnings: Sequence[str] = ()
 
 
 def read_measures(run: Run) -> Measures:
@@ -114,21 +92,6 @@ def _measured(part: Mapping[str, Any], names: Sequence[str]) -> bool:
     return [view.get("name") for view in part.get("views", ())] == list(names)
 
 
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """What a report says of cameras.
-
-    Attributes:
-        drawn: cameras; None where there are none.
-        note: what is drawn.
-        errors: rows of (error, of the completed pictures, of the true ones).
-    """
-
-    drawn: Trajectories | None
-    note: str
-    errors: Sequence[tuple[str, float | None, float | None]]
-
-
 def report_poses(
     reports: Sequence[Mapping[str, Any]],
     scene: Scene | None,
@@ -152,7 +115,7 @@ def report_poses(
     note = "Lines from the marks: viewing directions. "
     if scene is None:
         note += "The context's cameras are missing, since the project cannot be read. "
-    known = {} if found is None else _poses_of(found)
+    known = {view["name"]: view["cam_from_world"] for view in nested(found, "views") or ()}
     if known:
         estimated = _inverted([known.get(view["name"]) for view in entries])
         note += (
@@ -166,15 +129,6 @@ def report_poses(
     return Poses(Trajectories(given, requested, estimated), note.strip(), _errors(found))
 
 
-def _poses_of(found: Mapping[str, Any]) -> dict[str, NDArray[np.float64] | None]:
-    """cam_from_world (4, 4) by the target's name; None where it was not located."""
-    out = {}
-    for view in found.get("views", ()):
-        pose = view.get("cam_from_world")
-        out[view["name"]] = None if pose is None else np.array(pose, np.float64).reshape(4, 4)
-    return out
-
-
 def _inverted(poses: Sequence[Any]) -> NDArray[np.float64]:
     out = np.full((len(poses), 4, 4), np.nan)
     for row, pose in enumerate(poses):
@@ -186,25 +140,12 @@ def _inverted(poses: Sequence[Any]) -> NDArray[np.float64]:
 def _errors(found: Mapping[str, Any] | None) -> list[tuple[str, float | None, float | None]]:
     if found is None or not found.get("pictures"):
         return []
-    true = found.get("true_pictures") or {}
-    out = [("located, share", _share_located(found), _share_located(true))]
-    for key, name in (
-        ("ate_none", "ATE as estimated, rmse, scene units"),
-        ("ate_sim3", "ATE after Sim(3) alignment, rmse, scene units"),
-        ("rpe_none", "RPE, rmse, scene units"),
-    ):
-        out.append((name, _of(found, key, "rmse"), _of(true, key, "rmse")))
-    rotation = ("ate_none", "rotation_deg", "median")
-    out.append(("rotation error, median, degrees", _of(found, *rotation), _of(true, *rotation)))
-    return out
-
-
-def _of(part: Mapping[str, Any], *keys: str) -> float | None:
-    value: Any = part
-    for key in keys:
-        value = (value or {}).get(key)
-    return None if value is None else float(value)
-
-
-def _share_located(part: Mapping[str, Any]) -> float | None:
-    return part["located"] / part["pictures"] if part.get("pictures") else None
+    rows = (
+        ("located, share", ("success_share",)),
+        ("ATE as estimated, rmse, scene units", ("ate_none", "rmse")),
+        ("ATE after Sim(3) alignment, rmse, scene units", ("ate_sim3", "rmse")),
+        ("RPE, rmse, scene units", ("rpe_none", "rmse")),
+        ("rotation error, median, degrees", ("ate_none", "rotation_deg", "median")),
+    )
+    true = found.get("true_pictures")
+    return [(label, nested(found, *keys), nested(true, *keys)) for label, keys in rows]

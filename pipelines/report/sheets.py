@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
@@ -17,7 +16,7 @@ from gvtools.runs.layout import COMPLETION, GUIDANCE, VALID, round_folder
 from gvtools.runs.target_files import SUPPORT_OBSERVED, entry_camera, read_picture
 from gvtools.view_selection import nearest_views
 from viz.report.contact_sheet import TargetPictures, contact_row
-from viz.report.content import SheetRow
+from viz.report.content import SheetRow, Sheets
 
 if TYPE_CHECKING:
     from gvtools.runs.run import Run
@@ -26,21 +25,6 @@ if TYPE_CHECKING:
 # Decoding and compressing leave the interpreter alone.
 READERS = 2
 Reports = Sequence[Mapping[str, Any]]
-
-
-@dataclass(frozen=True, eq=False)
-class Sheets:
-    """What was found to show.
-
-    Attributes:
-        rows: a target each.
-        note: which targets they are, and where the others lie.
-        warnings: pictures that could not be read.
-    """
-
-    rows: tuple[SheetRow, ...]
-    note: str
-    warnings: tuple[str, ...]
 
 
 def chosen_targets(

@@ -95,7 +95,7 @@ def test_colours_stay_apart_for_the_colour_blind():
 
 
 def test_the_text_fits_and_tells_the_same():
-    text = growth_text(rounds(), width=72)
+    text = growth_text(rounds())
     lines = text.splitlines()
     assert max(map(len, lines)) <= 72
     bars = lines[1:4]
@@ -111,5 +111,3 @@ def test_nothing_to_draw_is_refused():
     for call in (lambda: draw_growth([], title="x"), lambda: growth_text([])):
         with pytest.raises(OptionError, match="no rounds"):
             call()
-    with pytest.raises(OptionError, match="60 or more"):
-        growth_text(rounds(), width=40)

@@ -21,7 +21,7 @@ from pipelines.report.data import collect, read_sweep
 from pipelines.report.sheets import chosen_targets
 from pipelines.report.write import write_report
 from viz.report.contact_sheet import TargetPictures, contact_row
-from viz.report.content import SheetRow
+from viz.report.content import SheetRow, Sheets
 from viz.report.page import report_html
 
 LABELS = ["context", "hint", "validity", "completion", "truth", "error"]
@@ -142,18 +142,19 @@ def test_an_evaluation_gives_intervals_and_estimated_poses(own):
     assert "evaluation/evaluation.json" in page.said
     assert "95 % interval" in page.said
     report = collect(own)
-    assert report.poses is not None
-    assert report.poses.estimated is not None
-    located = report.poses.located
+    poses = report.poses.drawn
+    assert poses is not None
+    assert poses.estimated is not None
+    located = poses.located
     if located.any():
-        apart = report.poses.estimated[located] - report.poses.requested[located]
+        apart = poses.estimated[located] - poses.requested[located]
         assert np.abs(apart).max() < 0.2
     # An evaluation of other settings says nothing of this run.
     record = json.loads((own / "run.json").read_text())
     record["settings"]["seed"] = 7
     (own / "run.json").write_text(json.dumps(record))
     report = collect(own)
-    assert report.figures_from == "metrics.json"
+    assert report.measures.source == "metrics.json"
     assert any("another state" in warning for warning in report.warnings)
 
 
@@ -169,7 +170,7 @@ def test_a_run_that_is_not_finished(own):
 def test_figures_of_another_state_are_left_out(own):
     shutil.rmtree(own / "round_002")
     report = collect(own)
-    assert report.figures_from is None
+    assert report.measures.source is None
     assert any("another state" in warning for warning in report.warnings)
 
 
@@ -182,7 +183,7 @@ def test_a_project_that_is_gone(own, scan, capsys):
     assert page.captions == ["hint", "validity", "completion"] * 4
     assert "no error maps" in page.said
     assert "context's cameras are missing" in page.said
-    shown = collect(own, project=scan).sheet
+    shown = collect(own, project=scan).sheets.rows
     assert [tile.label for row in shown for tile in row.tiles] == LABELS * 4
 
 
@@ -224,7 +225,7 @@ def test_a_damaged_evaluation_leaves_the_runs_own_figures(own, content):
     (own / "evaluation").mkdir()
     (own / "evaluation" / "evaluation.json").write_text(content)
     report = collect(own)
-    assert report.figures_from == "metrics.json"
+    assert report.measures.source == "metrics.json"
     assert len(report.warnings) == 1 and "evaluation.json" in report.warnings[0]
 
 
@@ -290,12 +291,13 @@ def test_no_text_of_a_users_files_becomes_markup(own, tmp_path):
         TargetPictures(evil, black, none, none, black, truth=black, context=black,
                        context_name=evil)
     )  # fmt: skip
-    views = [{**view, "name": evil} for view in report.views]
+    views = [{**view, "name": evil} for view in report.measures.views]
     report = replace(
         report, title=evil, facts=[("project", evil)], changed=[(evil, evil, evil)],
-        settings={evil: evil}, warnings=[evil], notes=[evil], views=views, sheet_note=evil,
-        sheet=[SheetRow(evil, tiles)], figures_from=evil, poses_note=evil,
-        pose_errors=[(evil, 1.0, None)],
+        settings={evil: evil}, warnings=[evil],
+        measures=replace(report.measures, notes=[evil], views=views, source=evil),
+        sheets=Sheets([SheetRow(evil, tiles)], evil),
+        poses=replace(report.poses, note=evil, errors=[(evil, 1.0, None)]),
     )  # fmt: skip
     (tmp_path / "evil.html").write_text(report_html(report), encoding="utf-8")
     page = Page(tmp_path / "evil.html")

@@ -7,7 +7,6 @@ from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from gvtools.errors import OptionError
 from viz.plots.canvas import Rounds, check_rounds, chosen, figure_of, round_axis
 from viz.plots.palette import COLORS, HATCHES
 from viz.plots.timing import times_panel
@@ -16,6 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Of a line of characters.
+WIDTH = 72
 FATES = ("added", "merged", "rejected", "new voxels")
 
 
@@ -46,22 +47,19 @@ def draw_growth(
     return figure_of(chosen(known, panels), title=heading)
 
 
-def growth_text(rounds: Rounds, width: int = 72) -> str:
+def growth_text(rounds: Rounds) -> str:
     """The growth as lines of characters: a bar of what is stored for each round, and the figures.
 
     Args:
         rounds: the lines of a run's ``rounds.jsonl``, in order.
-        width: of a line, at least 60 characters.
 
     Raises:
-        OptionError: no rounds, or a width below 60.
+        OptionError: no rounds.
     """
     check_rounds(rounds)
-    if width < 60:
-        raise OptionError(f"growth: {width} characters wide; expected 60 or more")
     legend = "round  observations  # observed  + generated"
-    head = legend.ljust(width - 18) + "coverage".rjust(18)
-    room = width - 8 - 9 - 18
+    head = legend.ljust(WIDTH - 18) + "coverage".rjust(18)
+    room = WIDTH - 8 - 9 - 18
     largest = max(1, max(entry["observed"] + entry["generated"] for entry in rounds))
     lines = [head]
     for entry in rounds:

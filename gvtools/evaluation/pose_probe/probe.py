@@ -155,12 +155,7 @@ class PoseProbe:
 
         Args:
             count: how many, evenly spread over the context; None takes all.
-
-        Raises:
-            OptionError: a count below 1.
         """
-        if count is not None and count < 1:
-            raise OptionError(f"pose_probe.leave_one_out {count}; expected at least 1")
         total = len(self._context)
         chosen = np.unique(np.linspace(0, total - 1, min(count or total, total)).round())
         pictures = [self._context[int(i)] for i in chosen]
