@@ -33,24 +33,6 @@ def test_poses_are_read_as_they_were_written(tmp_path, layout, write):
         assert again.width.tolist() == [640] * 6
 
 
-def test_we_read_what_evo_writes(tmp_path):
-    interface = pytest.importorskip("evo.tools.file_interface")
-    from evo.core.trajectory import PoseTrajectory3D
-
-    cameras = _cameras()
-    theirs = PoseTrajectory3D(
-        poses_se3=list(cameras.world_from_cam), timestamps=np.arange(6) + 0.25
-    )
-    interface.write_tum_trajectory_file(tmp_path / "tum.txt", theirs)
-    interface.write_kitti_poses_file(tmp_path / "kitti.txt", theirs)
-    for name in ("tum.txt", "kitti.txt"):
-        ours = read_trajectory(tmp_path / name, cameras)
-        np.testing.assert_allclose(
-            ours.world_from_cam, cameras.world_from_cam, rtol=1e-9, atol=1e-9
-        )
-    assert float(read_trajectory(tmp_path / "tum.txt", cameras).names[0]) == 0.25
-
-
 def test_intrinsics_are_matched_row_by_row_or_taken_from_the_first(tmp_path):
     cameras = _cameras(3)
     K = cameras.K.copy()
@@ -100,15 +82,3 @@ def test_wrong_files_are_refused_with_the_line(tmp_path, text, words):
 def test_absent_files_are_refused(tmp_path):
     with pytest.raises(ProjectError, match="cannot be read"):
         read_trajectory(tmp_path / "absent.txt", _cameras(1))
-
-
-@pytest.mark.data
-def test_published_trajectories_are_read_as_evo_reads_them(shared):
-    interface = pytest.importorskip("evo.tools.file_interface")
-    folder = shared / "oracle" / "trajectories"
-    for name, read in (
-        ("fr2_desk_groundtruth.txt", interface.read_tum_trajectory_file),
-        ("KITTI_00_gt.txt", interface.read_kitti_poses_file),
-    ):
-        ours = read_trajectory(folder / name, _cameras(1))
-        np.testing.assert_allclose(ours.centers, read(folder / name).positions_xyz, atol=1e-9)
