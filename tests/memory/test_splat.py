@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 from memory_scenes import camera, plane_view, points, random_camera, random_memory
-from reference_splat import reference_project
+from reference_splat import IMAGES, OTHERS, assert_same, reference_project
 
 from gvtools.cameras import concatenate
 from gvtools.errors import OptionError, ShapeError
@@ -14,23 +14,6 @@ from gvtools.guidance import Guidance
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
-
-IMAGES = ("rgb", "depth", "valid", "confidence", "generated")
-OTHERS = (
-    SplatOptions(),
-    SplatOptions(nearest_views=1, depth_band=0.2, blend_reach=0.8, support=0.2),
-    SplatOptions(view_weight=0.5, depth_reach=1.0, max_splat_px=4.0, occluders=False),
-)
-
-
-def assert_same(ours: Guidance, reference: Guidance) -> None:
-    """Equal to 1e-4, but for a pixel in a thousand where rounding tips a threshold."""
-    off = np.zeros(ours.valid.shape, bool)
-    for name in IMAGES:
-        one, two = getattr(ours, name), getattr(reference, name)
-        near = np.isclose(one.astype(float), two.astype(float), rtol=1e-4, atol=1e-4)
-        off |= ~near.reshape(*off.shape, -1).all(-1)
-    assert off.sum() <= off.size * 1e-3, f"{off.sum()} of {off.size} pixels differ"
 
 
 @pytest.mark.parametrize("options", OTHERS)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 from memory_scenes import random_camera, random_memory
-from reference_splat import reference_project
-from test_splat import IMAGES, OTHERS, assert_same
+from reference_splat import IMAGES, OTHERS, assert_same, reference_project
 
 from gvtools.cameras import concatenate
 from gvtools.errors import OptionError

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import refused
 from PIL import Image
 from tiny_scan import write_scan
 
@@ -22,20 +23,6 @@ RUN = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2
 @pytest.fixture
 def scan(tmp_path):
     return write_scan(tmp_path / "scan")
-
-
-def refused(capsys, *arguments: object) -> str:
-    """The one line with which the command ends, status 2."""
-    try:
-        status = main([str(argument) for argument in arguments])
-    except SystemExit as stop:
-        status = int(stop.code or 0)
-    error = capsys.readouterr().err.strip()
-    assert status == 2, error
-    last = error.splitlines()[-1]
-    assert "Traceback" not in error
-    assert last.startswith("gvtools: ")
-    return last
 
 
 def reconstruct(*arguments: object) -> tuple[object, ...]:

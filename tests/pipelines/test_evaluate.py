@@ -7,7 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
-from test_cli import refused
+from command_line import refused
 from tiny_scan import write_scan
 
 from gvtools.evaluation.images import psnr

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from test_cli import refused
+from command_line import refused
 from trajectory_writers import write_kitti, write_tum
 from walks import disturbed, line, moved, path
 

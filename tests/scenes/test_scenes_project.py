@@ -6,9 +6,8 @@ import sys
 
 import numpy as np
 import pytest
-from scenes_workspace import ramp, save, sevenscenes, transforms, workspace
-from test_scenes_rgbd import redwood, scannet, tum
-from test_scenes_transforms_json import PINHOLE, frame
+from rgbd_folders import redwood, scannet, tum
+from scenes_workspace import PINHOLE, frame, ramp, save, sevenscenes, transforms, workspace
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.project import open_project

@@ -5,7 +5,8 @@ import json
 
 import numpy as np
 import pytest
-from scenes_workspace import HEIGHT, WIDTH, depth_picture, pose_matrix, ramp, save, sevenscenes
+from rgbd_folders import redwood, scannet, tum
+from scenes_workspace import HEIGHT, WIDTH, pose_matrix, ramp, save, sevenscenes
 
 from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
 from gvtools.scenes.redwood import read_redwood
@@ -170,26 +171,6 @@ def test_intrinsics_of_another_size_are_pointed_out(tmp_path):
 # --- TUM --------------------------------------------------------------------------------------
 
 
-def tum(root, *, offset=0.004):
-    root.mkdir(parents=True)
-    pose = pose_matrix(0.3)
-    quaternion = (0.0, np.sin(0.05), 0.0, np.cos(0.05))
-    lists = {"rgb.txt": "# color\n", "depth.txt": "# depth\n", "groundtruth.txt": "# truth\n"}
-    for i in range(4):
-        time = 100 + i / 30
-        save(root / f"rgb/{time:.6f}.png", ramp(640, 480))
-        save(root / f"depth/{time + offset:.6f}.png", np.full((480, 640), 10000, np.uint16))
-        lists["rgb.txt"] += f"{time:.6f} rgb/{time:.6f}.png\n"
-        lists["depth.txt"] += f"{time + offset:.6f} depth/{time + offset:.6f}.png\n"
-        if i < 3:
-            values = (*pose[:3, 3], *quaternion)
-            line = " ".join(f"{value:.9f}" for value in values)
-            lists["groundtruth.txt"] += f"{time - 0.01:.4f} {line}\n"
-    for name, text in lists.items():
-        (root / name).write_text(text)
-    return root
-
-
 def test_tum_association_scale_and_poses(tmp_path):
     scene = read_tum(tum(tmp_path / "rgbd_dataset_freiburg3_x"))
     assert len(scene) == 3
@@ -277,25 +258,6 @@ def test_association_is_the_greedy_one_over_all_pairs():
 # --- Redwood ----------------------------------------------------------------------------------
 
 
-def redwood(root, numbers=(0, 1, 2)):
-    for i in range(3):
-        save(root / f"color/{i + 1:05d}-000{i}77.jpg", ramp())
-        save(root / f"depth/{i + 1:05d}-000{i}70.png", depth_picture())
-    text = ""
-    for number in numbers:
-        rows = "\n".join(" ".join(f"{v:.9f}" for v in row) for row in pose_matrix(number / 10))
-        text += f"{number} {number} {number + 1}\n{rows}\n"
-    (root / "trajectory.log").write_text(text)
-    (root / "odometry.log").write_text(text.replace("0.1", "0.9"))
-    camera = {
-        "width": 96,
-        "height": 72,
-        "intrinsic_matrix": [91, 0, 0, 0, 92, 0, 47.5, 35.5, 1],
-    }
-    (root / "camera.json").write_text(json.dumps(camera))
-    return root
-
-
 def test_redwood_pairs_poses_and_column_major_intrinsics(tmp_path):
     scene = read_redwood(redwood(tmp_path))
     assert len(scene) == 3
@@ -334,23 +296,6 @@ def test_redwood_without_intrinsics_takes_the_sensors(tmp_path):
 
 
 # --- ScanNet ----------------------------------------------------------------------------------
-
-
-def scannet(root):
-    for i in (0, 1, 2, 10):
-        save(root / f"color/{i}.jpg", ramp(192, 144))
-        save(root / f"depth/{i}.png", depth_picture())
-        (root / "pose").mkdir(exist_ok=True)
-        np.savetxt(root / f"pose/{i}.txt", pose_matrix(i) if i != 1 else np.full((4, 4), -np.inf))
-    (root / "intrinsic").mkdir()
-    K = np.eye(4)
-    K[:2, :3] = [[180, 0, 95.5], [0, 180, 71.5]]
-    np.savetxt(root / "intrinsic/intrinsic_color.txt", K)
-    K[:2, :3] = [[90, 0, 47.5], [0, 90, 35.5]]
-    np.savetxt(root / "intrinsic/intrinsic_depth.txt", K)
-    for camera in ("color", "depth"):
-        np.savetxt(root / f"intrinsic/extrinsic_{camera}.txt", np.eye(4))
-    return root
 
 
 def test_scannet_registers_depth_into_the_larger_picture_and_drops_lost_frames(tmp_path):

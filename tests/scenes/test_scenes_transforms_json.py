@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from scenes_workspace import (
     HEIGHT,
+    PINHOLE,
     WIDTH,
     depth_picture,
+    frame,
     pose_matrix,
     ramp,
     save,
@@ -26,13 +28,6 @@ from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.scene import Finding
 from gvtools.scenes.transforms_json import read_transforms, write_transforms
 from pipelines.cli import main
-
-FLIP = np.diag([1.0, -1, -1, 1])
-PINHOLE = {"fl_x": 90, "fl_y": 91, "cx": 48, "cy": 36, "w": WIDTH, "h": HEIGHT}
-
-
-def frame(name="images/a.png", x=0.0, **more):
-    return {"file_path": name, "transform_matrix": (pose_matrix(x) @ FLIP).tolist(), **more}
 
 
 def messages(scene):

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import refused
+from growth_rounds import rounds
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from test_cli import refused
-from test_growth import rounds
 
 from gvtools.errors import OptionError
 from pipelines.cli import main

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Browser, open_browser
-from test_cli import refused
+from command_line import refused
 
 from gvtools.scenes.project import open_project
 from pipelines.cli import main

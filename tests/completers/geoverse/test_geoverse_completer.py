@@ -27,13 +27,6 @@ pytest.importorskip("safetensors", reason="weights are read with safetensors")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Encodes with known cameras and fills holes, as ``tiny`` does."""
-    hints = {"cameras": True, "fill": "push-pull", "mask": 0.0}
-    return micro.weights_folder(tmp_path_factory.mktemp("micro"), micro.config(hints=hints))
-
-
 def complete(
     weights: Path,
     context: list[ContextView],

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from test_geoverse_projective import cameras, rigid
+from random_poses import cameras, rigid
 
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.completers.geoverse.plucker import (

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
+from random_poses import cameras, rigid
 
 from gvtools.completers.geoverse.projective import Projective, projection_matrices
 from gvtools.errors import ShapeError
@@ -11,23 +11,6 @@ from gvtools.networks.attention import attend
 
 SIZE = (84, 112)
 GRID = (3, 4)
-
-
-def rigid(count: int, *, seed: int = 0, reach: float = 1.0) -> torch.Tensor:
-    rng = np.random.default_rng(seed)
-    pose = np.tile(np.eye(4), (count, 1, 1))
-    pose[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
-    pose[:, :3, 3] = rng.uniform(-reach, reach, (count, 3))
-    return torch.from_numpy(pose)
-
-
-def cameras(batch: int = 2, views: int = 3, dtype=torch.float64):
-    pose = rigid(batch * views, seed=5).unflatten(0, (batch, views))
-    rng = np.random.default_rng(6)
-    K = np.tile(np.eye(3), (batch, views, 1, 1))
-    K[..., 0, 0], K[..., 1, 1] = rng.uniform(70, 130, (2, batch, views))
-    K[..., 0, 2], K[..., 1, 2] = 56 + rng.uniform(-5, 5, (2, batch, views))
-    return pose.to(dtype), torch.from_numpy(K).to(dtype)
 
 
 def tokens(head_dim: int, *, batch=2, views=3, heads=2, seed=0, dtype=torch.float64):

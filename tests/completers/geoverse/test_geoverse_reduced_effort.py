@@ -7,7 +7,6 @@ from typing import Any
 import geoverse_models as micro
 import numpy as np
 import pytest
-from test_geoverse_completer import weights
 
 from gvtools.completers import create
 from gvtools.completers.geoverse import completer as completer_module
@@ -19,7 +18,6 @@ from gvtools.guidance import Guidance
 
 pytest.importorskip("safetensors", reason="weights are read with safetensors")
 pytestmark = pytest.mark.usefixtures("one_thread")
-__all__ = ["weights"]
 
 
 def radii(known: Guidance) -> list[float]:

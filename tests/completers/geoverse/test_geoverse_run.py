@@ -8,7 +8,7 @@ from pathlib import Path
 
 import geoverse_models as micro
 import pytest
-from test_reconstruct import results, untimed
+from run_files import results, untimed
 from tiny_scan import write_scan
 
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
