@@ -10,7 +10,7 @@ from growth_rounds import rounds
 from PIL import Image
 
 from gvtools.errors import OptionError
-from viz.plots.growth import COLORS, draw_growth, growth_text
+from viz.plots.growth import draw_growth, growth_text
 
 
 def heights(axes, label):
@@ -59,20 +59,6 @@ def test_one_round_without_anything_and_many_still_draw():
     empty[0]["seconds"] = {}
     draw_growth(empty, title="room").savefig(io.BytesIO(), format="png", dpi=40)
     assert "0 added" in growth_text(empty)
-
-
-def test_colours_stay_apart_for_the_colour_blind():
-    """Viénot's deuteranope simulation keeps the colours of one panel apart."""
-    lms = np.array([[17.8824, 43.5161, 4.11935], [3.45565, 27.1554, 3.86714],
-                    [0.0299566, 0.184309, 1.46709]])  # fmt: skip
-    deutan = np.array([[1, 0, 0], [0.494207, 0, 1.24827], [0, 0, 1]])
-    simulate = np.linalg.inv(lms) @ deutan @ lms
-    for panel in (("observed", "generated", "voxels"), ("added", "merged", "rejected")):
-        rgb = [np.array(matplotlib.colors.to_rgb(COLORS[name])) ** 2.2 for name in panel]
-        seen = [simulate @ color for color in rgb]
-        for i, first in enumerate(seen):
-            for second in seen[:i]:
-                assert np.abs(first - second).max() > 0.1
 
 
 def test_the_text_fits_and_tells_the_same():

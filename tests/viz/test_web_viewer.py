@@ -37,13 +37,8 @@ SCENE = np.s_[60:460, 20:930]
 
 
 @pytest.fixture(scope="module")
-def folder(small_run):
-    return small_run
-
-
-@pytest.fixture(scope="module")
-def viewer(folder):
-    found = WebViewer(ViewSource(folder).read(), port=free_port())
+def viewer(small_run):
+    found = WebViewer(ViewSource(small_run).read(), port=free_port())
     yield found
     found.stop()
 
@@ -188,7 +183,7 @@ def test_the_splatter_renders_the_viewers_own_view(browser, viewer):
 
 
 @pytest.mark.slow
-def test_the_ply_is_downloaded(browser, viewer, folder, tmp_path):
+def test_the_ply_is_downloaded(browser, viewer, small_run, tmp_path):
     browser.driver.execute_cdp_cmd(
         "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
     )
@@ -196,13 +191,13 @@ def test_the_ply_is_downloaded(browser, viewer, folder, tmp_path):
     next(b for b in buttons if b.text == "Download PLY").click()
     path = tmp_path / "run.ply"
     wait(path.is_file)
-    assert path.read_bytes() == (folder / "memory.ply").read_bytes()
+    assert path.read_bytes() == (small_run / "memory.ply").read_bytes()
 
 
 @pytest.mark.slow
-def test_a_page_follows_a_run_that_grows(folder, tmp_path):
+def test_a_page_follows_a_run_that_grows(small_run, tmp_path):
     growing = tmp_path / "growing"
-    shutil.copytree(folder, growing)
+    shutil.copytree(small_run, growing)
     later = tmp_path / "later"
     (growing / "round_002").rename(later)
     source = ViewSource(growing)
@@ -216,7 +211,7 @@ def test_a_page_follows_a_run_that_grows(folder, tmp_path):
             browser.driver.get(viewer.url)
             wait(lambda: "observations after round 1" in browser.text())
             assert "not finished: 1 of 2 rounds done" in browser.text()
-            shutil.copy(folder / "memory.npz", growing / "memory.npz")
+            shutil.copy(small_run / "memory.npz", growing / "memory.npz")
             later.rename(growing / "round_002")
             viewer.update(source.read())
             wait(lambda: "observations after round 2" in browser.text())
@@ -285,8 +280,8 @@ def test_a_cloud_without_cameras_is_seen_whole_and_upright_from_outside(tmp_path
     assert position @ run.up() > look_at @ run.up()
 
 
-def test_of_two_cameras_selected_one_after_the_other_the_last_is_shown(folder):
-    run = ViewSource(folder).read()
+def test_of_two_cameras_selected_one_after_the_other_the_last_is_shown(small_run):
+    run = ViewSource(small_run).read()
     slow, fast = run.cameras[3], run.cameras[4]
     asked, go_on = threading.Event(), threading.Event()
 
@@ -320,8 +315,8 @@ def test_of_two_cameras_selected_one_after_the_other_the_last_is_shown(folder):
         viewer.stop()
 
 
-def test_points_cost_fifteen_bytes_and_stay_within_the_budget(folder):
-    run = ViewSource(folder).read()
+def test_points_cost_fifteen_bytes_and_stay_within_the_budget(small_run):
+    run = ViewSource(small_run).read()
     viewer = WebViewer(run, port=free_port(), budget=900)
     try:
         nodes = viewer._points._nodes.values()
