@@ -71,7 +71,7 @@ def interpolate(cameras: Cameras, count: int) -> Cameras:
         invert_rigid(pose),
         cameras.width[nearest],
         cameras.height[nearest],
-        _names("path", count),
+        (),
     )
 
 
@@ -191,7 +191,7 @@ def orbit(cameras: Cameras, count: int, *, center: ArrayLike | None = None) -> C
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)[:, None]
     around = np.cos(angle) * first + np.sin(angle) * side
     centers = middle + np.median(distance) * around + np.median(above) * axis
-    return _like_first(cameras, look_at(centers, middle, up=axis), "orbit")
+    return _like_first(cameras, look_at(centers, middle, up=axis))
 
 
 def spiral(cameras: Cameras, count: int) -> Cameras:
@@ -231,10 +231,10 @@ def spiral(cameras: Cameras, count: int) -> Cameras:
     # The depth swings at half the rate, so that successive turns differ.
     offset = np.stack([np.cos(angle), -np.sin(angle), -np.sin(0.5 * angle)], axis=1) * extent
     pose = look_at(middle + offset @ frame.T, middle + focus_distance * forward, up=up)
-    return _like_first(cameras, pose, "spiral")
+    return _like_first(cameras, pose)
 
 
-def _like_first(cameras: Cameras, world_from_cam: Float64, prefix: str) -> Cameras:
+def _like_first(cameras: Cameras, world_from_cam: Float64) -> Cameras:
     """Cameras at the given poses, with the intrinsics and the size of the first of ``cameras``."""
     count = len(world_from_cam)
     return Cameras(
@@ -242,9 +242,5 @@ def _like_first(cameras: Cameras, world_from_cam: Float64, prefix: str) -> Camer
         invert_rigid(world_from_cam),
         np.repeat(cameras.width[:1], count),
         np.repeat(cameras.height[:1], count),
-        _names(prefix, count),
+        (),
     )
-
-
-def _names(prefix: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{prefix}_{i:05d}" for i in range(count))

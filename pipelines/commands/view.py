@@ -58,17 +58,23 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: no run, an option that does not fit, no display.
     """
-    from pipelines.viewing.serve import ServerOptions, read_round, serve
+    from pipelines.viewing.serve import read_round, serve
     from pipelines.viewing.source import ViewSource
 
     _check(args)
     source, mode = ViewSource(args.run, project=args.project), args.color or "color"
     if args.live or not (args.open3d or args.screenshot):
-        options = ServerOptions(
-            host=args.host, port=args.port, max_points=args.max_points, round=args.round, mode=mode
-        )
         try:
-            serve(source, options, live=args.live, console=console)
+            serve(
+                source,
+                host=args.host,
+                port=args.port,
+                max_points=args.max_points,
+                round=args.round,
+                mode=mode,
+                live=args.live,
+                console=console,
+            )
         except KeyboardInterrupt:
             console.line("viewer ended")
         return
