@@ -75,12 +75,10 @@ def test_no_half_pixel_between_keypoints_and_cameras(probe: PoseProbe, take: Tak
 
 def test_the_claim_is_not_used_to_locate(probe: PoseProbe, take: Take) -> None:
     camera = camera_at((0.1, 0.0, 0.2), turn=(0, 3, 0))
-    honest, again = probe.locate(take(camera)), probe.locate(take(camera))
+    honest = probe.locate(take(camera))
     wrong = probe.locate(take(camera, camera_at((5.0, 5.0, -9.0), turn=(70, 20, 160))))
     assert honest.cam_from_world is not None and wrong.cam_from_world is not None
     np.testing.assert_array_equal(honest.cam_from_world, wrong.cam_from_world)
-    # The same seed gives the same answer.
-    np.testing.assert_array_equal(honest.cam_from_world, again.cam_from_world)
     assert wrong.center_error is not None and wrong.center_error > 5
 
 

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from gvtools.errors import OptionError
 from gvtools.evaluation.protocol import protocol_split
-from gvtools.evaluation.published import benchmark_names, load_benchmark
 from gvtools.scenes.selection import select
 
 NAMES = tuple(f"frame-{i:06d}" for i in range(100))
@@ -109,15 +108,6 @@ def test_the_two_layouts():
     assert (widest.stride, widest.start) == (14, 1)
     three = protocol_split(NAMES[:9], context=3)
     assert three.context == (NAMES[0], NAMES[4], NAMES[8])
-
-
-def test_the_benchmarks_protocols_split_a_scene():
-    for name in benchmark_names():
-        asked = load_benchmark(name)
-        split = protocol_split(
-            NAMES, context=asked.context, targets=asked.targets, rounds=asked.rounds
-        )
-        assert len(split.context) == 2 and [len(r) for r in split.rounds] == [6] * asked.rounds
 
 
 def test_a_split_reads_as_two_selections_in_its_order():

@@ -64,24 +64,14 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def scan(small_run):
-    return small_run.parent / "scan"
-
-
-@pytest.fixture(scope="module")
-def finished(small_run):
-    return small_run
-
-
-@pytest.fixture(scope="module")
-def page(finished):
-    return written(finished)
+def page(small_run):
+    return written(small_run)
 
 
 @pytest.fixture
-def own(finished, tmp_path):
+def own(small_run, tmp_path):
     """A copy to spoil."""
-    return Path(shutil.copytree(finished, tmp_path / "run"))
+    return Path(shutil.copytree(small_run, tmp_path / "run"))
 
 
 def written(run: Path, *more: object) -> Page:
@@ -97,8 +87,8 @@ def test_nothing_is_asked_of_the_network_and_nothing_runs(page):
     assert "script" not in page.tags
 
 
-def test_the_rounds_are_those_of_the_run(finished, page):
-    rounds = [json.loads(line) for line in (finished / "rounds.jsonl").read_text().splitlines()]
+def test_the_rounds_are_those_of_the_run(small_run, page):
+    rounds = [json.loads(line) for line in (small_run / "rounds.jsonl").read_text().splitlines()]
     table = [row for row in page.rows if len(row) == 15]
     assert len(table) == 1 + len(rounds)
     at = {name: table[0].index(name) for name in ("observed", "generated", "rejected")}
@@ -108,8 +98,8 @@ def test_the_rounds_are_those_of_the_run(finished, page):
             assert int(row[place].replace("\u202f", "")) == entry[name]
 
 
-def test_the_figures_are_those_of_the_metrics(finished, page):
-    metrics = json.loads((finished / "metrics.json").read_text())
+def test_the_figures_are_those_of_the_metrics(small_run, page):
+    metrics = json.loads((small_run / "metrics.json").read_text())
     rows = {row[0]: row for row in page.rows if len(row) == 4}
     for name, key in (("PSNR, dB", "psnr"), ("SSIM", "ssim")):
         for cell, region in zip(rows[name][1:], ("", "_valid", "_generated"), strict=True):
@@ -174,7 +164,7 @@ def test_figures_of_another_state_are_left_out(own):
     assert any("another state" in warning for warning in report.warnings)
 
 
-def test_a_project_that_is_gone(own, scan, capsys):
+def test_a_project_that_is_gone(own, small_scan, capsys):
     record = json.loads((own / "run.json").read_text())
     record["project"] = str(own / "nowhere")
     (own / "run.json").write_text(json.dumps(record))
@@ -183,15 +173,15 @@ def test_a_project_that_is_gone(own, scan, capsys):
     assert page.captions == ["hint", "validity", "completion"] * 4
     assert "no error maps" in page.said
     assert "context's cameras are missing" in page.said
-    shown = collect(own, project=scan).sheets.rows
+    shown = collect(own, project=small_scan).sheets.rows
     assert [tile.label for row in shown for tile in row.tiles] == LABELS * 4
 
 
-def test_a_run_that_has_its_project_open_writes_the_same_page(own, scan, page):
+def test_a_run_that_has_its_project_open_writes_the_same_page(own, small_scan, page):
     config = RunSettings(context="first:3", targets="range:4-7", views_per_round=2)
     before = (own / "report.html").read_bytes()
     (own / "report.html").unlink()
-    write_report(make_plan(open_project(scan), config), own)
+    write_report(make_plan(open_project(small_scan), config), own)
     assert (own / "report.html").read_bytes() == before
 
 
@@ -326,8 +316,8 @@ def browser():
 
 
 @pytest.mark.parametrize(("width", "columns"), [(390, 2), (1280, 6)])
-def test_the_page_in_a_browser(browser: Browser, finished, page, width, columns):
-    file = finished / "report.html"
+def test_the_page_in_a_browser(browser: Browser, small_run, page, width, columns):
+    file = small_run / "report.html"
     browser.resize(width, 844)
     browser.driver.get(file.as_uri())
     shown = browser.driver.execute_script(

@@ -132,20 +132,6 @@ def test_what_floats_in_front_contradicts(pair: tuple[PosedPicture, PosedPicture
     assert (dirty.seen == clean.seen)[~patch[dirty.rows, dirty.columns]].all()
 
 
-@pytest.mark.parametrize("turn", [(0, 2, 0), (2, 0, 0)])
-def test_a_wrong_rotation_raises_the_error(
-    pair: tuple[PosedPicture, PosedPicture], turn: tuple[float, float, float]
-) -> None:
-    first, second = pair
-    steps = [
-        depth_reprojection(first, moved(second, turn=(k * turn[0], k * turn[1], k * turn[2])))
-        for k in (0.0, 0.5, 1.0)
-    ]
-    for better, worse in pairwise(steps):
-        assert all(getattr(better, name) < getattr(worse, name) for name in FIGURES)
-        assert (better.covisible_share or 0) > (worse.covisible_share or 0)
-
-
 def test_a_wrong_place_a_shift_and_noise_raise_the_error(
     pair: tuple[PosedPicture, PosedPicture],
 ) -> None:
