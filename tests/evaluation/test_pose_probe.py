@@ -66,7 +66,7 @@ def test_no_half_pixel_between_keypoints_and_cameras(probe: PoseProbe, take: Tak
     # In a picture upside down, an offset of the keypoints from the camera's convention counts
     # twice; in one of half the size, it is another share of the picture. Half a pixel of 320
     # across is 0.1 degrees.
-    for scale, turn in ((1.0, (0, 0, 180)), (1.0, (0, 0, 90)), (0.5, (0, 0, 0)), (2.0, (0, 0, 0))):
+    for scale, turn in ((1.0, (0, 0, 180)), (1.0, (0, 0, 90)), (0.5, (0, 0, 0))):
         camera = camera_at((0.0, 0.0, 0.2), turn=turn, scale=scale)
         found = probe.locate(take(camera))
         assert found.ok and found.rotation_error_deg is not None, found.status
