@@ -36,6 +36,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages |= {
         "commands.md": commands_page(),
         "settings.md": settings_page(),
+        "training-settings.md": training_page(),
         "python.md": python_page(),
         "data.md": data_page(),
     }
@@ -66,7 +67,8 @@ def commands_page() -> str:
 
 
 def settings_page() -> str:
-    """Every setting of a run, by section, and what the profiles change."""
+    """Every setting of a run and of completers, by section, and what the profiles change."""
+    from gvtools.completers.base import options_of_all
     from gvtools.settings import markdown
     from pipelines.reconstruction.settings import RunSettings
 
@@ -79,13 +81,30 @@ def settings_page() -> str:
         "that does not exist is an error which names the nearest one. `gvtools reconstruct "
         "--help-settings` prints this list.",
         "",
-        markdown(settings),
+        markdown(settings, *options_of_all()),
         "## Profiles",
         "",
     ]
     for name, changes in settings.profiles.items():
         changed = ", ".join(f"`{key}={value}`" for key, value in changes.items())
         text.append(f"- `{name}`: {changed or 'the defaults'}")
+    return "\n".join(text) + "\n"
+
+
+def training_page() -> str:
+    """Every setting of a training, with its defaults."""
+    from gvtools.settings import markdown
+    from gvtools.training.options import TrainingSettings
+
+    text = [
+        "# Training settings",
+        "",
+        "`gvtools train CONFIG` takes a training that ships or a JSON file, then `--set "
+        "NAME=VALUE`. `gvtools train CONFIG --help-settings` prints these with the values of that "
+        "training.",
+        "",
+        markdown(TrainingSettings()),
+    ]
     return "\n".join(text) + "\n"
 
 

@@ -1,6 +1,6 @@
 """The generative core on its own: one observed view, one unknown view, no memory and no run.
 
-The core needs torch, numpy and safetensors alone; its small model ships with the package.
+The core needs neither Open3D nor a run; its small model ships with the package.
 
 python examples/07_core_alone.py [PROJECT [OUT]]
 """

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 from tempfile import gettempdir
 
+from gvtools.errors import ProjectError
 from gvtools.procedural.room_sample import write_room
 
 
@@ -14,7 +16,11 @@ def sample_project() -> Path:
     if len(sys.argv) > 1:
         return Path(sys.argv[1])
     folder = Path(gettempdir()) / "gvtools-examples" / "room"
-    return write_room(folder, views=12, width=240, height=180).folder
+    try:
+        return write_room(folder, views=12, width=240, height=180).folder
+    except ProjectError:  # the room of an earlier version
+        shutil.rmtree(folder)
+        return sample_project()
 
 
 def output_folder() -> Path:

@@ -76,12 +76,17 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
     # Waiting threads that spin would take the cores that other programs need, and with them ours.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     parser = build_parser(modules)
-    args = parser.parse_args(argv)
-    if args.command is None:
-        parser.print_help()
-        return 2
+    args = argparse.Namespace(debug=False)
     try:
+        args = parser.parse_args(argv)
+        if args.command is None:
+            parser.print_help()
+            return 2
         args.module.run(args, Console(quiet=args.quiet))
+    except BrokenPipeError:
+        # The reader of the output, such as ``head``, has seen enough; nothing is left to flush.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except GvError as error:
         if args.debug:
             raise

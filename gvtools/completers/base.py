@@ -34,7 +34,7 @@ class ContextView:
     Attributes:
         name: the view's name in its scene.
         camera: a batch of one.
-        rgb: (H, W, 3) float32 in [0, 1].
+        rgb: (H, W, 3) float32 in [0, 1]; a photograph's uint8 is taken, too, and scaled.
         depth: (H, W) float32 z-depth, scene units, 0 = none; None when the view has no depth.
         confidence: (H, W) float32 >= 0 of the depth; None when unknown.
     """
@@ -46,6 +46,8 @@ class ContextView:
     confidence: Float32 | None = None
 
     def __post_init__(self) -> None:
+        if self.rgb.dtype == np.uint8:
+            object.__setattr__(self, "rgb", self.rgb.astype(np.float32) / 255)
         size = (int(self.camera.height[0]), int(self.camera.width[0]))
         if len(self.camera) != 1 or self.rgb.shape != (*size, 3):
             raise ShapeError(
@@ -155,6 +157,8 @@ class ScaleAlignment:
             "residual": self.residual,
             "overlap_px": self.overlap_px,
             "inlier_share": self.inlier_share,
+            "centres": self.centres,
+            "correlation": self.correlation,
         }
 
 
@@ -283,6 +287,42 @@ def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
             )
 
 
+def run_completer(
+    completer: Completer, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
+) -> Completion:
+    """What a completer makes of views, held to the contract.
+
+    Raises:
+        ShapeError: it returned something else, of another size, or with NaN or infinity; or the
+            views are damaged.
+        OptionError: it changed pixels that memory knows.
+    """
+    completion = completer.complete(context, guidance, seed=seed)
+    if not isinstance(completion, Completion):
+        found = type(completion).__name__
+        raise ShapeError(f"completer {completer.name} returned a {found}; expected a Completion")
+    if completion.depth.shape != guidance.valid.shape:
+        raise ShapeError(
+            f"completer {completer.name} returned depth {completion.depth.shape}; expected "
+            f"{guidance.valid.shape} like the guidance"
+        )
+    for what in ("rgb", "depth", "confidence"):
+        values = getattr(completion, what)
+        if not np.isfinite(values).all():
+            raise ShapeError(
+                f"completer {completer.name}: {what} holds NaN or infinity; expected finite "
+                "values, and a depth of 0 where there is none"
+            )
+    known = guidance.valid
+    changed = (completion.depth != guidance.depth)[known].any()
+    if changed or (completion.rgb != guidance.rgb)[known].any():
+        raise OptionError(
+            f"completer {completer.name} changed colour or depth where the guidance is valid; "
+            "expected both unchanged there"
+        )
+    return completion
+
+
 _REGISTRY: dict[str, type[Completer] | str] = {
     "none": "gvtools.completers.none:NoneCompleter",
     "inpaint": "gvtools.completers.inpaint:InpaintCompleter",
@@ -319,15 +359,29 @@ def create(name: str, /, **options: Any) -> Completer:
 
     Raises:
         OptionError: an unknown name or option (the nearest one is named), a required option that
-            is absent, or a value that does not convert or is out of its range.
+            is absent, or a value that does not convert or is out of its range; or what was
+            registered is no Completer.
     """
+    return _kind(name)(**options)
+
+
+def options_of_all() -> list[Any]:
+    """The default options of each completer that has some, to be listed."""
+    kinds = [_kind(name).settings_type for name in available()]
+    return [kind.model_construct() for kind in kinds if kind is not None]
+
+
+def _kind(name: str) -> type[Completer]:
     if name not in _REGISTRY:
         near = difflib.get_close_matches(name, available(), n=1, cutoff=0.5)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(available())}"
         raise OptionError(f"no completer {name!r}; {hint}")
-    kind = _REGISTRY[name]
+    kind: Any = _REGISTRY[name]
     if isinstance(kind, str):
         module, _, attribute = kind.partition(":")
-        kind = getattr(import_module(module), attribute)
-    made: Completer = kind(**options)
-    return made
+        kind = getattr(import_module(module), attribute, None)
+    if not (isinstance(kind, type) and issubclass(kind, Completer)):
+        raise OptionError(
+            f"completer {name}: {_REGISTRY[name]!r}; expected a subclass of Completer"
+        )
+    return kind

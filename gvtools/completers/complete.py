@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gvtools.completers.base import Completer, Completion, ContextView, create
+from gvtools.completers.base import Completer, Completion, ContextView, create, run_completer
+from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 
 
@@ -27,7 +28,8 @@ def complete(
         options: of the completer called by name.
 
     Raises:
-        OptionError: an unknown completer or option.
+        OptionError: an unknown completer or option, options of a completer that was made before,
+            or a completer that breaks its contract.
         ShapeError: views that are damaged or do not fit each other.
 
     >>> import numpy as np
@@ -45,4 +47,9 @@ def complete(
     """
     if isinstance(completer, str):
         completer = create(completer, **options)
-    return completer.complete(context, guidance, seed=seed)
+    elif options:
+        raise OptionError(
+            f"options {', '.join(options)} beside a completer that was made before; give them to "
+            "its class"
+        )
+    return run_completer(completer, context, guidance, seed=seed)

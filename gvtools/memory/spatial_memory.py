@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 # Nearest neighbours are looked up for this many points when a cloud gives no spacing.
 SAMPLED = 20_000
+# How far float colours may leave 0 to 1.
+COLOR_SLACK = 0.01
 
 
 class SpatialMemory(Store):
@@ -43,8 +45,8 @@ class SpatialMemory(Store):
 
     def observe(
         self,
-        rgb: NDArray[np.uint8],
-        depth: NDArray[np.float32],
+        rgb: NDArray[np.uint8] | NDArray[np.floating],
+        depth: NDArray[np.float32] | None,
         camera: Cameras,
         *,
         round: int,
@@ -57,7 +59,7 @@ class SpatialMemory(Store):
         """Lift the pixels of one view to points and fuse them.
 
         Args:
-            rgb: (H, W, 3) uint8.
+            rgb: (H, W, 3) uint8, as a photograph has it, or float from 0 to 1, as a completion.
             depth: (H, W) float32 z-depth, scene units; 0, NaN and inf mean none.
             camera: a batch of one, of the same image size, in the world frame.
             round: see ``fuse``.
@@ -69,8 +71,15 @@ class SpatialMemory(Store):
 
         Raises:
             OptionError: ``round`` lies before the last one.
-            ShapeError: the images and the camera disagree in size, or the camera is unusable.
+            ShapeError: no depth, colours of another type or range, or images and camera disagree
+                in size, or the camera is unusable.
         """
+        if depth is None:
+            raise ShapeError(
+                f"{camera.names[0]}: no depth; expected (H, W) z-depth; a project without recorded "
+                "depth gets it by gvtools.reconstruct"
+            )
+        rgb = as_bytes(rgb, camera.names[0])
         points = back_project(
             rgb, depth, camera, frame=self.frame, confidence=confidence, mask=mask,
             options=options, levels=self.levels, pixel_binning=pixel_binning,
@@ -140,7 +149,9 @@ class SpatialMemory(Store):
         """A memory of an Open3D point cloud: its points are fused, one observation a voxel.
 
         A cloud does not tell from where its points were seen: a camera in their midst stands for
-        it, once for each combination of ``round``, ``view`` and ``generated``.
+        it, once for each combination of ``round``, ``view`` and ``generated``. Observations that
+        a memory keeps apart by direction therefore merge: ``save`` and ``load``, or ``to("cpu")``,
+        copy a memory as it is.
 
         Args:
             cloud: with ``positions`` and ``colors`` (uint8, or float from 0 to 1), and where it
@@ -154,19 +165,20 @@ class SpatialMemory(Store):
             name: of the camera.
 
         Raises:
-            ShapeError: no colours.
+            ShapeError: no colours, or colours of another type or range.
             DegenerateError: no two distinct points, or none with a positive confidence and spacing.
         """
         columns = {key: cloud.point[key].cpu().numpy() for key in cloud.point}
         if "colors" not in columns or "positions" not in columns:
             raise ShapeError("no positions or no colours red, green, blue in the point cloud")
         finite = np.isfinite(columns["positions"]).all(axis=1)
+        finite &= np.isfinite(columns["colors"]).all(axis=1)
         columns = {key: column[finite] for key, column in columns.items()}
         positions = columns["positions"].astype(np.float64)
         distance = _neighbour_distance(positions)
         if not distance > 0:
             raise DegenerateError(f"{len(positions)} distinct points; expected at least two")
-        edge = voxel or distance
+        edge = distance if voxel is None else voxel
         middle = positions.mean(axis=0)
         if frame is None:
             frame = LocalFrame.at(rounded_origin(middle, edge))
@@ -187,9 +199,7 @@ class SpatialMemory(Store):
         """Fuse a cloud's points, round by round and view by view."""
         count = len(columns["positions"])
         column = {key: values.reshape(count, -1)[:, 0] for key, values in columns.items()}
-        colors = columns["colors"]
-        if colors.dtype.kind == "f":
-            colors = np.rint(np.clip(colors, 0, 1) * 255)
+        colors = as_bytes(columns["colors"], name)
         generated = column.get("generated", np.zeros(count)) != 0
         round_ = column.get("round", generated).astype(np.int64)
         view = column.get("view", np.zeros(count)).astype(np.int64)
@@ -205,10 +215,28 @@ class SpatialMemory(Store):
             camera = Cameras(np.eye(3)[None], pose[None], one, one, (label,))
             rows = np.flatnonzero(group.reshape(-1) == i)
             points = PointSet(
-                columns["positions"][rows], colors[rows].astype(np.uint8), confidence[rows],
+                columns["positions"][rows], colors[rows], confidence[rows],
                 spacing[rows], camera, self.frame, None, {},
             )  # fmt: skip
             self.fuse(points, round=number, generated=bool(made))
+
+
+def as_bytes(colors: NDArray[Any], name: str) -> NDArray[np.uint8]:
+    """Colours (..., 3) as uint8: those of a photograph as they are, float ones from 0 to 1 scaled.
+
+    Raises:
+        ShapeError: of another type, not finite, or beyond 0 to 1.
+    """
+    if colors.dtype == np.uint8:
+        return colors
+    found = str(colors.dtype)
+    if colors.dtype.kind == "f":
+        low, high = float(colors.min(initial=0)), float(colors.max(initial=0))
+        # Interpolated colours may leave the range by a rounding; NaN fails both comparisons.
+        if low >= -COLOR_SLACK and high <= 1 + COLOR_SLACK:
+            return np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
+        found = f"{found} from {low:g} to {high:g}"
+    raise ShapeError(f"{name}: colours {found}; expected uint8, or float from 0 to 1")
 
 
 def _neighbour_distance(positions: NDArray[np.float64]) -> float:

@@ -151,7 +151,7 @@ class Run:
             yield view, files, truth
 
 
-def load_run(path: Path, *, project: Path | None = None) -> Run:
+def load_run(path: Path | str, *, project: Path | None = None) -> Run:
     """The run in a folder, finished or not.
 
     Args:
@@ -161,6 +161,7 @@ def load_run(path: Path, *, project: Path | None = None) -> Run:
     Raises:
         ProjectError: no run, a damaged one, or one of another version.
     """
+    path = Path(path)
     return Run(path, read_record(path), read_reports(path), project)
 
 

@@ -167,9 +167,16 @@ def keys(kind: type[Any], prefix: str | None = None) -> list[str]:
         prefix = f"{kind.section}." if kind.section else ""
     names = []
     for name, entry in entries(kind).items():
+        if name in hidden(kind):
+            continue
         nested = entry.section
         names += keys(nested, f"{prefix}{name}.") if nested else [f"{prefix}{name}"]
     return names
+
+
+def hidden(kind: type[Any]) -> frozenset[str]:
+    """Fields that are set by the options of another one, see ``Settings.options_of``."""
+    return frozenset(kind.options_of.values()) if issubclass(kind, Settings) else frozenset()
 
 
 def _entry_at(kind: type[Any], path: Sequence[str]) -> Entry | None:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
-from gvtools.settings.base import Entry, Settings, entries
+from gvtools.settings.base import Entry, Settings, entries, hidden
 
 _TYPES = {bool: "true or false", int: "integer", float: "number", str: "text"}
 
 
-def listing(settings: Settings, *, width: int = 100) -> str:
-    """Every setting with its default, range, unit and meaning, by section, for a terminal."""
+def listing(*settings: Settings, width: int = 100) -> str:
+    """Every setting with its value, range, unit and meaning, by section, for a terminal."""
     lines = []
-    for section, about, rows in _sections(settings):
+    for section, about, rows in _all_sections(settings):
         lines += ["", textwrap.fill(f"{section}: {about}" if section else about, width), ""]
         for key, default, accepts, entry in rows:
             unit = f" {entry.unit}" if entry.unit else ""
@@ -26,10 +26,10 @@ def listing(settings: Settings, *, width: int = 100) -> str:
     return "\n".join(lines[1:])
 
 
-def markdown(settings: Settings) -> str:
+def markdown(*settings: Settings) -> str:
     """The same as Markdown: a heading and a table a section."""
     lines = []
-    for section, about, rows in _sections(settings):
+    for section, about, rows in _all_sections(settings):
         lines += [f"## {section or 'General'}", "", about, ""]
         lines += ["| setting | default | unit | accepts | meaning |", "|---|---|---|---|---|"]
         for key, default, accepts, entry in rows:
@@ -42,12 +42,20 @@ def markdown(settings: Settings) -> str:
 _Rows = list[tuple[str, str, str, Entry]]
 
 
+def _all_sections(settings: Sequence[Settings]) -> Iterator[tuple[str, str, _Rows]]:
+    """The sections of the first settings, then of others below their own section's name."""
+    for i, each in enumerate(settings):
+        yield from _sections(each, f"{each.section}." if i and each.section else "")
+
+
 def _sections(settings: Any, prefix: str = "", doc: str = "") -> Iterator[tuple[str, str, _Rows]]:
     """Each section's key, its class's first line with its own documentation, and its rows."""
     rows: _Rows = []
     inner = []
     for name, entry in entries(type(settings)).items():
-        key, value = f"{prefix}{name}", getattr(settings, name)
+        if name in hidden(type(settings)):
+            continue
+        key, value = f"{prefix}{name}", getattr(settings, name, "(required)")
         if entry.section is None:
             rows.append((key, _shown(value), _accepts(entry), entry))
         else:

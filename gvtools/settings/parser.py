@@ -53,10 +53,7 @@ def with_file(settings: S, path: Path, *, profile: str | None = None) -> S:
     if not isinstance(data, dict):
         raise OptionError(f"{path}: holds a {type(data).__name__}; expected an object of settings")
     if settings.profiles:
-        # Below the file's other settings, wherever it stands among them.
-        named = data.pop("profile", None) if profile is None else profile
-        data.pop("profile", None)
-        data = {**({} if named is None else {"profile": named}), **data}
+        data |= {} if profile is None else {"profile": profile}
     try:
         return with_values(settings, dotted(data))
     except OptionError as error:
@@ -108,14 +105,15 @@ def changes(before: Settings, after: Settings) -> dict[str, Any]:
 
 
 def _expanded(settings: Settings, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[str, Any]]:
-    """The pairs with what a profile stands for before its name."""
-    for key, value in pairs:
+    """The pairs, those that a profile stands for below all others."""
+    given = list(pairs)
+    for key, value in given:
         if key == "profile" and settings.profiles:
             if str(value) not in settings.profiles:
                 known = ", ".join(settings.profiles)
                 raise OptionError(f"profile {value!r}; expected one of {known}")
             yield from settings.profiles[value].items()
-        yield key, value
+    yield from given
 
 
 def _path(kind: type[Settings], key: str) -> list[str]:
@@ -154,6 +152,8 @@ def _converted(key: str, entry: Entry, value: Any) -> Any:
             return None
         if get_origin(entry.kind) is dict:
             return {}
+    if get_origin(entry.kind) is dict and not isinstance(value, Mapping):
+        raise OptionError(f"{key} {value!r}; expected an object of options by name")
     if entry.section is not None and value != {}:
         inside = f"{key}.{next(iter(entries(entry.section)))}"
         raise OptionError(f"{key} {value!r}; it is a section; set one of its own, such as {inside}")

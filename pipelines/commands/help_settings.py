@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -14,17 +14,26 @@ class HelpSettings(argparse.Action):
     """Like ``--help``, of settings.
 
     Args:
-        settings: makes the defaults, when they are asked for.
+        settings: gives the settings of a command and those of its parts, when they are asked for;
+            takes what was given on the command line before.
         options: of the option, see ``argparse.Action``.
     """
 
-    def __init__(self, *, settings: Callable[[], Settings], **options: Any) -> None:
+    def __init__(
+        self, *, settings: Callable[[argparse.Namespace], Sequence[Settings]], **options: Any
+    ) -> None:
         super().__init__(**options, nargs=0)
         self._settings = settings
 
-    def __call__(self, parser: argparse.ArgumentParser, *args: object) -> None:
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, *args: object
+    ) -> None:
         """Print them to standard output and end the program with status 0."""
+        from gvtools.errors import GvError
         from gvtools.settings import listing
 
-        print(listing(self._settings()))
+        try:
+            print(listing(*self._settings(namespace)))
+        except GvError as error:
+            parser.error(str(error))
         parser.exit()

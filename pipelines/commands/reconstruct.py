@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from pipelines.commands.help_settings import HelpSettings
 
 if TYPE_CHECKING:
+    from gvtools.settings import Settings
     from pipelines.console import Console
     from pipelines.reconstruction.settings import RunSettings
 
@@ -70,10 +71,10 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
     add_scene_arguments(parser)
 
 
-def _settings() -> RunSettings:
-    from pipelines.reconstruction.settings import RunSettings
+def _settings(args: argparse.Namespace) -> list[Settings]:
+    from gvtools.completers.base import options_of_all
 
-    return RunSettings()
+    return [config_from(args), *options_of_all()]
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
@@ -108,18 +109,28 @@ def copy_figures(args: argparse.Namespace, out: Path) -> None:
 
 
 def config_from(args: argparse.Namespace) -> RunSettings:
-    """Defaults, then the profile, then --config, then the options, then --set."""
+    """Defaults, then the profile, then --config, then the options, then --set.
+
+    ``--set profile=NAME`` stands for ``--profile NAME``.
+    """
     from gvtools.settings import with_file, with_profile, with_texts, with_values
     from pipelines.reconstruction.settings import RunSettings
 
-    config = RunSettings()
+    config, profile = RunSettings(), args.profile
+    texts = []
+    for text in args.set:
+        key, _, value = text.partition("=")
+        if key.strip() == "profile":
+            profile = value.strip()
+        else:
+            texts.append(text)
     if args.config:
-        config = with_file(config, args.config, profile=args.profile)
-    elif args.profile:
-        config = with_profile(config, args.profile)
+        config = with_file(config, args.config, profile=profile)
+    elif profile:
+        config = with_profile(config, profile)
     names = ("context", "targets", "views_per_round", "rounds", "max_side", "depth", "completer",
              "voxel", "device", "seed")  # fmt: skip
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     if args.allow_overlap:
         given["allow_overlap"] = True
-    return with_texts(with_values(config, given), args.set)
+    return with_texts(with_values(config, given), texts)

@@ -15,7 +15,7 @@ from gvtools.errors import OptionError
 from pipelines.commands.help_settings import HelpSettings
 
 if TYPE_CHECKING:
-    from gvtools.training.options import TrainingSettings
+    from gvtools.settings import Settings
     from pipelines.console import Console
 
 SUMMARY = "train the generative core: encoder, denoisers, distillation"
@@ -71,10 +71,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the last figures there")
 
 
-def _settings() -> TrainingSettings:
-    from gvtools.training.options import TrainingSettings
+def _settings(args: argparse.Namespace) -> list[Settings]:
+    from gvtools.settings import with_texts
+    from gvtools.training.options import TrainingSettings, shipped_or_read
 
-    return TrainingSettings()
+    known = TrainingSettings() if args.config is None else shipped_or_read(args.config)[0]
+    return [with_texts(known, args.set)]
 
 
 def run(args: argparse.Namespace, console: Console) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.evaluation.nested import nested
+from pipelines.report.nested import nested
 
 if TYPE_CHECKING:
     from gvtools.evaluation.ranking import Setting

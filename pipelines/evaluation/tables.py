@@ -11,7 +11,7 @@ from gvtools.evaluation.ranking import MeasuredRow, Setting, comparison_table, s
 from gvtools.evaluation.tables import Column, Table, Value, render
 from gvtools.evaluation.view_figures import FIGURES
 from gvtools.files import write_text
-from pipelines.evaluation.nested import nested
+from pipelines.report.nested import nested
 
 BETTER = {"psnr": "higher", "ssim": "higher", "lpips": "lower", "depth": "lower"}
 UNITS = {"psnr": "dB"}

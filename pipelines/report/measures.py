@@ -11,7 +11,7 @@ import numpy as np
 
 from gvtools.evaluation.view_figures import FIGURES
 from gvtools.runs.layout import METRICS
-from pipelines.evaluation.nested import nested
+from pipelines.report.nested import nested
 from viz.plots.trajectories import Trajectories
 from viz.report.content import Measures, Poses
 

@@ -20,6 +20,7 @@ from gvtools.completers import (
     register,
 )
 from gvtools.completers.base import _REGISTRY
+from gvtools.completers.complete import complete
 from gvtools.completers.settings import CompleterSettings
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
@@ -129,6 +130,51 @@ def test_a_completer_of_ones_own_serves_a_run_and_is_made_once(painter, tmp_path
             assert target.generated.any() and entry["fused_pixels"] > 0
             # 0.3 of 255.
             assert np.isin(target.picture[target.generated], (76, 77)).all()
+
+
+class _Careless(Completer):
+    """Returns what it was made with."""
+
+    name = "careless"
+
+    def __init__(self, outcome):
+        super().__init__()
+        self.outcome = outcome
+
+    def complete(self, context, guidance, *, seed=0):
+        rgb, depth = guidance.rgb.copy(), guidance.depth.copy()
+        if self.outcome == "changed":
+            depth[guidance.valid] += 1
+        elif self.outcome == "not finite":
+            depth[~guidance.valid] = np.nan
+        elif self.outcome == "too few":
+            rgb, depth = rgb[:, :4], depth[:, :4]
+        else:
+            return None
+        return Completion(rgb, depth, np.zeros_like(depth))
+
+
+@pytest.mark.parametrize(
+    ("outcome", "words"),
+    [
+        ("changed", "changed colour or depth where the guidance is valid"),
+        ("not finite", "depth holds NaN or infinity"),
+        ("too few", "expected .* like the guidance"),
+        ("nothing", "returned a NoneType; expected a Completion"),
+    ],
+)
+def test_what_breaks_the_contract_is_named(outcome, words):
+    valid = np.zeros((1, 6, 8), bool)
+    valid[:, :3] = True
+    weight = valid.astype(np.float32)
+    guidance = Guidance(
+        Cameras.pinhole(8, 6, focal=8.0), weight[..., None].repeat(3, -1), weight, valid, weight,
+        np.zeros_like(valid),
+    )  # fmt: skip
+    with pytest.raises((OptionError, ShapeError), match=words):
+        complete((), guidance, completer=_Careless(outcome))
+    with pytest.raises(OptionError, match="steps beside a completer that was made before"):
+        complete((), guidance, completer=_Careless(outcome), steps=2)
 
 
 def test_a_taken_name_and_a_malformed_reference_are_refused(painter):

@@ -211,3 +211,30 @@ def test_a_deep_copy_and_a_recoloured_one_leave_the_memory_alone():
     whole.columns.arrays.positions[:] = 0
     np.testing.assert_array_equal(memory.columns.colors, colors)
     assert len(whole) < len(memory) and memory.columns.positions.any()
+
+
+def test_a_copy_by_to_grows_apart_from_its_original():
+    memory = random_memory(3)
+    before, voxels = len(memory), memory.voxels
+    own = memory.own_confidence()
+    other = memory.to("cpu")
+    for number in range(4, 8):
+        other.observe(*_frame(2.0 + number), round=number)
+    assert (len(memory), memory.voxels) == (before, voxels) and len(other) > before
+    np.testing.assert_array_equal(memory.own_confidence(), own)
+    memory.observe(*_frame(1.5), round=9)
+    memory.forget(round=9)
+    assert (len(memory), memory.voxels) == (before, voxels)
+
+
+def test_float_colours_are_those_of_the_photograph_and_others_are_refused():
+    rgb, depth, view = _frame(2.0)
+    of_bytes, of_floats = SpatialMemory(0.02), SpatialMemory(0.02)
+    of_bytes.observe(rgb, depth, view, round=0)
+    of_floats.observe(rgb / np.float32(255), depth, view, round=0)
+    np.testing.assert_array_equal(_attribute(of_bytes, "colors"), _attribute(of_floats, "colors"))
+    for wrong in (rgb.astype(np.float32) + 2, rgb.astype(np.int64), np.full(rgb.shape, np.nan)):
+        with pytest.raises(ShapeError, match="expected uint8, or float from 0 to 1"):
+            of_bytes.observe(wrong, depth, view, round=1)
+    with pytest.raises(ShapeError, match="no depth; expected"):
+        of_bytes.observe(rgb, None, view, round=1)

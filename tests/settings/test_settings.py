@@ -170,9 +170,11 @@ def test_a_section_by_itself_goes_by_its_full_name():
             with_texts(StereoOptions(), [text])
 
 
-def test_later_texts_stand_over_earlier_ones_a_profile_included():
-    assert with_texts(RUN, ["max_side=100", "profile=fast"]).max_side == 480
-    assert with_texts(RUN, ["profile=fast", "max_side=100"]).max_side == 100
+def test_later_texts_stand_over_earlier_ones_and_all_over_a_profile():
+    assert with_texts(RUN, ["max_side=64", "max_side=100"]).max_side == 100
+    for texts in (["max_side=100", "profile=fast"], ["profile=fast", "max_side=100"]):
+        config = with_texts(RUN, texts)
+        assert (config.max_side, config.views_per_round) == (100, 12)
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -195,8 +197,10 @@ def test_every_setting_is_documented(settings):
 
 def test_help_settings_ends_the_program(capsys):
     with pytest.raises(SystemExit) as end:
-        main(["reconstruct", "--help-settings"])
+        main(["reconstruct", "--max-side", "900", "--help-settings"])
     assert end.value.code == 0
     out = capsys.readouterr().out
-    assert "  max_side=1600 px  (integer, at least 64, or none)\n      Longer side" in out
+    assert "  max_side=900 px  (integer, at least 64, or none)\n      Longer side" in out
     assert "fusion: What is taken of depth and of completions." in out
+    assert "  completer.sweeps=60  (integer, at least 0)" in out
+    assert "  completer.cascade_steps=none  (integer, at least 1, or none)" in out

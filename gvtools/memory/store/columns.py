@@ -81,8 +81,9 @@ class Columns:
     def __init__(self, device: str = "cpu") -> None:
         import open3d as o3d
 
+        device = "cpu" if device.lower() in ("cpu", "cpu:0") else device
         kind = device.split(":")[0].lower()
-        if kind != "cpu" and not (kind == "cuda" and o3d.core.cuda.is_available()):
+        if device != "cpu" and not (kind == "cuda" and o3d.core.cuda.is_available()):
             raise OptionError(
                 f"memory device {device!r}; expected 'cpu', or 'cuda:0' where Open3D finds CUDA"
             )

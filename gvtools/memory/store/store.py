@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from copy import copy
+from copy import copy, deepcopy
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -66,8 +66,9 @@ class Store:
         axes: (3, 3) rotation whose columns are the voxel grid's axes in the world frame; None for
             the world's own. See LocalFrame.
         options: see MemoryOptions.
-        device: where the tensors live, "cpu" or "cuda:0". Memories grow on the CPU; on another
-            device they can be projected by the torch back end and used by Open3D, see ``to``.
+        device: where the tensors live, "cpu" or "cuda:0". What runs on the CPU (fusing, forgetting,
+            the cpu and one-pixel back ends) needs them there, see ``to``; elsewhere the torch back
+            end projects them and Open3D uses them.
 
     Attributes:
         columns: the observations.
@@ -267,11 +268,13 @@ class Store:
         return other
 
     def to(self: S, device: str) -> S:
-        """A snapshot whose tensors are a copy on a device.
+        """A copy of this memory, independent of it, whose tensors live on a device.
 
         Raises:
             OptionError: Open3D has no such device here.
         """
         other = self.snapshot()
         other.columns = self.columns.to(device)
+        other.segments, other.index = deepcopy(self.segments), deepcopy(self.index)
+        other.agreements = {round_: list(log) for round_, log in self.agreements.items()}
         return other
