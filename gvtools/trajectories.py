@@ -18,11 +18,11 @@ Float64 = NDArray[np.float64]
 ROUNDING = 1e-13
 # A step below this share of the others is none.
 STEP = 1e-9
-# Largest coordinate, scene units: far beyond any scene.
-FARTHEST = 1e30
+# Revolutions of a spiral, and its share of the captured extent.
+TURNS, SPREAD = 2.0, 0.8
 
 
-def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Cameras:
+def interpolate(cameras: Cameras, count: int) -> Cameras:
     """A smooth path through key cameras, evenly spaced by a measure of motion.
 
     Centres follow a monotone cubic (PCHIP) of the path length, so the path is C1 and does not
@@ -34,11 +34,10 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
     Args:
         cameras: at least two key cameras, in order.
         count: number of cameras on the path, >= 2.
-        closed: return to the first camera at the end (it is not repeated).
 
     Raises:
         OptionError: fewer than two keys or cameras asked for.
-        DegenerateError: all keys are the same camera, or one has no finite pose.
+        DegenerateError: all keys are the same camera.
     """
     from scipy.interpolate import PchipInterpolator
     from scipy.spatial.transform import Rotation, Slerp
@@ -47,22 +46,15 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
         raise OptionError(
             f"interpolate: {len(cameras)} key camera(s), {count} asked for; expected 2 or more each"
         )
-    _check_poses("interpolate", cameras)
-    rows = list(range(len(cameras)))
-    if closed:
-        # One key more at either end makes the spline's slopes there those of a loop.
-        rows = [rows[-1], *rows, 0, 1]
-    world = cameras.world_from_cam[rows]
+    world = cameras.world_from_cam
     rotation = Rotation.from_matrix(world[:, :3, :3])
     steps = _steps(world[:, :3, 3], (rotation[:-1].inv() * rotation[1:]).magnitude())
     keep = np.concatenate([[True], steps > 0])
     if keep.sum() < 2:
         raise DegenerateError("interpolate: all key cameras are the same; give cameras that differ")
-    index = np.array(rows)[keep]
-    length = np.concatenate([[0.0], np.cumsum(steps)])
-    first, last = (length[1], length[-2]) if closed else (0.0, length[-1])
-    length = length[keep]
-    at = np.linspace(first, last, count + int(closed))[:count]
+    index = np.flatnonzero(keep)
+    length = np.concatenate([[0.0], np.cumsum(steps)])[keep]
+    at = np.linspace(0, length[-1], count)
     # PCHIP has no cross-talk between coordinates: centred first for large offsets.
     origin = world[0, :3, 3]
     pose = np.tile(np.eye(4), (count, 1, 1))
@@ -79,7 +71,7 @@ def interpolate(cameras: Cameras, count: int, *, closed: bool = False) -> Camera
         invert_rigid(pose),
         cameras.width[nearest],
         cameras.height[nearest],
-        _names("path", count),
+        (),
     )
 
 
@@ -100,7 +92,6 @@ def focus_point(cameras: Cameras) -> Float64:
     Raises:
         DegenerateError: the axes are parallel or there is one only.
     """
-    _check_poses("focus point", cameras)
     world = cameras.world_from_cam
     origin = cameras.centers.mean(axis=0)
     axes, centers = world[:, :3, 2], world[:, :3, 3] - origin
@@ -142,22 +133,20 @@ def look_at(centers: ArrayLike, target: ArrayLike, *, up: ArrayLike) -> Float64:
 
     Raises:
         OptionError: ``up`` has no direction.
-        DegenerateError: a centre lies on the target, the view is along ``up``, or a value is not
-            finite.
+        DegenerateError: a centre lies on the target, or the view is along ``up``.
     """
     centers, target = np.asarray(centers, np.float64), np.asarray(target, np.float64)
-    up = _direction(up)
+    axis = np.asarray(up, np.float64)
+    if not np.linalg.norm(axis) > 0:
+        raise OptionError(f"up {axis.tolist()}; expected three numbers, not all 0")
+    axis = axis / np.linalg.norm(axis)
     magnitude = float(np.abs(np.concatenate([centers.ravel(), target.ravel()])).max())
-    if not magnitude < FARTHEST:
-        raise DegenerateError(
-            f"look at: coordinates up to {magnitude:g}; expected finite ones below {FARTHEST:g}"
-        )
     forward = target - centers
     distance = np.linalg.norm(forward, axis=1, keepdims=True)
     if (distance <= 1e-12 * magnitude).any():
         raise DegenerateError("look at: a camera centre lies on the point that it looks at")
     forward = forward / distance
-    right = np.cross(forward, up)
+    right = np.cross(forward, axis)
     norm = np.linalg.norm(right, axis=1, keepdims=True)
     if (norm < 1e-6).any():
         raise DegenerateError("look at: a camera looks along the up vector; choose another up")
@@ -169,93 +158,61 @@ def look_at(centers: ArrayLike, target: ArrayLike, *, up: ArrayLike) -> Float64:
     return pose
 
 
-def orbit(
-    cameras: Cameras,
-    count: int,
-    *,
-    center: ArrayLike | None = None,
-    radius: float | None = None,
-    height: float | None = None,
-    up: ArrayLike | None = None,
-    degrees: float = 360.0,
-) -> Cameras:
-    """Cameras on a circle (or an arc of it) that look at its middle.
+def orbit(cameras: Cameras, count: int, *, center: ArrayLike | None = None) -> Cameras:
+    """Cameras on a circle that look at its middle.
 
-    The arc starts at the direction of the first camera. A full turn does not repeat its start.
+    It starts at the direction of the first camera and turns counter-clockwise as seen from above;
+    the start is not repeated. Radius and height are the cameras' medians.
 
     Args:
         cameras: where the scene was seen from; intrinsics and size are those of the first.
         count: number of cameras, >= 1.
         center: (3,) what to look at; None means ``focus_point``.
-        radius: distance from the axis, scene units; None means the cameras' median.
-        height: above ``center`` along ``up``, scene units; None means the cameras' median.
-        up: (3,) the axis; None means ``mean_up``.
-        degrees: how far to turn, counter-clockwise as seen from above.
 
     Raises:
-        OptionError: no camera given or asked for, a radius that is not positive, or a number that
-            is not finite.
+        OptionError: no camera given or asked for.
         DegenerateError: no focus point or no up vector can be found, or the first camera stands
             on the axis.
     """
-    if len(cameras) < 1 or count < 1 or (radius is not None and radius <= 0):
+    if len(cameras) < 1 or count < 1:
         raise OptionError(
-            f"orbit: {len(cameras)} camera(s) given, {count} asked for, radius {radius}; "
-            "expected 1 or more, and a positive radius"
+            f"orbit: {len(cameras)} camera(s) given, {count} asked for; expected 1 or more"
         )
-    _check_numbers("orbit", radius=radius, height=height, degrees=degrees)
-    _check_poses("orbit", cameras)
     middle = focus_point(cameras) if center is None else np.asarray(center, np.float64)
-    axis = _direction(mean_up(cameras) if up is None else up)
+    axis = mean_up(cameras)
     offset = cameras.centers - middle
     above = offset @ axis
     flat = offset - above[:, None] * axis
     distance = np.linalg.norm(flat, axis=1)
     if distance[0] <= 1e-9 * float(np.abs(offset).max()):
         raise DegenerateError("orbit: the first camera stands on the axis; give another center=")
-    radius = float(np.median(distance)) if radius is None else radius
-    height = float(np.median(above)) if height is None else height
     first = flat[0] / distance[0]
     side = np.cross(axis, first)
-    full = abs(abs(degrees) - 360.0) < 1e-9
-    angle = np.radians(np.linspace(0, degrees, count + int(full))[:count])[:, None]
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)[:, None]
     around = np.cos(angle) * first + np.sin(angle) * side
-    centers = middle + radius * around + height * axis
-    return _like_first(cameras, look_at(centers, middle, up=axis), "orbit")
+    centers = middle + np.median(distance) * around + np.median(above) * axis
+    return _like_first(cameras, look_at(centers, middle, up=axis))
 
 
-def spiral(
-    cameras: Cameras,
-    count: int,
-    *,
-    turns: float = 2.0,
-    spread: float = 0.8,
-    focus_distance: float | None = None,
-) -> Cameras:
+def spiral(cameras: Cameras, count: int) -> Cameras:
     """A spiral about the mean camera of a forward-facing capture (as LLFF shows its scenes).
 
-    The offset along each axis of the mean camera stays within ``spread`` of the cameras' own
-    extent there (their 90th percentile), and every camera looks at one point in front.
+    The offset along each axis of the mean camera stays within SPREAD of the cameras' own extent
+    there (their 90th percentile), and every camera looks at one point in front: at the distance of
+    ``focus_point``, or ten times the extent where the axes are parallel or diverge.
 
     Args:
         cameras: a forward-facing capture, at least two; intrinsics and size are the first's.
-        count: number of cameras, >= 1; the end meets the start.
-        turns: revolutions.
-        spread: share of the captured extent.
-        focus_distance: distance of the point looked at, scene units; None means that of
-            ``focus_point``, or ten times the extent where the axes are parallel or diverge.
+        count: number of cameras, >= 1; the end meets the start after TURNS revolutions.
 
     Raises:
-        OptionError: fewer than two cameras, none asked for, a focus that is not in front, or a
-            number that is not finite.
+        OptionError: fewer than two cameras, or none asked for.
         DegenerateError: the cameras' viewing directions or up vectors cancel out.
     """
     if len(cameras) < 2 or count < 1:
         raise OptionError(
             f"spiral: {len(cameras)} camera(s) given, {count} asked for; expected 2 and 1 or more"
         )
-    _check_numbers("spiral", turns=turns, spread=spread, focus_distance=focus_distance)
-    _check_poses("spiral", cameras)
     middle = cameras.centers.mean(axis=0)
     forward = cameras.world_from_cam[:, :3, 2].mean(axis=0)
     if np.linalg.norm(forward) < 1e-3:
@@ -263,52 +220,21 @@ def spiral(
     forward /= np.linalg.norm(forward)
     up = mean_up(cameras)
     frame = look_at(np.zeros((1, 3)), forward, up=up)[0, :3, :3]
-    extent = np.percentile(np.abs((cameras.centers - middle) @ frame), 90, axis=0) * spread
-    if focus_distance is None:
-        try:
-            focus_distance = float((focus_point(cameras) - middle) @ forward)
-        except DegenerateError:
-            focus_distance = 0.0
-        if focus_distance <= extent[2]:
-            focus_distance = 10.0 * float(np.linalg.norm(extent))
+    extent = np.percentile(np.abs((cameras.centers - middle) @ frame), 90, axis=0) * SPREAD
+    try:
+        focus_distance = float((focus_point(cameras) - middle) @ forward)
+    except DegenerateError:
+        focus_distance = 0.0
     if focus_distance <= extent[2]:
-        raise OptionError(
-            f"spiral: focus_distance {focus_distance:g}; expected more than {extent[2]:g}, "
-            "the path's own depth"
-        )
-    angle = 2 * np.pi * turns * np.arange(count) / count
+        focus_distance = 10.0 * float(np.linalg.norm(extent))
+    angle = 2 * np.pi * TURNS * np.arange(count) / count
     # The depth swings at half the rate, so that successive turns differ.
     offset = np.stack([np.cos(angle), -np.sin(angle), -np.sin(0.5 * angle)], axis=1) * extent
     pose = look_at(middle + offset @ frame.T, middle + focus_distance * forward, up=up)
-    return _like_first(cameras, pose, "spiral")
+    return _like_first(cameras, pose)
 
 
-def _check_numbers(what: str, **numbers: float | None) -> None:
-    for name, value in numbers.items():
-        if value is not None and not abs(value) < FARTHEST:
-            raise OptionError(f"{what}: {name} {value}; expected less than {FARTHEST:g} either way")
-
-
-def _check_poses(what: str, cameras: Cameras) -> None:
-    largest = np.abs(cameras.world_from_cam).max(axis=(1, 2), initial=0)
-    wrong = np.flatnonzero(~(largest < FARTHEST))
-    if len(wrong):
-        raise DegenerateError(
-            f"{what}: the pose of camera {cameras.names[wrong[0]]} holds {largest[wrong[0]]:g}; "
-            f"expected finite values below {FARTHEST:g}"
-        )
-
-
-def _direction(vector: ArrayLike) -> Float64:
-    """(3,) of length 1."""
-    values = np.asarray(vector, np.float64)
-    length = float(np.linalg.norm(values))
-    if values.shape != (3,) or not 0 < length < np.inf:
-        raise OptionError(f"up {values.tolist()}; expected three finite numbers, not all 0")
-    return np.asarray(values / length)
-
-
-def _like_first(cameras: Cameras, world_from_cam: Float64, prefix: str) -> Cameras:
+def _like_first(cameras: Cameras, world_from_cam: Float64) -> Cameras:
     """Cameras at the given poses, with the intrinsics and the size of the first of ``cameras``."""
     count = len(world_from_cam)
     return Cameras(
@@ -316,9 +242,5 @@ def _like_first(cameras: Cameras, world_from_cam: Float64, prefix: str) -> Camer
         invert_rigid(world_from_cam),
         np.repeat(cameras.width[:1], count),
         np.repeat(cameras.height[:1], count),
-        _names(prefix, count),
+        (),
     )
-
-
-def _names(prefix: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{prefix}_{i:05d}" for i in range(count))

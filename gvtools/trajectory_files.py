@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
-from gvtools.files import write_text
 
 Float64 = NDArray[np.float64]
 
@@ -132,34 +131,6 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
     return _with_intrinsics(track.poses, like, names, path)
 
 
-def write_trajectory(path: str | Path, cameras: Cameras, *, layout: str = "tum") -> None:
-    """Write the poses of ``cameras``; the file appears complete or not at all.
-
-    Args:
-        path: the file.
-        cameras: whose poses to write. A name that is a number becomes the TUM timestamp when all
-            names are; otherwise the row number does.
-        layout: "tum" or "kitti"; 17 digits keep float64 poses.
-
-    Raises:
-        ProjectError: an unknown layout, or a file that cannot be written.
-    """
-    path = Path(path)
-    world = cameras.world_from_cam
-    if layout == "tum":
-        stamps = cameras.names if _all_numbers(cameras.names) else range(len(cameras))
-        quaternions = _quaternions(world[:, :3, :3])
-        lines = [
-            " ".join([str(stamp), *(f"{x:.17g}" for x in (*pose[:3, 3], *quaternion))])
-            for stamp, pose, quaternion in zip(stamps, world, quaternions, strict=True)
-        ]
-    elif layout == "kitti":
-        lines = [" ".join(f"{x:.17g}" for x in pose[:3].ravel()) for pose in world]
-    else:
-        raise ProjectError(f"{path}: trajectory layout {layout!r}; expected 'tum' or 'kitti'")
-    write_text(path, "".join(line + "\n" for line in lines))
-
-
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
     """Line numbers and words of the lines that hold data."""
     try:
@@ -200,19 +171,6 @@ def _rotation(quaternion: Float64, *, where: str) -> Float64:
             f"{where}: a quaternion of length {norm:.6g}; expected 1 (order qx qy qz qw)"
         )
     return np.asarray(Rotation.from_quat(quaternion).as_matrix())
-
-
-def _quaternions(rotations: Float64) -> Float64:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(rotations).as_quat(canonical=True))
-
-
-def _all_numbers(names: tuple[str, ...]) -> bool:
-    try:
-        return len({float(name) for name in names}) == len(names)
-    except ValueError:
-        return False
 
 
 def _with_intrinsics(poses: Float64, like: Cameras, names: list[str], path: Path) -> Cameras:

@@ -126,7 +126,7 @@ def evaluate(
         no_lpips=None if lpips else "no network was given",
         seed=seed,
         console=Console(quiet=quiet),
-    ).figures
+    )
     mean = found["images"]["mean"] if "images" in found else {}
     psnr, ssim, perceptual = (mean.get(key, {}).get("mean") for key in ("psnr", "ssim", "lpips"))
     return RunFigures(found["coverage"], psnr, ssim, perceptual, found["views"], found)

@@ -62,6 +62,12 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
+@pytest.fixture(scope="session")
+def small_scan(small_run: Path) -> Path:
+    """The project of ``small_run``."""
+    return small_run.parent / "scan"
+
+
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
     """Threads cost more than they give on a tiny network, most of all where others work, too."""

@@ -107,18 +107,6 @@ def test_intrinsics_are_interpolated_and_sizes_are_the_nearest_keys():
     assert path.width.tolist() == [640, 640, 640, 320, 320]
 
 
-def test_a_closed_path_is_smooth_where_it_closes():
-    keys = _ring(8, arc=2 * np.pi * 7 / 8)
-    path = interpolate(keys, 400, closed=True)
-    loop = np.concatenate([path.centers, path.centers[:2]])
-    velocity = np.diff(loop, axis=0)
-    assert (
-        np.linalg.norm(np.diff(velocity, axis=0), axis=1).max()
-        < 0.1 * np.linalg.norm(velocity, axis=1).max()
-    )
-    np.testing.assert_allclose(path.centers[0], keys.centers[0], atol=1e-12)
-
-
 def test_interpolation_needs_two_different_cameras():
     with pytest.raises(OptionError, match="2 or more"):
         interpolate(_ring(1), 5)
@@ -167,19 +155,11 @@ def test_an_orbit_looks_at_its_middle_with_a_steady_up():
     up = mean_up(_ring())
     np.testing.assert_allclose(path.world_from_cam[:, :3, 0] @ up, 0, atol=1e-12)
     assert (path.world_from_cam[:, :3, 1] @ up < 0).all()
+    # It begins in the direction of the first camera, at the cameras' distance.
+    np.testing.assert_allclose(np.linalg.norm(path.centers - FOCUS, axis=1), np.hypot(4, 1.2), 0.01)
+    assert path.centers[0] == pytest.approx(_ring().centers[0], abs=0.3)
     steps = np.linalg.norm(np.diff(np.vstack([path.centers, path.centers[:1]]), axis=0), axis=1)
     np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
-
-
-def test_an_orbit_with_the_given_axis_meets_the_cameras_it_came_from():
-    given = _ring(7, arc=1.5)
-    path = orbit(given, 7, up=UP, degrees=np.degrees(1.5))
-    np.testing.assert_allclose(path.centers, given.centers, atol=1e-8)
-    np.testing.assert_allclose(path.cam_from_world, given.cam_from_world, atol=1e-8)
-    wide = orbit(given, 3, up=UP, radius=9.0, height=0.5)
-    offset = wide.centers - FOCUS
-    np.testing.assert_allclose(offset @ UP, 0.5, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(offset - 0.5 * UP, axis=1), 9.0, atol=1e-9)
 
 
 def test_a_spiral_stays_within_the_capture_and_looks_at_one_point():
@@ -194,13 +174,11 @@ def test_a_spiral_stays_within_the_capture_and_looks_at_one_point():
     xy, _ = path.project(focus_point(path)[None])
     np.testing.assert_allclose(xy[:, 0], [[320, 240]] * 60, atol=1e-6)
     assert np.linalg.norm(focus_point(path) - target) < 1.0
-    with pytest.raises(OptionError, match="focus_distance"):
-        spiral(given, 10, focus_distance=-1.0)
 
 
 def test_degenerate_orbits_say_why():
-    with pytest.raises(OptionError, match="positive radius"):
-        orbit(_ring(), 5, radius=-1.0)
+    with pytest.raises(OptionError, match="1 or more"):
+        orbit(_ring(), 0)
     with pytest.raises(DegenerateError, match="on the axis"):
         orbit(_ring(), 5, center=_ring().centers[0])
     with pytest.raises(DegenerateError, match="cancel"):

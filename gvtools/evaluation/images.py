@@ -77,11 +77,7 @@ def ssim(
 
 
 def image_figures(
-    image: ArrayLike,
-    truth: ArrayLike,
-    regions: Mapping[str, ArrayLike | None],
-    *,
-    sample_covariance: bool = False,
+    image: ArrayLike, truth: ArrayLike, regions: Mapping[str, ArrayLike | None]
 ) -> dict[str, dict[str, float | None]]:
     """PSNR and SSIM over several regions of one image, for little more than the price of one.
 
@@ -89,7 +85,6 @@ def image_figures(
         image: (H, W, C) floats in [0, 1], or uint8, which stands for 255 times that.
         truth: likewise.
         regions: by name, (H, W) bool, True = compare; None compares all pixels.
-        sample_covariance: see ``ssim``.
 
     Returns:
         For each region ``psnr`` and ``ssim``, as those functions give them; the SSIM of an image
@@ -102,7 +97,7 @@ def image_figures(
     square = ((first - second) ** 2).mean(axis=-1)
     similarity = None
     if min(first.shape[:2]) >= SIDE:
-        similarity = ssim_map(first, second, sample_covariance=sample_covariance)
+        similarity = ssim_map(first, second)
     out = {}
     for name, mask in regions.items():
         where = _mask(mask, first.shape[:2])

@@ -1,19 +1,22 @@
-"""LPIPS (R. Zhang et al., CVPR 2018) by the ``lpips`` package, with weights from disk alone.
+"""LPIPS (R. Zhang et al., CVPR 2018), with weights from disk alone.
 
-The package holds the calibrated last layers; the network below them is published by torchvision's
-authors and has to be on disk: in a folder that is named, or in torch's own cache. Without it there
-is no LPIPS, and no other network's distance is given under that name.
+The package ``lpips`` holds the calibrated last layers; no code of it is run, as it needs
+torchvision, whose compiled operators often do not fit the installed torch. The network below them
+is published by torchvision's authors and has to be on disk: in a folder that is named, or in
+torch's own cache. Without it there is no LPIPS, and no other network's distance is given under that
+name. The layers, and with them the names in a state dict, are those of torchvision's models:
+K. Simonyan, A. Zisserman, "Very deep convolutional networks" (VGG-16), and A. Krizhevsky, "One
+weird trick for parallelizing convolutional neural networks" (AlexNet).
 """
 
 from __future__ import annotations
 
 import hashlib
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import importlib.util
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +24,95 @@ from numpy.typing import NDArray
 from gvtools.errors import CheckpointError, OptionError, ShapeError
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor, nn
 
 # Below this, the networks' deepest layers have no pixels.
 SMALLEST = 32
+# Mean and spread of the colours, in [-1, 1], that the networks were trained with.
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+# Channels of VGG-16's convolutions, "M" for a halving of the resolution.
+_VGG16 = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
+
+
+def vgg16() -> nn.Sequential:
+    """VGG-16's convolutional layers."""
+    from torch import nn
+
+    layers: list[nn.Module] = []
+    channels = 3
+    for width in _VGG16:
+        if isinstance(width, str):
+            layers.append(nn.MaxPool2d(2, 2))
+            continue
+        layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
+        channels = width
+    return nn.Sequential(*layers)
+
+
+def alexnet() -> nn.Sequential:
+    """AlexNet's convolutional layers."""
+    from torch import nn
+
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 11, stride=4, padding=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, padding=2),
+        nn.ReLU(inplace=True),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(384, 256, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(256, 256, 3, padding=1),
+        nn.ReLU(inplace=True),
+    )
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """One network that LPIPS is defined on.
+
+    Attributes:
+        build: makes its layers.
+        compared: numbers of the layers whose output is compared.
+        file: the published weights; the name ends with the first digits of the file's SHA-256.
+    """
+
+    build: Callable[[], nn.Sequential]
+    compared: tuple[int, ...]
+    file: str
+
+    @property
+    def url(self) -> str:
+        """Where the weights are published."""
+        return f"https://download.pytorch.org/models/{self.file}"
+
+    @property
+    def digest(self) -> str:
+        """How the SHA-256 of the published file begins."""
+        return self.file.rsplit("-", 1)[1].split(".")[0]
+
+
+BACKBONES = {
+    "vgg": Backbone(vgg16, (3, 8, 15, 22, 29), "vgg16-397923af.pth"),
+    "alex": Backbone(alexnet, (1, 4, 7, 9, 11), "alexnet-owt-7be5be79.pth"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A network with its weights.
+
+    Attributes:
+        layers: the convolutional ones.
+        compared: numbers of those whose output is compared.
+        heads: (1, C, 1, 1) for each of these, what its channels weigh.
+    """
+
+    layers: nn.Sequential
+    compared: tuple[int, ...]
+    heads: Sequence[Tensor]
 
 
 class Lpips:
@@ -41,8 +129,6 @@ class Lpips:
     """
 
     def __init__(self, net: str = "vgg", *, folder: Path | None = None) -> None:
-        from gvtools.evaluation.lpips_backbones import BACKBONES
-
         if net not in BACKBONES:
             raise OptionError(f"LPIPS network {net!r}; expected one of {', '.join(BACKBONES)}")
         self.net = net
@@ -82,8 +168,6 @@ def find_weights(net: str, folder: Path | None = None) -> Path:
     """
     import torch
 
-    from gvtools.evaluation.lpips_backbones import BACKBONES
-
     backbone = BACKBONES[net]
     place = Path(folder) if folder is not None else Path(torch.hub.get_dir()) / "checkpoints"
     file = place / backbone.file
@@ -95,54 +179,42 @@ def find_weights(net: str, folder: Path | None = None) -> Path:
     return file
 
 
-def load_model(net: str, file: Path) -> nn.Module:
-    """The package's network on the weights of ``file``.
+def load_model(net: str, file: Path) -> Model:
+    """The network on the weights of ``file``, with the package's last layers.
 
     Raises:
         CheckpointError: the package is absent, or the file does not hold the network's weights.
     """
     import torch
 
-    from gvtools.evaluation.lpips_backbones import BACKBONES
-
     backbone = BACKBONES[net]
     try:
         stored = torch.load(file, map_location="cpu", weights_only=True)
-        layers = backbone.build()
+        layers = backbone.build().requires_grad_(False).eval()
         prefix = "features."
         own = {k[len(prefix) :]: v for k, v in stored.items() if k.startswith(prefix)}
         layers.load_state_dict(own)
     except Exception as error:
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise CheckpointError(
-            f"{file}: does not hold the weights of {backbone.model} ({first}); download "
+            f"{file}: does not hold the weights of LPIPS's network {net} ({first}); download "
             f"{backbone.url} again"
         ) from error
-    with _torchvision_if_whole():
-        try:
-            import lpips
-            from lpips import pretrained_networks
-        except ImportError as error:
-            raise CheckpointError(
-                f"LPIPS: the package lpips is absent ({error}); pip install 'gvtools[lpips]'"
-            ) from error
-        published = pretrained_networks.tv
-        pretrained_networks.tv = SimpleNamespace(
-            **{backbone.model: lambda **_: SimpleNamespace(features=layers)}
-        )
-        try:
-            model: nn.Module = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)
-        finally:
-            pretrained_networks.tv = published
-    return model.requires_grad_(False).eval()
+    package = importlib.util.find_spec("lpips")
+    if package is None or package.origin is None:
+        raise CheckpointError("LPIPS: the package lpips is absent; pip install 'gvtools[lpips]'")
+    calibrated = Path(package.origin).with_name("weights") / "v0.1" / f"{net}.pth"
+    heads = torch.load(calibrated, map_location="cpu", weights_only=True)
+    names = [f"lin{number}.model.1.weight" for number in range(len(backbone.compared))]
+    return Model(layers, backbone.compared, [heads[name] for name in names])
 
 
 def distance(
-    model: Any, image: NDArray[np.uint8], truth: NDArray[np.uint8]
+    model: Model, image: NDArray[np.uint8], truth: NDArray[np.uint8]
 ) -> tuple[float, NDArray[np.float32]]:
     """See ``Lpips.distance``; ``model`` is from ``load_model``."""
     import torch
-    from torch.nn.functional import interpolate
+    from torch.nn.functional import conv2d, interpolate
 
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ShapeError(f"LPIPS of {image.shape} and {truth.shape}; expected equal (H, W, 3)")
@@ -151,43 +223,26 @@ def distance(
             f"LPIPS of {image.dtype} {image.shape}; expected uint8, at least "
             f"{SMALLEST}x{SMALLEST} pixels"
         )
-    pair = [
-        torch.from_numpy(x.copy()).permute(2, 0, 1)[None].float() / 127.5 - 1
-        for x in (image, truth)
-    ]
     with torch.inference_mode():
-        features = [model.net(model.scaling_layer(x)) for x in pair]
-        layers = [
-            head((_unit(first) - _unit(second)) ** 2)
-            for head, first, second in zip(model.lins, *features, strict=True)
+        maps = [
+            conv2d((first - second) ** 2, head)
+            for head, first, second in zip(
+                model.heads, _features(model, image), _features(model, truth), strict=True
+            )
         ]
-        total = sum(float(layer.mean()) for layer in layers)
+        total = sum(float(layer.mean()) for layer in maps)
         size = image.shape[:2]
-        spread = [interpolate(layer, size=size, mode="bilinear")[0, 0] for layer in layers]
+        spread = [interpolate(layer, size=size, mode="bilinear")[0, 0] for layer in maps]
     return total, np.sum([layer.numpy() for layer in spread], axis=0)
 
 
-def _unit(features: Any) -> Any:
-    """Features of length 1 at every pixel, as the package normalises them."""
-    return features / ((features**2).sum(dim=1, keepdim=True).sqrt() + 1e-10)
+def _features(model: Model, picture: NDArray[np.uint8]) -> Iterator[Tensor]:
+    """(1, C, h, w) of each compared layer, of length 1 at every pixel."""
+    import torch
 
-
-@contextmanager
-def _torchvision_if_whole() -> Iterator[None]:
-    """Lets the package be imported where torchvision is absent or does not fit torch."""
-    try:
-        import torchvision  # noqa: F401
-    except Exception:
-        broken = [name for name in sys.modules if name.split(".")[0] == "torchvision"]
-        for name in broken:
-            del sys.modules[name]
-        empty, models = ModuleType("torchvision"), ModuleType("torchvision.models")
-        empty.models = models  # type: ignore[attr-defined]
-        sys.modules |= {"torchvision": empty, "torchvision.models": models}
-        try:
-            yield
-        finally:
-            for name in ("torchvision", "torchvision.models"):
-                sys.modules.pop(name, None)
-        return
-    yield
+    x = torch.from_numpy(picture.copy()).permute(2, 0, 1)[None].float() / 127.5 - 1
+    x = (x - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
+    for number, layer in enumerate(model.layers):
+        x = layer(x)
+        if number in model.compared:
+            yield x / ((x**2).sum(dim=1, keepdim=True).sqrt() + 1e-10)

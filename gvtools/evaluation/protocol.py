@@ -6,22 +6,21 @@ chosen, so this is a rule of our own, and every split is written beside its scor
 
 1. A window of context + targets * rounds views, ``stride`` views apart, begins at a view drawn from
    ``seed`` among all that let it end inside the scene.
-2. Layout "ends", to interpolate: the context is spread evenly over the window, its first and last
-   view included; the views between them are the targets. Layout "first", to extrapolate: the
-   context comes first, the targets follow.
+2. One round, to interpolate (layout "ends"): the context is spread evenly over the window, its
+   first and last view included; the views between them are the targets. Several rounds, to
+   extrapolate (layout "first"): the context comes first, the targets follow.
 3. The targets, in the scene's order, are cut into rounds of equal size.
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from gvtools.errors import OptionError, ProjectError
-
-LAYOUTS = ("ends", "first")
+from gvtools.errors import OptionError
+from gvtools.options import check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +51,7 @@ class Split:
         return tuple(name for names in self.rounds for name in names)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON; ``split_from_dict`` reads it."""
+        """Plain data for JSON."""
         return asdict(self) | {
             "context": list(self.context),
             "rounds": [list(names) for names in self.rounds],
@@ -67,7 +66,6 @@ def protocol_split(
     rounds: int = 1,
     stride: int | None = None,
     seed: int = 0,
-    layout: str | None = None,
 ) -> Split:
     """The split of a scene by the rule above.
 
@@ -79,19 +77,14 @@ def protocol_split(
         stride: views from one of the window to the next; None is as wide as the scene allows. In
             a video's many frames that leaves the views little in common; give a number there.
         seed: draws where the window begins. The same seed takes about the same part of any scene.
-        layout: "ends" or "first"; None is "ends" for one round and "first" for several.
 
     Raises:
-        OptionError: numbers below 1, an unknown layout, a name twice, or too few views.
+        OptionError: numbers below 1, or too few views.
     """
-    _check_numbers(1, context=context, targets=targets, rounds=rounds, stride=stride)
-    _check_numbers(0, seed=seed)
-    layout = layout or ("ends" if rounds == 1 else "first")
-    if layout not in LAYOUTS:
-        raise OptionError(f"layout {layout!r}; expected one of {', '.join(LAYOUTS)}")
-    if len(set(names)) < len(names):
-        twice = next(name for i, name in enumerate(names) if name in names[:i])
-        raise OptionError(f"view {twice!r} is there twice; expected a name for each view")
+    for what, number in {"context": context, "targets": targets, "rounds": rounds}.items():
+        check_range(what, number, least=1)
+    check_range("stride", stride, least=1)
+    layout = "ends" if rounds == 1 else "first"
     window = context + targets * rounds
     if stride is None:
         stride = max((len(names) - 1) // (window - 1), 1)
@@ -119,34 +112,3 @@ def protocol_split(
         views=len(names),
         seed=seed,
     )
-
-
-def _check_numbers(least: int, **numbers: int | None) -> None:
-    for what, number in numbers.items():
-        if number is not None and not number >= least:
-            raise OptionError(f"{what} {number}; expected at least {least}")
-
-
-def split_from_dict(data: Mapping[str, Any]) -> Split:
-    """The split that ``Split.to_dict`` wrote.
-
-    Raises:
-        ProjectError: keys that are unknown or absent, or a view twice.
-    """
-    known = {entry.name for entry in fields(Split)}
-    if set(data) != known:
-        odd = sorted(set(data) ^ known)
-        raise ProjectError(
-            f"split: keys {', '.join(odd)} are absent or unknown; expected "
-            f"{', '.join(sorted(known))}"
-        )
-    split = Split(
-        **{
-            **data,
-            "context": tuple(data["context"]),
-            "rounds": tuple(tuple(names) for names in data["rounds"]),
-        }
-    )
-    if len({*split.context, *split.targets}) < len(split.context) + len(split.targets):
-        raise ProjectError("split: a view is there twice; expected context and targets apart")
-    return split

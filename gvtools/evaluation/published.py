@@ -7,16 +7,19 @@ and the rows as published.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from importlib import resources
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import OptionError
 
+Aspect = Literal[
+    "pixels", "lpips_net", "poses_from", "pose_unit", "reprojection", "met3r", "hardware"
+]
 # What a definition may ask of a setting: its field, and how it is called in a reason.
-ASPECTS = {
+ASPECTS: dict[Aspect, str] = {
     "pixels": "compared pixels",
     "lpips_net": "LPIPS network",
     "poses_from": "poses from",
@@ -55,18 +58,10 @@ class Figure(_Record):
     label: str
     better: Literal["higher", "lower"]
     digits: int
-    definition: dict[str, str | None]
+    definition: dict[Aspect, str | None]
     stated: str
     not_stated: Texts
     unit: str = ""
-
-    @field_validator("definition")
-    @classmethod
-    def _known(cls, definition: dict[str, str | None]) -> dict[str, str | None]:
-        for aspect in definition:
-            if aspect not in ASPECTS:
-                raise ValueError(unknown("aspect", aspect, ASPECTS))
-        return definition
 
 
 class PublishedRow(_Record):
@@ -134,61 +129,39 @@ def load_benchmark(name: str) -> Benchmark:
 
     Raises:
         OptionError: there is no such benchmark.
-        ProjectError: its specification is absent, or not what it has to be.
     """
     specs, key = _specs(), name_key(name)
     if key in specs:
-        return parse_benchmark(specs[key], f"{key}.yaml")
+        return parse_benchmark(specs[key])
     raise OptionError(unknown("benchmark", name, specs))
 
 
 def _specs() -> dict[str, str]:
     """The specifications' texts by their files' names."""
-    try:
-        entries = list(resources.files("data_specs").joinpath("benchmarks").iterdir())
-    except (ImportError, OSError):
-        entries = []
+    entries = resources.files("data_specs").joinpath("benchmarks").iterdir()
     texts = {x.name[:-5]: x.read_text(encoding="utf-8") for x in entries if x.name[-5:] == ".yaml"}
-    if not texts:
-        raise ProjectError("package data_specs: no benchmarks/*.yaml; install gvtools again")
     return dict(sorted(texts.items()))
 
 
-def parse_benchmark(text: str, origin: str) -> Benchmark:
-    """A benchmark from its YAML; ``origin`` is the file's name, for messages.
+def parse_benchmark(text: str) -> Benchmark:
+    """A benchmark from its YAML.
 
     Raises:
-        ProjectError: no YAML, a key that is unknown or absent, or a row without all figures.
+        ValueError: a key that is unknown or absent, or a row without all figures.
     """
     import yaml
 
-    try:
-        data = dict(yaml.safe_load(text))
-        protocol, published = dict(data.pop("protocol")), dict(data.pop("published"))
-        figures = {name: {"name": name, **dict(f)} for name, f in dict(data["figures"]).items()}
-        data["figures"] = figures
-        rows = _rows(published, list(figures))
-        return Benchmark.model_validate({**data, **protocol, "rows": rows})
-    except yaml.YAMLError as error:
-        reason = f"no readable YAML ({' '.join(str(error).split())})"
-    except ValidationError as error:
-        first = error.errors()[0]
-        reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-    except KeyError as error:
-        reason = f"no {error}"
-    except (TypeError, ValueError) as error:
-        reason = str(error)
-    raise ProjectError(f"{origin}: {reason}; expected a specification like those beside it")
-
-
-def _rows(published: Mapping[str, Any], figures: list[str]) -> list[dict[str, Any]]:
-    columns = ["system", *figures]
-    if published["columns"] != columns:
-        raise ValueError(f"published.columns: {published['columns']}, not {columns}")
-    rows = published["rows"]
-    if len({row[0] for row in rows}) < len(rows) or {len(row) for row in rows} != {len(columns)}:
-        raise ValueError(f"published.rows: not one a system with {len(figures)} numbers")
-    return [{"system": row[0], "figures": dict(zip(figures, row[1:], strict=True))} for row in rows]
+    data = yaml.safe_load(text)
+    protocol, published = data.pop("protocol"), data.pop("published")
+    names = list(data["figures"])
+    if published["columns"] != ["system", *names]:
+        raise ValueError(f"published.columns: {published['columns']}; expected system, {names}")
+    rows = [
+        {"system": system, "figures": dict(zip(names, values, strict=True))}
+        for system, *values in published["rows"]
+    ]
+    figures = {name: {"name": name, **figure} for name, figure in data["figures"].items()}
+    return Benchmark.model_validate({**data, **protocol, "figures": figures, "rows": rows})
 
 
 def unknown(what: str, given: object, known: Iterable[str]) -> str:

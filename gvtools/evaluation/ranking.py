@@ -11,15 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from gvtools.errors import OptionError
-from gvtools.evaluation.published import (
-    ASPECTS,
-    Benchmark,
-    Figure,
-    PublishedRow,
-    name_key,
-    unknown,
-)
+from gvtools.evaluation.published import ASPECTS, Benchmark, Figure, PublishedRow, name_key
 from gvtools.evaluation.tables import Cell, Column, Table, Value
 
 PUBLISHED = "published"
@@ -91,13 +83,7 @@ class SideBySideRow:
 
 
 def reasons_not_to_rank(setting: Setting, benchmark: Benchmark, figure: str) -> tuple[str, ...]:
-    """Why a figure measured in ``setting`` has no rank among the published; empty if it has one.
-
-    Raises:
-        OptionError: no such figure in the benchmark.
-    """
-    if figure not in benchmark.figures:
-        raise OptionError(unknown(f"{benchmark.name}: figure", figure, benchmark.figures))
+    """Why a figure measured in ``setting`` has no rank among the published; empty if it has one."""
     reasons: list[str] = []
     if setting.data_set is None or name_key(setting.data_set) != name_key(benchmark.name):
         own = setting.data_set or "a scene of one's own"
@@ -131,9 +117,6 @@ def side_by_side(
     """Published rows, then measured ones, with ranks figure by figure where they are comparable.
 
     Values are compared as published, in so many decimals; equal ones share a rank.
-
-    Raises:
-        OptionError: a measured figure that the benchmark does not know.
     """
     rows: list[PublishedRow | MeasuredRow] = [*benchmark.rows, *measured]
     why = [_reasons(row, benchmark) for row in rows]
@@ -183,9 +166,6 @@ def _reasons(row: PublishedRow | MeasuredRow, benchmark: Benchmark) -> dict[str,
     """For each figure without a rank, why."""
     if isinstance(row, PublishedRow):
         return {}
-    for name in row.figures:
-        if name not in benchmark.figures:
-            raise OptionError(unknown(f"{row.system}: figure", name, benchmark.figures))
     out: dict[str, tuple[str, ...]] = {}
     for name in benchmark.figures:
         value = row.figures.get(name)

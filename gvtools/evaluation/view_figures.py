@@ -32,7 +32,6 @@ def view_figures(
     generated: NDArray[np.bool_],
     depth: ArrayLike | None = None,
     lpips: Lpips | None = None,
-    sample_covariance: bool = False,
 ) -> dict[str, float | None]:
     """PSNR, SSIM, LPIPS and depth error of one picture.
 
@@ -46,7 +45,6 @@ def view_figures(
         lpips: the network; None leaves LPIPS out. On a region it is the mean of the distance's
             map, which has no meaning for regions much smaller than the network's view. Pictures
             below 32 x 32 pixels have none.
-        sample_covariance: see gvtools.evaluation.images.ssim.
 
     Returns:
         FIGURES by name; None where there is nothing to compare.
@@ -61,7 +59,7 @@ def view_figures(
     generated = generated & ~observed
     regions = {"": use, "_valid": observed & use, "_generated": generated & use}
     out: dict[str, float | None] = dict.fromkeys(FIGURES)
-    found = image_figures(picture, truth.rgb, regions, sample_covariance=sample_covariance)
+    found = image_figures(picture, truth.rgb, regions)
     for region, figures in found.items():
         out |= {f"{name}{region}": value for name, value in figures.items()}
     if lpips is not None and min(shape) >= SMALLEST:

@@ -67,12 +67,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--project", type=Path, metavar="DIR", help="where the run's project lies, if it was moved"
     )
-    parser.add_argument(
-        "--features",
-        metavar="MODULE:NAME",
-        help="of feature consistency: a class of your own with name and features(rgb) (default "
-        "dense-gradient)",
-    )
     group = parser.add_argument_group("running the protocol on a project first")
     group.add_argument(
         "--protocol", choices=PROTOCOLS, help="pass: 2 context and 6 target views; long: "
@@ -98,7 +92,6 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.files import write_json
     from pipelines.evaluation.evaluate import (
         evaluate_runs,
-        feature_network,
         load_benchmarks,
         load_runs,
         write_evaluation,
@@ -116,15 +109,12 @@ def run(args: argparse.Namespace, console: Console) -> None:
         name=args.name,
         parts=_parts(args.parts),
         matcher=args.matcher,
-        features=args.features,
         control=not args.no_control,
         seed=args.seed,
         data_set=args.data_set,
         lpips_net=args.lpips_net,
         lpips_measured=lpips is not None,
     )
-    # Before a run that may take long.
-    feature_network(args.features)
     paths = args.runs if args.protocol is None else [_run_protocol(args, out, console)]
     runs = load_runs(paths, project=args.project)
     evaluations = evaluate_runs(runs, options, lpips=lpips, no_lpips=no_lpips, console=console)

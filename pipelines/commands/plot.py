@@ -75,10 +75,7 @@ def _figure(what: str, folder: Path) -> Figure:
                 f"{folder}: holds no tradeoff.json, nor do the folders above; expected the folder "
                 "of a sweep; gvtools tradeoff makes one"
             )
-        return draw_pareto(
-            sweep.trials, front=sweep.front, recommended=sweep.recommended, budget=sweep.budget,
-            title=title,
-        )  # fmt: skip
+        return draw_pareto(sweep, title=title)
     from gvtools.runs.run import load_run
 
     run = load_run(folder)
@@ -94,14 +91,10 @@ def _figure(what: str, folder: Path) -> Figure:
         if poses is None:
             raise ProjectError(f"{folder}: no cameras to draw ({sources.problem or 'no rounds'})")
         return draw_trajectories(poses, title=title)
-    if what == "growth":
+    if what in ("growth", "coverage"):
         from viz.plots.growth import draw_growth
 
-        return draw_growth(rounds, title=title)
-    if what == "coverage":
-        from viz.plots.coverage import draw_coverage
-
-        return draw_coverage(rounds, title=title)
+        return draw_growth(rounds, title=title, panels=None if what == "growth" else [what])
     from viz.plots.timing import draw_timing
 
     return draw_timing(rounds, title=title)

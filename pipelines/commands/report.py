@@ -54,7 +54,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     write_text(out, page)
     for warning in report.warnings:
         console.warn(warning)
-    console.line(f"{out}: {len(page) / 2**20:.1f} MiB, {len(report.sheet)} targets with pictures")
+    shown = len(report.sheets.rows)
+    console.line(f"{out}: {len(page) / 2**20:.1f} MiB, {shown} targets with pictures")
 
 
 def _refuse_foreign(out: Path) -> None:

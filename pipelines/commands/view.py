@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
+from gvtools.options import check_range
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -27,6 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--web", action="store_true", help="serve a web page (default)")
     how.add_argument("--open3d", action="store_true", help="open Open3D's window instead")
+    how.add_argument(
+        "--screenshot", type=Path, metavar="FILE", help="write a PNG and end; needs no display"
+    )
     parser.add_argument(
         "--live", action="store_true", help="follow a run that is at work, from before its start"
     )
@@ -40,13 +44,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=MAX_POINTS,
         metavar="N",
         help="draw at most so many points on the page, spread evenly (%(default)s)",
-    )
-    parser.add_argument(
-        "--screenshot",
-        type=Path,
-        metavar="FILE",
-        help="write a PNG and end; needs no display. With --open3d, Open3D renders it where there "
-        "is EGL or X",
     )
     parser.add_argument("--color", choices=COLORS, help="what colours show (default color)")
     parser.add_argument("--round", type=int, metavar="R", help="begin with it (default the last)")
@@ -62,32 +59,33 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: no run, an option that does not fit, no display.
     """
-    from pipelines.viewing.serve import ServerOptions, read_round, serve
+    from pipelines.viewing.serve import read_round, serve
     from pipelines.viewing.source import ViewSource
 
     _check(args)
     source, mode = ViewSource(args.run, project=args.project), args.color or "color"
     if args.live or not (args.open3d or args.screenshot):
-        options = ServerOptions(
-            host=args.host, port=args.port, max_points=args.max_points, round=args.round, mode=mode
-        )
         try:
-            serve(source, options, live=args.live, console=console)
+            serve(
+                source,
+                host=args.host,
+                port=args.port,
+                max_points=args.max_points,
+                round=args.round,
+                mode=mode,
+                live=args.live,
+                console=console,
+            )
         except KeyboardInterrupt:
             console.line("viewer ended")
         return
     shown, number = read_round(source, args.round)
     if args.screenshot is not None:
-        from viz.open3d.screenshot import chosen_camera, take_screenshot, write_screenshot
+        from viz.run_view.screenshot import chosen_camera, write_screenshot
 
         camera = chosen_camera(shown, args.camera)
-        taken = take_screenshot(shown, camera.camera, round=number, mode=mode, open3d=args.open3d)
-        write_screenshot(args.screenshot, taken.rgb)
-        by = "Open3D" if taken.by == "open3d" else "the project's own splatter"
-        reason = f" ({taken.why})" if taken.why else ""
-        console.line(
-            f"{args.screenshot}: round {number} from {camera.name}, rendered by {by}{reason}"
-        )
+        write_screenshot(args.screenshot, shown, camera, round=number, mode=mode)
+        console.line(f"{args.screenshot}: round {number} from {camera.name}")
     else:
         from viz.open3d.window import Open3dViewer
 
@@ -97,9 +95,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 def _check(args: argparse.Namespace) -> None:
     if args.live and (args.open3d or args.screenshot):
         raise OptionError("--live: the web page alone follows a run; leave the other option out")
-    if not 0 < args.port < 65536:
-        raise OptionError(f"--port {args.port}; expected 1 to 65535")
-    if args.max_points < 1:
-        raise OptionError(f"--max-points {args.max_points}; expected 1 or more")
+    check_range("--port", args.port, least=1, most=65535)
+    check_range("--max-points", args.max_points, least=1)
     if args.screenshot is not None and args.screenshot.suffix.lower() != ".png":
         raise OptionError(f"--screenshot {args.screenshot}: expected a name that ends with .png")

@@ -83,24 +83,23 @@ def evaluate_runs(
         no_lpips: why there is none.
         console: for progress.
     """
-    matcher, network = _matcher(options.matcher), feature_network(options.features)
+    matcher = _matcher(options.matcher)
     evaluations = []
     for run in runs:
         console.line(f"{run.path}: {len(run.rounds) - 1} rounds")
         if not run.complete:
             console.warn(f"{run.path}: not every round is done; measured are those that are")
-        evaluation = evaluate_run(
+        figures = evaluate_run(
             run,
             parts=options.parts,
             lpips=lpips,
             no_lpips=no_lpips,
             matcher=matcher,
-            network=network,
             control=options.control,
             seed=options.seed,
             console=console,
         )
-        evaluations.append(described(run, evaluation.figures))
+        evaluations.append(described(run, figures))
     name_apart(evaluations)
     return evaluations
 
@@ -152,25 +151,6 @@ def _matcher(name: str) -> Any:
     from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
 
     return LightGlueMatcher()
-
-
-def feature_network(spec: str | None) -> Any:
-    """The feature network that the user named, or None for the default."""
-    if spec is None:
-        return None
-    from importlib import import_module
-
-    module, _, name = spec.partition(":")
-    try:
-        network = getattr(import_module(module), name)()
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise OptionError(
-            f"--features {spec!r}: cannot be made ({error}); expected MODULE:NAME of a class "
-            "without required arguments"
-        ) from None
-    if not hasattr(network, "features") or not hasattr(network, "name"):
-        raise OptionError(f"--features {spec!r}: expected name and features(rgb) of it")
-    return network
 
 
 def _print(table: Table, console: Console) -> None:

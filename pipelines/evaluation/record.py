@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipelines.report.nested import nested
+
 if TYPE_CHECKING:
     from gvtools.evaluation.ranking import Setting
     from gvtools.runs.run import Run
@@ -21,7 +23,6 @@ class EvaluationOptions:
         name: of the measured row.
         parts: of run_evaluation.PARTS.
         matcher: of the pose probe, "sift" or "lightglue".
-        features: network of feature consistency as MODULE:NAME; None takes "dense-gradient".
         control: measure the true pictures of the targets as well.
         seed: of resampling, matching and robust estimates.
         data_set: that the runs are scenes of; None ranks nothing.
@@ -32,7 +33,6 @@ class EvaluationOptions:
     name: str
     parts: tuple[str, ...]
     matcher: str
-    features: str | None
     control: bool
     seed: int
     data_set: str | None
@@ -73,8 +73,8 @@ def setting_of(
         for entry in report["views"]
     }
     per_round = [len(report["views"]) for finished in runs for report in finished.rounds[1:]]
-    met3r = [e.get("consistency", {}).get("generated", {}).get("met3r") for e in evaluations]
-    poses = [e["poses"] for e in evaluations if e.get("poses", {}).get("pictures")]
+    met3r = [nested(e, "consistency", "generated", "met3r", "status") for e in evaluations]
+    poses = [e["poses"] for e in evaluations if nested(e, "poses", "pictures")]
     located = sum(part["located"] for part in poses), sum(part["pictures"] for part in poses)
     masked = max(
         (e["images"]["settings"]["masked_share"] for e in evaluations if "images" in e), default=0
@@ -92,7 +92,7 @@ def setting_of(
         poses_from=f"pose probe ({options.matcher}), {located[0]} of {located[1]} views located",
         pose_unit="scene units",
         reprojection=None,
-        met3r="original" if all(m and m["status"] == "measured" for m in met3r) else None,
+        met3r="original" if set(met3r) == {"measured"} else None,
         hardware=f"{os.cpu_count()} CPU cores",
     )
 
@@ -123,14 +123,14 @@ def joined(
     from gvtools.evaluation.view_figures import FIGURES
     from gvtools.runs.identity import versions
 
-    means = {
-        name: [e.get("images", {}).get("mean", {}).get(name, {}).get("mean") for e in evaluations]
-        for name in FIGURES
-    }
-    over = {name: mean_interval(values, seed=options.seed) for name, values in means.items()}
-    poses = [e["poses"] for e in evaluations if e.get("poses", {}).get("pictures")]
-    notes = {key: text for e in evaluations for key, text in e.get("images", {})
-             .get("notes", {}).items()}  # fmt: skip
+    over = {}
+    for name in FIGURES:
+        means = [nested(e, "images", "mean", name, "mean") for e in evaluations]
+        over[name] = mean_interval(means, seed=options.seed)
+    poses = [e["poses"] for e in evaluations if nested(e, "poses", "pictures")]
+    notes: dict[str, str] = {}
+    for evaluation in evaluations:
+        notes |= nested(evaluation, "images", "notes") or {}
     return {
         **{name: interval.mean for name, interval in over.items()},
         "coverage": mean_interval([e["coverage"] for e in evaluations]).mean,
@@ -147,7 +147,6 @@ def joined(
             "seed": options.seed,
             "parts": list(options.parts),
             "matcher": options.matcher,
-            "features": options.features or "dense-gradient",
             "lpips_net": options.lpips_net,
             "control": options.control,
             "bootstrap": {"level": LEVEL, "resamples": RESAMPLES},

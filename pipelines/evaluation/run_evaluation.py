@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +16,6 @@ from gvtools.runs.memory_file import load_memory
 from gvtools.runs.run import Run
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.consistency.feature_consistency import FeatureNetwork
     from gvtools.evaluation.lpips_distance import Lpips
     from gvtools.evaluation.pose_probe.features import FeatureMatcher
     from gvtools.scenes.scene import Frame
@@ -43,28 +40,6 @@ class _Target:
     truth: Frame | None
 
 
-@dataclass
-class Evaluation:
-    """What a run came to; ``figures`` is JSON-ready.
-
-    Attributes:
-        figures: by part; what could not be measured is None, with the reason under ``notes``.
-        seconds: what each part took.
-    """
-
-    figures: dict[str, Any] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        """Add the block's time to a part."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - start
-
-
 def evaluate_run(
     run: Run,
     *,
@@ -72,12 +47,14 @@ def evaluate_run(
     lpips: Lpips | None,
     no_lpips: str | None,
     matcher: FeatureMatcher | None = None,
-    network: FeatureNetwork | None = None,
     control: bool = True,
     seed: int = 0,
     console: Console,
-) -> Evaluation:
+) -> dict[str, Any]:
     """Measure one run.
+
+    The figures are JSON-ready, by part; what could not be measured is None, with the reason under
+    ``notes``.
 
     Args:
         run: with at least one round of targets.
@@ -85,38 +62,33 @@ def evaluate_run(
         lpips: the network, or None.
         no_lpips: why there is none.
         matcher: of the pose probe; None is SIFT.
-        network: of the feature consistency; None is "dense-gradient".
         control: measure the true pictures of the targets as well, to read the figures by.
         seed: of resampling, matching and robust estimates.
         console: for progress.
     """
-    out = Evaluation()
-    with out.timed("reading"):
-        targets = [
-            _Target(
-                view.round,
-                dict(view.report),
-                PosedPicture(files.name, files.camera, files.picture, files.depth),
-                files.observed,
-                files.generated,
-                None if truth is None else truth.load(),
-            )
-            for view, files, truth in run.targets()
-        ]
-    out.figures["rounds"] = len(run.rounds) - 1
-    out.figures["views"] = len(targets)
-    out.figures["coverage"] = _mean([target.entry["coverage"] for target in targets])
-    out.figures["seconds_per_view"] = _seconds_per_view(run)
+    targets = [
+        _Target(
+            view.round,
+            dict(view.report),
+            PosedPicture(files.name, files.camera, files.picture, files.depth),
+            files.observed,
+            files.generated,
+            None if truth is None else truth.load(),
+        )
+        for view, files, truth in run.targets()
+    ]
+    out: dict[str, Any] = {
+        "rounds": len(run.rounds) - 1,
+        "views": len(targets),
+        "coverage": _mean([target.entry["coverage"] for target in targets]),
+        "seconds_per_view": _seconds_per_view(run),
+    }
     if "images" in parts:
-        with out.timed("images"):
-            out.figures["images"] = _images(targets, lpips, no_lpips, seed, console)
+        out["images"] = _images(targets, lpips, no_lpips, seed, console)
     if "consistency" in parts:
-        with out.timed("consistency"):
-            out.figures["consistency"] = _consistency(targets, network, control, seed, console)
+        out["consistency"] = _consistency(targets, control, seed, console)
     if "poses" in parts:
-        with out.timed("poses"):
-            out.figures["poses"] = _poses(run, targets, matcher, control, seed, console)
-    out.figures["evaluation_seconds"] = dict(out.seconds)
+        out["poses"] = _poses(run, targets, matcher, control, seed, console)
     return out
 
 
@@ -183,17 +155,16 @@ def _images(
 
 def _consistency(
     targets: Sequence[_Target],
-    network: FeatureNetwork | None,
     control: bool,
     seed: int,
     console: Console,
 ) -> dict[str, Any]:
     pictures = [target.picture for target in targets]
-    out = {"generated": _consistent(pictures, network, seed, console, "consistency")}
+    out = {"generated": _consistent(pictures, seed, console, "consistency")}
     true = _true_pictures(targets)
     if control and len(true) > 1:
         label = "consistency of the true pictures"
-        out["true_pictures"] = _consistent(true, network, seed, console, label)
+        out["true_pictures"] = _consistent(true, seed, console, label)
     return out
 
 
@@ -213,7 +184,6 @@ def _true_pictures(targets: Sequence[_Target]) -> list[PosedPicture]:
 
 def _consistent(
     pictures: Sequence[PosedPicture],
-    network: FeatureNetwork | None,
     seed: int,
     console: Console,
     label: str,
@@ -227,9 +197,9 @@ def _consistent(
     )
     from gvtools.evaluation.consistency.geometric_verification import verify_geometry
 
-    depth = asdict(depth_reprojection_of_views(pictures, pairs="consecutive"))
+    depth = asdict(depth_reprojection_of_views(pictures))
     features = [
-        feature_consistency(first, second, network=network)
+        feature_consistency(first, second)
         for first, second in console.track(list(pairwise(pictures)), f"{label}: pairs")
     ]
     matched = _sampled(pictures, MOST_MATCHED)
@@ -242,7 +212,6 @@ def _consistent(
         "feature_consistency": {
             "network": features[0].network if features else None,
             "score": _interval([pair.score for pair in features], seed),
-            "same_image": _mean([pair.same_image for pair in features]),
             "unrelated": _mean([pair.unrelated for pair in features]),
             "overlap": _mean([pair.overlap for pair in features]),
             "pairs": [asdict(pair) for pair in features],
@@ -251,7 +220,7 @@ def _consistent(
     metric, status = load_met3r()
     scores = []
     if metric is not None:
-        scores = [met3r_score(a, b, metric=metric) for a, b in pairwise(pictures)]
+        scores = [met3r_score(a, b, metric) for a, b in pairwise(pictures)]
         measured = sum(pair.score is not None for pair in scores)
         status = "measured" if measured else "empty: no pair with overlap"
     out["met3r"] = {

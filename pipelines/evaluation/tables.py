@@ -11,10 +11,43 @@ from gvtools.evaluation.ranking import MeasuredRow, Setting, comparison_table, s
 from gvtools.evaluation.tables import Column, Table, Value, render
 from gvtools.evaluation.view_figures import FIGURES
 from gvtools.files import write_text
+from pipelines.report.nested import nested
 
 BETTER = {"psnr": "higher", "ssim": "higher", "lpips": "lower", "depth": "lower"}
 UNITS = {"psnr": "dB"}
 DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3, "depth": 4}
+# Figures of consistency and of poses: name, where evaluation.json has the value, and how many.
+CONSISTENCY: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = (
+    ("depth reprojection, pixels", ("depth_reprojection", "mean_pixels"),
+     ("depth_reprojection", "pairs")),
+    ("depth reprojection, relative", ("depth_reprojection", "mean_relative_depth"),
+     ("depth_reprojection", "pairs")),
+    ("depth contradicting, share", ("depth_reprojection", "contradicting_share"),
+     ("depth_reprojection", "pairs")),
+    ("verified matches a pair", ("geometric_verification", "mean_verified"),
+     ("geometric_verification", "images")),
+    ("registered, share", ("geometric_verification", "registered_share"),
+     ("geometric_verification", "images")),
+    ("triangulated matches, share", ("geometric_verification", "triangulated_share"), ()),
+    ("reprojection at given poses, pixels", ("geometric_verification", "mean_reprojection"),
+     ("geometric_verification", "points")),
+    ("epipolar distance, pixels", ("geometric_verification", "epipolar"), ()),
+)  # fmt: skip
+POSES: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = (
+    ("located, share", ("success_share",), ("pictures",)),
+    ("rotation error, median, degrees", ("rotation_error_deg", "median"),
+     ("rotation_error_deg", "n")),
+    ("centre error, median, scene units", ("center_error", "median"), ("center_error", "n")),
+    ("ATE (Sim(3)), rmse, scene units", ("ate_sim3", "rmse"), ("ate_sim3", "n")),
+    ("ATE (Sim(3)), rmse, share of extent", ("ate_sim3", "translation_share", "rmse"),
+     ("ate_sim3", "n")),
+    ("RPE (Sim(3)), rmse, scene units", ("rpe_sim3", "rmse"), ("rpe_sim3", "n")),
+    ("RPE (Sim(3)), rmse, share of extent", ("rpe_sim3", "translation_share", "rmse"),
+     ("rpe_sim3", "n")),
+    ("RPE (Sim(3)), rmse, degrees", ("rpe_sim3", "rotation_deg", "rmse"), ("rpe_sim3", "n")),
+    ("pose AUC at 3 degrees, failures as wrong", ("auc", "3"), ("pictures",)),
+    ("pose AUC at 30 degrees, failures as wrong", ("auc", "30"), ("pictures",)),
+)  # fmt: skip
 SUFFIXES = {"csv": ".csv", "markdown": ".md", "latex": ".tex"}
 
 
@@ -82,20 +115,35 @@ def scalars(evaluation: Mapping[str, Any]) -> list[Scalar]:
     out: list[Scalar] = []
     consistency = evaluation.get("consistency")
     if consistency:
-        ours = dict(_consistency_figures(consistency["generated"]))
-        true = dict(_consistency_figures(consistency.get("true_pictures")))
-        for label, (value, low, high, n) in ours.items():
-            out.append((label, value, low, high, n, true.get(label, (None,))[0]))
-        features = consistency["generated"]["feature_consistency"]
-        for key, label in (("unrelated", "of unrelated content"), ("same_image", "of one image")):
-            out.append((f"feature consistency {label}", features[key], None, None, None, None))
+        ours, true = consistency["generated"], consistency.get("true_pictures")
+        for label, keys, n in CONSISTENCY:
+            out.append((label, nested(ours, *keys), None, None, _count(ours, n),
+                        nested(true, *keys)))  # fmt: skip
+        features = ours["feature_consistency"]
+        score = features["score"]
+        out.append((
+            "feature consistency", score["mean"], score["low"], score["high"], score["n"],
+            nested(true, "feature_consistency", "score", "mean"),
+        ))  # fmt: skip
+        label = "feature consistency of unrelated content"
+        out.append((label, features["unrelated"], None, None, None, None))
     poses = evaluation.get("poses", {})
-    parts = [_pose_figures(poses), _pose_figures(poses.get("true_pictures"))]
-    for label, (value, n) in parts[0].items():
-        out.append((label, value, None, None, n, parts[1].get(label, (None,))[0]))
-    for label, (value, n) in _pose_figures(poses.get("context_left_out")).items():
-        out.append((f"context left out: {label}", value, None, None, n, None))
+    if poses.get("success_share") is not None:
+        left_out, true = poses.get("context_left_out"), poses.get("true_pictures")
+        for label, keys, n in POSES:
+            if keys[0] in poses:
+                out.append((label, nested(poses, *keys), None, None, _count(poses, n),
+                            nested(true, *keys)))  # fmt: skip
+        for label, keys, n in POSES:
+            if left_out and keys[0] in left_out:
+                out.append((f"context left out: {label}", nested(left_out, *keys), None, None,
+                            _count(left_out, n), None))  # fmt: skip
     return out
+
+
+def _count(part: Mapping[str, Any], keys: Sequence[str]) -> int | None:
+    found = nested(part, *keys) if keys else None
+    return len(found) if isinstance(found, list | tuple) else found
 
 
 def _without_figures(evaluation: Mapping[str, Any]) -> list[str]:
@@ -120,59 +168,6 @@ def _without_figures(evaluation: Mapping[str, Any]) -> list[str]:
     return list(dict.fromkeys(out))
 
 
-Quad = tuple[float | None, float | None, float | None, int | None]
-
-
-def _consistency_figures(part: Mapping[str, Any] | None) -> list[tuple[str, Quad]]:
-    if not part:
-        return []
-    depth, geometry = part["depth_reprojection"], part["geometric_verification"]
-    features = part["feature_consistency"]
-    score, pairs = features["score"], len(depth["pairs"])
-    plain = (
-        ("depth reprojection, pixels", depth["mean_pixels"], pairs),
-        ("depth reprojection, relative", depth["mean_relative_depth"], pairs),
-        ("depth contradicting, share", depth["contradicting_share"], pairs),
-        ("verified matches a pair", geometry["mean_verified"], geometry["images"]),
-        ("registered, share", geometry["registered_share"], geometry["images"]),
-        ("triangulated matches, share", geometry["triangulated_share"], None),
-        ("reprojection at given poses, pixels", geometry["mean_reprojection"], geometry["points"]),
-        ("epipolar distance, pixels", geometry["epipolar"], None),
-    )
-    network = features["network"]
-    label = f"feature consistency ({network})" if network else "feature consistency"
-    return [(name, (value, None, None, n)) for name, value, n in plain] + [
-        (label, (score["mean"], score["low"], score["high"], score["n"]))
-    ]
-
-
-def _pose_figures(part: Mapping[str, Any] | None) -> dict[str, tuple[float | None, int | None]]:
-    if not part or part.get("success_share") is None:
-        return {}
-    out: dict[str, tuple[float | None, int | None]] = {
-        "located, share": (part["success_share"], part["pictures"])
-    }
-    for key, label in (
-        ("rotation_error_deg", "rotation error, median, degrees"),
-        ("center_error", "centre error, median, scene units"),
-    ):
-        found = part[key]
-        out[label] = (found["median"], found["n"]) if found else (None, 0)
-    for key in ("ate_sim3", "rpe_sim3"):
-        if key in part:
-            label = f"{key.split('_')[0].upper()} (Sim(3)), rmse"
-            figures = part[key]
-            out[f"{label}, scene units"] = (figures["rmse"], figures["n"])
-            out[f"{label}, share of extent"] = (figures["translation_share"]["rmse"], figures["n"])
-            if key == "rpe_sim3":
-                out[f"{label}, degrees"] = (figures["rotation_deg"]["rmse"], figures["n"])
-    auc = part.get("auc")
-    if auc:
-        out["pose AUC at 3 degrees, failures as wrong"] = (auc["3"], part["pictures"])
-        out["pose AUC at 30 degrees, failures as wrong"] = (auc["30"], part["pictures"])
-    return out
-
-
 def comparison(row: MeasuredRow, benchmark: Benchmark) -> Table:
     """Published rows of a benchmark with the measured one beside them."""
     return comparison_table(side_by_side([row], benchmark), benchmark)
@@ -186,34 +181,21 @@ def measured_row(
     The time is that of all rounds, as published.
     """
 
-    def mean(values: Sequence[float | None]) -> float | None:
+    def mean(*keys: str) -> float | None:
+        values = [nested(evaluation, *keys) for evaluation in evaluations]
         known = [value for value in values if value is not None]
         return sum(known) / len(known) if len(known) == len(values) and known else None
 
-    def image(figure: str) -> float | None:
-        return mean([e.get("images", {}).get("mean", {}).get(figure, {}).get("mean")
-                     for e in evaluations])  # fmt: skip
-
-    def pose(kind: str, *keys: str) -> float | None:
-        values = []
-        for evaluation in evaluations:
-            value: Any = evaluation.get("poses", {}).get(kind)
-            for key in keys:
-                value = value.get(key) if value else None
-            values.append(value)
-        return mean(values)
-
-    met3r = [e.get("consistency", {}).get("generated", {}).get("met3r") for e in evaluations]
     figures = {
-        "psnr": image("psnr"),
-        "ssim": image("ssim"),
-        "lpips": image("lpips"),
-        "ate": pose("ate_sim3", "rmse"),
-        "rpe_r": pose("rpe_sim3", "rotation_deg", "rmse"),
-        "rpe_t": pose("rpe_sim3", "rmse"),
+        "psnr": mean("images", "mean", "psnr", "mean"),
+        "ssim": mean("images", "mean", "ssim", "mean"),
+        "lpips": mean("images", "mean", "lpips", "mean"),
+        "ate": mean("poses", "ate_sim3", "rmse"),
+        "rpe_r": mean("poses", "rpe_sim3", "rotation_deg", "rmse"),
+        "rpe_t": mean("poses", "rpe_sim3", "rmse"),
         "reproj": None,
-        "met3r": mean([m["score"]["mean"] if m else None for m in met3r]),
-        "time": mean([e["seconds_of_rounds"] for e in evaluations]),
+        "met3r": mean("consistency", "generated", "met3r", "score", "mean"),
+        "time": mean("seconds_of_rounds"),
     }
     return MeasuredRow(name, figures, setting)
 

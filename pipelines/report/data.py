@@ -72,14 +72,8 @@ def collect(
     sources = sources or open_sources(run)
     measures = read_measures(run)
     psnr = {view["name"]: view.get("psnr") for view in measures.views}
-    sheets = contact_sheets(
-        run,
-        psnr=psnr,
-        most=most,
-        scene=sources.scene,
-        truths=sources.truths,
-    )
-    poses = report_poses(reports, sources.scene, record["context"], measures.poses)
+    scene, truths = sources.scene, sources.truths
+    sheets = contact_sheets(run, psnr=psnr, most=most, scene=scene, truths=truths)
     trade_off, unread = _trade_off(path, record)
     settings = dotted(run.settings)
     return RunReport(
@@ -95,16 +89,9 @@ def collect(
             *sheets.warnings,
             *unread,
         ],
-        figures=measures.figures,
-        intervals=measures.intervals,
-        figures_from=measures.source,
-        views=measures.views,
-        notes=measures.notes,
-        sheet=sheets.rows,
-        sheet_note=sheets.note,
-        poses=poses.drawn,
-        poses_note=poses.note,
-        pose_errors=poses.errors,
+        measures=measures,
+        sheets=sheets,
+        poses=report_poses(reports, scene, record["context"], measures.poses),
         trade_off=trade_off,
     )
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gvtools.evaluation.view_figures import FIGURES
 from gvtools.runs.layout import METRICS
+from pipelines.report.nested import nested
 from viz.plots.trajectories import Trajectories
+from viz.report.content import Measures, Poses
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,134 +22,55 @@ if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
 
 EVALUATION = "evaluation/evaluation.json"
-# What reading a file of another version, or one that was changed by hand, comes upon.
-MALFORMED = (KeyError, TypeError, ValueError, AttributeError)
-
-
-@dataclass(frozen=True)
-class Measures:
-    """What was read, as viz.report.page.RunReport has it.
-
-    Attributes:
-        source: the file; None where nothing was measured.
-        figures: means by name.
-        intervals: 95 % intervals by name.
-        views: figures of each target.
-        notes: why figures are absent.
-        poses: what the pose probe found; None where it was not asked.
-        warnings: files that belong to another state of the run, or cannot be read.
-    """
-
-    source: str | None = None
-    figures: Mapping[str, float | None] = field(default_factory=dict)
-    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    views: Sequence[Mapping[str, Any]] = ()
-    notes: Sequence[str] = ()
-    poses: Mapping[str, Any] | None = None
-    warnings: Sequence[str] = ()
 
 
 def read_measures(run: Run) -> Measures:
     """Of evaluation/evaluation.json where it is of this run as it stands, else of metrics.json."""
-    path, record = run.path, run.record
     names = [view.name for view in run.views]
     warnings: list[str] = []
-    evaluation = _read(path / EVALUATION, warnings)
-    found: Measures | None = None
+    evaluation, entry = _read(run.path / EVALUATION, warnings), None
     if evaluation is not None:
-        try:
-            found = _evaluated(evaluation, record, names)
-        except MALFORMED as error:
-            warnings.append(f"{EVALUATION} is of another version ({error!r}); evaluate again")
-        else:
-            if found is None:
-                warnings.append(
-                    f"{EVALUATION} is of another state of this run; gvtools evaluate renews it"
-                )
-    if found is not None and found.source is not None:
-        return replace(found, warnings=warnings)
-    poses = None if found is None else found.poses
-    metrics = _read(path / METRICS, warnings)
+        entry = _of_this_run(evaluation, run.record, names)
+        if entry is None:
+            warnings.append(
+                f"{EVALUATION} is of another state of this run; gvtools evaluate renews it"
+            )
+    poses = None if entry is None else entry.get("poses")
+    if entry is not None and "images" in entry:
+        images = entry["images"]
+        means = {name: images["mean"][name] for name in FIGURES}
+        return Measures(
+            EVALUATION,
+            {name: mean["mean"] for name, mean in means.items()},
+            {
+                name: (mean["low"], mean["high"])
+                for name, mean in means.items()
+                if mean["low"] is not None and mean["high"] is not None
+            },
+            images["views"],
+            list(images["notes"].values()),
+            poses,
+            warnings,
+        )
+    metrics = _read(run.path / METRICS, warnings)
     if metrics is None:
         note = (
             f"There is no {METRICS} yet; a run writes it at its end, gvtools evaluate at any time"
         )
         return Measures(notes=[note], poses=poses, warnings=warnings)
-    try:
-        if _measured(metrics, names):
-            return replace(_of_metrics(metrics), poses=poses, warnings=warnings)
+    if not _measured(metrics, names):
         warnings.append(f"{METRICS} is of another state of this run; gvtools evaluate renews it")
-    except MALFORMED as error:
-        warnings.append(f"{METRICS} is of another version ({error!r}); gvtools evaluate renews it")
-    return Measures(poses=poses, warnings=warnings)
-
-
-def _evaluated(
-    evaluation: Mapping[str, Any], record: Mapping[str, Any], names: Sequence[str]
-) -> Measures | None:
-    """Of an evaluation: without a source where it has poses alone, None where it is not of this."""
-    entry = _of_this_run(evaluation, record, names)
-    if entry is None:
-        return None
-    poses = entry.get("poses")
-    if poses is not None:
-        _poses_of(poses)
-        _errors(poses)
-    if "images" not in entry:
-        return Measures(poses=poses)
-    images = entry["images"]
-    means = {name: images["mean"].get(name) or {} for name in FIGURES}
-    return _checked(
-        Measures(
-            EVALUATION,
-            {name: mean.get("mean") for name, mean in means.items()},
-            {
-                name: (mean["low"], mean["high"])
-                for name, mean in means.items()
-                if mean.get("low") is not None and mean.get("high") is not None
-            },
-            images["views"],
-            list(images["notes"].values()),
-            poses,
-        )
-    )
-
-
-def _of_metrics(metrics: Mapping[str, Any]) -> Measures:
+        return Measures(poses=poses, warnings=warnings)
     figures = {name: metrics.get(name) for name in FIGURES}
-    return _checked(Measures(METRICS, figures, {}, metrics["views"], metrics.get("notes", ())))
-
-
-def _checked(found: Measures) -> Measures:
-    """The same.
-
-    Raises:
-        TypeError: a figure is none.
-        KeyError: a target lacks what every target has.
-    """
-    numbers = [*found.figures.values(), *(end for ends in found.intervals.values() for end in ends)]
-    for view in found.views:
-        numbers += [view.get(name) for name in FIGURES]
-        numbers += [view["coverage"], view["coverage_after"]]
-        if not isinstance(view["round"], int):
-            raise TypeError(f"{view['round']!r} is no round")
-    for number in numbers:
-        if not isinstance(number, (int, float, NoneType)):
-            raise TypeError(f"{number!r} is no figure")
-    for note in found.notes:
-        if not isinstance(note, str):
-            raise TypeError(f"{note!r} is no note")
-    return found
+    notes = metrics.get("notes", ())
+    return Measures(METRICS, figures, {}, metrics["views"], notes, poses, warnings)
 
 
 def _read(file: Path, warnings: list[str]) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     try:
-        found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        if not isinstance(found, dict):
-            raise ValueError("no JSON object")
-        return found
+        return dict(json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         warnings.append(f"{file.name} cannot be read ({error})")
         return None
@@ -169,21 +90,6 @@ def _of_this_run(
 def _measured(part: Mapping[str, Any], names: Sequence[str]) -> bool:
     """Whether a part of an evaluation is of exactly these targets, in their order."""
     return [view.get("name") for view in part.get("views", ())] == list(names)
-
-
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """What a report says of cameras.
-
-    Attributes:
-        drawn: cameras; None where there are none.
-        note: what is drawn.
-        errors: rows of (error, of the completed pictures, of the true ones).
-    """
-
-    drawn: Trajectories | None
-    note: str
-    errors: Sequence[tuple[str, float | None, float | None]]
 
 
 def report_poses(
@@ -209,7 +115,7 @@ def report_poses(
     note = "Lines from the marks: viewing directions. "
     if scene is None:
         note += "The context's cameras are missing, since the project cannot be read. "
-    known = {} if found is None else _poses_of(found)
+    known = {view["name"]: view["cam_from_world"] for view in nested(found, "views") or ()}
     if known:
         estimated = _inverted([known.get(view["name"]) for view in entries])
         note += (
@@ -223,15 +129,6 @@ def report_poses(
     return Poses(Trajectories(given, requested, estimated), note.strip(), _errors(found))
 
 
-def _poses_of(found: Mapping[str, Any]) -> dict[str, NDArray[np.float64] | None]:
-    """cam_from_world (4, 4) by the target's name; None where it was not located."""
-    out = {}
-    for view in found.get("views", ()):
-        pose = view.get("cam_from_world")
-        out[view["name"]] = None if pose is None else np.array(pose, np.float64).reshape(4, 4)
-    return out
-
-
 def _inverted(poses: Sequence[Any]) -> NDArray[np.float64]:
     out = np.full((len(poses), 4, 4), np.nan)
     for row, pose in enumerate(poses):
@@ -243,25 +140,12 @@ def _inverted(poses: Sequence[Any]) -> NDArray[np.float64]:
 def _errors(found: Mapping[str, Any] | None) -> list[tuple[str, float | None, float | None]]:
     if found is None or not found.get("pictures"):
         return []
-    true = found.get("true_pictures") or {}
-    out = [("located, share", _share_located(found), _share_located(true))]
-    for key, name in (
-        ("ate_none", "ATE as estimated, rmse, scene units"),
-        ("ate_sim3", "ATE after Sim(3) alignment, rmse, scene units"),
-        ("rpe_none", "RPE, rmse, scene units"),
-    ):
-        out.append((name, _of(found, key, "rmse"), _of(true, key, "rmse")))
-    rotation = ("ate_none", "rotation_deg", "median")
-    out.append(("rotation error, median, degrees", _of(found, *rotation), _of(true, *rotation)))
-    return out
-
-
-def _of(part: Mapping[str, Any], *keys: str) -> float | None:
-    value: Any = part
-    for key in keys:
-        value = (value or {}).get(key)
-    return None if value is None else float(value)
-
-
-def _share_located(part: Mapping[str, Any]) -> float | None:
-    return part["located"] / part["pictures"] if part.get("pictures") else None
+    rows = (
+        ("located, share", ("success_share",)),
+        ("ATE as estimated, rmse, scene units", ("ate_none", "rmse")),
+        ("ATE after Sim(3) alignment, rmse, scene units", ("ate_sim3", "rmse")),
+        ("RPE, rmse, scene units", ("rpe_none", "rmse")),
+        ("rotation error, median, degrees", ("ate_none", "rotation_deg", "median")),
+    )
+    true = found.get("true_pictures")
+    return [(label, nested(found, *keys), nested(true, *keys)) for label, keys in rows]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from gvtools.runs.layout import COMPLETION, GUIDANCE, VALID, round_folder
 from gvtools.runs.target_files import SUPPORT_OBSERVED, entry_camera, read_picture
 from gvtools.view_selection import nearest_views
 from viz.report.contact_sheet import TargetPictures, contact_row
-from viz.report.content import SheetRow
+from viz.report.content import SheetRow, Sheets
 
 if TYPE_CHECKING:
     from gvtools.runs.run import Run
@@ -25,21 +25,6 @@ if TYPE_CHECKING:
 # Decoding and compressing leave the interpreter alone.
 READERS = 2
 Reports = Sequence[Mapping[str, Any]]
-
-
-@dataclass(frozen=True, eq=False)
-class Sheets:
-    """What was found to show.
-
-    Attributes:
-        rows: a target each.
-        note: which targets they are, and where the others lie.
-        warnings: pictures that could not be read.
-    """
-
-    rows: tuple[SheetRow, ...]
-    note: str
-    warnings: tuple[str, ...]
 
 
 def chosen_targets(
@@ -60,20 +45,14 @@ def chosen_targets(
         views = report["views"]
         known = all(psnr.get(view["name"]) is not None for view in views)
         worth = [psnr[view["name"]] if known else view["coverage"] for view in views]
-        order = [int(place) for place in np.argsort(np.array(worth, np.float64), kind="stable")]
-        queue: list[tuple[int, int]] = []
-        while order:
-            queue.append((number, order.pop(0 if len(queue) % 2 == 0 else -1)))
-        if queue:
-            queues.append(queue)
+        order = np.argsort(np.array(worth, np.float64), kind="stable").tolist()
+        alternating = [place for ends in zip(order, reversed(order), strict=True) for place in ends]
+        queues.append([(number, place) for place in alternating[: len(views)]])
+    queues = [queue for queue in queues if queue]
     if len(queues) > most:
         queues = [queues[i] for i in np.unique(np.linspace(0, len(queues) - 1, most).astype(int))]
-    out: list[tuple[int, int]] = []
-    while any(queues) and len(out) < most:
-        for queue in queues:
-            if queue and len(out) < most:
-                out.append(queue.pop(0))
-    return sorted(out)
+    turns = [place for turn in zip_longest(*queues) for place in turn if place is not None]
+    return sorted(turns[:most])
 
 
 def contact_sheets(
@@ -143,18 +122,7 @@ def _pictures(
     hint, support, completion = (
         read_picture(folder, kind, entry["stem"]) for kind in (GUIDANCE, VALID, COMPLETION)
     )
-    size = completion.shape[:2]
-    if hint.shape != (*size, 3) or completion.shape != (*size, 3) or support.shape != size:
-        raise ValueError(
-            f"guidance {hint.shape}, completion {completion.shape}, validity {support.shape}; "
-            "expected colour, colour and grey of one size"
-        )
     frame = None if truth is None else truth.load()
-    if frame is not None and frame.rgb.shape != completion.shape:
-        raise ValueError(
-            f"its photograph is {frame.rgb.shape[1]}x{frame.rgb.shape[0]} now, the completion "
-            f"{completion.shape[1]}x{completion.shape[0]}"
-        )
     given = nearest(entry)
     return TargetPictures(
         name=str(entry["name"]),

@@ -113,13 +113,7 @@ def _draw(drawn: TradeOff, path: Path, title: str) -> None:
     from gvtools.files import replaced_when_written
 
     with replaced_when_written(path) as temporary:
-        draw_pareto(
-            drawn.trials,
-            front=drawn.front,
-            recommended=drawn.recommended,
-            budget=drawn.budget,
-            title=title,
-        ).savefig(temporary, format="png", dpi=120)
+        draw_pareto(drawn, title=title).savefig(temporary, format="png", dpi=120)
 
 
 def _print_recommendation(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from gvtools.errors import GvError, OptionError
 from pipelines.console import Console
@@ -14,31 +13,26 @@ from viz.run_view.view import RunView
 POLL_SECONDS = 1.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class ServerOptions:
-    """Where a page is served, and what it begins with.
-
-    Attributes:
-        host: address to serve at.
-        port: the first one that is tried.
-        max_points: points drawn of the whole at most.
-        round: number of the first round shown; None takes the last.
-        mode: colour mode, see viz.run_view.point_colors.
-    """
-
-    host: str
-    port: int
-    max_points: int
-    round: int | None = None
-    mode: str = "color"
-
-
-def serve(source: ViewSource, options: ServerOptions, *, live: bool, console: Console) -> None:
+def serve(
+    source: ViewSource,
+    *,
+    host: str,
+    port: int,
+    max_points: int,
+    round: int | None,
+    mode: str,
+    live: bool,
+    console: Console,
+) -> None:
     """Serve a run's web page until an interrupt.
 
     Args:
         source: of the run.
-        options: of the page.
+        host: address to serve at.
+        port: the first one that is tried.
+        max_points: points drawn of the whole at most.
+        round: number of the first round shown; None takes the last.
+        mode: colour mode to begin with, see viz.run_view.point_colors.
         live: wait for the first round, and show new ones as they come.
         console: told of the address, of new rounds and of problems.
 
@@ -50,19 +44,12 @@ def serve(source: ViewSource, options: ServerOptions, *, live: bool, console: Co
 
     if live:
         _wait_for_round(source, console)
-    shown, number = read_round(source, options.round)
-    viewer = WebViewer(
-        shown,
-        host=options.host,
-        port=options.port,
-        budget=options.max_points,
-        round=number,
-        mode=options.mode,
-    )
+    shown, number = read_round(source, round)
+    viewer = WebViewer(shown, host=host, port=port, budget=max_points, round=number, mode=mode)
     try:
         console.line(f"{source.path}: look at {viewer.url} (Ctrl-C ends)")
-        if not is_loopback(options.host):
-            console.warn(f"--host {options.host}: whoever reaches this machine can see the run")
+        if not is_loopback(host):
+            console.warn(f"--host {host}: whoever reaches this machine can see the run")
         lacking = source.lacking()
         if lacking:
             console.line(lacking)

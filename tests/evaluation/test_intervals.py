@@ -34,9 +34,3 @@ def test_what_is_not_there_is_left_out_and_counted():
     assert (one.mean, one.low, one.n) == (5.0, None, 1)
     same = mean_interval([2.0, 2.0])
     assert same.low == same.high == pytest.approx(2)
-
-
-def test_an_infinite_value_has_no_interval():
-    found = mean_interval([30.0, float("inf")])
-    assert found.mean == float("inf")
-    assert found.low is None

@@ -77,11 +77,11 @@ def test_keypoints_are_lifted_onto_the_wall(context: list[PosedPicture]) -> None
     assert picture.depth is not None
     rng = np.random.default_rng(0)
     xy = rng.uniform([1, 1], [WIDTH - 1, HEIGHT - 1], (400, 2))
-    lifted = lift_keypoints(xy, picture.depth, picture.camera, edge=0.05)
-    assert lifted.ok.mean() > 0.95
-    points = lifted.points[lifted.ok]
+    points, ok = lift_keypoints(xy, picture.depth, picture.camera, edge=0.05)
+    assert ok.mean() > 0.95
+    points = points[ok]
     again, _ = picture.camera.project(points)
-    np.testing.assert_allclose(again[0], xy[lifted.ok], atol=1e-6)
+    np.testing.assert_allclose(again[0], xy[ok], atol=1e-6)
     # Of three walls that cross, the nearest along a ray is where all three are largest.
     off = np.stack([points @ n - offset for n, offset, _, _ in WALLS])
     assert np.percentile(np.abs(off.max(axis=0)), 95) < 1e-5
@@ -96,10 +96,9 @@ def test_keypoints_at_depth_edges_and_holes_are_left_out() -> None:
     xy = np.array(
         [[99.9, 30.0], [90.0, 30.0], [20.4, 50.6], [21.2, 60.1], [0.1, 0.1], [319.9, 239.9]]
     )
-    lifted = lift_keypoints(xy, depth, camera, edge=0.05)
-    assert lifted.ok.tolist() == [False, True, False, False, True, True]
-    assert (lifted.without_depth, lifted.at_edges) == (2, 1)
-    np.testing.assert_allclose(np.linalg.inv(camera.K[0]) @ [90, 30, 1] * 2, lifted.points[1])
+    points, ok = lift_keypoints(xy, depth, camera, edge=0.05)
+    assert ok.tolist() == [False, True, False, False, True, True]
+    np.testing.assert_allclose(np.linalg.inv(camera.K[0]) @ [90, 30, 1] * 2, points[1])
 
 
 def test_absolute_pose_of_exact_matches_with_skew_and_outliers() -> None:
@@ -110,13 +109,13 @@ def test_absolute_pose_of_exact_matches_with_skew_and_outliers() -> None:
     K[0, 0, 1] = 15.0
     xy = dataclasses.replace(camera, K=K).project(points)[0][0]
     xy[:60] = rng.uniform([0, 0], [WIDTH, HEIGHT], (60, 2))
-    pose = absolute_pose(xy, points, K[0], width=WIDTH, height=HEIGHT, max_error=2.0)
+    pose = absolute_pose(xy, points, K[0], max_error=2.0)
     assert pose is not None
     truth = camera.cam_from_world[0]
     assert angle_deg(pose.cam_from_world[:3, :3], truth[:3, :3]) < 1e-4
     assert center_distance(pose.cam_from_world, truth) < 1e-5
     assert pose.inliers[60:].all() and pose.inliers[:60].sum() <= 2
-    assert absolute_pose(xy[:3], points[:3], K[0], width=9, height=9, max_error=2.0) is None
+    assert absolute_pose(xy[:3], points[:3], K[0], max_error=2.0) is None
 
 
 @given(st.floats(1e-9, 179.9), st.integers(0, 1000))
@@ -160,7 +159,6 @@ def test_a_summary_counts_failures_as_failures() -> None:
     assert summary.center_error.rmse == pytest.approx(np.sqrt(0.05))
     # Share of all pictures below x degrees: 0 to 1, a third to 3, two thirds to 5.
     assert summary.rotation_auc[5.0] == pytest.approx((2 / 3 + 4 / 3) / 5, abs=2e-3)
-    assert str(summary).startswith("2 of 3 located")
 
 
 def test_a_summary_without_support_has_no_figures() -> None:
@@ -168,6 +166,5 @@ def test_a_summary_without_support_has_no_figures() -> None:
     assert none.success_share == 0
     assert none.rotation_error_deg is None and none.center_error is None and none.inliers is None
     assert none.rotation_auc[5.0] == 0
-    assert str(none) == "0 of 1 located"
     nothing = summarise([])
     assert nothing.success_share is None and nothing.rotation_auc[5.0] is None

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import json
 from itertools import pairwise
 
@@ -8,9 +7,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from gvtools.errors import OptionError, ProjectError
-from gvtools.evaluation.protocol import LAYOUTS, Split, protocol_split, split_from_dict
-from gvtools.evaluation.published import benchmark_names, load_benchmark
+from gvtools.errors import OptionError
+from gvtools.evaluation.protocol import protocol_split
 from gvtools.scenes.selection import select
 
 NAMES = tuple(f"frame-{i:06d}" for i in range(100))
@@ -22,7 +20,6 @@ settings = st.fixed_dictionaries(
         "rounds": st.integers(1, 4),
         "stride": st.none() | st.integers(1, 9),
         "seed": st.integers(0, 10**9),
-        "layout": st.none() | st.sampled_from(LAYOUTS),
     }
 )
 
@@ -55,7 +52,7 @@ def test_any_split_is_a_window_of_the_scene_cut_as_asked(chosen, spare):
         assert (size - 1) * (split.stride + 1) >= count, "not as wide as the scene allows"
     else:
         assert split.stride == chosen["stride"]
-    layout = chosen["layout"] or ("ends" if chosen["rounds"] == 1 else "first")
+    layout = "ends" if chosen["rounds"] == 1 else "first"
     assert split.layout == layout
     if layout == "first":
         assert max(context) < min(targets)
@@ -66,11 +63,12 @@ def test_any_split_is_a_window_of_the_scene_cut_as_asked(chosen, spare):
 
 
 @given(settings, st.integers(0, 30))
-def test_the_same_question_has_the_same_answer_and_survives_json(chosen, spare):
+def test_the_same_question_has_the_same_answer(chosen, spare):
     names = [f"v{i}" for i in range(_needed(chosen) + spare)]
     split = protocol_split(names, **chosen)
     assert protocol_split(tuple(names), **chosen) == split
-    assert split_from_dict(json.loads(json.dumps(split.to_dict()))) == split
+    stored = json.loads(json.dumps(split.to_dict()))
+    assert stored["context"] == list(split.context) and stored["start"] == split.start
 
 
 @given(settings)
@@ -112,15 +110,6 @@ def test_the_two_layouts():
     assert three.context == (NAMES[0], NAMES[4], NAMES[8])
 
 
-def test_the_benchmarks_protocols_split_a_scene():
-    for name in benchmark_names():
-        asked = load_benchmark(name)
-        split = protocol_split(
-            NAMES, context=asked.context, targets=asked.targets, rounds=asked.rounds
-        )
-        assert len(split.context) == 2 and [len(r) for r in split.rounds] == [6] * asked.rounds
-
-
 def test_a_split_reads_as_two_selections_in_its_order():
     split = protocol_split(NAMES, rounds=3, stride=4, seed=3)
     assert select(NAMES, ",".join(split.context)) == split.context
@@ -134,28 +123,9 @@ def test_a_split_reads_as_two_selections_in_its_order():
         ({"context": 0}, "context 0; expected at least 1"),
         ({"rounds": 0}, "rounds 0; expected at least 1"),
         ({"stride": 0}, "stride 0; expected at least 1"),
-        ({"seed": -1}, "seed -1; expected at least 0"),
-        ({"layout": "middle"}, "layout 'middle'; expected one of ends, first"),
         ({"stride": 15}, "100 views; expected at least 106 for 2 context and 1 x 6 target views"),
     ],
 )
 def test_what_cannot_be_is_refused(options, message):
     with pytest.raises(OptionError, match=message):
         protocol_split(NAMES, **options)
-
-
-def test_a_name_twice_is_refused():
-    with pytest.raises(OptionError, match="'b' is there twice"):
-        protocol_split(["a", "b", "c", "b", "a"], targets=1)
-
-
-def test_a_damaged_split_is_refused():
-    data = protocol_split(NAMES, seed=1).to_dict()
-    assert set(data) == {entry.name for entry in dataclasses.fields(Split)}
-    with pytest.raises(ProjectError, match="split: keys stride are absent or unknown"):
-        split_from_dict({key: value for key, value in data.items() if key != "stride"})
-    with pytest.raises(ProjectError, match="keys step are"):
-        split_from_dict({**data, "step": 1})
-    leaked = {**data, "context": [data["rounds"][0][0], data["context"][1]]}
-    with pytest.raises(ProjectError, match="there twice"):
-        split_from_dict(leaked)

@@ -6,10 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvtools.cameras import Cameras
-from gvtools.errors import ShapeError
 from gvtools.evaluation.consistency.depth_reprojection import (
     depth_reprojection,
-    depth_reprojection_of_views,
 )
 from gvtools.evaluation.consistency.feature_consistency import feature_consistency
 from gvtools.evaluation.posed_picture import PosedPicture
@@ -60,31 +58,3 @@ def test_depth_that_is_none_gives_a_status_and_no_figure(depth):
         features = feature_consistency(first, second)
         assert features.status.startswith("empty: ")
         assert features.score is None and features.places == 0
-
-
-def test_masks_of_nothing_and_of_everything():
-    assert depth_reprojection(wall(mask=~EVERYWHERE), wall()).known == 0
-    unseen = depth_reprojection(wall(), wall(mask=~EVERYWHERE))
-    assert unseen.unknown_share == 1 and not unseen.ok
-    assert depth_reprojection(wall(mask=EVERYWHERE), wall()) == depth_reprojection(wall(), wall())
-    for kind in (np.uint8, np.float32):
-        with pytest.raises(ShapeError, match="expected bool"):
-            wall(mask=EVERYWHERE.astype(kind))
-
-
-@pytest.mark.parametrize("value", [0, 128, 255])
-def test_constant_pictures_agree_in_depth_and_tell_nothing_by_features(value):
-    flat = np.full_like(NOISE, value)
-    assert depth_reprojection(wall(rgb=flat), wall(rgb=flat, shift=0.1)).ok
-    found = feature_consistency(wall(rgb=flat), wall(rgb=flat, shift=0.1))
-    assert found.status.startswith("degenerate: ")
-    assert found.score is None
-    assert found.overlap > 0.9
-
-
-@pytest.mark.parametrize("pictures", [[], [wall()]])
-@pytest.mark.parametrize("pairs", ["all", "consecutive"])
-def test_no_view_and_one_view_have_a_status(pictures, pairs):
-    found = depth_reprojection_of_views(pictures, pairs=pairs)
-    assert found.status == f"empty: {len(pictures)} view(s); at least 2 are needed"
-    assert found.mean_pixels is found.covisible_share is None

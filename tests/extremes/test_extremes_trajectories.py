@@ -46,15 +46,6 @@ def test_paths_are_those_of_the_scene_in_any_unit(power):
     np.testing.assert_allclose(focus_point(arc(unit)) / unit, focus_point(arc()), atol=1e-9)
 
 
-@pytest.mark.parametrize("unit", [1e30, 1e100])
-def test_units_beyond_any_scene_are_refused(unit):
-    for make in MAKERS:
-        with pytest.raises(DegenerateError, match=r"below 1e\+30"):
-            make(arc(unit), 5)
-    with pytest.raises(DegenerateError, match=r"below 1e\+30"):
-        focus_point(arc(unit))
-
-
 @pytest.mark.parametrize("gap", [0.0, 1e-12, 9e-10, 1.1e-9])
 @pytest.mark.parametrize("where", ["first", "middle", "last"])
 def test_keys_that_all_but_repeat_another_do_no_harm(gap, where):
@@ -96,45 +87,12 @@ def test_the_middle_of_any_turn_is_half_of_it(angle, seed):
     assert angle >= np.pi - 1e-12 or np.abs(half - 0.5 * angle * axis).max() < 1e-12
 
 
-def test_poses_that_are_not_finite_are_named():
-    for bad in (np.nan, np.inf):
-        damaged = keys([(0, 0, 0), (1, bad, 0), (2, 0, 1)], [(0, 0, 0), (0, 0.3, 0), (0.2, 0, 0)])
-        for make in MAKERS:
-            with pytest.raises(DegenerateError, match="camera 000001 holds"):
-                make(damaged, 3)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize(
-    ("make", "option"),
-    [
-        (orbit, "radius"),
-        (orbit, "height"),
-        (orbit, "degrees"),
-        (spiral, "turns"),
-        (spiral, "spread"),
-        (spiral, "focus_distance"),
-    ],
-)
-def test_numbers_that_are_not_finite_are_refused(make, option, bad):
-    with pytest.raises(OptionError, match=option):
-        make(arc(), 3, **{option: bad})
-
-
-@pytest.mark.parametrize("up", [(0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 0)])
-def test_an_up_vector_without_a_direction_is_refused(up):
-    with pytest.raises(OptionError, match="up"):
-        orbit(arc(), 3, up=up)
-    with pytest.raises(OptionError, match="up"):
-        look_at([[0.0, 0, 0]], [0, 0, 1], up=up)
-
-
 def test_a_point_to_look_at_has_to_differ_from_the_centre_beyond_rounding():
     for center, target in (((0, 0, 0), (0, 0, 0)), ((0, 0, 1e9), (0, 0, 1e9 + 1e-4))):
         with pytest.raises(DegenerateError, match="lies on the point"):
             look_at([center], target, up=(0, 1, 0))
-    with pytest.raises(DegenerateError, match="finite"):
-        look_at([(0, 0, 0)], (np.nan, 0, 0), up=(0, 1, 0))
+    with pytest.raises(OptionError, match="up"):
+        look_at([(0, 0, 0)], (0, 0, 1), up=(0, 0, 0))
     near = look_at([(0, 0, 0)], (0, 0, 1e-29), up=(0, -1, 0))[0]
     np.testing.assert_array_equal(near, np.eye(4))
 

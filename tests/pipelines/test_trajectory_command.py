@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 from command_line import refused
+from trajectory_writers import write_kitti, write_tum
 from walks import disturbed, line, moved, path
 
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.scenes.colmap_writer import write_colmap
-from gvtools.trajectory_files import write_trajectory
 from pipelines.cli import main
 
 
@@ -28,10 +28,10 @@ def measured(tmp_path, *arguments: object) -> dict:
 
 def test_files_of_one_layout(tmp_path):
     reference = path()
-    for layout in ("tum", "kitti"):
+    for layout, write in (("tum", write_tum), ("kitti", write_kitti)):
         one, two = tmp_path / f"{layout}.a.txt", tmp_path / f"{layout}.b.txt"
-        write_trajectory(one, cameras(reference), layout=layout)
-        write_trajectory(two, cameras(moved(reference, scale=3)), layout=layout)
+        write(one, cameras(reference))
+        write(two, cameras(moved(reference, scale=3)))
         figures = measured(tmp_path, "ate", one, two)
         assert figures["status"] == "aligned"
         assert figures["rmse"] < 1e-9
@@ -46,7 +46,7 @@ def test_an_euroc_file_against_a_tum_file(tmp_path):
     from scipy.spatial.transform import Rotation
 
     reference = path()
-    write_trajectory(tmp_path / "tum.txt", cameras(reference))
+    write_tum(tmp_path / "tum.txt", cameras(reference))
     rows = ["#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, v_x, v_y, v_z"]
     for i, pose in enumerate(disturbed(reference, metres=0.1)):
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
@@ -72,7 +72,7 @@ def test_a_colmap_model_without_pictures_is_paired_by_name(tmp_path):
 
 
 def test_degenerate_paths_are_null_with_the_reason(tmp_path, capsys):
-    write_trajectory(tmp_path / "line.txt", cameras(line()))
+    write_tum(tmp_path / "line.txt", cameras(line()))
     file = tmp_path / "line.txt"
     figures = measured(tmp_path, "ate", file, file)
     assert figures["rmse"] is None
@@ -84,7 +84,7 @@ def test_degenerate_paths_are_null_with_the_reason(tmp_path, capsys):
 
 
 def test_the_table_is_printed_without_json(tmp_path, capsys):
-    write_trajectory(tmp_path / "a.txt", cameras(path()))
+    write_tum(tmp_path / "a.txt", cameras(path()))
     assert main(["trajectory", "ate", str(tmp_path / "a.txt"), str(tmp_path / "a.txt")]) == 0
     text = capsys.readouterr().out
     assert "rotation, degrees" in text
@@ -92,8 +92,8 @@ def test_the_table_is_printed_without_json(tmp_path, capsys):
 
 
 def test_wrong_input_ends_in_one_line(tmp_path, capsys):
-    write_trajectory(tmp_path / "a.txt", cameras(path()))
-    write_trajectory(tmp_path / "b.txt", cameras(path(39)), layout="kitti")
+    write_tum(tmp_path / "a.txt", cameras(path()))
+    write_kitti(tmp_path / "b.txt", cameras(path(39)))
     a, b = tmp_path / "a.txt", tmp_path / "b.txt"
     assert "40 and 39" in refused(capsys, "trajectory", "ate", a, b)
     assert "no such file" in refused(capsys, "trajectory", "ate", a, tmp_path / "c.txt")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,15 +12,13 @@ from command_line import refused
 from growth_rounds import rounds
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from tiny_scan import write_scan
 
 from gvtools.errors import OptionError
 from pipelines.cli import main
 from viz.plots.canvas import png
-from viz.plots.coverage import draw_coverage
 from viz.plots.growth import draw_growth
 from viz.plots.losses import draw_losses, loss_names, running_median
-from viz.plots.pareto import draw_pareto
+from viz.plots.pareto import TradeOff, draw_pareto
 from viz.plots.quality import draw_quality
 from viz.plots.timing import draw_timing, stage_seconds
 from viz.plots.trajectories import Trajectories, draw_trajectories, principal_axes
@@ -53,13 +50,6 @@ def test_dollar_signs_in_names_are_no_formulas():
     assert with_sign != png(draw_growth(rounds(), title="proj x_{"))
     records = [{"step": k, "loss": 1.0, name: 2.0} for k in range(3)]
     assert png(draw_losses({"stage $^$": records}, title=name))
-
-
-def test_coverage_is_in_percent_of_each_round():
-    axes: Any = draw_coverage(rounds()).axes[0]
-    np.testing.assert_allclose(points(axes, "before"), [[1, 60], [2, 70]])
-    np.testing.assert_allclose(points(axes, "after"), [[1, 80], [2, 90]])
-    assert axes.get_ylabel() == "coverage, % of pixels"
 
 
 def test_the_bars_of_the_stages_sum_up_to_the_run():
@@ -182,33 +172,27 @@ def test_quality_draws_each_target_and_the_means():
 def test_a_front_over_time_and_memory():
     trials = [{"label": "start", "kind": "start", "seconds": 2.0, "bytes": 2.0**20, "psnr": 20.0}]
     seconds: Any
-    seconds, size = draw_pareto(trials, front=trials, budget=5.0).axes
+    seconds, size = draw_pareto(TradeOff("", trials, trials, None, 5.0)).axes
     np.testing.assert_allclose(points(seconds, "start"), [[2, 20]])
     np.testing.assert_allclose(points(size, "start"), [[1, 20]])
     assert [size.get_xlabel(), size.get_ylabel()] == ["memory, MiB", "PSNR, dB, whole pictures"]
     assert [seconds.get_xscale(), size.get_xscale()] == ["linear", "linear"]
     trials.append({**trials[0], "seconds": 7.0, "kind": "trial"})
-    scales = [axes.get_xscale() for axes in draw_pareto(trials, front=trials[:1]).axes]
-    assert scales == ["log", "linear"]
+    found = TradeOff("", trials, trials[:1], trials[0], None)
+    assert [axes.get_xscale() for axes in draw_pareto(found).axes] == ["log", "linear"]
+    with pytest.raises(OptionError, match="without trials"):
+        draw_pareto(TradeOff("", [], [], None, None))
 
 
 def test_a_panel_that_is_not_there():
     with pytest.raises(OptionError, match="stored, fates, coverage, time"):
         draw_growth(rounds(), panels=["size"])
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
-    scan = write_scan(tmp_path_factory.mktemp("scan"), views=5)
-    out = tmp_path_factory.mktemp("runs") / "wall"
-    assert main(["reconstruct", str(scan), "--out", str(out), "--context", "first:3",
-                 "--targets", "range:3-4", "--quiet"]) == 0  # fmt: skip
-    return out
+    assert Image.open(io.BytesIO(png(draw_growth(rounds(), panels=["time"])))).size == (564, 408)
 
 
 @pytest.mark.parametrize("kind", ["growth", "coverage", "timing", "trajectories"])
-def test_each_figure_of_a_run_from_the_command_line(finished, tmp_path, kind):
-    assert main(["plot", kind, str(finished), "--out", str(tmp_path / "f.png"), "--quiet"]) == 0
+def test_each_figure_of_a_run_from_the_command_line(small_run, tmp_path, kind):
+    assert main(["plot", kind, str(small_run), "--out", str(tmp_path / "f.png"), "--quiet"]) == 0
     assert np.asarray(Image.open(tmp_path / "f.png").convert("L")).std() > 10
 
 
@@ -224,15 +208,10 @@ def test_losses_of_a_training_and_of_one_stage(tmp_path):
         assert out.read_bytes().startswith(start)
 
 
-def test_what_cannot_be_drawn_is_refused(finished, tmp_path, capsys):
+def test_what_cannot_be_drawn_is_refused(small_run, tmp_path, capsys):
     out = tmp_path / "f.png"
     assert "log.jsonl" in refused(capsys, "plot", "losses", tmp_path, "--out", out)
-    assert "tradeoff.json" in refused(capsys, "plot", "pareto", finished, "--out", out)
+    assert "tradeoff.json" in refused(capsys, "plot", "pareto", small_run, "--out", out)
     assert "run.json" in refused(capsys, "plot", "growth", tmp_path, "--out", out)
-    assert ".svg" in refused(capsys, "plot", "growth", finished, "--out", tmp_path / "f.bmp")
+    assert ".svg" in refused(capsys, "plot", "growth", small_run, "--out", tmp_path / "f.bmp")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_figure_as_bytes():
-    image = Image.open(io.BytesIO(png(draw_coverage(rounds()), dpi=100)))
-    assert image.size == (470, 340)

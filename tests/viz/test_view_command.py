@@ -13,6 +13,8 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from browser import free_port
+from command_line import refused
 from PIL import Image
 
 from gvtools.errors import OptionError
@@ -27,11 +29,6 @@ from viz.run_view.render import picture_of
 from viz.web.viewer import BUDGET, LOCAL, PORT
 
 CAMERA = "frame-000004.color.png"
-
-
-@pytest.fixture(scope="module")
-def folder(small_run):
-    return small_run
 
 
 @contextmanager
@@ -52,62 +49,44 @@ def display(tmp_path):
         server.wait()
 
 
-def refused(capsys, *arguments):
-    assert main(["view", *map(str, arguments)]) == 2
-    error = capsys.readouterr().err.strip()
-    assert len(error.splitlines()) == 1 and error.startswith("gvtools: ")
-    return error
-
-
 def test_the_parser_knows_what_the_viewers_know():
     assert (view.LOCAL, view.PORT, view.MAX_POINTS) == (LOCAL, PORT, BUDGET)
     assert LOCAL == "127.0.0.1"
     assert tuple(MODES) == view.COLORS
 
 
-def test_a_picture_needs_no_display(folder, tmp_path, monkeypatch, capsys):
+def test_a_picture_needs_no_display(small_run, tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     out = tmp_path / "shot.png"
     options = ("--screenshot", str(out), "--camera", CAMERA, "--round", "1")
-    assert main(["view", str(folder), *options]) == 0
-    assert "rendered by the project's own splatter" in capsys.readouterr().out
-    memory = SpatialMemory.load(folder / "memory.npz")
+    assert main(["view", str(small_run), *options]) == 0
+    assert f"round 1 from {CAMERA}" in capsys.readouterr().out
+    memory = SpatialMemory.load(small_run / "memory.npz")
     memory.forget(round=2)
     row = next(i for i in range(len(memory.views)) if memory.views[i].camera.names[0] == CAMERA)
     expected = picture_of(memory.project(memory.views[row].camera))
     np.testing.assert_array_equal(np.array(Image.open(out)), expected)
 
 
-def test_the_splatter_steps_in_for_open3d_and_says_so(folder, tmp_path, monkeypatch, capsys):
-    from viz.open3d import screenshot
-
-    # A child that cannot render, as without EGL and X.
-    monkeypatch.setattr(screenshot, "CHILD", ("-c", "raise RuntimeError('no EGL')"))
-    out = tmp_path / "shot.png"
-    assert main(["view", str(folder), "--open3d", "--screenshot", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert "rendered by the project's own splatter (Open3D cannot: no EGL)" in said
-    assert np.array(Image.open(out)).std() > 10
-
-
-def test_bad_options_are_refused_in_one_line(folder, tmp_path, monkeypatch, capsys):
+def test_bad_options_are_refused_in_one_line(small_run, tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    words = ("view", small_run)
     shot = ("--screenshot", tmp_path / "x.png")
-    assert "no such file or folder" in refused(capsys, tmp_path / "absent", *shot)
-    assert "such as 'frame-000000" in refused(capsys, folder, *shot, "--camera", "nobody")
-    assert "rounds 0 to 2" in refused(capsys, folder, "--round", "3")
-    assert "ends with .png" in refused(capsys, folder, "--screenshot", tmp_path / "x.jpg")
-    assert "no display" in refused(capsys, folder, "--open3d")
-    assert "--live" in refused(capsys, folder, "--live", *shot)
-    assert "expected 1 to 65535" in refused(capsys, folder, "--port", "99999")
+    assert "no such file or folder" in refused(capsys, "view", tmp_path / "absent", *shot)
+    assert "such as 'frame-000000" in refused(capsys, *words, *shot, "--camera", "nobody")
+    assert "rounds 0 to 2" in refused(capsys, *words, "--round", "3")
+    assert "ends with .png" in refused(capsys, *words, "--screenshot", tmp_path / "x.jpg")
+    assert "no display" in refused(capsys, *words, "--open3d")
+    assert "--live" in refused(capsys, *words, "--live", *shot)
+    assert "at most 65535" in refused(capsys, *words, "--port", "99999")
     # 192.0.2.1 is nobody's, by RFC 5737.
-    assert "cannot listen" in refused(capsys, folder, "--host", "192.0.2.1")
+    assert "cannot listen" in refused(capsys, *words, "--host", "192.0.2.1")
     assert not (tmp_path / "x.png").exists()
 
 
 @pytest.mark.slow
-def test_the_open3d_window_shows_the_run_and_steps_through_it(folder, tmp_path):
+def test_the_open3d_window_shows_the_run_and_steps_through_it(small_run, tmp_path):
     code = f"""
 from pathlib import Path
 import numpy as np
@@ -115,7 +94,7 @@ from pipelines.viewing.source import ViewSource
 from viz.open3d.window import Open3dViewer
 
 said = []
-viewer = Open3dViewer(ViewSource(Path({str(folder)!r})).read(), say=said.append)
+viewer = Open3dViewer(ViewSource(Path({str(small_run)!r})).read(), say=said.append)
 viewer.look_from(0)
 def look():
     for _ in range(3):
@@ -153,29 +132,11 @@ print("\\n".join(said))
     assert lines[2].startswith("round 2 of 2") and "round: round that" in lines[2]
 
 
-@pytest.mark.slow
-def test_open3d_renders_a_picture_where_there_is_a_display(folder, tmp_path, capsys, monkeypatch):
-    with display(tmp_path) as name:
-        monkeypatch.setenv("DISPLAY", name)
-        pictures = []
-        for extra in ((), ("--open3d",)):
-            out = tmp_path / f"shot{len(extra)}.png"
-            options = ("--screenshot", str(out), "--camera", "frame-000001.color.png", *extra)
-            assert main(["view", str(folder), *options]) == 0
-            pictures.append(np.array(Image.open(out)).astype(int))
-    said = capsys.readouterr().out
-    if "Open3D cannot" in said:
-        pytest.skip(said.splitlines()[-1])
-    assert "rendered by Open3D" in said
-    # Both show the same thing from the same place, each in its own way.
-    assert np.abs(pictures[0] - pictures[1]).mean() < 20
-
-
-def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(folder, tmp_path, capsys):
+def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(small_run, tmp_path, capsys):
     pytest.importorskip("viser", reason="viser is not installed")
     port = free_port()
     later = tmp_path / "run"
-    threading.Timer(1.0, shutil.copytree, (folder, later)).start()
+    threading.Timer(1.0, shutil.copytree, (small_run, later)).start()
 
     def reached() -> bool:
         with socket.socket() as probe:
@@ -204,15 +165,9 @@ def test_a_run_that_fails_at_once_says_no_more_than_why(tmp_path, capfd):
     assert "Traceback" not in said.err and "KeyboardInterrupt" not in said.err
 
 
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-def test_a_round_that_came_while_the_viewer_started_is_shown(folder, tmp_path, capsys):
+def test_a_round_that_came_while_the_viewer_started_is_shown(small_run, tmp_path, capsys):
     growing, later = tmp_path / "growing", tmp_path / "later"
-    shutil.copytree(folder, growing)
+    shutil.copytree(small_run, growing)
     (growing / "round_002").rename(later)
     source = ViewSource(growing)
     shown = source.read()
@@ -226,9 +181,9 @@ def test_a_round_that_came_while_the_viewer_started_is_shown(folder, tmp_path, c
 
 
 @pytest.mark.parametrize("report", ['{"round": 2,', "[]", '{"round": 2, "views": []}'])
-def test_a_report_that_cannot_be_read_does_not_end_the_viewer(folder, tmp_path, capsys, report):
+def test_a_report_that_cannot_be_read_does_not_end_the_viewer(small_run, tmp_path, capsys, report):
     growing, kept = tmp_path / "growing", tmp_path / "kept"
-    shutil.copytree(folder, growing)
+    shutil.copytree(small_run, growing)
     (growing / "round_002").rename(kept)
     source, rounds = ViewSource(growing), list[int]()
     following = serve.Following(
@@ -246,10 +201,10 @@ def test_a_report_that_cannot_be_read_does_not_end_the_viewer(folder, tmp_path, 
     assert rounds == [2]
 
 
-def test_an_interrupted_start_is_no_interrupted_run(folder, monkeypatch, capsys):
+def test_an_interrupted_start_is_no_interrupted_run(small_run, monkeypatch, capsys):
     def interrupted(self):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(ViewSource, "read", interrupted)
-    assert main(["view", str(folder)]) == 0
+    assert main(["view", str(small_run)]) == 0
     assert capsys.readouterr() == ("viewer ended\n", "")

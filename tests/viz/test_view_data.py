@@ -30,23 +30,18 @@ from viz.run_view.view import CONTEXT, TARGET
 
 
 @pytest.fixture(scope="module")
-def folder(small_run):
-    return small_run
-
-
-@pytest.fixture(scope="module")
-def run(folder):
-    return ViewSource(folder).read()
+def run(small_run):
+    return ViewSource(small_run).read()
 
 
 def rgb(color):
     return [int(color[k : k + 2], 16) for k in (1, 3, 5)]
 
 
-def test_counts_are_those_of_the_rounds_and_of_the_memory_itself(run, folder):
-    lines = [json.loads(line) for line in (folder / "rounds.jsonl").read_text().splitlines()]
+def test_counts_are_those_of_the_rounds_and_of_the_memory_itself(run, small_run):
+    lines = [json.loads(line) for line in (small_run / "rounds.jsonl").read_text().splitlines()]
     assert run.last_round == 2 and run.whole
-    bare = ViewSource(folder / "memory.npz").read()
+    bare = ViewSource(small_run / "memory.npz").read()
     for number, line in enumerate(lines):
         expected = (line["observed"], line["generated"])
         for shown in (run, bare):
@@ -63,20 +58,20 @@ def test_cameras_are_the_context_and_the_targets_with_their_rounds(run):
     np.testing.assert_allclose(run.up(), [0, -1, 0], atol=1e-6)
 
 
-def test_pictures_are_the_rounds_files_and_the_projects_truth(run, folder):
+def test_pictures_are_the_rounds_files_and_the_projects_truth(run, small_run):
     target = run.cameras[3]
     pictures = run.pictures(target)
     assert list(pictures) == ["guidance", "completion", "memory after", "truth"]
-    stored = Image.open(folder / "round_001" / f"generated_{target.stem}.png")
+    stored = Image.open(small_run / "round_001" / f"generated_{target.stem}.png")
     np.testing.assert_array_equal(pictures["completion"], np.array(stored))
-    truth = Image.open(folder.parent / "scan" / target.name)
+    truth = Image.open(small_run.parent / "scan" / target.name)
     np.testing.assert_array_equal(pictures["truth"], np.array(truth))
     assert list(run.pictures(run.cameras[0])) == ["truth"]
 
 
-def test_a_run_whose_project_is_gone_shows_what_it_has(folder, tmp_path):
+def test_a_run_whose_project_is_gone_shows_what_it_has(small_run, tmp_path):
     copy = tmp_path / "run"
-    shutil.copytree(folder, copy)
+    shutil.copytree(small_run, copy)
     record = json.loads((copy / "run.json").read_text())
     (copy / "run.json").write_text(json.dumps({**record, "project": str(tmp_path / "gone")}))
     source = ViewSource(copy)
@@ -84,13 +79,13 @@ def test_a_run_whose_project_is_gone_shows_what_it_has(folder, tmp_path):
     assert "truth" not in shown.pictures(shown.cameras[3])
     assert "gone" in str(source.lacking())
     # Told where the project lies now, it has them again.
-    moved = ViewSource(copy, project=folder.parent / "scan").read()
+    moved = ViewSource(copy, project=small_run.parent / "scan").read()
     assert "truth" in moved.pictures(moved.cameras[3])
 
 
-def test_no_file_outside_the_run_is_read(folder, tmp_path):
+def test_no_file_outside_the_run_is_read(small_run, tmp_path):
     copy = tmp_path / "run"
-    shutil.copytree(folder, copy)
+    shutil.copytree(small_run, copy)
     secret = tmp_path / "guidance_secret.png"
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(secret)
     path = copy / "round_001" / "report.json"
@@ -172,7 +167,7 @@ def test_depth_errors_are_those_that_were_put_in(run):
     assert np.isnan(nothing).all()
 
 
-def test_what_is_drawn_is_even_and_does_not_change_as_the_memory_grows(run, folder):
+def test_what_is_drawn_is_even_and_does_not_change_as_the_memory_grows(run, small_run):
     memory = run.memory
     everything = detail(memory, len(memory))
     assert everything.edge == 0 and len(everything.rows) == len(memory)
@@ -184,7 +179,7 @@ def test_what_is_drawn_is_even_and_does_not_change_as_the_memory_grows(run, fold
     keys = np.column_stack([cells, memory.generated])
     assert len(np.unique(keys, axis=0)) == len(np.unique(keys[drawn.rows], axis=0))
     # The points of earlier rounds are drawn before the last round as after it.
-    earlier = SpatialMemory.load(folder / "memory.npz")
+    earlier = SpatialMemory.load(small_run / "memory.npz")
     earlier.forget(round=2)
     budget = memory.voxels
     now, before = detail(memory, budget), detail(earlier, budget)
@@ -203,29 +198,29 @@ def test_a_budget_below_the_cells_around_the_origin_is_kept(budget):
     assert np.isfinite([drawn.edge, drawn.size]).all()
 
 
-def test_rendering_goes_back_and_forth_between_rounds_exactly(run, folder):
+def test_rendering_goes_back_and_forth_between_rounds_exactly(run, small_run):
     camera = run.cameras[5].camera
     renderer = RunRenderer(run)
     pictures = {n: picture_of(renderer.render(camera, round=n)) for n in (2, 0, 1, 2)}
     for number, picture in pictures.items():
-        memory = SpatialMemory.load(folder / "memory.npz")
+        memory = SpatialMemory.load(small_run / "memory.npz")
         for later in range(2, number, -1):
             memory.forget(round=later)
         np.testing.assert_array_equal(picture, picture_of(memory.project(camera)))
     assert (pictures[0] != pictures[2]).any()
-    assert len(run.memory) == len(SpatialMemory.load(folder / "memory.npz"))
+    assert len(run.memory) == len(SpatialMemory.load(small_run / "memory.npz"))
     tinted = picture_of(renderer.render(camera, round=2, mode="source"))
     assert (tinted != pictures[2]).any()
 
 
-def test_starting_a_viewer_imports_neither_torch_nor_matplotlib(folder):
+def test_starting_a_viewer_imports_neither_torch_nor_matplotlib(small_run):
     pytest.importorskip("viser", reason="viser is not installed")
     code = (
         "import sys; from pathlib import Path\n"
         "import pipelines.cli; pipelines.cli.build_parser()\n"
         "from pipelines.viewing.source import ViewSource\n"
         "from viz.web.viewer import WebViewer\n"
-        f"source = ViewSource(Path({str(folder)!r}))\n"
+        f"source = ViewSource(Path({str(small_run)!r}))\n"
         "viewer = WebViewer(source.read(), port=18230)\n"
         "source.lacking(); viewer.stop()\n"
         "print(sorted({'torch', 'matplotlib'} & set(sys.modules)))"

@@ -7,9 +7,7 @@ from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from gvtools.errors import OptionError
 from viz.plots.canvas import Rounds, check_rounds, chosen, figure_of, round_axis
-from viz.plots.coverage import coverage_panel
 from viz.plots.palette import COLORS, HATCHES
 from viz.plots.timing import times_panel
 
@@ -17,6 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Of a line of characters.
+WIDTH = 72
 FATES = ("added", "merged", "rejected", "new voxels")
 
 
@@ -47,22 +47,19 @@ def draw_growth(
     return figure_of(chosen(known, panels), title=heading)
 
 
-def growth_text(rounds: Rounds, width: int = 72) -> str:
+def growth_text(rounds: Rounds) -> str:
     """The growth as lines of characters: a bar of what is stored for each round, and the figures.
 
     Args:
         rounds: the lines of a run's ``rounds.jsonl``, in order.
-        width: of a line, at least 60 characters.
 
     Raises:
-        OptionError: no rounds, or a width below 60.
+        OptionError: no rounds.
     """
     check_rounds(rounds)
-    if width < 60:
-        raise OptionError(f"growth: {width} characters wide; expected 60 or more")
     legend = "round  observations  # observed  + generated"
-    head = legend.ljust(width - 18) + "coverage".rjust(18)
-    room = width - 8 - 9 - 18
+    head = legend.ljust(WIDTH - 18) + "coverage".rjust(18)
+    room = WIDTH - 8 - 9 - 18
     largest = max(1, max(entry["observed"] + entry["generated"] for entry in rounds))
     lines = [head]
     for entry in rounds:
@@ -140,6 +137,38 @@ def fates_panel(axes: Axes, *, rounds: Rounds) -> None:
         ncols=4, loc="upper right", frameon=False, fontsize="small", handlelength=1.2,
         columnspacing=0.9,
     )  # fmt: skip
+
+
+def coverage_panel(axes: Axes, *, rounds: Rounds) -> None:
+    """How much of the targets the memory supports, in percent of the pixels, round by round."""
+    round_axis(axes, rounds)
+    axes.set_title("target pixels that the memory supports")
+    axes.set_ylabel("coverage, % of pixels")
+    axes.set_ylim(0, 126)
+    axes.set_yticks(range(0, 101, 20))
+    known = [
+        (i, 100 * entry["coverage_before"], 100 * entry["coverage_after"])
+        for i, entry in enumerate(rounds)
+        if entry["coverage_before"] is not None and entry["coverage_after"] is not None
+    ]
+    if not known:
+        axes.text(0.5, 0.5, "no targets", transform=axes.transAxes, ha="center")
+        return
+    at, before, after = zip(*known, strict=True)
+    axes.vlines(at, before, after, color="#999999", linewidth=2, zorder=2)
+    axes.scatter(
+        at, before, s=45, color="white", edgecolor=COLORS["observed"], linewidth=1.8, zorder=3,
+        label="before the round",
+    )  # fmt: skip
+    axes.scatter(at, after, s=45, color=COLORS["observed"], zorder=3, label="after the round")
+    if len(known) <= 12:
+        for x, low, high in known:
+            axes.annotate(f"{high:.1f}", (x, high), (0, 6), textcoords="offset points",
+                          ha="center", fontsize="small")  # fmt: skip
+            if high - low > 6:
+                axes.annotate(f"{low:.1f}", (x, low), (0, -13), textcoords="offset points",
+                              ha="center", fontsize="small")  # fmt: skip
+    axes.legend(ncols=2, loc="upper left", frameon=False, fontsize="small")
 
 
 def _engineering(axes: Axes) -> None:

@@ -31,12 +31,13 @@ LABELS = {"seconds": "seconds of a whole run", "bytes": "memory, MiB"}
 
 @dataclass(frozen=True)
 class TradeOff:
-    """What a sweep of settings came to, as ``draw_pareto`` takes it.
+    """What a sweep of settings came to.
 
     Attributes:
         source: the file that it was read from.
-        trials: on all targets.
-        front: those that no other beats, fastest first.
+        trials: on all targets, each with ``seconds``, ``bytes``, ``psnr``, ``label`` and ``kind``
+            (of STYLES).
+        front: those that no other beats in both time and PSNR, fastest first.
         recommended: the chosen one; None where none is within the budget.
         budget: seconds; None without one.
     """
@@ -49,21 +50,12 @@ class TradeOff:
 
 
 def draw_pareto(
-    trials: Sequence[Trial],
-    *,
-    front: Sequence[Trial],
-    recommended: Trial | None = None,
-    budget: float | None = None,
-    title: str | None = None,
-    panels: Sequence[str] | None = None,
+    found: TradeOff, *, title: str | None = None, panels: Sequence[str] | None = None
 ) -> Figure:
     """PSNR over seconds of a run and over the memory's size, logarithmic where they spread.
 
     Args:
-        trials: each with ``seconds``, ``bytes``, ``psnr``, ``label`` and ``kind`` (of STYLES).
-        front: the trials that no other beats in both time and PSNR, fastest first.
-        recommended: a ring around it.
-        budget: seconds, a vertical line.
+        found: what a sweep came to.
         title: of the scene.
         panels: of "seconds" and "bytes"; None is both.
 
@@ -73,15 +65,16 @@ def draw_pareto(
     Raises:
         OptionError: no trials, or no such panel.
     """
-    if not trials:
+    if not found.trials:
         raise OptionError("a trade-off without trials; expected one at least")
 
     def panel(axes: Axes, key: str) -> None:
-        _points(axes, key, trials, recommended)
+        _points(axes, key, found.trials, found.recommended)
+        limit: list[float] = []
         if key == "seconds":
-            _front(axes, front, budget)
-        limit = [budget] if key == "seconds" and budget is not None else []
-        _spread(axes, [*(trial[key] for trial in trials), *limit])
+            _front(axes, found)
+            limit = [] if found.budget is None else [found.budget]
+        _spread(axes, [*(trial[key] for trial in found.trials), *limit])
         axes.legend(fontsize="small", loc="lower right")
 
     known = {key: partial(panel, key=key) for key in SCALES}
@@ -137,14 +130,14 @@ def _spread(axes: Axes, values: Sequence[float]) -> None:
         axes.minorticks_off()
 
 
-def _front(axes: Axes, front: Sequence[Trial], budget: float | None) -> None:
+def _front(axes: Axes, found: TradeOff) -> None:
     axes.step(
-        [trial["seconds"] for trial in front],
-        [trial["psnr"] for trial in front],
+        [trial["seconds"] for trial in found.front],
+        [trial["psnr"] for trial in found.front],
         where="post",
         color=BLUE,
         zorder=2,
         label="front",
     )
-    if budget is not None:
-        axes.axvline(budget, color=RED, linestyle="--", label=f"budget {budget:g} s")
+    if found.budget is not None:
+        axes.axvline(found.budget, color=RED, linestyle="--", label=f"budget {found.budget:g} s")

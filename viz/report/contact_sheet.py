@@ -8,16 +8,12 @@ from __future__ import annotations
 import base64
 import io
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import ShapeError
 from viz.plots.palette import BLUE, ORANGE
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 # Longer side of a thumbnail, pixels: twice what a phone shows of it, for its dense screen.
 SIDE = 320
@@ -168,7 +164,7 @@ def _photograph(picture: NDArray[np.uint8], side: int) -> tuple[str, int, int]:
     from PIL import Image
 
     image = Image.fromarray(picture)
-    image = image.resize(_size(image, side), Image.Resampling.BOX)
+    image.thumbnail((side, side), Image.Resampling.BOX)
     out = io.BytesIO()
     image.save(out, format="JPEG", quality=QUALITY)
     return data_uri(out.getvalue(), "image/jpeg"), image.width, image.height
@@ -179,12 +175,7 @@ def _flat_colours(picture: NDArray[np.uint8], side: int) -> tuple[str, int, int]
     from PIL import Image
 
     image = Image.fromarray(picture)
-    image = image.resize(_size(image, side), Image.Resampling.NEAREST)
+    image.thumbnail((side, side), Image.Resampling.NEAREST)
     out = io.BytesIO()
     image.quantize(8, dither=Image.Dither.NONE).save(out, format="PNG")
     return data_uri(out.getvalue(), "image/png"), image.width, image.height
-
-
-def _size(image: Image, side: int) -> tuple[int, int]:
-    factor = min(1.0, side / max(image.size))
-    return max(1, round(image.width * factor)), max(1, round(image.height * factor))

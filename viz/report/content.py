@@ -20,6 +20,59 @@ class SheetRow:
     tiles: Sequence[Tile]
 
 
+@dataclass(frozen=True)
+class Sheets:
+    """Targets whose pictures are shown.
+
+    Attributes:
+        rows: a target each.
+        note: which targets they are, and where the others lie.
+        warnings: pictures that could not be read.
+    """
+
+    rows: Sequence[SheetRow] = ()
+    note: str = ""
+    warnings: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What was measured on a run's targets.
+
+    Attributes:
+        source: the file; None where nothing was measured.
+        figures: means over the targets by name, such as ``psnr_generated``.
+        intervals: by the same names, 95 % intervals (low, high) of the means where known.
+        views: figures of each target.
+        notes: why figures are absent.
+        poses: what the pose probe found; None where it was not asked.
+        warnings: files that belong to another state of the run, or cannot be read.
+    """
+
+    source: str | None = None
+    figures: Mapping[str, float | None] = field(default_factory=dict)
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    views: Sequence[Mapping[str, Any]] = ()
+    notes: Sequence[str] = ()
+    poses: Mapping[str, Any] | None = None
+    warnings: Sequence[str] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """What a report says of cameras.
+
+    Attributes:
+        drawn: cameras; None where there are none.
+        note: what is drawn, or why nothing is.
+        errors: rows of (error, of the completed pictures, of the true ones); may be empty.
+    """
+
+    drawn: Trajectories | None = None
+    note: str = ""
+    errors: Sequence[tuple[str, float | None, float | None]] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class RunReport:
     """All that a report tells; every text may come from a user's files.
@@ -31,16 +84,9 @@ class RunReport:
         changed: settings that differ from the defaults, as (setting, value, default).
         settings: all of them, by dotted name.
         warnings: what a reader has to know.
-        figures: means over the targets by name, such as ``psnr_generated``; each a number or None.
-        intervals: by the same names, 95 % intervals (low, high) of the means where known.
-        figures_from: the file that they were read from; None where there are none.
-        views: figures of each target.
-        notes: why figures are absent.
-        sheet: the targets that are shown.
-        sheet_note: which they are, and where the others lie.
-        poses: cameras; None where they are unknown.
-        poses_note: what is drawn, or why nothing is.
-        pose_errors: rows of (error, of the completed pictures, of the true ones); may be empty.
+        measures: figures of the targets.
+        sheets: pictures of the targets.
+        poses: cameras, and errors of estimated ones.
         trade_off: where a sweep was made.
     """
 
@@ -49,15 +95,8 @@ class RunReport:
     rounds: Rounds
     changed: Sequence[tuple[str, str, str]]
     settings: Mapping[str, str]
-    warnings: Sequence[str] = ()
-    figures: Mapping[str, float | None] = field(default_factory=dict)
-    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    figures_from: str | None = None
-    views: Sequence[Mapping[str, Any]] = ()
-    notes: Sequence[str] = ()
-    sheet: Sequence[SheetRow] = ()
-    sheet_note: str = ""
-    poses: Trajectories | None = None
-    poses_note: str = ""
-    pose_errors: Sequence[tuple[str, float | None, float | None]] = ()
+    warnings: Sequence[str]
+    measures: Measures
+    sheets: Sheets
+    poses: Poses
     trade_off: TradeOff | None = None

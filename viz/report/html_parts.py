@@ -23,25 +23,19 @@ def text(value: object) -> str:
     return escape(str(value), quote=True).replace("\n", "<br>")
 
 
-def table(
-    columns: Sequence[str], rows: Iterable[Sequence[object]], *, labels: int = 1, caption: str = ""
-) -> str:
+def table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, caption: str = "") -> str:
     """A table that scrolls by itself where the page is narrower.
 
     Args:
         columns: headings.
-        rows: each as long as the headings.
-        labels: so many columns hold names and stand on the left; numbers stand on the right.
+        rows: each as long as the headings, a name first.
         caption: above it.
     """
     head = "".join(f'<th scope="col">{text(column)}</th>' for column in columns)
     body = []
-    for row in rows:
-        cells = [
-            f'<th scope="row">{text(value)}</th>' if number < labels else f"<td>{text(value)}</td>"
-            for number, value in enumerate(row)
-        ]
-        body.append(f"<tr>{''.join(cells)}</tr>")
+    for name, *values in rows:
+        cells = "".join(f"<td>{text(value)}</td>" for value in values)
+        body.append(f'<tr><th scope="row">{text(name)}</th>{cells}</tr>')
     # A caption of the table itself would scroll with it.
     said = paragraph(caption, "quiet") if caption else ""
     return (

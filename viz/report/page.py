@@ -60,7 +60,7 @@ def _key_figures(report: RunReport) -> str:
     last = report.rounds[-1]
     seconds = sum(entry["seconds"].get("total") or 0 for entry in report.rounds)
     covered = [view["coverage"] for entry in report.rounds for view in entry["views"]]
-    found = report.figures
+    found = report.measures.figures
     cards = [
         ("observations", last["points"]),
         ("of them generated", f"{last['generated'] / max(1, last['points']):.1%}"),

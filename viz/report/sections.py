@@ -38,14 +38,14 @@ def growth(report: RunReport) -> str:
         (("coverage",), "share of the target pixels that the memory supports, by round"),
     ]
     drawn = [_drawn(draw_growth(rounds, panels=panels), alt) for panels, alt in plots]
-    if is_measured(report.views):
+    if is_measured(report.measures.views):
         alt = "PSNR of observed and generated pixels, by round"
-        drawn.append(_drawn(draw_quality(report.views), alt))
+        drawn.append(_drawn(draw_quality(report.measures.views), alt))
     return _plots(drawn) + _round_table(report)
 
 
 def _round_table(report: RunReport) -> str:
-    regions = REGIONS if is_measured(report.views) else {}
+    regions = REGIONS if is_measured(report.measures.views) else {}
     columns = [
         "round", "targets", "voxels", "observed", "generated", "added", "merged", "rejected",
         "coverage before", "coverage after", *(f"PSNR {where}, dB" for where in regions.values()),
@@ -53,7 +53,7 @@ def _round_table(report: RunReport) -> str:
     ]  # fmt: skip
     rows = []
     for entry in report.rounds:
-        mine = [view for view in report.views if view["round"] == entry["round"]]
+        mine = [view for view in report.measures.views if view["round"] == entry["round"]]
         rows.append([
             entry["round"], len(entry["views"]), entry["voxels"],
             *(entry[name] for name in ("observed", "generated", "added", "merged", "rejected")),
@@ -69,7 +69,7 @@ def _round_table(report: RunReport) -> str:
 
 def figures(report: RunReport) -> str:
     """Figures of observed and of generated pixels, over the targets and of each."""
-    notes = bulleted(report.notes) if report.notes else ""
+    notes = bulleted(report.measures.notes) if report.measures.notes else ""
     rows = [
         [name, *(_cell(report, f"{measure}{region}", scale) for region in REGIONS)]
         for measure, (name, scale) in MEASURES.items()
@@ -77,15 +77,15 @@ def figures(report: RunReport) -> str:
     rows = [row for row in rows if any(cell != NONE for cell in row[1:])]
     means = ""
     if rows:
-        said = f"Means over the targets, from {report.figures_from}"
-        said += ", below each the 95 % interval of the mean" if report.intervals else ""
+        said = f"Means over the targets, from {report.measures.source}"
+        said += ", below each the 95 % interval of the mean" if report.measures.intervals else ""
         said += ". Depth errors are medians of a target's, relative to the true depth."
         means = table(["", *REGIONS.values()], rows, caption=said)
     return means + notes + _figures_of_each(report)
 
 
 def _cell(report: RunReport, key: str, scale: float) -> str:
-    value, interval = report.figures.get(key), report.intervals.get(key)
+    value, interval = report.measures.figures.get(key), report.measures.intervals.get(key)
     if value is None:
         return NONE
     said = f"{value * scale:.4g}"
@@ -95,17 +95,17 @@ def _cell(report: RunReport, key: str, scale: float) -> str:
 
 
 def _figures_of_each(report: RunReport) -> str:
-    if not report.views:
+    if not report.measures.views:
         return ""
     known = [
         (f"{measure}{region}", f"{name}, {where}", scale)
         for measure, (name, scale) in MEASURES.items()
         for region, where in REGIONS.items()
-        if any(view.get(f"{measure}{region}") is not None for view in report.views)
+        if any(view.get(f"{measure}{region}") is not None for view in report.measures.views)
     ]
     heads = ["target", "round", "coverage before", "after", *(head for _, head, _ in known)]
     rows = []
-    for view in report.views:
+    for view in report.measures.views:
         values = [(view.get(key), scale) for key, _, scale in known]
         rows.append([
             view["name"], view["round"], _share(view["coverage"]), _share(view["coverage_after"]),
@@ -116,14 +116,14 @@ def _figures_of_each(report: RunReport) -> str:
 
 def pictures(report: RunReport) -> str:
     """The contact sheets, with their legend."""
-    if not report.sheet:
-        return paragraph(report.sheet_note) if report.sheet_note else ""
+    if not report.sheets.rows:
+        return paragraph(report.sheets.note) if report.sheets.note else ""
     swatches = "".join(
         f'<span><span class="swatch" style="background:{color}"></span>{name}</span>'
         for name, color in SUPPORT.items()
     )
     scale = ""
-    if any(shown.label == "error" for row in report.sheet for shown in row.tiles):
+    if any(shown.label == "error" for row in report.sheets.rows for shown in row.tiles):
         scale = (
             '<span>error, mean over the channels: 0<span class="scale" '
             f'style="background:{color_scale()}"></span>{WORST:.0%} of the range or more</span>'
@@ -132,27 +132,27 @@ def pictures(report: RunReport) -> str:
     rows = "".join(
         f'<div class="target"><h3>{text(row.heading)}</h3>'
         f'<div class="tiles">{"".join(map(tile, row.tiles))}</div></div>'
-        for row in report.sheet
+        for row in report.sheets.rows
     )
-    return f"{paragraph(report.sheet_note)}{legend}{rows}"
+    return f"{paragraph(report.sheets.note)}{legend}{rows}"
 
 
 def trajectories(report: RunReport) -> str:
     """Cameras from above and from the side, and the errors of estimated poses."""
-    said = paragraph(report.poses_note) if report.poses_note else ""
-    if report.poses is None:
+    said = paragraph(report.poses.note) if report.poses.note else ""
+    if report.poses.drawn is None:
         return said
     drawn = [
         _drawn(
-            draw_trajectories(report.poses, panels=[name]),
+            draw_trajectories(report.poses.drawn, panels=[name]),
             f"cameras {where}: context, requested and estimated",
         )
         for name, where in (("top", "from above"), ("side", "from the side"))
     ]
     errors = ""
-    if report.pose_errors:
+    if report.poses.errors:
         errors = table(["estimated poses", "completed pictures", "true pictures"],
-                       report.pose_errors)  # fmt: skip
+                       report.poses.errors)  # fmt: skip
     return said + _plots(drawn) + errors
 
 
@@ -172,13 +172,7 @@ def trade_off(report: RunReport) -> str:
         return ""
     drawn = [
         _drawn(
-            draw_pareto(
-                found.trials,
-                front=found.front,
-                recommended=found.recommended,
-                budget=found.budget,
-                panels=[name],
-            ),
+            draw_pareto(found, panels=[name]),
             f"PSNR over {name}, trial by trial",
         )
         for name in ("seconds", "bytes")

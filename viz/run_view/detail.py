@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory.store.voxel_levels import levels_above
-
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
     from viz.run_view.view import RunView
@@ -50,11 +48,12 @@ def detail(memory: SpatialMemory, budget: int) -> Detail:
     size = float(np.median(spacing)) if count else memory.voxel
     if count <= budget:
         return Detail(np.arange(count), 0.0, size)
-    generated = memory.generated
-    edge = memory.voxel
-    reach = max(float(np.abs(axis).max()) for axis in coordinates(memory))
+    positions = memory.columns.positions
+    reach = float(np.abs(positions).max())
+    edge = max(memory.voxel, reach / 2 ** (AXIS_BITS - 2))
     while True:
-        _, first = np.unique((cell_keys(memory, edge) << 1) | generated, return_index=True)
+        keys = (_cell_keys(positions, edge) << 1) | memory.generated
+        _, first = np.unique(keys, return_index=True)
         # Cells that meet at the origin do not become one however large they are.
         if len(first) <= budget or edge > reach:
             return Detail(np.sort(first)[:budget], edge, max(size, edge))
@@ -66,32 +65,11 @@ def point_pixels(focal: float, drawn: Detail, run: RunView) -> float:
     return float(np.clip(1.2 * focal * drawn.size / run.typical_depth, 2.0, 8.0))
 
 
-def cell_keys(memory: SpatialMemory, edge: float, *, whole: bool = False) -> NDArray[np.int64]:
-    """(N,) int64, equal for observations of one cell; below 2⁶⁰ unless ``whole``.
-
-    Args:
-        memory: whose observations.
-        edge: of a cell, scene units; doubled until the cells can be numbered.
-        whole: makes one cell of each voxel that is wider.
-    """
-    count = len(memory)
-    level = memory.columns.level[:count] if whole else np.zeros(count, np.uint8)
-    while True:
-        above = levels_above(level, edge / memory.voxel)
-        keys = above
-        for axis in coordinates(memory):
-            # Times the inverse, as the memory counts its voxels.
-            cell = np.floor(axis * (1.0 / np.float64(edge)))
-            if not cell.max(initial=0.0) - cell.min(initial=0.0) < 1 << AXIS_BITS:
-                break
-            number = cell.astype(np.int64) >> above
-            keys = (keys << AXIS_BITS) | (number - number.min(initial=0))
-        else:
-            return keys
-        edge *= 2.0
-
-
-def coordinates(memory: SpatialMemory) -> tuple[NDArray[np.float32], ...]:
-    """x, y and z (N,) of the observations, in the memory's frame, scene units."""
-    x, y, z = memory.columns.positions.T
-    return x, y, z
+def _cell_keys(positions: NDArray[np.float32], edge: float) -> NDArray[np.int64]:
+    """(N,) int64 below 2⁶⁰, equal for positions (N, 3) of one cell."""
+    keys = np.zeros(len(positions), np.int64)
+    for axis in positions.T:
+        # Times the inverse, as the memory counts its voxels.
+        cell = np.floor(axis * (1.0 / np.float64(edge))).astype(np.int64)
+        keys = (keys << AXIS_BITS) | (cell - cell.min())
+    return keys

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
 from viz.plots.palette import COLORS, GREY
-from viz.run_view.detail import cell_keys
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -105,10 +104,13 @@ def view_counts(memory: SpatialMemory) -> NDArray[np.int64]:
 
     What several views agreed on counts for the one that keeps it, so this is the least number.
     """
-    view = memory.columns.view.astype(np.int64)
-    _, voxel = np.unique(cell_keys(memory, memory.voxel, whole=True), return_inverse=True)
-    views = max(1, len(memory.views))
-    pairs = np.unique(voxel.astype(np.int64) * views + view)
+    from gvtools.memory.thinning import thinned
+
+    if not len(memory):
+        return np.zeros(0, np.int64)
+    voxel = thinned(memory, None).group
+    views = len(memory.views)
+    pairs = np.unique(voxel * views + memory.columns.view)
     return np.bincount(pairs // views, minlength=int(voxel.max(initial=-1)) + 1)[voxel]
 
 

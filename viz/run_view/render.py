@@ -29,10 +29,7 @@ class RunRenderer:
 
     def __init__(self, run: RunView) -> None:
         self.run = run
-        self._memory: SpatialMemory | None = None
-        self._round = -1
-        self._colored: SpatialMemory | None = None
-        self._mode = ""
+        self._shown: tuple[int, str, SpatialMemory] | None = None
 
     def render(self, camera: Cameras, *, round: int, mode: str = "color") -> Guidance:
         """The memory as it was after a round, in the colours of a mode, seen by a camera.
@@ -42,31 +39,19 @@ class RunRenderer:
             round: 0 to the run's last.
             mode: of viz.run_view.point_colors.MODES.
         """
-        return self._shown(round, mode).project(camera)
-
-    def _shown(self, round: int, mode: str) -> SpatialMemory:
-        memory = self._after(round)
-        if self._colored is None or mode != self._mode:
+        if self._shown is None or self._shown[:2] != (round, mode):
+            memory = self._after(round)
             colors = point_colors(memory, mode, true_depth=self.run.recorded_depth)
-            self._colored = memory.recolored(colors.rgb)
-            self._mode = mode
-        return self._colored
+            self._shown = round, mode, memory.recolored(colors.rgb)
+        return self._shown[2].project(camera)
 
     def _after(self, round: int) -> SpatialMemory:
         """The memory exactly as it was: later rounds are forgotten in a copy."""
-        if self._memory is None or round > self._round:
-            later = any(number > round for number in self.run.memory.rounds)
-            self._memory = copy.deepcopy(self.run.memory) if later else self.run.memory
-            self._colored = None
-        elif round < self._round:
-            if self._memory is self.run.memory:
-                self._memory = copy.deepcopy(self._memory)
-            self._colored = None
-        for number in reversed(self._memory.rounds):
-            if number > round:
-                self._memory.forget(round=number)
-        self._round = round
-        return self._memory
+        later = [number for number in self.run.memory.rounds if number > round]
+        memory = copy.deepcopy(self.run.memory) if later else self.run.memory
+        for number in reversed(later):
+            memory.forget(round=number)
+        return memory
 
 
 def picture_of(guidance: Guidance) -> NDArray[np.uint8]:

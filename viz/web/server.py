@@ -6,10 +6,11 @@ import io
 import ipaddress
 import re
 import socket
+from collections.abc import Callable
 from contextlib import redirect_stdout
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
+from urllib.parse import urlsplit
 
 from gvtools.errors import OptionError
 
@@ -17,13 +18,12 @@ if TYPE_CHECKING:
     import viser
 
 LOCAL = "127.0.0.1"
-# Browsers let any page open a WebSocket to this machine and name that page in the Origin. Pages
-# that this machine serves itself may read a run, also through a tunnel's port; others may not.
+# Pages that this machine serves itself may read a run, also through a tunnel's port.
 LOCAL_PAGE = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
 
 
 def make_server(host: str, port: int, title: str) -> viser.ViserServer:
-    """A server; on a loopback address it refuses WebSockets of pages from elsewhere.
+    """A server that refuses WebSockets of pages from elsewhere.
 
     Args:
         host: address to listen at.
@@ -59,13 +59,40 @@ def make_server(host: str, port: int, title: str) -> viser.ViserServer:
             "of this machine"
         ) from None
     # viser has no option for the origins that it answers.
-    origins = [None, LOCAL_PAGE] if is_loopback(host) else None
-    serve = partial(websockets.serve, origins=origins)
+    plain = websockets.serve
+
+    def serve(*places: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            origin, asked = (request.headers.get(key) for key in ("Origin", "Host"))
+            if may_read(origin, asked, host):
+                return process_request(connection, request)
+            return connection.respond(403, "a page from elsewhere may not read this run\n")
+
+        return plain(*places, process_request=answer, **options)
+
     # viser prints where it listens; the command that starts it says more.
     with redirect_stdout(io.StringIO()), patch.object(websockets, "serve", serve):
         server = Server(host=host, port=port, label=title, verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server
+
+
+def may_read(origin: str | None, asked: str | None, host: str) -> bool:
+    """Whether the page that sends a request may read a run.
+
+    Browsers let any page open a WebSocket to any machine, and name the page in the Origin.
+
+    Args:
+        origin: of the page; None where no page asks.
+        asked: the address that was asked, as the request has it.
+        host: where the server listens.
+    """
+    if origin is None:
+        return True
+    # On loopback the name that was asked may be another's, who lets it lead to this machine.
+    if is_loopback(host):
+        return LOCAL_PAGE.fullmatch(origin) is not None
+    return urlsplit(origin).netloc == asked
 
 
 def is_loopback(host: str) -> bool:

@@ -17,12 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Float64
-from gvtools.errors import OptionError
 from gvtools.evaluation.consistency.correspondence import (
     Correspondence,
     Seen,
@@ -35,17 +35,13 @@ from gvtools.evaluation.posed_picture import PosedPicture
 QUANTILES = 200
 
 
-@dataclass(frozen=True)
-class DepthReprojection:
-    """Agreement of the depth of two views. Figures that no pixel stands behind are None.
+@dataclass(frozen=True, kw_only=True)
+class _Figures:
+    """Agreement of depth. Figures that no pixel stands behind are None.
 
     Attributes:
-        first: name of the view whose pixels were followed.
-        second: name of the view they were followed into.
         status: "measured", or "empty: ..." with the reason why no pixel is co-visible.
-        known: first's pixels with depth, inside its mask.
-        inside: those that fall inside the second picture.
-        covisible: of these, on the surface that second sees.
+        covisible: pixels that fall inside the second picture, on the surface that second sees.
         mean_pixels: forward-backward distance over the co-visible pixels, pixels of the first view.
         median_pixels: likewise.
         mean_relative_depth: |z − d₂| / d₂ over the co-visible pixels (0.01 = 1 %).
@@ -56,11 +52,7 @@ class DepthReprojection:
         unknown_share: of the pixels inside: where second has no depth.
     """
 
-    first: str
-    second: str
     status: str
-    known: int
-    inside: int
     covisible: int
     mean_pixels: float | None
     median_pixels: float | None
@@ -77,37 +69,36 @@ class DepthReprojection:
         return self.status == "measured"
 
 
-@dataclass(frozen=True)
-class DepthReprojectionOfViews:
-    """Depth reprojection over many pairs of views, each pair weighing as many pixels as it has.
+@dataclass(frozen=True, kw_only=True)
+class DepthReprojection(_Figures):
+    """Agreement of the depth of two views.
 
     Attributes:
-        status: "measured", or "empty: ..." with the reason.
-        pairs: every pair that was compared, those without overlap included.
-        without_overlap: (first, second) names of the pairs that have no co-visible pixel.
-        covisible: co-visible pixels of all pairs.
-        mean_pixels: over all co-visible pixels, pixels.
-        median_pixels: likewise; its rank is right to half a percent of the pixels.
-        mean_relative_depth: over all co-visible pixels.
-        median_relative_depth: likewise, like median_pixels.
-        covisible_share: of all pixels that fall inside a second picture.
-        occluded_share: likewise.
-        contradicting_share: likewise.
-        unknown_share: likewise.
+        first: name of the view whose pixels were followed.
+        second: name of the view they were followed into.
+        known: first's pixels with depth, inside its mask.
+        inside: those that fall inside the second picture.
     """
 
-    status: str
+    first: str
+    second: str
+    known: int
+    inside: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthReprojectionOfViews(_Figures):
+    """Agreement over many pairs of views, each pair weighing as many pixels as it has.
+
+    The medians' ranks are right to half a percent of the pixels.
+
+    Attributes:
+        pairs: every pair that was compared, those without overlap included.
+        without_overlap: (first, second) names of the pairs that have no co-visible pixel.
+    """
+
     pairs: tuple[DepthReprojection, ...]
     without_overlap: tuple[tuple[str, str], ...]
-    covisible: int
-    mean_pixels: float | None
-    median_pixels: float | None
-    mean_relative_depth: float | None
-    median_relative_depth: float | None
-    covisible_share: float | None
-    occluded_share: float | None
-    contradicting_share: float | None
-    unknown_share: float | None
 
 
 def depth_reprojection(
@@ -127,37 +118,27 @@ def depth_reprojection(
 
 
 def depth_reprojection_of_views(
-    pictures: Sequence[PosedPicture], *, pairs: str = "all", occlusion: float = 0.05
+    pictures: Sequence[PosedPicture], *, occlusion: float = 0.05
 ) -> DepthReprojectionOfViews:
-    """Depth reprojection over pairs of views.
+    """Depth reprojection of each view into its successor.
 
     Args:
-        pictures: the views, for "consecutive" in their order along the path.
-        pairs: "all" follows every view into every other, "consecutive" each into its successor.
+        pictures: the views, in their order along the path.
         occlusion: as in `depth_reprojection`.
 
     Raises:
-        OptionError: another rule for the pairs, or an occlusion outside 0 to 1.
+        OptionError: an occlusion outside 0 to 1.
     """
-    if pairs not in ("all", "consecutive"):
-        raise OptionError(f"pairs {pairs!r}; expected 'all' or 'consecutive'")
-    count = len(pictures)
-    chosen = [
-        (i, j)
-        for i in range(count)
-        for j in range(count)
-        if (i != j if pairs == "all" else j == i + 1)
-    ]
     found, pixels, relative = [], [], []
-    for i, j in chosen:
-        figures, distances, differences = _compare(pictures[i], pictures[j], occlusion)
+    for first, second in pairwise(pictures):
+        figures, distances, differences = _compare(first, second, occlusion)
         found.append(figures)
         pixels.append(_quantiles(distances))
         relative.append(_quantiles(differences))
     covisible = np.array([pair.covisible for pair in found], np.int64)
     inside = np.array([pair.inside for pair in found], np.int64)
     if not found:
-        status = f"empty: {count} view(s); at least 2 are needed"
+        status = f"empty: {len(pictures)} view(s); at least 2 are needed"
     elif not covisible.any():
         status = f"empty: none of the {len(found)} pairs has a co-visible pixel"
     else:

@@ -7,9 +7,8 @@ features and a geometry that MASt3R guesses from the two pictures; here both are
 place of the first view falls in the second, with the occlusion test of `correspond`. The numbers
 are on another scale than MEt3R's, which `met3r_score` calls as it is.
 
-A score alone says little: pictures of nothing are consistent, and so are repeats. Beside it stand
-what the same network and geometry give for the first view with itself, and for content that does
-not belong there.
+A score alone says little: pictures of nothing are consistent, and so are repeats. Beside it stands
+what the same network and geometry give for content that does not belong there.
 """
 
 from __future__ import annotations
@@ -30,10 +29,8 @@ from gvtools.evaluation.posed_picture import PosedPicture
 
 Float32 = NDArray[np.float32]
 
-# Where unrelated content scores less than this above the same picture, the features tell nothing
-# apart and neither does the score.
+# Where unrelated content scores less, the features tell nothing apart and neither does the score.
 LEAST_SCALE = 0.02
-ROLLED = "second rolled by half its width and height"
 
 
 class FeatureNetwork(Protocol):
@@ -68,9 +65,8 @@ class FeatureConsistency:
         overlap: share of the first view's places (cells of its feature map) that were compared.
         places: how many.
         undefined: co-visible places left out because both features are zero there.
-        same_image: the score of the first view with itself: 0 up to rounding.
-        unrelated: the score with the same geometry and the features of unrelated content.
-        unrelated_source: what that content is.
+        unrelated: the score with second's features rolled by half the picture to the right and half
+            downwards: the same colours and structures in the wrong places.
     """
 
     first: str
@@ -81,9 +77,7 @@ class FeatureConsistency:
     overlap: float
     places: int
     undefined: int
-    same_image: float | None
     unrelated: float | None
-    unrelated_source: str
 
     @property
     def ok(self) -> bool:
@@ -98,17 +92,16 @@ class Met3rScore:
     Attributes:
         first: name of a view.
         second: name of the other.
-        status: "measured"; "unavailable: ..." with what is lacking and how to get it; or "empty:
-            ..." where MEt3R finds no overlap.
+        status: "measured", or "empty: ..." where MEt3R finds no overlap.
         score: MEt3R, lower is better; None unless measured.
-        overlap: share of the first picture that MEt3R compares; None unless it ran.
+        overlap: share of the first picture that MEt3R compares.
     """
 
     first: str
     second: str
     status: str
     score: float | None
-    overlap: float | None
+    overlap: float
 
 
 def feature_consistency(
@@ -116,7 +109,6 @@ def feature_consistency(
     second: PosedPicture,
     *,
     network: FeatureNetwork | None = None,
-    unrelated: PosedPicture | None = None,
     occlusion: float = 0.05,
 ) -> FeatureConsistency:
     """Compare second's features, carried into first by depth and cameras, with first's.
@@ -125,9 +117,6 @@ def feature_consistency(
         first: the view that is looked at, with depth.
         second: the view that is carried into it, with depth for the occlusion test.
         network: what makes the features; None is `DenseGradient`, which needs no weights.
-        unrelated: a picture of something else, for the reference value; it is laid over second and
-            its camera and depth play no part. None rolls second's features by half the picture to
-            the right and half downwards: the same colours and structures in the wrong places.
         occlusion: largest relative depth difference at which both see one surface.
 
     Raises:
@@ -136,23 +125,22 @@ def feature_consistency(
     """
     network = network or DenseGradient()
     ours, theirs = _features(network, first), _features(network, second)
-    if unrelated is None:
-        others, source = np.roll(theirs, [n // 2 for n in theirs.shape[1:]], (1, 2)), ROLLED
-    else:
-        others, source = _features(network, unrelated), unrelated.name
-    if not len(ours) == len(theirs) == len(others):
+    if len(ours) != len(theirs):
         raise ShapeError(
-            f"{network.name}: {len(ours)}, {len(theirs)} and {len(others)} feature channels; "
-            "expected one number for all pictures"
+            f"{network.name}: {len(ours)} and {len(theirs)} feature channels; expected one number "
+            "for all pictures"
         )
     where = _places(first, ours)
-    here, there = _common(first, second, where, occlusion)
-    score, undefined = _dissimilarity(_sample(ours, here), _sample(theirs, there))
-    reference, _ = _dissimilarity(_sample(ours, here), _sample(others, there))
-    itself, back = _common(first, first, where, occlusion)
-    same, _ = _dissimilarity(_sample(ours, itself), _sample(ours, back))
+    found = correspond(first, second, occlusion=occlusion, where=where)
+    on = found.seen == Seen.COVISIBLE
+    here = found.start[on] / (first.camera.width[0], first.camera.height[0])
+    there = found.xy[on] / (second.camera.width[0], second.camera.height[0])
+    own = _sample(ours, here)
+    score, undefined = _dissimilarity(own, _sample(theirs, there))
+    rolled = np.roll(theirs, [n // 2 for n in theirs.shape[1:]], (1, 2))
+    reference, _ = _dissimilarity(own, _sample(rolled, there))
     compared = len(here) - undefined
-    status = _status(first, second, network.name, (score, reference, same))
+    status = _status(first, second, network.name, score, reference)
     return FeatureConsistency(
         first=first.name,
         second=second.name,
@@ -162,9 +150,7 @@ def feature_consistency(
         overlap=compared / int(where.sum()),
         places=compared,
         undefined=undefined,
-        same_image=same,
         unrelated=reference,
-        unrelated_source=source,
     )
 
 
@@ -172,18 +158,18 @@ def _status(
     first: PosedPicture,
     second: PosedPicture,
     network: str,
-    scores: tuple[float | None, float | None, float | None],
+    score: float | None,
+    reference: float | None,
 ) -> str:
-    """What scores of second, of unrelated content and of first itself stand for."""
-    score, reference, same = scores
+    """What the scores of second and of unrelated content stand for."""
     if score is None and first.depth is not None and second.depth is not None:
         return f"empty: {first.name} and {second.name} have no co-visible place with features"
     if score is None:
         return f"empty: {first.name if first.depth is None else second.name} has no depth"
-    if reference is not None and same is not None and reference - same < LEAST_SCALE:
+    if reference is not None and reference < LEAST_SCALE:
         return (
-            f"degenerate: {network} gives unrelated content {reference:.3g} and the same "
-            f"picture {same:.3g}; it tells nothing apart here"
+            f"degenerate: {network} gives unrelated content {reference:.3g}; it tells nothing "
+            "apart here"
         )
     return "measured"
 
@@ -215,13 +201,9 @@ def load_met3r(size: int = 256) -> tuple[Callable[..., Any] | None, str]:
 
 
 def met3r_score(
-    first: PosedPicture,
-    second: PosedPicture,
-    *,
-    metric: Callable[..., Any] | None = None,
-    size: int = 256,
+    first: PosedPicture, second: PosedPicture, metric: Callable[..., Any], *, size: int = 256
 ) -> Met3rScore:
-    """The original MEt3R of two pictures, if the package ``met3r`` is installed.
+    """The original MEt3R of two pictures.
 
     The largest centred square of each picture, resampled to ``size``, goes in; cameras, depth and
     masks do not. MEt3R gives 0 (its best) where the pictures do not overlap; here that is None.
@@ -229,21 +211,12 @@ def met3r_score(
     Args:
         first: the view that MEt3R compares in.
         second: the view that it carries there.
-        metric: a ``met3r.MEt3R`` module made for ``size``, to use for many pairs; None makes one
-            with its own defaults, on the GPU if there is one. Making one fetches its weights.
+        metric: a ``met3r.MEt3R`` module made for ``size``, see `load_met3r`.
         size: pixels, a multiple of 16.
     """
-
-    def without(status: str, overlap: float | None = None) -> Met3rScore:
-        return Met3rScore(first.name, second.name, status, None, overlap)
-
     import torch
 
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if metric is None:
-        metric, status = load_met3r(size)
-        if metric is None:
-            return without(status)
+    device = torch.device("cpu")
     if isinstance(metric, torch.nn.Module):
         device = next((weight.device for weight in metric.parameters()), device)
     pair = torch.from_numpy(np.stack([_square(first.rgb, size), _square(second.rgb, size)])[None])
@@ -256,7 +229,8 @@ def met3r_score(
         )
     overlap = float(mask.float().mean())
     if overlap == 0:
-        return without("empty: MEt3R finds no overlap", overlap)
+        status = "empty: MEt3R finds no overlap"
+        return Met3rScore(first.name, second.name, status, None, overlap)
     return Met3rScore(first.name, second.name, "measured", float(score.mean()), overlap)
 
 
@@ -283,29 +257,15 @@ def _places(picture: PosedPicture, features: Float32) -> NDArray[np.bool_]:
     return where
 
 
-def _common(
-    first: PosedPicture, second: PosedPicture, where: NDArray[np.bool_], occlusion: float
-) -> tuple[Float64, Float64]:
-    """Co-visible places in both views, (N, 2) each, as shares of width and height."""
-    found = correspond(first, second, occlusion=occlusion, where=where)
-    on = found.seen == Seen.COVISIBLE
-    return (
-        found.start[on] / (first.camera.width[0], first.camera.height[0]),
-        found.xy[on] / (second.camera.width[0], second.camera.height[0]),
-    )
-
-
 def _sample(features: Float32, places: Float64) -> Float64:
     """(N, C) features at places given as shares of width and height, bilinear, edges repeated."""
-    height, width = features.shape[1:]
-    x = np.clip(places[:, 0] * width - 0.5, 0, width - 1)
-    y = np.clip(places[:, 1] * height - 0.5, 0, height - 1)
-    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    along_x, along_y = x - left, y - top
-    upper = features[:, top, left] * (1 - along_x) + features[:, top, right] * along_x
-    lower = features[:, bottom, left] * (1 - along_x) + features[:, bottom, right] * along_x
-    return (upper * (1 - along_y) + lower * along_y).T
+    import torch
+    from torch.nn.functional import grid_sample
+
+    given = torch.from_numpy(features.astype(np.float64))[None]
+    grid = torch.from_numpy(2 * places - 1)[None, None]
+    found = grid_sample(given, grid, padding_mode="border", align_corners=False)
+    return found[0, :, 0].T.numpy()
 
 
 def _dissimilarity(first: Float64, second: Float64) -> tuple[float | None, int]:

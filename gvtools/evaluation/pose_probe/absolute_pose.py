@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Float64
 
-if TYPE_CHECKING:
-    import pycolmap
-
-# Rounds of refining over all inliers and counting them anew; the set settles within two or three.
-ROUNDS = 4
 LEAST = 4  # matches: three leave up to four poses
 # Matches within this many times the error of a pose are near to it: their own pose is no rival.
 NEAR = 3.0
@@ -45,20 +39,16 @@ def absolute_pose(
     points: Float64,
     K: Float64,
     *,
-    width: int,
-    height: int,
     max_error: float,
     seed: int = 0,
     min_inlier_share: float = 0.1,
 ) -> AbsolutePose | None:
-    """Estimate by LO-RANSAC over P3P, then refine over all inliers until their set stays.
+    """Estimate by LO-RANSAC over P3P, refine over all inliers, and count those of the result.
 
     Args:
         xy: (M, 2), pixels; the first pixel's centre is (0.5, 0.5).
         points: (M, 3), world frame, scene units.
         K: (3, 3), pixels.
-        width: of the picture, pixels.
-        height: of the picture, pixels.
         max_error: reprojection error of an inlier, pixels.
         seed: of the sampling.
         min_inlier_share: samples are drawn until a pose of this share would have been met; below
@@ -74,55 +64,25 @@ def absolute_pose(
     # COLMAP's pinhole has no skew, and coordinates near 0 keep their digits.
     pinhole = np.column_stack([xy[:, 0] - K[0, 1] * (xy[:, 1] - K[1, 2]) / K[1, 1], xy[:, 1]])
     origin = points.mean(axis=0)
-    local = points - origin
+    # The picture's size plays no part.
     camera = pycolmap.Camera(
-        model="PINHOLE",
-        width=width,
-        height=height,
-        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+        model="PINHOLE", width=1, height=1, params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     )
     estimation = pycolmap.AbsolutePoseEstimationOptions()
     estimation.ransac.max_error = max_error
     estimation.ransac.random_seed = seed
     estimation.ransac.min_inlier_ratio = min_inlier_share
-    found = pycolmap.estimate_absolute_pose(pinhole, local, camera, estimation)
+    found = pycolmap.estimate_and_refine_absolute_pose(pinhole, points - origin, camera, estimation)
     if found is None:
         return None
-    pose, inliers = found["cam_from_world"], found["inlier_mask"]
-    refined = _refined(pose, inliers, pinhole, local, camera, max_error)
-    if refined is None:
-        return None
-    pose, inliers, errors = refined
     cam_from_world = np.eye(4)
-    cam_from_world[:3] = pose.matrix()
+    cam_from_world[:3] = found["cam_from_world"].matrix()
+    errors = _reprojection_errors(cam_from_world, xy, points - origin, K)
+    inliers = errors <= max_error
+    if inliers.sum() < LEAST:
+        return None
     cam_from_world[:3, 3] -= cam_from_world[:3, :3] @ origin
     return AbsolutePose(cam_from_world, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
-
-
-def _refined(
-    pose: pycolmap.Rigid3d,
-    inliers: NDArray[np.bool_],
-    xy: Float64,
-    points: Float64,
-    camera: pycolmap.Camera,
-    max_error: float,
-) -> tuple[pycolmap.Rigid3d, NDArray[np.bool_], Float64] | None:
-    """Pose, inliers and errors (M,) once refining changes no inlier; None with too few of them."""
-    import pycolmap
-
-    errors = np.full(len(xy), np.inf)
-    for _ in range(ROUNDS):
-        if inliers.sum() < LEAST:
-            return None
-        refined = pycolmap.refine_absolute_pose(pose, xy, points, inliers, camera)
-        if refined is None:
-            return None
-        pose, before = refined["cam_from_world"], inliers
-        errors = _reprojection_errors(pose.matrix(), xy, points, camera.calibration_matrix())
-        inliers = errors <= max_error
-        if np.array_equal(inliers, before):
-            break
-    return None if inliers.sum() < LEAST else (pose, inliers, errors)
 
 
 def rival_pose(
@@ -131,8 +91,6 @@ def rival_pose(
     K: Float64,
     *,
     pose: AbsolutePose,
-    width: int,
-    height: int,
     max_error: float,
     share: float,
     seed: int = 0,
@@ -147,8 +105,6 @@ def rival_pose(
         points: (M, 3), world frame, scene units.
         K: (3, 3), pixels.
         pose: of these matches.
-        width: of the picture, pixels.
-        height: of the picture, pixels.
         max_error: reprojection error of an inlier, pixels.
         share: of the inliers of ``pose``; rivals with far fewer are not looked for.
         seed: of the sampling.
@@ -161,7 +117,7 @@ def rival_pose(
     depth += pose.cam_from_world[2, 3]
     known, rest = pose, np.ones(len(xy), np.bool_)
     for _ in range(RIVALS):
-        rest &= _reprojection_errors(known.cam_from_world[:3], xy, points, K) > NEAR * max_error
+        rest &= _reprojection_errors(known.cam_from_world, xy, points, K) > NEAR * max_error
         if rest.sum() < max(wanted, LEAST):
             return None
         # Half of the wanted share: matches are counted here, not the places they come from.
@@ -169,8 +125,6 @@ def rival_pose(
             xy[rest],
             points[rest],
             K,
-            width=width,
-            height=height,
             max_error=max_error,
             seed=seed,
             min_inlier_share=min(0.5 * wanted / int(rest.sum()), 0.9),
@@ -204,7 +158,7 @@ def _contradicts(first: Float64, second: Float64, depth: float) -> bool:
 
 def _reprojection_errors(pose: Float64, xy: Float64, points: Float64, K: Float64) -> Float64:
     """(M,) pixels; infinite behind the camera."""
-    local = points @ pose[:, :3].T + pose[:, 3]
+    local = points @ pose[:3, :3].T + pose[:3, 3]
     ahead = local[:, 2] > 0
     z = np.where(ahead, local[:, 2], 1)
     projected = (local @ K.T)[:, :2] / z[:, None]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr
 
 from gvtools.errors import ShapeError
+from gvtools.evaluation.consistency.colmap_matching import quiet_colmap
 from gvtools.settings import Settings
 
 # Lightness of BT.601, as grey pictures are commonly made for SIFT.
@@ -117,14 +118,10 @@ class SiftMatcher(Settings):
             options = pycolmap.FeatureExtractionOptions()
             options.use_gpu = False
             options.sift.max_num_features = max(8192, self.max_features)
-            level = pycolmap.logging.minloglevel
-            pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
-            try:
+            with quiet_colmap():
                 self._extractor.append(
                     pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
                 )
-            finally:
-                pycolmap.logging.minloglevel = level
         return self._extractor[0]
 
 

@@ -2,34 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, Float64
 
 
-@dataclass(frozen=True, eq=False)
-class LiftedKeypoints:
-    """What became of N keypoints.
-
-    Attributes:
-        points: (N, 3) float64, world frame, scene units; NaN where there is none.
-        ok: (N,) bool, whether there is a point.
-        without_depth: keypoints with a pixel without depth beside them.
-        at_edges: keypoints at a depth edge.
-    """
-
-    points: Float64
-    ok: NDArray[np.bool_]
-    without_depth: int
-    at_edges: int
-
-
 def lift_keypoints(
     xy: Float64, depth: NDArray[np.float32], camera: Cameras, *, edge: float
-) -> LiftedKeypoints:
+) -> tuple[Float64, NDArray[np.bool_]]:
     """Keypoints lifted by the depth between the four pixel centres around each.
 
     Depth is interpolated as its inverse, which on a plane is linear in the picture. A keypoint
@@ -41,6 +22,9 @@ def lift_keypoints(
         depth: (H, W) z-depth, scene units; 0, NaN and inf mean none.
         camera: a batch of one, of the same size.
         edge: largest spread of the four depths, as a share of the depth.
+
+    Returns:
+        (N, 3) float64, world frame, scene units, and (N,) bool, which of them hold.
     """
     height, width = depth.shape
     corner = np.clip(np.floor(xy - 0.5), 0, np.maximum([width - 2, height - 2], 0)).astype(np.int64)
@@ -54,10 +38,7 @@ def lift_keypoints(
     u, v = along.T
     weight = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v])
     z = 1 / (four * weight).sum(axis=0)
-    has_depth = np.isfinite(z)
-    smooth = (four.max(axis=0) - four.min(axis=0)) * z <= edge
-    ok = has_depth & smooth
+    ok = (four.max(axis=0) - four.min(axis=0)) * z <= edge
     rays = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(camera.K[0]).T
     points = rays * z[:, None] @ camera.world_from_cam[0, :3, :3].T + camera.centers[0]
-    points[~ok] = np.nan
-    return LiftedKeypoints(points, ok, int((~has_depth).sum()), int((has_depth & ~smooth).sum()))
+    return points, ok

@@ -95,15 +95,6 @@ class PoseSummary:
     inliers: Statistics | None
     inlier_share: Statistics | None
 
-    def __str__(self) -> str:
-        text = f"{self.located} of {self.pictures} located"
-        if self.rotation_error_deg is None or self.center_error is None:
-            return text
-        return (
-            f"{text}, off by {self.rotation_error_deg.median:.2f} degrees and "
-            f"{self.center_error.median:.3g} scene units in the median of those"
-        )
-
 
 def summarise(found: Sequence[Located]) -> PoseSummary:
     """The findings of all probed pictures; leave none out, failures least of all."""

@@ -10,11 +10,11 @@ from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 
 from gvtools.cameras import Cameras, Float64, concatenate
-from gvtools.errors import DegenerateError, OptionError, ShapeError
+from gvtools.errors import DegenerateError, OptionError
 from gvtools.evaluation.pose_probe.absolute_pose import (
     AbsolutePose,
     absolute_pose,
@@ -92,7 +92,6 @@ class PoseProbe:
     Attributes:
         options: see PoseProbeOptions.
         extent: twice the largest distance of a context centre from their mean, scene units.
-        dropped: context keypoints without a 3D point, by reason.
 
     Args:
         context: views with depth from any source (measured, or the memory's projection); those
@@ -120,40 +119,26 @@ class PoseProbe:
         self._context = tuple(context)
         if len({picture.name for picture in self._context}) != len(self._context):
             raise OptionError("pose probe: two context views have one name; names must differ")
-        self.dropped = {"view without depth": 0, "no depth": 0, "depth edge": 0, "masked": 0}
         self._views = [self._lifted(picture) for picture in self._context]
         if not any(len(view.points) for view in self._views):
             raise DegenerateError(
-                f"pose probe: none of {len(self._context)} context views has keypoints with depth "
-                f"({self.dropped}); give views with texture and depth"
+                f"pose probe: none of {len(self._context)} context views has keypoints with depth; "
+                "give views with texture and depth"
             )
         self.extent = _extent([picture.camera for picture in self._context])
 
-    def locate(
-        self,
-        picture: PosedPicture,
-        *,
-        K: ArrayLike | None = None,
-        leave_out: Collection[str] = (),
-    ) -> Located:
+    def locate(self, picture: PosedPicture, *, leave_out: Collection[str] = ()) -> Located:
         """Where ``picture`` looks from, by its pixels alone.
 
         Args:
             picture: its mask limits the keypoints; its camera's pose is only compared with.
-            K: (3, 3) intrinsics to solve with, pixels; None takes those of the picture's camera.
             leave_out: names of context views not to match; other names mean nothing.
-
-        Raises:
-            ShapeError: K of another shape.
         """
-        intrinsics = np.asarray(picture.camera.K[0] if K is None else K, np.float64)
-        if intrinsics.shape != (3, 3):
-            raise ShapeError(f"pose probe: K {intrinsics.shape}; expected (3, 3)")
         features = self._matcher.extract(picture.rgb)
         features = features[_inside(features.xy, picture.mask)]
         views = self._promising(features, leave_out)
         keypoint, points = self._correspondences(features, views)
-        pose, counts = self._solved(features, keypoint, points, intrinsics)
+        pose, counts = self._solved(features, keypoint, points, picture.camera.K[0])
         reason = self._reason(counts)
         return self._located(
             picture,
@@ -170,12 +155,7 @@ class PoseProbe:
 
         Args:
             count: how many, evenly spread over the context; None takes all.
-
-        Raises:
-            OptionError: a count below 1.
         """
-        if count is not None and count < 1:
-            raise OptionError(f"pose_probe.leave_one_out {count}; expected at least 1")
         total = len(self._context)
         chosen = np.unique(np.linspace(0, total - 1, min(count or total, total)).round())
         pictures = [self._context[int(i)] for i in chosen]
@@ -183,16 +163,12 @@ class PoseProbe:
 
     def _lifted(self, picture: PosedPicture) -> _ContextView:
         features = self._matcher.extract(picture.rgb)
-        inside = _inside(features.xy, picture.mask)
-        self.dropped["masked"] += int((~inside).sum())
-        features = features[inside]
+        features = features[_inside(features.xy, picture.mask)]
         if picture.depth is None:
-            self.dropped["view without depth"] += len(features)
             return _ContextView(picture.name, features[:0], np.zeros((0, 3)))
-        lifted = lift_keypoints(features.xy, picture.depth, picture.camera, edge=self.options.edge)
-        self.dropped["no depth"] += lifted.without_depth
-        self.dropped["depth edge"] += lifted.at_edges
-        return _ContextView(picture.name, features[lifted.ok], lifted.points[lifted.ok])
+        edge = self.options.edge
+        points, ok = lift_keypoints(features.xy, picture.depth, picture.camera, edge=edge)
+        return _ContextView(picture.name, features[ok], points[ok])
 
     def _promising(self, features: Features, leave_out: Collection[str]) -> list[_ContextView]:
         """The views whose most prominent keypoints match those of the picture most often."""
@@ -228,7 +204,7 @@ class PoseProbe:
         place = place.reshape(-1)
         size = {"width": features.width, "height": features.height}
         error = self.options.max_error or max(2.0, max(size.values()) / 160)
-        pose = absolute_pose(xy, points, K, **size, max_error=error, seed=self.seed)
+        pose = absolute_pose(xy, points, K, max_error=error, seed=self.seed)
         if pose is None:
             return None, _Counts(len(features), len(places), 0, 0, 0)
         agreed = np.unique(place[pose.inliers])
@@ -237,7 +213,6 @@ class PoseProbe:
             points,
             K,
             pose=pose,
-            **size,
             max_error=error,
             share=self.options.max_rival,
             seed=self.seed,

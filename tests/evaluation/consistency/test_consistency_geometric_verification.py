@@ -113,14 +113,9 @@ def test_a_pose_beyond_the_limit_shows_in_the_triangulated_share(
 def test_damaged_pictures_lose_matches(
     right: GeometricVerification, views: list[PosedPicture], change: str
 ) -> None:
-    counts = [right.mean_verified or 0]
-    for strength in (1, 2):
-        damaged = [
-            blurred(view, 1.2 * strength) if change == "blur" else noisy(view, 15 * strength)
-            for view in views[:3]
-        ]
-        counts.append(verify_geometry(damaged).mean_verified or 0)
-    assert counts[0] > 1.1 * counts[1] > 1.2 * counts[2] > 0
+    damaged = [blurred(view, 2.4) if change == "blur" else noisy(view, 30) for view in views[:3]]
+    count = verify_geometry(damaged).mean_verified or 0
+    assert (right.mean_verified or 0) > 1.3 * count > 0
 
 
 def test_a_picture_of_something_else_is_named(views: list[PosedPicture]) -> None:

@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tiny_scan import write_scan
+from trajectory_writers import write_tum
 
 from gvtools.errors import OptionError
 from gvtools.runs.layout import target_stems
 from gvtools.scenes.project import open_project
-from gvtools.trajectory_files import write_trajectory
 from pipelines.reconstruction.plan import make_schedule
 from pipelines.reconstruction.targets import resolve_targets
 
@@ -46,7 +46,7 @@ def test_bad_specifications_are_refused(scene, spec):
 
 def test_a_trajectory_file_gives_the_poses(scene, tmp_path):
     path = tmp_path / "path.txt"
-    write_trajectory(path, scene.cameras)
+    write_tum(path, scene.cameras)
     targets = resolve_targets(scene, scene.names, str(path))
     np.testing.assert_allclose(
         targets.cameras.cam_from_world, scene.cameras.cam_from_world, atol=1e-6

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from tiny_scan import write_scan
 
-from gvtools.errors import OptionError
 from gvtools.runs.folder_lock import folder_lock
 from gvtools.settings import changes, with_profile, with_texts
 from pipelines.cli import build_parser, main
@@ -18,7 +17,6 @@ from pipelines.commands.tradeoff import asked_for
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.tradeoff.sweep import EQUAL
 from pipelines.tradeoff.trial import applied
-from viz.plots.pareto import draw_pareto
 
 # Another edge than the first guess, as if it had been measured.
 WIDER = ("--set", "fusion.voxel_scale=1.25")
@@ -131,11 +129,6 @@ def test_what_cannot_be_swept_is_one_line(scan, tmp_path, capsys, more, said):
     assert main(["tradeoff", str(scan), "--out", str(tmp_path / "x"), *more]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
-
-
-def test_a_plot_without_trials_is_refused():
-    with pytest.raises(OptionError, match="without trials"):
-        draw_pareto([], front=[], title="nothing")
 
 
 def test_a_damaged_trial_is_made_anew(scan, swept, tmp_path):

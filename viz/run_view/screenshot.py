@@ -1,0 +1,52 @@
+"""A picture of a run without a window or a display, rendered by the project's own splatter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gvtools.errors import OptionError
+from gvtools.files import replaced_when_written
+from viz.run_view.render import RunRenderer, picture_of
+from viz.run_view.view import CONTEXT, RunView, ShownCamera
+
+
+def write_screenshot(
+    path: Path, run: RunView, shown: ShownCamera, *, round: int, mode: str
+) -> None:
+    """Write a run seen by one of its cameras as PNG, white where nothing is known.
+
+    Args:
+        path: the file.
+        run: what to show.
+        shown: where to look from.
+        round: the memory as it was after it.
+        mode: of viz.run_view.point_colors.MODES.
+
+    Raises:
+        ProjectError: it cannot be written.
+    """
+    from PIL import Image
+
+    guidance = RunRenderer(run).render(shown.camera, round=round, mode=mode)
+    with replaced_when_written(path) as temporary:
+        Image.fromarray(picture_of(guidance)).save(temporary, format="PNG")
+
+
+def chosen_camera(run: RunView, name: str | None) -> ShownCamera:
+    """The camera of a view, or the first of the context.
+
+    Raises:
+        OptionError: no such view, or no cameras at all.
+    """
+    if not run.cameras:
+        raise OptionError(f"{run.path}: holds no cameras to look from; expected a run's memory")
+    if name is None:
+        return next((c for c in run.cameras if c.kind == CONTEXT), run.cameras[0])
+    for shown in run.cameras:
+        if shown.name == name:
+            return shown
+    names = [shown.name for shown in run.cameras]
+    raise OptionError(
+        f"--camera {name!r}: no such view; expected one of {len(names)}, such as {names[0]!r} or "
+        f"{names[-1]!r}"
+    )
