@@ -19,6 +19,7 @@ from gvtools.errors import ProjectError
 from gvtools.runs.layout import AFTER, COMPLETION, GUIDANCE, round_folder
 from gvtools.runs.target_files import entry_camera, read_picture
 from viz.run_view.point_colors import PointColors, point_colors, view_counts
+from viz.run_view.upright import STRAY, guessed_up
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -28,10 +29,6 @@ CONTEXT, TARGET = "context", "target"
 # The pictures that a round leaves of a target, by the title that a viewer gives them.
 PICTURES = {"guidance": GUIDANCE, "completion": COMPLETION, "memory after": AFTER}
 TRUTH = "truth"
-# Percent of the points at each end that may lie far off.
-STRAY = 0.5
-# Scenes are wider than high; lower by so much is no accident.
-FLATTER = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,12 +156,11 @@ class RunView:
     def up(self) -> NDArray[np.float64]:
         """(3,) unit vector, world frame: what most of the context's cameras hold to be up.
 
-        Without cameras, z if the points reach less far that way, else -y as in a camera's frame.
+        Without cameras it is a guess, see guessed_up.
         """
         chosen = [c for c in self.cameras if c.kind == CONTEXT] or list(self.cameras)
         if not chosen:
-            _, deep, high = self.bounds[1] - self.bounds[0]
-            return np.array([0.0, 0, 1] if high < FLATTER * deep else [0.0, -1, 0])
+            return self._guessed_up
         # Image rows run downwards.
         total = -np.sum([c.camera.cam_from_world[0, 1, :3] for c in chosen], axis=0)
         length = float(np.linalg.norm(total))
@@ -173,6 +169,10 @@ class RunView:
     @cached_property
     def _view_counts(self) -> NDArray[np.int64]:
         return view_counts(self.memory)
+
+    @cached_property
+    def _guessed_up(self) -> NDArray[np.float64]:
+        return guessed_up(self.memory.frame.to_world(self._sample()[1]))
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
