@@ -48,9 +48,10 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
     assert len(names["cloud"].point.positions) == len(names["memory"]) > 0  # type: ignore[attr-defined, arg-type]
 
 
-def test_the_completer_of_the_page_on_completers_works() -> None:
-    from gvtools.completers.base import create
+def test_the_completer_of_the_page_on_completers_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    from gvtools.completers import base
 
+    monkeypatch.setattr(base, "_REGISTRY", dict(base._REGISTRY))
     page = (ROOT / "docs/concepts/completers.md").read_text(encoding="utf-8")
     exec(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)[0], {})
     known = np.zeros((1, 4, 6), bool)
@@ -59,7 +60,7 @@ def test_the_completer_of_the_page_on_completers_works() -> None:
     guidance = gvtools.Guidance(
         camera, np.zeros((1, 4, 6, 3), np.float32), zeros, known, zeros, known
     )
-    completion = create("grey", level="0.25").complete([], guidance)
+    completion = base.create("grey", level="0.25").complete([], guidance)
     assert np.all(completion.rgb == 0.25)
 
 
