@@ -12,7 +12,9 @@ from stereo_scenes import plane_depth, plane_scene
 from gvtools.cameras import concatenate
 from gvtools.depth.stereo.depth_range import DepthRange
 from gvtools.depth.stereo.hypotheses import best_plane, parabola, plane_hypotheses
-from gvtools.depth.stereo.matching import CpuMatcher, Level, TorchMatcher, make_matcher
+from gvtools.depth.stereo.matching import Level, make_matcher
+from gvtools.depth.stereo.matching_cpu import CpuMatcher
+from gvtools.depth.stereo.matching_torch import TorchMatcher
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.pyramid import build_pyramid, level_of, window_taps, window_weights
 from gvtools.depth.stereo.refinement import fitted, refined, upsampled
