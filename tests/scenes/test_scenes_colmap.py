@@ -169,20 +169,19 @@ def test_depth_map_of_another_aspect_is_an_error_finding_and_raises_when_loaded(
         scene[name].load()
 
 
-def test_masks_images_and_depths_may_be_given(tmp_path):
+def test_masks_and_images_may_be_given(tmp_path):
     reconstruction = workspace(tmp_path / "project", "PINHOLE")
     name = next(iter(reconstruction.images.values())).name
     (tmp_path / "project" / "images").rename(tmp_path / "pictures")
     save(tmp_path / "ignore" / f"{name}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    (tmp_path / "deep").mkdir()
-    np.save(tmp_path / "deep" / f"{name}.npy", np.full((HEIGHT, WIDTH), 2.5))
+    (tmp_path / "project/stereo/depth_maps").mkdir(parents=True)
+    np.save(tmp_path / f"project/stereo/depth_maps/{name}.npy", np.full((HEIGHT, WIDTH), 2.5))
     with pytest.raises(ProjectError, match="without images"):
         read_colmap(tmp_path / "project")
     scene = read_colmap(
         tmp_path / "project",
         images=tmp_path / "pictures",
         masks=tmp_path / "ignore",
-        depths=tmp_path / "deep",
     )
     frame = scene[name].load()
     assert not frame.mask.any()
