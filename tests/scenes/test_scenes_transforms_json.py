@@ -21,7 +21,7 @@ from scenes_workspace import (
 )
 
 from gvtools.cameras import Cameras
-from gvtools.errors import GvError, ProjectError, ShapeError
+from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.scene import Finding
 from gvtools.scenes.transforms_json import read_transforms, write_transforms
@@ -235,7 +235,7 @@ def test_wrong_values_name_the_frame_the_key_and_the_value(tmp_path, capsys, key
     assert "unexpected" not in told
 
 
-@pytest.mark.parametrize("angle", [0, -0.6, math.pi, 4, 5e-324, math.nan, "0.6", None])
+@pytest.mark.parametrize("angle", [0, -0.6, math.pi, 4, math.nan, "0.6", None])
 def test_an_angle_of_view_lies_between_0_and_pi(tmp_path, capsys, angle):
     save(tmp_path / "images/a.png", ramp())
     path = transforms(tmp_path, [frame()], camera_angle_x=angle)
@@ -301,20 +301,15 @@ def test_written_file_reads_back(tmp_path):
     )
     for i, name in enumerate(names):
         save(tmp_path / "images" / name, ramp(int(cameras.width[i]), int(cameras.height[i])))
-        np.save(tmp_path / f"{name}.npy", np.full((72, 96), 2.5))
     write_transforms(
         tmp_path / "transforms.json",
         cameras,
         image_paths=[(tmp_path / "images" / names[0]).resolve(), "images/b.png", "images/c.png"],
-        depth_paths=[f"{name}.npy" for name in names],
     )
     written = json.loads((tmp_path / "transforms.json").read_text())
     assert written["frames"][0]["file_path"] == "images/a.png"
     scene = read_transforms(tmp_path)
     np.testing.assert_allclose(scene.cameras.K, cameras.K, atol=1e-12)
     np.testing.assert_allclose(scene.cameras.cam_from_world, pose, atol=1e-12)
-    np.testing.assert_array_equal(scene.views[0].load().depth, 2.5)
     assert scene.names == names
     assert not list(tmp_path.glob("*.partial"))
-    with pytest.raises(ShapeError, match="1 images"):
-        write_transforms(tmp_path / "t.json", cameras, image_paths=["a"])
