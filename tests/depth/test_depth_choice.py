@@ -70,7 +70,7 @@ def test_auto_takes_recorded_depth_where_all_have_it(scan):
 
 
 def test_auto_mixes_view_by_view(scan, monkeypatch):
-    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
+    monkeypatch.setattr(choice, "_stereo", lambda *_: (Computed(), "plane-sweep"))
     partly = without_depth(scan, 1, 3)
     chosen = choose_source(partly, partly.names, "auto")
     assert isinstance(chosen.source, MixedDepth)
@@ -82,7 +82,7 @@ def test_auto_mixes_view_by_view(scan, monkeypatch):
 
 
 def test_auto_computes_where_there_is_none(scan, monkeypatch):
-    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
+    monkeypatch.setattr(choice, "_stereo", lambda *_: (Computed(), "plane-sweep"))
     bare = without_depth(scan, *range(6))
     chosen = choose_source(bare, bare.names, "auto")
     assert chosen.source.name == "computed"
@@ -140,16 +140,6 @@ def test_a_rough_source_is_a_small_sweep_without_posing(scan, tmp_path):
     assert rough_source(bare, pair) is pair
 
 
-def test_a_sweep_tells_which_views_it_has_computed(scan):
-    """A view needs its sources' own estimates, and nothing is computed before it is asked for."""
-    stereo = PlaneSweepStereo(scan, options=StereoOptions(sources=2, align=False), views=scan.names)
-    assert stereo.computed == ()
-    view = scan.views[0]
-    stereo.depth(scan, view, view.load())
-    assert set(stereo.computed) == {view.name, *stereo.raw(view).sources}
-    assert len(stereo.computed) == 3
-
-
 def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):
     workspace(tmp_path)
     scene = read_colmap(tmp_path)
@@ -157,7 +147,7 @@ def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):
     for asked in ("auto", "colmap"):
         assert isinstance(choose_source(scene, scene.names, asked).source, ColmapPatchMatch)
     # Without sparse points, it could not run.
-    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
+    monkeypatch.setattr(choice, "_stereo", lambda *_: (Computed(), "plane-sweep"))
     bare = replace(scene, points=None)
     assert choose_source(bare, bare.names, "auto").source.name == "computed"
 

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
+from gvtools.depth.scale_check import depth_of_points
 from gvtools.scenes.scene import Scene
 from gvtools.similarity import align_depth_scale
 
@@ -80,24 +81,15 @@ def fit_scale(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
 
 
 def _fit_points(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
-    points = scene.points
-    if points is None:
+    if scene.points is None:
         return FoundationScale("unsupported: no sparse points", "points", *(np.nan,) * 3, 0)
-    made, known = [np.zeros(0)], [np.zeros(0)]
-    for part in passes:
-        for name in part.names:
-            camera = scene[name].camera
-            mine = points.view_index == scene.names.index(name)
-            _, z = camera.project(points.positions[points.point_index[mine]])
-            depth = part.depth[name]
-            rows, columns = depth.shape
-            x = points.xy[mine, 0] * (columns / int(camera.width[0]))
-            y = points.xy[mine, 1] * (rows / int(camera.height[0]))
-            inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows) & (z[0] > 0)
-            cell = y[inside].astype(np.int64), x[inside].astype(np.int64)
-            made.append(depth[cell].astype(np.float64) * part.unit)
-            known.append(z[0][inside])
-    depth, reference = np.concatenate(made), np.concatenate(known)
+    pairs = [
+        (measured.astype(np.float64) * part.unit, known)
+        for part in passes
+        for name in part.names
+        for measured, known in [depth_of_points(scene, name, part.depth[name])]
+    ]
+    depth, reference = (np.concatenate([np.zeros(0), *side]) for side in zip(*pairs, strict=True))
     fitted = align_depth_scale(
         depth, reference, valid=depth > 0, min_support=MIN_POINTS, inlier_band=0.1
     )

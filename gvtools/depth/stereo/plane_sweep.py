@@ -162,11 +162,6 @@ class PlaneSweepStereo:
             self._raw[view.name] = raw
         return raw
 
-    @property
-    def computed(self) -> tuple[str, ...]:
-        """Names of the views whose own estimate is kept, in the order in which they were asked."""
-        return tuple(self._raw)
-
     def _confirming(self, name: str) -> RawDepth | None:
         """A source's own estimate; None when no view of the pool shows what it does."""
         try:
@@ -256,10 +251,9 @@ class PlaneSweepStereo:
         return narrowed(depths, coarse)
 
     def _sources(self, view: View, depths: DepthRange) -> tuple[str, ...]:
-        chosen = choose_sources(
+        names = choose_sources(
             self._known(view), view.name, self.views, count=self.options.sources, depths=depths
         )
-        names = tuple(source.name for source in chosen)
         if names:
             # As large as the finest level, whose pixels are meant.
             camera, *others = (
