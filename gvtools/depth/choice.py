@@ -144,8 +144,8 @@ def _asked_recorded(scene: Scene, views: Sequence[str], choice: str, recorded: i
     advice = "add depth maps, or use auto"
     if choice == "colmap":
         advice = (
-            "pycolmap has no CUDA here; run COLMAP's patch_match_stereo on an undistorted workspace "
-            "(stereo/depth_maps is then read), or use plane-sweep"
+            "pycolmap has no CUDA here; run COLMAP's patch_match_stereo on an undistorted "
+            "workspace (stereo/depth_maps is then read), or use plane-sweep"
         )
     raise ProjectError(f"{scene.root}: none of the {len(views)} context views has depth; {advice}")
 

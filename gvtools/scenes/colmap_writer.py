@@ -18,15 +18,18 @@ if TYPE_CHECKING:
     import pycolmap
 
 
+NO_POINTS, NO_TRACKS = np.zeros((0, 3)), np.zeros(0, np.int64)
+
+
 def write_colmap(
     folder: Path,
     cameras: Cameras,
     *,
-    points: NDArray[np.float64],
-    colors: NDArray[np.uint8],
-    point_index: NDArray[np.integer[Any]],
-    view_index: NDArray[np.integer[Any]],
-    xy: NDArray[np.float64],
+    points: NDArray[np.float64] = NO_POINTS,
+    colors: NDArray[np.uint8] | None = None,
+    point_index: NDArray[np.integer[Any]] = NO_TRACKS,
+    view_index: NDArray[np.integer[Any]] = NO_TRACKS,
+    xy: NDArray[np.float64] = NO_POINTS[:, :2],
 ) -> None:
     """Write a binary model that COLMAP and pycolmap read back, in the cameras' own frame.
 
@@ -37,7 +40,7 @@ def write_colmap(
         folder: the model folder itself, usually ``workspace/sparse/0``; made when absent.
         cameras: V cameras; K without skew, each with a name of its own.
         points: (N, 3), world frame, scene units.
-        colors: (N, 3).
+        colors: (N, 3); None is black.
         point_index: (M,), for each track element its point.
         view_index: (M,), and its view.
         xy: (M, 2), and where it was seen, pixels with the first centre at (0.5, 0.5).
@@ -48,6 +51,8 @@ def write_colmap(
     """
     if len(set(cameras.names)) != len(cameras):
         raise ShapeError("cameras: two views share a name; a model needs unique image names")
+    if colors is None:
+        colors = np.zeros(points.shape, np.uint8)
     model = _reconstruction(cameras, points, colors, point_index, view_index, xy)
     try:
         folder.mkdir(parents=True, exist_ok=True)
