@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from gvtools.scenes.transforms_frame import LensParameters, frame_keys
 from gvtools.scenes.undistort import Undistortion, undistortion
 
 FILE = "transforms.json"
+EXPORTER = "gvtools"  # the value of ``exported_by`` in files written here
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg")  # Blender's files name pictures without a suffix
 
@@ -141,6 +142,7 @@ def write_transforms(
     cameras: Cameras,
     *,
     image_paths: Sequence[str | Path],
+    generated: Collection[str] = (),
 ) -> None:
     """Write cameras as a ``transforms.json`` that nerfstudio, instant-ngp and this project read.
 
@@ -148,6 +150,7 @@ def write_transforms(
         path: the file.
         cameras: V cameras; K without skew.
         image_paths: V pictures, absolute or relative to the file's folder.
+        generated: names of the cameras whose pictures a completer made.
 
     Raises:
         ProjectError: the file cannot be written.
@@ -155,7 +158,7 @@ def write_transforms(
     frames = []
     for i, image in enumerate(image_paths):
         K, pose = cameras.K[i], cameras.world_from_cam[i] @ OPENCV_FROM_OPENGL
-        frame = {
+        frame: dict[str, Any] = {
             "file_path": _relative(image, path.parent),
             "fl_x": K[0, 0],
             "fl_y": K[1, 1],
@@ -165,9 +168,11 @@ def write_transforms(
             "h": int(cameras.height[i]),
             "transform_matrix": pose.tolist(),
         }
+        if cameras.names[i] in generated:
+            frame["generated"] = True
         frames.append(frame)
-    text = json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=2)
-    write_text(path, text)
+    data = {"exported_by": EXPORTER, "camera_model": "PINHOLE", "frames": frames}
+    write_text(path, json.dumps(data, indent=2))
 
 
 def _relative(file: str | Path, folder: Path) -> str:
