@@ -1,7 +1,7 @@
 """The files of a COLMAP model: where they are, and whether a reader got all that they hold.
 
-pycolmap refuses most damage by itself, but reserves whatever memory a wrong count asks for, and
-does not notice that a binary file ends early.
+pycolmap refuses most damage by itself, but takes whatever memory a wrong count asks for, and does
+not notice that a binary file ends early.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def model_files(folder: Path) -> ModelFiles:
     """The files of the model in ``folder``, complete and with counts that they can hold.
 
     Raises:
-        ProjectError: files are missing, or too short for the records that they claim to hold.
+        ProjectError: files are missing, or do not hold the records that they claim to hold.
     """
     suffix = _suffix(folder)
     rigged = [stem for stem in RIGGED if (folder / f"{stem}{suffix}").is_file()]
@@ -75,34 +75,46 @@ def model_files(folder: Path) -> ModelFiles:
             path = folder / f"{stem}.bin"
             size, count = path.stat().st_size, _count(path)
             if size < 8 or count * LEAST_BYTES[stem] + 8 > size:
-                raise ProjectError(
-                    f"{path}: {size} bytes cannot hold the {count} records that its head names; "
-                    "the file is truncated or damaged; copy or export it again"
-                )
+                raise _damaged(path, f"{count} records that its head names cannot be in it")
+        for stem in ("images", "points3D"):
+            _check_records(folder / f"{stem}.bin")
     return ModelFiles(folder, suffix, _siblings(folder))
 
 
-def check_sizes(folder: Path, model: pycolmap.Reconstruction) -> None:
-    """Compare the sizes of binary files with those of the records that a reader got from them.
+def check_cameras(folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Compare the size of cameras.bin with the cameras that a reader got from it.
 
     Raises:
-        ProjectError: a file is shorter or longer.
+        ProjectError: it is shorter or longer.
     """
-    cameras, images, points = model.cameras, model.images, model.points3D
-    expected = {
-        "cameras": sum(24 + 8 * len(camera.params) for camera in cameras.values()),
-        "images": sum(
-            73 + len(image.name.encode()) + 24 * image.num_points2D() for image in images.values()
-        ),
-        "points3D": sum(51 + 8 * point.track.length() for point in points.values()),
-    }
-    for stem, size in expected.items():
-        path = folder / f"{stem}.bin"
-        if path.stat().st_size != 8 + size:
-            raise ProjectError(
-                f"{path}: {path.stat().st_size} bytes; the records in it take {8 + size}; the file "
-                "is truncated or damaged; copy or export it again"
-            )
+    path = folder / "cameras.bin"
+    expected = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+    if path.stat().st_size != expected:
+        raise _damaged(path, f"its cameras take {expected}")
+
+
+def _check_records(path: Path) -> None:
+    """Walk images.bin or points3D.bin by the counts in each record."""
+    data = path.read_bytes()
+    offset = 8
+    try:
+        for _ in range(_count(path)):
+            if path.stem == "images":
+                name_end = data.index(b"\0", offset + 64)
+                offset = name_end + 9 + 24 * struct.unpack_from("<Q", data, name_end + 1)[0]
+            else:
+                offset += 51 + 8 * struct.unpack_from("<Q", data, offset + 43)[0]
+    except (struct.error, ValueError):
+        offset = -1
+    if offset != len(data):
+        raise _damaged(path, "its records take another number")
+
+
+def _damaged(path: Path, reason: str) -> ProjectError:
+    return ProjectError(
+        f"{path}: {path.stat().st_size} bytes, and {reason}; the file is truncated or damaged; "
+        "copy or export it again"
+    )
 
 
 def _suffix(folder: Path) -> str:

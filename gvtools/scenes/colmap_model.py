@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import rigid_transform
 from gvtools.errors import ProjectError
-from gvtools.scenes.colmap_files import ModelFiles, check_sizes, model_files, text_names
+from gvtools.scenes.colmap_files import ModelFiles, check_cameras, model_files, text_names
 from gvtools.scenes.photographs import rotation_findings
-from gvtools.scenes.quaternions import rotation_from_quaternion
 from gvtools.scenes.scene import Finding, SparsePoints, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
 
@@ -29,7 +28,6 @@ REASONS = {
     "line_stream2": "a line of images.txt is malformed; an image has two lines",
     "line_stream ": "a line of points3D.txt is malformed",
     "Rig with ID": "an image, camera, rig or frame is named that is not there",
-    "bad_alloc": "a record claims more than memory holds",
 }
 
 
@@ -119,15 +117,16 @@ def _read(files: ModelFiles) -> pycolmap.Reconstruction:
     try:
         if files.suffix == ".bin":
             reconstruction.read_binary(files.folder)
-            check_sizes(files.folder, reconstruction)
+            check_cameras(files.folder, reconstruction)
         else:
             reconstruction.read_text(files.folder)
+        _ = [image.name for image in reconstruction.images.values()]  # decoded when asked for
     except UnicodeDecodeError:
         raise ProjectError(
             f"{files.folder}: the name of an image is no UTF-8; the file is damaged or of another "
             "encoding; export the model again"
         ) from None
-    except (ValueError, IndexError, KeyError, RuntimeError, OSError, MemoryError) as error:
+    except (ValueError, IndexError, KeyError, RuntimeError, OSError) as error:
         lines = str(error).split("Check failed:")[-1].strip().splitlines() or ["no reason"]
         reason = next((said for part, said in REASONS.items() if part in lines[0]), lines[0][:120])
         raise ProjectError(
@@ -148,11 +147,31 @@ def _registered(
             continue
         name = names.get(image.image_id, image.name)
         matrix = np.array(image.cam_from_world().matrix())
-        matrix[:, :3] = rotation_from_quaternion(image.cam_from_world().rotation.quat)
+        matrix[:, :3] = _rotation(image.cam_from_world().rotation.quat)
         pose, defect = rigid_transform(matrix, what=f"{files.folder}, image {name}")
         defects.append(defect)
         images.append(RegisteredImage(image.image_id, name, image.camera_id, pose))
     return tuple(sorted(images, key=lambda image: natural_key(image.name))), defects
+
+
+def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation of a quaternion, times its squared length.
+
+    A quaternion that is not of unit length so gives a scaled rotation, which the check of poses
+    either mends exactly or refuses; formulas for unit quaternions would shear it instead.
+
+    Args:
+        quaternion: (4,) x, y, z, w.
+
+    Returns:
+        (3, 3) float64.
+    """
+    from scipy.spatial.transform import Rotation
+
+    square = float(quaternion @ quaternion)
+    if not 0 < square < np.inf:
+        return np.full((3, 3), square)
+    return np.asarray(square * Rotation.from_quat(quaternion).as_matrix())
 
 
 def sparse_points(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError, ShapeError
-from gvtools.scenes.colmap_files import check_sizes
+from gvtools.scenes.colmap_files import model_files
 
 if TYPE_CHECKING:
     import pycolmap
@@ -58,8 +58,8 @@ def write_colmap(
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".model-", dir=folder) as partial:
             model.write_binary(partial)
-            # The writer does not notice a full disk; the sizes tell.
-            check_sizes(Path(partial), model)
+            # The writer does not notice a full disk; the walk over the records does.
+            model_files(Path(partial))
             for file in sorted(Path(partial).iterdir()):
                 os.replace(file, folder / file.name)
     except OSError as error:
