@@ -10,9 +10,10 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.colmap_depth import depth_map_path, depth_map_size, read_depth_map
 from gvtools.scenes.colmap_files import find_model
 from gvtools.scenes.colmap_model import ColmapModel, load_model, sparse_points
-from gvtools.scenes.images import read_depth, same_aspect
+from gvtools.scenes.images import read_depth
 from gvtools.scenes.photographs import (
     Photograph,
+    depth_findings,
     given_folder,
     header_findings,
     lens_findings,
@@ -154,35 +155,20 @@ def _depth_file(folder: Path, name: str) -> Path | None:
 
 
 def _depth_findings(photographs: list[Photograph]) -> list[Finding]:
-    findings = []
     kinds: Counter[str] = Counter()
-    resized: Counter[str] = Counter()
+    maps = []
     for item in photographs:
         if item.depth is None:
             kinds["none"] += 1
-            continue
-        if item.depth.suffix != ".bin":
+        elif item.depth.suffix != ".bin":
             kinds["arrays"] += 1
-            continue
-        kinds[item.depth.name.split(".")[-2]] += 1
-        try:
-            size = depth_map_size(item.depth)
-        except ProjectError as error:
-            findings.append(Finding("error", str(error)))
-            continue
-        width, height = item.lens.source_size
-        if size == (width, height):
-            continue
-        line = f"{size[0]}x{size[1]} for pictures of {width}x{height}"
-        if same_aspect(size, (width, height)):
-            resized[f"depth maps of {line}: nearest pixel taken"] += 1
         else:
-            message = f"{item.depth}: depth of {line}; expected the same aspect"
-            findings.append(Finding("error", message))
+            kinds[item.depth.name.split(".")[-2]] += 1
+            maps.append((item.depth, item.lens.source_size))
+    findings = depth_findings(maps, depth_map_size)
     if kinds["none"] < len(photographs):
         listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
         findings.append(Finding("info", f"depth maps: {listed}"))
-    findings += [Finding("info", f"{count} {line}") for line, count in resized.items()]
     return findings
 
 

@@ -83,7 +83,7 @@ class FrameKeys(BaseModel):
             size[0] / 2 if self.cx is None else self.cx,
             size[1] / 2 if self.cy is None else self.cy,
         )
-        shared = (*self._focal(size[0], what), *center)
+        shared: tuple[float, ...] = (*self._focal(size[0], what), *center)
         named = self.camera_model
         if named in FISHEYE or (not named and self.is_fisheye):
             return LensParameters(

@@ -47,10 +47,15 @@ class CpuMatcher(Matcher):
         return torch.from_numpy(paths).mean(0)
 
 
-def _pictures(level: Level) -> list[NDArray[Any]]:
+def _pictures(level: Level) -> tuple[Any, Any, Any, Any, Any]:
     """A level's reference, sources, sizes, matrix and offset."""
-    parts = (level.reference, level.sources, level.sizes, level.matrix, level.offset)
-    return [part.numpy() for part in parts]
+    return (
+        level.reference.numpy(),
+        level.sources.numpy(),
+        level.sizes.numpy(),
+        level.matrix.numpy(),
+        level.offset.numpy(),
+    )
 
 
 @compiled(fastmath=FAST, inline="always")
