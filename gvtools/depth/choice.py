@@ -18,6 +18,7 @@ CHOICES = ("auto", "sensor", "colmap", "plane-sweep", "da3")
 # The voxel edge from eight views is then within 10 % of that from sparse points or from full depth,
 # measured on four scenes.
 ROUGH_SIDE, ROUGH_LEVELS = 160, 2
+PAIR = "rectified-pair"  # the name of that source
 PAIRED = "two views side by side: OpenCV's semi-global matching, which is made for them"
 
 
@@ -108,10 +109,9 @@ def _chosen(
     if choice in ("sensor", "colmap"):
         return _asked_recorded(scene, views, choice, recorded)
     if choice == "plane-sweep":
-        source, how = _stereo(scene, views, stereo)
-        return ChosenSource(
-            source, f"asked for plane-sweep; {how}" if how == PAIRED else "asked for"
-        )
+        source = _stereo(scene, views, stereo)
+        paired = f"asked for plane-sweep; {PAIRED}"
+        return ChosenSource(source, paired if source.name == PAIR else "asked for")
     if recorded == len(views):
         return ChosenSource(RecordedDepth(), "every context view has recorded depth")
     if recorded and len(views) < 2 and foundation.weights is None:
@@ -122,7 +122,8 @@ def _chosen(
     elif has_patch_match() and scene.points is not None and len(views) > 1:
         source, how = ColmapPatchMatch(scene, views), "COLMAP's PatchMatch, as there is CUDA"
     else:
-        source, how = _stereo(scene, views, stereo)
+        source = _stereo(scene, views, stereo)
+        how = PAIRED if source.name == PAIR else "plane-sweep stereo of the photographs"
     if not recorded:
         return ChosenSource(source, f"no context view has recorded depth; {how}")
     return ChosenSource(
@@ -150,10 +151,7 @@ def _asked_recorded(scene: Scene, views: Sequence[str], choice: str, recorded: i
     raise ProjectError(f"{scene.root}: none of the {len(views)} context views has depth; {advice}")
 
 
-def _stereo(
-    scene: Scene, views: Sequence[str], options: StereoOptions | None
-) -> tuple[DepthSource, str]:
-    """Stereo of photographs, and which one."""
+def _stereo(scene: Scene, views: Sequence[str], options: StereoOptions | None) -> DepthSource:
     if len(views) < 2:
         raise ProjectError(
             f"{scene.root}: {len(views)} context view(s) without depth; expected depth, or at "
@@ -162,11 +160,10 @@ def _stereo(
     from gvtools.depth.rectified_pair import RectifiedPair, is_rectifiable
 
     if len(views) == 2 and is_rectifiable(scene.subset(views).cameras):
-        return RectifiedPair(scene, views), PAIRED
+        return RectifiedPair(scene, views)
     from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 
-    source = PlaneSweepStereo(scene, options=options or StereoOptions(), views=tuple(views))
-    return source, "plane-sweep stereo of the photographs"
+    return PlaneSweepStereo(scene, options=options or StereoOptions(), views=tuple(views))
 
 
 def _foundation(scene: Scene, views: Sequence[str], options: FoundationOptions) -> DepthSource:

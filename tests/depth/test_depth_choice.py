@@ -12,7 +12,7 @@ from tiny_scan import write_scan
 
 from gvtools.depth import choice, colmap_patch_match
 from gvtools.depth.choice import choose_source, rough_source
-from gvtools.depth.colmap_patch_match import ColmapPatchMatch, write_workspace
+from gvtools.depth.colmap_patch_match import ColmapPatchMatch
 from gvtools.depth.rectified_pair import RectifiedPair
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded
@@ -70,7 +70,7 @@ def test_auto_takes_recorded_depth_where_all_have_it(scan):
 
 
 def test_auto_mixes_view_by_view(scan, monkeypatch):
-    monkeypatch.setattr(choice, "_stereo", lambda *_: (Computed(), "plane-sweep"))
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
     partly = without_depth(scan, 1, 3)
     chosen = choose_source(partly, partly.names, "auto")
     assert isinstance(chosen.source, MixedDepth)
@@ -82,7 +82,7 @@ def test_auto_mixes_view_by_view(scan, monkeypatch):
 
 
 def test_auto_computes_where_there_is_none(scan, monkeypatch):
-    monkeypatch.setattr(choice, "_stereo", lambda *_: (Computed(), "plane-sweep"))
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
     bare = without_depth(scan, *range(6))
     chosen = choose_source(bare, bare.names, "auto")
     assert chosen.source.name == "computed"
@@ -147,7 +147,7 @@ def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):
     for asked in ("auto", "colmap"):
         assert isinstance(choose_source(scene, scene.names, asked).source, ColmapPatchMatch)
     # Without sparse points, it could not run.
-    monkeypatch.setattr(choice, "_stereo", lambda *_: (Computed(), "plane-sweep"))
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
     bare = replace(scene, points=None)
     assert choose_source(bare, bare.names, "auto").source.name == "computed"
 
@@ -194,6 +194,8 @@ def test_patch_match_gets_a_workspace_of_the_given_views_alone(tmp_path, monkeyp
         assert {image.name for image in model.images.values()} == set(given)
         assert scene.points is not None
         assert len(model.points3D) == len(scene.points.positions)
+        assert model.compute_mean_reprojection_error() < 0.5
+        assert all(len(point.track.elements) == 3 for point in model.points3D.values())
         lines = (folder / "stereo" / "patch-match.cfg").read_text().split("\n")
         assert lines[:2] == [given[0], "__auto__, 20"]
         assert sorted(p.name for p in (folder / "images").rglob("*.*")) == sorted(
@@ -259,14 +261,3 @@ def test_the_scale_of_depth_is_that_of_the_sparse_points(scan, factor):
     assert not few.ok
     assert not disagrees(few)
     assert scale_to_points(scan, view.name, frame.depth) is None
-
-
-def test_the_workspace_keeps_positions_and_tracks(tmp_path):
-    import pycolmap
-
-    workspace(tmp_path / "project")
-    scene = read_colmap(tmp_path / "project")
-    write_workspace(tmp_path / "dense", scene, scene.names[1:3])
-    model = pycolmap.Reconstruction(tmp_path / "dense" / "sparse")
-    assert model.compute_mean_reprojection_error() < 0.5
-    assert all(len(point.track.elements) == 2 for point in model.points3D.values())
