@@ -90,13 +90,21 @@ def test_points_cut_off_at_a_line_end_are_noticed(tmp_path):
         read_colmap(tmp_path)
 
 
-def test_point_that_is_not_finite_is_refused(tmp_path):
-    workspace(tmp_path)
-    path = tmp_path / "sparse/0/points3D.bin"
+@pytest.mark.parametrize(
+    ("name", "offset", "value", "told"),
+    [
+        ("points3D", 8 + 8, np.inf, "1 sparse points hold NaN or infinity"),
+        ("images", 8 + 4 + 4 * 8, np.nan, "NaN"),  # tx of the first image
+        ("cameras", 8 + 24, np.nan, r"camera 1: SIMPLE_RADIAL 96x72 .* NaN"),
+    ],
+)
+def test_numbers_that_are_not_finite_are_refused(tmp_path, name, offset, value, told):
+    workspace(tmp_path, classic=True)
+    path = tmp_path / f"sparse/0/{name}.bin"
     data = bytearray(path.read_bytes())
-    struct.pack_into("<d", data, 8 + 8, float("inf"))
+    struct.pack_into("<d", data, offset, value)
     path.write_bytes(data)
-    with pytest.raises(ProjectError, match="1 sparse points hold NaN or infinity"):
+    with pytest.raises(GvError, match=told):
         read_colmap(tmp_path)
 
 
@@ -141,45 +149,21 @@ def test_windows_line_ends_are_read(tmp_path):
     np.testing.assert_array_equal(scene.cameras.cam_from_world, expected.cameras.cam_from_world)
 
 
-def test_pose_with_nan_is_refused(tmp_path):
-    workspace(tmp_path, classic=True)
-    path = tmp_path / "sparse/0/images.bin"
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<d", data, 8 + 4 + 4 * 8, float("nan"))  # tx of the first image
-    path.write_bytes(data)
-    with pytest.raises(GvError, match="NaN"):
-        read_colmap(tmp_path)
-
-
-def test_camera_with_nan_is_refused(tmp_path):
-    workspace(tmp_path)
-    path = tmp_path / "sparse/0/cameras.bin"
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<d", data, 8 + 24, float("nan"))
-    path.write_bytes(data)
-    with pytest.raises(ProjectError, match=r"camera 1: SIMPLE_RADIAL 96x72 .* NaN"):
-        read_colmap(tmp_path)
-
-
 def test_no_model_no_image_and_half_a_model(tmp_path):
+    import pycolmap
+
     with pytest.raises(ProjectError, match="no COLMAP model"):
         read_colmap(tmp_path)
+    (tmp_path / "empty").mkdir()
+    pycolmap.Reconstruction().write_binary(tmp_path / "empty")
+    with pytest.raises(ProjectError, match="no registered image among 0"):
+        read_colmap(tmp_path / "empty")
     workspace(tmp_path)
     (tmp_path / "sparse/0/frames.bin").unlink()
     with pytest.raises(ProjectError, match=r"rigs\.bin without frames\.bin"):
         read_colmap(tmp_path)
     (tmp_path / "sparse/0/points3D.bin").unlink()
     with pytest.raises(ProjectError, match="incomplete model"):
-        read_colmap(tmp_path)
-
-
-def test_model_without_registered_image(tmp_path):
-    import pycolmap
-
-    folder = tmp_path / "sparse"
-    folder.mkdir()
-    pycolmap.Reconstruction().write_binary(folder)
-    with pytest.raises(ProjectError, match="no registered image among 0"):
         read_colmap(tmp_path)
 
 

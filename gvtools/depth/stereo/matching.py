@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 
 from gvtools.depth.stereo.options import StereoOptions
-from gvtools.errors import OptionError
 
 # Semi-global aggregation (Hirschmueller, TPAMI 2008, equation 13): the penalties of a change by
 # one plane and by more, in units of the cost, and the contrast that halves the second.
@@ -88,21 +87,3 @@ class Matcher(ABC):
         Returns:
             (H, W) float32 in [0, 1].
         """
-
-
-def make_matcher(options: StereoOptions) -> tuple[Matcher, torch.device]:
-    """The back end of the options, and where its tensors live.
-
-    Raises:
-        OptionError: CUDA is asked for and torch sees none.
-    """
-    from gvtools.depth.stereo.matching_cpu import CpuMatcher
-    from gvtools.depth.stereo.matching_torch import TorchMatcher
-
-    if options.backend == "cpu":
-        return CpuMatcher(options), torch.device("cpu")
-    there = torch.cuda.is_available()
-    if options.device == "cuda" and not there:
-        raise OptionError("stereo device 'cuda': torch sees no CUDA device; choose 'auto' or 'cpu'")
-    cuda = options.device == "cuda" or (options.device == "auto" and there)
-    return TorchMatcher(options), torch.device("cuda" if cuda else "cpu")

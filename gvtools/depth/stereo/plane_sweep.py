@@ -12,10 +12,10 @@ from gvtools.cameras import Cameras, concatenate
 from gvtools.depth.source import DepthMap
 from gvtools.depth.stereo import cleanup, silhouettes
 from gvtools.depth.stereo.alignment import PoseEquations, adjusted, pose_equations
+from gvtools.depth.stereo.back_ends import make_matcher
 from gvtools.depth.stereo.confidence import confidence_of
 from gvtools.depth.stereo.consistency import agreement
 from gvtools.depth.stereo.depth_range import DepthRange, estimate_range
-from gvtools.depth.stereo.matching import make_matcher
 from gvtools.depth.stereo.motion import enough_disparity, only_turned
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.pyramid import (

@@ -9,9 +9,9 @@ import pytest
 import torch
 from stereo_scenes import plane_scene
 
+from gvtools.depth.stereo.back_ends import make_matcher
 from gvtools.depth.stereo.depth_range import DepthRange
 from gvtools.depth.stereo.hypotheses import best_plane, parabola, plane_hypotheses
-from gvtools.depth.stereo.matching import make_matcher
 from gvtools.depth.stereo.matching_cpu import CpuMatcher
 from gvtools.depth.stereo.matching_torch import TorchMatcher
 from gvtools.depth.stereo.options import StereoOptions
