@@ -31,16 +31,12 @@ class FoundationScale:
         status: "aligned", or "unsupported: ..." with the reason.
         support: "points" or "cameras".
         scale: scene units per unit of the network (after the known cameras' own unit).
-        inlier_share: of the points; the centres' correlation where they are the support.
-        residual: median relative deviation of the points; NaN for cameras.
         count: points, or centres.
     """
 
     status: str
     support: str
     scale: float
-    inlier_share: float
-    residual: float
     count: int
 
     @property
@@ -82,7 +78,7 @@ def fit_scale(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
 
 def _fit_points(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
     if scene.points is None:
-        return FoundationScale("unsupported: no sparse points", "points", *(np.nan,) * 3, 0)
+        return FoundationScale("unsupported: no sparse points", "points", np.nan, 0)
     pairs = [
         (measured.astype(np.float64) * part.unit, known)
         for part in passes
@@ -93,19 +89,12 @@ def _fit_points(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
     fitted = align_depth_scale(
         depth, reference, valid=depth > 0, min_support=MIN_POINTS, inlier_band=0.1
     )
-    return FoundationScale(
-        fitted.status,
-        "points",
-        fitted.scale,
-        fitted.inlier_share,
-        fitted.residual,
-        fitted.support,
-    )
+    return FoundationScale(fitted.status, "points", fitted.scale, fitted.support)
 
 
 def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
     """The median of the passes' own fits, weighted by their views; see ``MIN_CENTRES``."""
-    scales, weights, correlations, reason = [], [], [], "no pass"
+    scales, weights, reason = [], [], "no pass"
     for part in passes:
         known = np.concatenate([scene[name].camera.centers for name in part.names])
         fitted = center_similarity(
@@ -118,7 +107,6 @@ def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
         else:
             scales.append(float(fitted.scale[0]))
             weights.append(len(part.names))
-            correlations.append(float(fitted.correlation[0]))
     if scales and max(weights) < MIN_CENTRES:
         # Each of them would fit by chance; several that agree do not.
         agree = len(scales) >= MIN_PASSES and max(scales) <= PASSES_AGREE * min(scales)
@@ -126,8 +114,6 @@ def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
             reason = f"{max(weights)} views a pass, at least {MIN_CENTRES} are needed"
             scales = []
     if not scales:
-        return FoundationScale(f"unsupported: {reason}", "cameras", np.nan, np.nan, np.nan, 0)
+        return FoundationScale(f"unsupported: {reason}", "cameras", np.nan, 0)
     scale = float(np.median(np.repeat(scales, weights)))
-    return FoundationScale(
-        "aligned", "cameras", scale, float(np.median(correlations)), np.nan, sum(weights)
-    )
+    return FoundationScale("aligned", "cameras", scale, sum(weights))
