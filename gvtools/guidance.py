@@ -12,6 +12,9 @@ from gvtools import cameras as camera_batches
 from gvtools.cameras import Cameras
 from gvtools.errors import ShapeError
 
+# The fields of Guidance that hold a value for each pixel, in order.
+IMAGES = ("rgb", "depth", "valid", "confidence", "generated")
+
 
 @dataclass(frozen=True, eq=False)
 class Guidance:
@@ -43,22 +46,11 @@ class Guidance:
     def select(self, index: Sequence[int]) -> Guidance:
         """Some views, in that order."""
         rows = list(index)
-        return Guidance(
-            self.cameras[rows],
-            self.rgb[rows],
-            self.depth[rows],
-            self.valid[rows],
-            self.confidence[rows],
-            self.generated[rows],
-        )
+        return Guidance(self.cameras[rows], *(getattr(self, name)[rows] for name in IMAGES))
 
     def blank(self) -> Guidance:
         """The same cameras, and a memory that knows nothing."""
-        zeros = {
-            name: np.zeros_like(getattr(self, name))
-            for name in ("rgb", "depth", "valid", "confidence", "generated")
-        }
-        return Guidance(self.cameras, **zeros)
+        return Guidance(self.cameras, *(np.zeros_like(getattr(self, name)) for name in IMAGES))
 
     @property
     def coverage(self) -> float:
@@ -77,8 +69,5 @@ def concatenate(views: Sequence[Guidance]) -> Guidance:
         raise ShapeError(f"guidance of {len(sizes)} picture sizes {sizes}; expected one")
     return Guidance(
         camera_batches.concatenate([guidance.cameras for guidance in views]),
-        *(
-            np.concatenate([getattr(guidance, name) for guidance in views])
-            for name in ("rgb", "depth", "valid", "confidence", "generated")
-        ),
+        *(np.concatenate([getattr(guidance, name) for guidance in views]) for name in IMAGES),
     )

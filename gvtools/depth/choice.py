@@ -18,6 +18,7 @@ CHOICES = ("auto", "sensor", "colmap", "plane-sweep", "da3")
 # The voxel edge from eight views is then within 10 % of that from sparse points or from full depth,
 # measured on four scenes.
 ROUGH_SIDE, ROUGH_LEVELS = 160, 2
+PAIR = "rectified-pair"  # the name of that source
 PAIRED = "two views side by side: OpenCV's semi-global matching, which is made for them"
 
 
@@ -105,65 +106,56 @@ def _chosen(
     if choice == "da3":
         source = _foundation(scene, views, foundation)
         return ChosenSource(source, f"asked for; weights of {foundation.weights}")
-    if choice == "sensor":
-        if scene.kind == "colmap":
-            raise OptionError(f"depth 'sensor': {scene.root} is a colmap project; use auto")
-        if not recorded:
-            raise ProjectError(
-                f"{scene.root}: none of the {len(views)} context views has depth; add depth maps, "
-                "or use auto"
-            )
-        return ChosenSource(RecordedDepth(), f"asked for; {recorded} of {len(views)} views have it")
-    if choice == "colmap":
-        if scene.kind != "colmap":
-            raise OptionError(f"depth 'colmap': {scene.root} is a {scene.kind} project; use auto")
-        if recorded:
-            return ChosenSource(
-                RecordedDepth(), f"asked for; {recorded} of {len(views)} views have stereo maps"
-            )
-        if not has_patch_match():
-            raise ProjectError(
-                f"{scene.root}: none of the {len(views)} context views has depth, and pycolmap has "
-                "no CUDA here; run COLMAP's patch_match_stereo on an undistorted workspace "
-                "(stereo/depth_maps is then read), or use plane-sweep"
-            )
-        return ChosenSource(ColmapPatchMatch(scene, views), "asked for; computed now with CUDA")
+    if choice in ("sensor", "colmap"):
+        return _asked_recorded(scene, views, choice, recorded)
     if choice == "plane-sweep":
         source = _stereo(scene, views, stereo)
         paired = f"asked for plane-sweep; {PAIRED}"
-        return ChosenSource(source, paired if _is_pair(source) else "asked for")
+        return ChosenSource(source, paired if source.name == PAIR else "asked for")
     if recorded == len(views):
         return ChosenSource(RecordedDepth(), "every context view has recorded depth")
-    computed: DepthSource
-    if len(views) < 2 and foundation.weights is None:
-        if recorded:
-            return ChosenSource(RecordedDepth(), "a single view leaves nothing to compute from")
-        raise ProjectError(
-            f"{scene.root}: one context view without depth; expected depth, or at least 2 views to "
-            "compute it from"
-        )
+    if recorded and len(views) < 2 and foundation.weights is None:
+        return ChosenSource(RecordedDepth(), "a single view leaves nothing to compute from")
     if foundation.weights is not None:
-        computed, how = (
-            _foundation(scene, views, foundation),
-            "Depth Anything 3, as weights are given",
-        )
-    elif has_patch_match() and scene.points is not None:
-        computed, how = ColmapPatchMatch(scene, views), "COLMAP's PatchMatch, as there is CUDA"
+        source = _foundation(scene, views, foundation)
+        how = "Depth Anything 3, as weights are given"
+    elif has_patch_match() and scene.points is not None and len(views) > 1:
+        source, how = ColmapPatchMatch(scene, views), "COLMAP's PatchMatch, as there is CUDA"
     else:
-        computed, how = _stereo(scene, views, stereo), "plane-sweep stereo of the photographs"
-        how = PAIRED if _is_pair(computed) else how
+        source = _stereo(scene, views, stereo)
+        how = PAIRED if source.name == PAIR else "plane-sweep stereo of the photographs"
     if not recorded:
-        return ChosenSource(computed, f"no context view has recorded depth; {how}")
+        return ChosenSource(source, f"no context view has recorded depth; {how}")
     return ChosenSource(
-        MixedDepth(RecordedDepth(), computed),
+        MixedDepth(RecordedDepth(), source),
         f"{recorded} of {len(views)} views have recorded depth; the others {how}",
     )
+
+
+def _asked_recorded(scene: Scene, views: Sequence[str], choice: str, recorded: int) -> ChosenSource:
+    """Depth of a sensor or of COLMAP, which a project of the other kind does not have."""
+    if (choice == "colmap") != (scene.kind == "colmap"):
+        raise OptionError(f"depth {choice!r}: {scene.root} is a {scene.kind} project; use auto")
+    what = "stereo maps" if choice == "colmap" else "it"
+    if recorded:
+        reason = f"asked for; {recorded} of {len(views)} views have {what}"
+        return ChosenSource(RecordedDepth(), reason)
+    if choice == "colmap" and has_patch_match():
+        return ChosenSource(ColmapPatchMatch(scene, views), "asked for; computed now with CUDA")
+    advice = "add depth maps, or use auto"
+    if choice == "colmap":
+        advice = (
+            "pycolmap has no CUDA here; run COLMAP's patch_match_stereo on an undistorted "
+            "workspace (stereo/depth_maps is then read), or use plane-sweep"
+        )
+    raise ProjectError(f"{scene.root}: none of the {len(views)} context views has depth; {advice}")
 
 
 def _stereo(scene: Scene, views: Sequence[str], options: StereoOptions | None) -> DepthSource:
     if len(views) < 2:
         raise ProjectError(
-            f"{scene.root}: stereo of {len(views)} context view(s); expected at least 2"
+            f"{scene.root}: {len(views)} context view(s) without depth; expected depth, or at "
+            "least 2 views to compute it from"
         )
     from gvtools.depth.rectified_pair import RectifiedPair, is_rectifiable
 
@@ -178,12 +170,6 @@ def _foundation(scene: Scene, views: Sequence[str], options: FoundationOptions) 
     from gvtools.depth.foundation.source import FoundationDepth
 
     return FoundationDepth(scene, views=views, options=options)
-
-
-def _is_pair(source: DepthSource) -> bool:
-    from gvtools.depth.rectified_pair import RectifiedPair
-
-    return isinstance(source, RectifiedPair)
 
 
 def _ignored(source: DepthSource, options: StereoOptions | None) -> tuple[str, ...]:

@@ -25,18 +25,36 @@ def scale_to_points(scene: Scene, name: str, depth: NDArray[np.float32]) -> Scal
     Returns:
         The fit of points = scale x depth: 1 is agreement; None in a scene without sparse points.
     """
-    points = scene.points
-    if points is None:
+    if scene.points is None:
         return None
+    measured, known = depth_of_points(scene, name, depth)
+    return align_depth_scale(measured, known, valid=measured > 0, min_support=MIN_POINTS)
+
+
+def depth_of_points(
+    scene: Scene, name: str, depth: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """The depth map's value at each sparse point of a view, and the point's own depth.
+
+    Args:
+        scene: the project, with sparse points.
+        name: of the view.
+        depth: (h, w) z-depth, of the view's size or another one, 0 = none.
+
+    Returns:
+        (N,) the map's, and (N,) the points', scene units.
+    """
+    points = scene.points
+    assert points is not None
     row = scene.names.index(name)
+    camera = scene.views[row].camera
     mine = points.view_index == row
-    _, z = scene.views[row].camera.project(points.positions[points.point_index[mine]])
+    _, z = camera.project(points.positions[points.point_index[mine]])
     height, width = depth.shape
-    column = np.floor(points.xy[mine, 0]).astype(np.int64)
-    line = np.floor(points.xy[mine, 1]).astype(np.int64)
+    column = np.floor(points.xy[mine, 0] * (width / int(camera.width[0]))).astype(np.int64)
+    line = np.floor(points.xy[mine, 1] * (height / int(camera.height[0]))).astype(np.int64)
     inside = (column >= 0) & (column < width) & (line >= 0) & (line < height) & (z[0] > 0)
-    measured = depth[line[inside], column[inside]]
-    return align_depth_scale(measured, z[0][inside], valid=measured > 0, min_support=MIN_POINTS)
+    return depth[line[inside], column[inside]], z[0][inside]
 
 
 def disagrees(fit: ScaleFit | None) -> bool:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from gvtools.depth.source import DepthMap
 from gvtools.files import replaced_when_written
-from gvtools.runs.arrays import save_arrays
 from gvtools.runs.layout import context_depth, target_stems
 from gvtools.runs.target_files import write_png
 
@@ -71,7 +70,7 @@ def write_context_depth(
     with replaced_when_written(path.with_suffix(".png")) as temporary:
         write_png(temporary, picture)
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
-        save_arrays(
+        np.savez_compressed(
             file,
             depth=depth_map.depth,
             confidence=depth_map.confidence,

@@ -77,10 +77,9 @@ class RunDirectory:
         record = self.path / RECORD
         if not record.exists():
             return False
-        try:
-            before = json.loads(record.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise ProjectError(f"{record}: unreadable ({error}); give another --out") from None
+        before = self._record()
+        if before is None:
+            raise ProjectError(f"{record}: no readable JSON; give another --out")
         ours = isinstance(before, dict) and before.keys() >= {*identity, "versions"}
         if ours and not self._results():
             # Nothing came of the first attempt; its options bind nobody.
@@ -105,7 +104,8 @@ class RunDirectory:
     def _start(self, identity: dict[str, Any], *, resume: bool) -> int:
         resumes = self.check(identity, resume=resume)
         record = {**identity, "versions": versions()}
-        same = self._is_recorded(record)
+        # A first attempt at the very same run, by the same versions, was begun here.
+        same = self._record() == json.loads(json.dumps(record))
         self._drop_partial(but=self._part(0) if same else None)
         if not resumes:
             if not same:
@@ -120,13 +120,12 @@ class RunDirectory:
             self._settle(done - 1)
         return done
 
-    def _is_recorded(self, record: dict[str, Any]) -> bool:
-        """Whether a first attempt at the very same run, by the same versions, was begun here."""
+    def _record(self) -> Any:
+        """What the run's record holds; None where it cannot be read."""
         try:
-            before = json.loads((self.path / RECORD).read_text(encoding="utf-8"))
+            return json.loads((self.path / RECORD).read_text(encoding="utf-8"))
         except (OSError, ValueError):
-            return False
-        return bool(before == json.loads(json.dumps(record)))
+            return None
 
     def _results(self) -> list[Path]:
         """What the folder holds beside the run's record and what a kill left half-written."""

@@ -10,7 +10,7 @@ Other modules of this package read and write these files; nothing outside knows 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path, PurePosixPath
 
@@ -57,51 +57,39 @@ def inside(folder: Path, path: Path) -> Path:
 def file_stems(names: Sequence[str]) -> dict[str, PurePosixPath]:
     """For each view name the path that its files start with, below the output folder.
 
-    An image suffix is left out, unless two views then had the same files; where whole names differ
-    in case alone, or in how they write one path, all but one get a number. No two stems are the
-    same for a file system that ignores case, and their order in ``names`` plays no part.
+    An image suffix is left out, unless two views then had the same files; what is then still the
+    same for a file system that ignores case gets a number.
 
     Raises:
         OptionError: a name that leads out of the folder.
     """
-    whole, stems = {}, {}
+    whole, short = {}, {}
     for name in names:
         path = PurePosixPath(name.replace("\\", "/"))
         if path.is_absolute() or ".." in path.parts or not path.name:
             raise OptionError(f"view {name!r}: leads out of the output folder; rename the view")
-        whole[name] = path
-        stems[name] = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
-    # A whole name may be what another one is without its suffix, so look again after each change.
-    while shared := [name for name in _ambiguous(stems) if stems[name] != whole[name]]:
-        stems |= {name: whole[name] for name in shared}
-    used = {str(path).lower() for path in stems.values()}
-    seen: set[str] = set()
-    for name in sorted(_ambiguous(stems)):
-        path = stems[name]
-        if str(path).lower() in seen:
-            numbered = (path.with_name(f"{path.name}_{number}") for number in count(2))
-            stems[name] = next(path for path in numbered if str(path).lower() not in used)
-            used.add(str(stems[name]).lower())
-        seen.add(str(path).lower())
-    return stems
-
-
-def _ambiguous(stems: dict[str, PurePosixPath]) -> list[str]:
-    """The names that share their stem with another. File systems may ignore case."""
-    number = Counter(str(path).lower() for path in stems.values())
-    return [name for name, path in stems.items() if number[str(path).lower()] > 1]
+        whole[name] = str(path)
+        short[name] = str(path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path)
+    number_of = Counter(stem.lower() for stem in short.values())
+    stems = {name: stem if number_of[stem.lower()] == 1 else whole[name]
+             for name, stem in short.items()}  # fmt: skip
+    return {name: PurePosixPath(stem) for name, stem in _distinct(stems).items()}
 
 
 def target_stems(names: Sequence[str]) -> tuple[str, ...]:
     """For each target a distinct part of file names: without folders, and mostly without ending."""
-    stems = [str(stem).replace("/", "__") for stem in file_stems(names).values()]
-    number_of = Counter(stem.lower() for stem in stems)
-    used = {stem for stem, number in number_of.items() if number == 1}
-    out = []
-    for i, stem in enumerate(stems):
-        candidate, number = stem, i
-        while number_of[stem.lower()] > 1 and (candidate == stem or candidate.lower() in used):
-            candidate, number = f"{stem}_{number:04d}", number + len(stems)
-        used.add(candidate.lower())
-        out.append(candidate)
-    return tuple(out)
+    stems = {name: str(stem).replace("/", "__") for name, stem in file_stems(names).items()}
+    return tuple(_distinct(stems).values())
+
+
+def _distinct(stems: Mapping[str, str]) -> dict[str, str]:
+    """The stems, by name, with numbers behind those that another name has, in order of names."""
+    used: set[str] = set()
+    distinct = dict(stems)
+    for name in sorted(stems):
+        candidates = (
+            f"{stems[name]}_{number}" if number > 1 else stems[name] for number in count(1)
+        )
+        distinct[name] = next(stem for stem in candidates if stem.lower() not in used)
+        used.add(distinct[name].lower())
+    return distinct

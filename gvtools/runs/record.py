@@ -5,31 +5,73 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from types import NoneType
-from typing import Any
+from typing import Annotated, Any
 
-import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
 from gvtools.errors import ProjectError
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import RECORD, REPORT, round_folder
 
-# Keys that records and reports have, with their JSON types.
-_RECORDED: dict[str, type | tuple[type, ...]] = {
-    "project": str, "reading": dict, "targets_project": (str, NoneType), "targets_kind": str,
-    "schedule": list, "context": list, "targets": list, "settings": dict,
-    "derived": dict, "versions": dict,
-}  # fmt: skip
-_CONFIGURED: dict[str, type | tuple[type, ...]] = {
-    "completer": str, "voxel": (int, float), "seed": int
-}  # fmt: skip
-_COUNTS = (
-    "points", "observed", "generated", "voxels", "added", "merged", "rejected", "bytes"
-)  # fmt: skip
-_SHARES = ("coverage_before", "coverage_after")
-_SHARES_OF_A_VIEW = ("coverage", "coverage_after")
-_CAMERA = {"K": (3, 3), "cam_from_world": (4, 4), "width": (), "height": ()}
-_OF_A_VIEW = ("name", "coverage", "coverage_after", "camera", "stem", "scale")
+Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
+
+
+class _Record(BaseModel):
+    """What readers of run.json stand on."""
+
+    project: str
+    reading: dict[str, Any]
+    targets_project: str | None
+    targets_kind: str
+    schedule: list[list[Any]]
+    context: list[str]
+    targets: list[str]
+    settings: dict[str, Any]
+    derived: dict[str, Any]
+    versions: dict[str, Any]
+
+
+class _Settings(BaseModel):
+    """What readers of the resolved settings stand on."""
+
+    completer: str
+    voxel: float
+    seed: int
+
+
+class _Camera(BaseModel):
+    K: Annotated[list[Row3], Field(min_length=3, max_length=3)]
+    cam_from_world: Annotated[list[Row4], Field(min_length=4, max_length=4)]
+    width: int
+    height: int
+
+
+class _View(BaseModel):
+    name: str
+    stem: str
+    coverage: float
+    coverage_after: float
+    camera: _Camera
+    scale: dict[str, Any]
+
+
+class _Report(BaseModel):
+    """What readers of a round's report stand on."""
+
+    round: int
+    points: int
+    observed: int
+    generated: int
+    voxels: int
+    added: int
+    merged: int
+    rejected: int
+    bytes: int
+    coverage_before: float | None
+    coverage_after: float | None
+    seconds: dict[str, float]
+    views: list[_View]
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -43,29 +85,20 @@ def read_record(path: Path) -> dict[str, Any]:
         raise ProjectError(f"{path}: holds no {RECORD}; expected the folder of a run")
     try:
         record: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        if not isinstance(record, dict):
-            raise TypeError("no JSON object")
-        lacking = [key for key in _RECORDED if key not in record]
-        if lacking:
-            raise KeyError(", ".join(lacking))
-        _check_types(record, _RECORDED)
-        _check_types(resolved_settings(record), _CONFIGURED)
-        if not all(isinstance(rows, list) for rows in record["schedule"]):
-            raise TypeError("schedule holds more than lists")
-        for key in ("context", "targets"):
-            if not all(isinstance(name, str) for name in record[key]):
-                raise TypeError(f"{key} holds more than names")
+        _Record.model_validate(record)
+        _Settings.model_validate(resolved_settings(record))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise _outdated(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ProjectError(
-            f"{file}: no record of a run of this version ({error!r}); run reconstruct again"
-        ) from None
+        raise _outdated(file, repr(error)) from None
     return record
 
 
-def _check_types(data: Mapping[str, Any], kinds: Mapping[str, type | tuple[type, ...]]) -> None:
-    for key, kind in kinds.items():
-        if not isinstance(data[key], kind):
-            raise TypeError(f"{key} is {data[key]!r}")
+def _outdated(file: Path, reason: str) -> ProjectError:
+    return ProjectError(
+        f"{file}: no record of a run of this version ({reason}); run reconstruct again"
+    )
 
 
 def resolved_settings(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -88,42 +121,13 @@ def read_reports(path: Path) -> tuple[Mapping[str, Any], ...]:
     """
     reports = tuple(RunDirectory(path).reports())
     for number, report in enumerate(reports):
-        if not _is_report(report, number):
+        try:
+            whole = _Report.model_validate(report).round == number
+        except ValidationError:
+            whole = False
+        if not whole:
             raise ProjectError(
                 f"{round_folder(path, number) / REPORT}: no report of this version; run "
                 "reconstruct again"
             )
     return reports
-
-
-def _is_report(report: Any, number: int) -> bool:
-    """Whether it has what readers of a round's report stand on."""
-    return (
-        isinstance(report, dict)
-        and report.get("round") == number
-        and all(isinstance(report.get(key), int) for key in _COUNTS)
-        and all(isinstance(report.get(key, ""), (int, float, NoneType)) for key in _SHARES)
-        and isinstance(report.get("seconds"), dict)
-        and all(isinstance(value, (int, float)) for value in report["seconds"].values())
-        and isinstance(report.get("views"), list)
-        and all(_is_view(view) for view in report["views"])
-    )
-
-
-def _is_view(view: Any) -> bool:
-    return (
-        isinstance(view, dict)
-        and all(key in view for key in _OF_A_VIEW)
-        and all(isinstance(view[key], str) for key in ("name", "stem"))
-        and all(isinstance(view[key], (int, float)) for key in _SHARES_OF_A_VIEW)
-        and isinstance(view["scale"], dict)
-        and isinstance(view["camera"], dict)
-        and all(_is_array(view["camera"].get(key), shape) for key, shape in _CAMERA.items())
-    )
-
-
-def _is_array(value: Any, shape: tuple[int, ...]) -> bool:
-    try:
-        return np.array(value, np.float64).shape == shape
-    except (TypeError, ValueError):
-        return False

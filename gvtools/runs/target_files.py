@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance
-from gvtools.runs.arrays import save_arrays
 from gvtools.runs.layout import (
     AFTER,
     COMPLETION,
@@ -65,7 +64,7 @@ def write_target(
     write_png(target_picture(folder, GUIDANCE, stem), to_bytes(guidance.rgb[0]))
     write_png(target_picture(folder, VALID, stem), support)
     write_png(target_picture(folder, COMPLETION, stem), to_bytes(completion.rgb[0]))
-    save_arrays(
+    np.savez_compressed(
         target_depth(folder, stem),
         guidance=guidance.depth[0],
         completion=completion.depth[0],

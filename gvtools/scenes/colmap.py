@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from functools import partial
 from pathlib import Path
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.colmap_depth import depth_map_path, depth_map_size, read_depth_map
 from gvtools.scenes.colmap_files import find_model
 from gvtools.scenes.colmap_model import ColmapModel, load_model, sparse_points
-from gvtools.scenes.colmap_writer import write_colmap
-from gvtools.scenes.images import read_depth, same_aspect
+from gvtools.scenes.images import read_depth
 from gvtools.scenes.photographs import (
     Photograph,
+    depth_findings,
     given_folder,
     header_findings,
     lens_findings,
@@ -23,18 +22,10 @@ from gvtools.scenes.photographs import (
 )
 from gvtools.scenes.scene import Finding, Scene
 
-__all__ = ["read_colmap", "write_colmap"]
-
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 
 
-def read_colmap(
-    root: Path,
-    *,
-    images: Path | None = None,
-    masks: Path | None = None,
-    depths: Path | None = None,
-) -> Scene:
+def read_colmap(root: Path, *, images: Path | None = None, masks: Path | None = None) -> Scene:
     """A COLMAP project with every view in an undistorted pinhole camera.
 
     The model is looked for in ``sparse/0``, ``sparse`` and ``root`` itself, the pictures in
@@ -46,8 +37,6 @@ def read_colmap(
         root: the workspace or the model folder.
         images: the image folder, where it is not beside the model.
         masks: the mask folder, where it is not beside the images.
-        depths: the depth folder: COLMAP's ``NAME.geometric.bin`` or ``NAME.photometric.bin``, or
-            ``NAME.npy`` or ``NAME.npz`` (key ``depth``) in scene units.
 
     Returns:
         The scene, in the model's frame and scale.
@@ -66,8 +55,11 @@ def read_colmap(
     model = load_model(folder)
     homes = _homes(root, folder)
     image_folder = _image_folder(images, homes, folder)
-    mask_folder = _beside(masks, "masks", [image_folder.parent, *homes])
-    depth_folder = _beside(depths, "stereo/depth_maps", [*homes, image_folder.parent])
+    beside = image_folder.parent
+    mask_folder = (
+        _first([beside, *homes], "masks") if masks is None else given_folder(masks, "masks")
+    )
+    depth_folder = _first([*homes, beside], "stereo/depth_maps")
     findings = list(model.findings)
     photographs, ids = _photographs(model, image_folder, mask_folder, depth_folder, findings)
     points, dropped = sparse_points(model, {key: i for i, key in enumerate(ids)})
@@ -89,22 +81,18 @@ def _homes(root: Path, folder: Path) -> list[Path]:
 
 
 def _image_folder(given: Path | None, homes: list[Path], folder: Path) -> Path:
-    if given is not None:
-        if not Path(given).is_dir():
-            raise ProjectError(f"{given}: no such image folder")
-        return Path(given)
-    for home in homes:
-        if (home / "images").is_dir():
-            return home / "images"
-    raise ProjectError(
-        f"{folder}: a model without images: no folder 'images' in "
-        f"{', '.join(str(home) for home in homes)}; give it with --images"
-    )
+    found = _first(homes, "images") if given is None else Path(given)
+    if found is None:
+        raise ProjectError(
+            f"{folder}: a model without images: no folder 'images' in "
+            f"{', '.join(str(home) for home in homes)}; give it with --images"
+        )
+    if not found.is_dir():
+        raise ProjectError(f"{given}: no such image folder")
+    return found
 
 
-def _beside(given: Path | None, name: str, homes: list[Path]) -> Path | None:
-    if given is not None:
-        return given_folder(given, name)
+def _first(homes: list[Path], name: str) -> Path | None:
     return next((home / name for home in homes if (home / name).is_dir()), None)
 
 
@@ -135,7 +123,7 @@ def _photographs(
                 image.cam_from_world,
                 mask,
                 depth,
-                partial(reader),
+                reader,
             )
         )
         ids.append(image.image_id)
@@ -167,35 +155,20 @@ def _depth_file(folder: Path, name: str) -> Path | None:
 
 
 def _depth_findings(photographs: list[Photograph]) -> list[Finding]:
-    findings = []
     kinds: Counter[str] = Counter()
-    resized: Counter[str] = Counter()
+    maps = []
     for item in photographs:
         if item.depth is None:
             kinds["none"] += 1
-            continue
-        if item.depth.suffix != ".bin":
+        elif item.depth.suffix != ".bin":
             kinds["arrays"] += 1
-            continue
-        kinds[item.depth.name.split(".")[-2]] += 1
-        try:
-            size = depth_map_size(item.depth)
-        except ProjectError as error:
-            findings.append(Finding("error", str(error)))
-            continue
-        width, height = item.lens.source_size
-        if size == (width, height):
-            continue
-        line = f"{size[0]}x{size[1]} for pictures of {width}x{height}"
-        if same_aspect(size, (width, height)):
-            resized[f"depth maps of {line}: nearest pixel taken"] += 1
         else:
-            message = f"{item.depth}: depth of {line}; expected the same aspect"
-            findings.append(Finding("error", message))
+            kinds[item.depth.name.split(".")[-2]] += 1
+            maps.append((item.depth, item.lens.source_size))
+    findings = depth_findings(maps, depth_map_size)
     if kinds["none"] < len(photographs):
         listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
         findings.append(Finding("info", f"depth maps: {listed}"))
-    findings += [Finding("info", f"{count} {line}") for line, count in resized.items()]
     return findings
 
 

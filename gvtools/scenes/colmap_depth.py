@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.errors import ProjectError, ShapeError
+from gvtools.files import replaced_when_written
 
 KINDS = ("geometric", "photometric")  # the first that exists is read
 _HEAD = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
@@ -74,12 +75,6 @@ def write_depth_map(path: Path, depth: ArrayLike) -> None:
     values = np.asarray(depth, "<f4")
     if values.ndim != 2:
         raise ShapeError(f"{path}: depth of shape {values.shape}; expected (H, W)")
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        head = f"{values.shape[1]}&{values.shape[0]}&1&".encode()
-        partial.write_bytes(head + values.tobytes())
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise ProjectError(f"{path}: the depth map could not be written ({error})") from None
+    head = f"{values.shape[1]}&{values.shape[0]}&1&".encode()
+    with replaced_when_written(path) as temporary:
+        temporary.write_bytes(head + values.tobytes())

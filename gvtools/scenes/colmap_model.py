@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +11,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import rigid_transform
 from gvtools.errors import ProjectError
-from gvtools.scenes.colmap_files import ModelFiles, check_cameras_size, check_model
+from gvtools.scenes.colmap_files import ModelFiles, check_cameras, model_files, text_names
 from gvtools.scenes.photographs import rotation_findings
-from gvtools.scenes.quaternions import rotation_from_quaternion
 from gvtools.scenes.scene import Finding, SparsePoints, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
 
@@ -22,10 +20,14 @@ if TYPE_CHECKING:
     import pycolmap
 
 # What the reader's terser complaints mean.
-_REASONS = {
+REASONS = {
     "camera.VerifyParams()": "a camera has not as many parameters as its model needs",
     "inserted": "an id occurs twice",
     "unordered_map::at": "an image, camera, rig or frame is named that is not there",
+    "line_stream1": "a line of images.txt is malformed; an image has two lines",
+    "line_stream2": "a line of images.txt is malformed; an image has two lines",
+    "line_stream ": "a line of points3D.txt is malformed",
+    "Rig with ID": "an image, camera, rig or frame is named that is not there",
 }
 
 
@@ -72,14 +74,14 @@ def load_model(folder: Path) -> ColmapModel:
         ProjectError: damaged, incomplete, without registered image, or with a spherical camera.
         ShapeError: a pose with NaN.
     """
-    files = check_model(folder)
+    files = model_files(folder)
     findings = []
     if files.others:
         listed = ", ".join(f"{name} ({count} images)" for name, count in files.others)
         findings.append(
             Finding("warning", f"model {folder.name} is read; further models are not: {listed}")
         )
-    reconstruction = _read(files, findings)
+    reconstruction = _read(files)
     if reconstruction.num_reg_images() == 0:
         raise ProjectError(
             f"{folder}: no registered image among {reconstruction.num_images()}; expected at least "
@@ -108,65 +110,68 @@ def load_model(folder: Path) -> ColmapModel:
     return ColmapModel(files, images, lenses, reconstruction, tuple(findings))
 
 
-def _read(files: ModelFiles, findings: list[Finding]) -> pycolmap.Reconstruction:
+def _read(files: ModelFiles) -> pycolmap.Reconstruction:
     import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     try:
         if files.suffix == ".bin":
             reconstruction.read_binary(files.folder)
-        elif _has_carriage_returns(files.folder):
-            # The reader takes a carriage return for content and then finds no image at all.
-            findings.append(Finding("info", "the text model has Windows line ends: converted"))
-            with tempfile.TemporaryDirectory() as copy:
-                for path in files.folder.glob("*.txt"):
-                    text = path.read_bytes().replace(b"\r\n", b"\n")
-                    (Path(copy) / path.name).write_bytes(text)
-                reconstruction.read_text(copy)
+            check_cameras(files.folder, reconstruction)
         else:
             reconstruction.read_text(files.folder)
+        _ = [image.name for image in reconstruction.images.values()]  # decoded when asked for
+    except UnicodeDecodeError:
+        raise ProjectError(
+            f"{files.folder}: the name of an image is no UTF-8; the file is damaged or of another "
+            "encoding; export the model again"
+        ) from None
     except (ValueError, IndexError, KeyError, RuntimeError, OSError) as error:
         lines = str(error).split("Check failed:")[-1].strip().splitlines() or ["no reason"]
-        reason = _REASONS.get(lines[0], lines[0][:120])
+        reason = next((said for part, said in REASONS.items() if part in lines[0]), lines[0][:120])
         raise ProjectError(
-            f"{files.folder}: the model's files contradict each other ({reason}); "
+            f"{files.folder}: the model's files are damaged or contradict each other ({reason}); "
             "export the model again"
         ) from None
-    if files.suffix == ".bin":
-        counts = [len(camera.params) for camera in reconstruction.cameras.values()]
-        check_cameras_size(files.folder / "cameras.bin", counts)
     return reconstruction
-
-
-def _has_carriage_returns(folder: Path) -> bool:
-    for path in folder.glob("*.txt"):
-        with path.open("rb") as file:
-            if b"\r\n" in file.read(65536):
-                return True
-    return False
 
 
 def _registered(
     files: ModelFiles, reconstruction: pycolmap.Reconstruction
 ) -> tuple[tuple[RegisteredImage, ...], list[float]]:
     """The images with a pose, and how far each rotation was from orthonormal."""
+    names = text_names(files.folder) if files.suffix == ".txt" else {}
     images, defects = [], []
     for image in reconstruction.images.values():
         if not image.has_pose:
             continue
-        try:
-            name = files.names.get(image.image_id) or image.name
-        except UnicodeDecodeError:
-            raise ProjectError(
-                f"{files.folder}: the name of image {image.image_id} is no UTF-8; the file is "
-                "damaged or of another encoding; export the model again"
-            ) from None
+        name = names.get(image.image_id, image.name)
         matrix = np.array(image.cam_from_world().matrix())
-        matrix[:, :3] = rotation_from_quaternion(image.cam_from_world().rotation.quat)
+        matrix[:, :3] = _rotation(image.cam_from_world().rotation.quat)
         pose, defect = rigid_transform(matrix, what=f"{files.folder}, image {name}")
         defects.append(defect)
         images.append(RegisteredImage(image.image_id, name, image.camera_id, pose))
     return tuple(sorted(images, key=lambda image: natural_key(image.name))), defects
+
+
+def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation of a quaternion, times its squared length.
+
+    A quaternion that is not of unit length so gives a scaled rotation, which the check of poses
+    either mends exactly or refuses; formulas for unit quaternions would shear it instead.
+
+    Args:
+        quaternion: (4,) x, y, z, w.
+
+    Returns:
+        (3, 3) float64.
+    """
+    from scipy.spatial.transform import Rotation
+
+    square = float(quaternion @ quaternion)
+    if not 0 < square < np.inf:
+        return np.full((3, 3), square)
+    return np.asarray(square * Rotation.from_quat(quaternion).as_matrix())
 
 
 def sparse_points(

@@ -3,148 +3,75 @@
 from __future__ import annotations
 
 import os
-import shutil
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError, ShapeError
-from gvtools.scenes.colmap_files import check_model
+from gvtools.scenes.colmap_files import model_files
 
 if TYPE_CHECKING:
     import pycolmap
 
-MODEL_STEMS = ("cameras", "images", "points3D", "rigs", "frames")
+
+NO_POINTS, NO_TRACKS = np.zeros((0, 3)), np.zeros(0, np.int64)
 
 
 def write_colmap(
     folder: Path,
     cameras: Cameras,
     *,
-    points: ArrayLike | None = None,
-    colors: ArrayLike | None = None,
-    point_index: ArrayLike | None = None,
-    view_index: ArrayLike | None = None,
-    xy: ArrayLike | None = None,
-    text: bool = False,
+    points: NDArray[np.float64] = NO_POINTS,
+    colors: NDArray[np.uint8] | None = None,
+    point_index: NDArray[np.integer[Any]] = NO_TRACKS,
+    view_index: NDArray[np.integer[Any]] = NO_TRACKS,
+    xy: NDArray[np.float64] = NO_POINTS[:, :2],
 ) -> None:
-    """Write a model that COLMAP and pycolmap read back, in the cameras' own frame.
+    """Write a binary model that COLMAP and pycolmap read back, in the cameras' own frame.
 
     Cameras become PINHOLE cameras (views of equal K and size share one), images get the ids
     1..V in the cameras' order and the cameras' names, points the ids 1..N.
 
     Args:
         folder: the model folder itself, usually ``workspace/sparse/0``; made when absent.
-        cameras: V cameras; K without skew.
-        points: (N, 3) float64, world frame, scene units.
-        colors: (N, 3) uint8; black when not given.
-        point_index: (M,) integers, for each track element its point.
-        view_index: (M,) integers, and its view.
-        xy: (M, 2) float64, and where it was seen, pixels with the first centre at (0.5, 0.5).
-        text: write the text form instead of the binary one.
+        cameras: V cameras; K without skew, each with a name of its own.
+        points: (N, 3), world frame, scene units.
+        colors: (N, 3); None is black.
+        point_index: (M,), for each track element its point.
+        view_index: (M,), and its view.
+        xy: (M, 2), and where it was seen, pixels with the first centre at (0.5, 0.5).
 
     Raises:
-        ShapeError: arrays that do not fit together, indices out of range, or K with skew.
-        ProjectError: the folder holds a binary model that would hide the text, or cannot be
-            written.
+        ShapeError: K with skew, or a name twice.
+        ProjectError: the folder cannot be written.
     """
-    folder = Path(folder)
-    tracks = _checked_tracks(len(cameras), points, colors, point_index, view_index, xy)
-    _check_names(cameras, text)
-    if text and any((folder / f"{stem}.bin").exists() for stem in MODEL_STEMS):
-        raise ProjectError(
-            f"{folder}: holds a binary model, which readers prefer to text; "
-            "expected none; choose another folder or remove the .bin files"
-        )
-    model = _reconstruction(cameras, *tracks)
-    try:
-        _write(model, folder, text)
-    except OSError as error:
-        raise ProjectError(f"{folder}: the model could not be written ({error})") from None
-
-
-def _write(model: pycolmap.Reconstruction, folder: Path, text: bool) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=".model-", dir=folder))
-    try:
-        if text:
-            model.write_text(partial)
-        else:
-            model.write_binary(partial)
-        # The writer does not notice a full disk; the walk over every record does.
-        check_model(partial)
-        for file in sorted(partial.iterdir()):
-            os.replace(file, folder / file.name)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _checked_tracks(
-    views: int,
-    points: ArrayLike | None,
-    colors: ArrayLike | None,
-    point_index: ArrayLike | None,
-    view_index: ArrayLike | None,
-    xy: ArrayLike | None,
-) -> tuple[NDArray[Any], ...]:
-    positions = np.zeros((0, 3)) if points is None else np.asarray(points, np.float64)
-    if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
-        raise ShapeError(f"points: shape {positions.shape}; expected (N, 3), finite")
-    shade = np.zeros(positions.shape, np.uint8) if colors is None else np.asarray(colors)
-    if shade.shape != positions.shape or shade.dtype != np.uint8:
-        raise ShapeError(
-            f"colors: {shade.dtype} of shape {shade.shape}; expected uint8 of {positions.shape}"
-        )
-    given = [value is not None for value in (point_index, view_index, xy)]
-    if any(given) != all(given):
-        raise ShapeError("tracks: point_index, view_index and xy are given together or not at all")
-    if not all(given):
-        empty = np.zeros(0, np.int64)
-        return positions, shade, empty, empty, np.zeros((0, 2))
-    of_point = np.asarray(point_index, np.int64)
-    of_view = np.asarray(view_index, np.int64)
-    where = np.asarray(xy, np.float64)
-    if of_point.ndim != 1 or of_view.shape != of_point.shape or where.shape != (len(of_point), 2):
-        raise ShapeError(
-            f"tracks: point_index {of_point.shape}, view_index {of_view.shape}, xy {where.shape}; "
-            "expected (M,), (M,), (M, 2)"
-        )
-    for name, index, count in (
-        ("point_index", of_point, len(positions)),
-        ("view_index", of_view, views),
-    ):
-        if len(index) and (index.min() < 0 or index.max() >= count):
-            raise ShapeError(
-                f"tracks: {name} runs from {index.min()} to {index.max()}; "
-                f"expected 0 to {count - 1}"
-            )
-    return positions, shade, of_point, of_view, where
-
-
-def _check_names(cameras: Cameras, text: bool) -> None:
     if len(set(cameras.names)) != len(cameras):
         raise ShapeError("cameras: two views share a name; a model needs unique image names")
-    bad = [name for name in cameras.names if not name or "\n" in name or "\0" in name]
-    if bad:
-        raise ShapeError(f"cameras: the name {bad[0]!r} cannot be an image name in a model")
-    blank = [name for name in cameras.names if text and len(name.split()) != 1]
-    if blank:
-        raise ShapeError(
-            f"cameras: the name {blank[0]!r} has a blank, where readers of text models stop; "
-            "write the binary form"
-        )
+    if colors is None:
+        colors = np.zeros(points.shape, np.uint8)
+    model = _reconstruction(cameras, points, colors, point_index, view_index, xy)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".model-", dir=folder) as partial:
+            model.write_binary(partial)
+            # The writer does not notice a full disk; the walk over the records does.
+            model_files(Path(partial))
+            for file in sorted(Path(partial).iterdir()):
+                os.replace(file, folder / file.name)
+    except OSError as error:
+        raise ProjectError(f"{folder}: the model could not be written ({error})") from None
 
 
 def _reconstruction(
     cameras: Cameras,
     positions: NDArray[np.float64],
     colors: NDArray[np.uint8],
-    point_index: NDArray[np.int64],
-    view_index: NDArray[np.int64],
+    point_index: NDArray[np.integer[Any]],
+    view_index: NDArray[np.integer[Any]],
     xy: NDArray[np.float64],
 ) -> pycolmap.Reconstruction:
     import pycolmap

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gvtools.errors import ProjectError
+from gvtools.scenes.scene import Frame
 
 DEPTH_SATURATED = 65535  # "no reading" of Kinect-like 16-bit depth, besides 0
 OPAQUE_FROM = 128  # an alpha at or above this counts as part of the picture
@@ -45,19 +46,6 @@ class ImageHeader:
         return self.mode in ("RGBA", "LA", "PA", "RGBa", "La")
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """One decoded picture.
-
-    Attributes:
-        rgb: (H, W, 3) uint8.
-        mask: (H, W) bool from the alpha channel, True = use; None where all pixels are opaque.
-    """
-
-    rgb: NDArray[np.uint8]
-    mask: NDArray[np.bool_] | None = None
-
-
 def read_header(path: Path) -> ImageHeader:
     """Size and layout of the picture at ``path``.
 
@@ -74,7 +62,7 @@ def read_header(path: Path) -> ImageHeader:
         raise _unreadable(path, error) from None
 
 
-def read_image(path: Path) -> Picture:
+def read_image(path: Path) -> Frame:
     """The picture at ``path`` as 8-bit RGB, with its alpha channel as a mask.
 
     Grey is repeated over the channels, palettes are resolved, 16 bits a channel keep their upper
@@ -90,7 +78,7 @@ def read_image(path: Path) -> Picture:
         raise _unreadable(path, error) from None
 
 
-def _decode(image: Image.Image, path: Path) -> Picture:
+def _decode(image: Image.Image, path: Path) -> Frame:
     if image.mode in ("I", "F"):
         raise ProjectError(
             f"{path}: the picture holds 32-bit values ({image.mode}); "
@@ -98,13 +86,13 @@ def _decode(image: Image.Image, path: Path) -> Picture:
         )
     if image.mode.startswith("I;16"):
         grey = (np.asarray(image) >> 8).astype(np.uint8)
-        return Picture(np.repeat(grey[..., None], 3, axis=-1))
+        return Frame(np.repeat(grey[..., None], 3, axis=-1))
     if image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
         rgba = np.array(image.convert("RGBA"))
         mask = rgba[..., 3] >= OPAQUE_FROM
         rgb = np.ascontiguousarray(rgba[..., :3])
-        return Picture(rgb, None if mask.all() else mask)
-    return Picture(np.array(image.convert("RGB")))
+        return Frame(rgb, mask=None if mask.all() else mask)
+    return Frame(np.array(image.convert("RGB")))
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:

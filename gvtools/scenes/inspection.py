@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gvtools.errors import GvError
-from gvtools.scenes.scene import Finding, Scene, SparsePoints, View
+from gvtools.scenes.scene import Finding, Scene
 
 # Focal lengths of usual lenses, over the image's sides.
 FOCAL = (0.1, 50.0)
 # Mean reprojection error, pixels, above which a model is no good one.
 REPROJECTION = 4.0
-SAMPLED_VIEWS = 16  # opened when only a sample is asked for, spread over the scene
 
 
 @dataclass(frozen=True)
@@ -82,18 +81,22 @@ class SceneReport:
         return asdict(self)
 
 
-def inspect(scene: Scene, *, read_pixels: bool | Literal["sample"] = True) -> SceneReport:
+class _Opened(NamedTuple):
+    """One view that was decoded: its masked share, and of its depth, if any, what is valid."""
+
+    masked: float
+    pixels: int = 0
+    valid: int = 0
+    range: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def inspect(scene: Scene) -> SceneReport:
     """Open a scene's files and sum up what a run would get.
 
-    Args:
-        scene: an opened project.
-        read_pixels: decode all views, none, or, with "sample", at most sixteen spread evenly.
-
-    Returns:
-        The report. Files that cannot be read become error findings; nothing is raised for them.
+    Files that cannot be read become error findings; nothing is raised for them.
     """
     findings = list(scene.findings)
-    opened = _open(_views_to_open(scene, read_pixels), findings)
+    opened = _open(scene, findings)
     cameras = scene.cameras if scene.views else None
     focal = cameras.K[:, (0, 1), (0, 1)] if cameras is not None else np.zeros((1, 2))
     centers = cameras.centers if cameras is not None else np.zeros((1, 3))
@@ -107,7 +110,6 @@ def inspect(scene: Scene, *, read_pixels: bool | Literal["sample"] = True) -> Sc
     errors = reprojection_errors(scene)
     findings += _views_without_depth(scene)
     findings += _doubtful_cameras(scene, errors)
-    _depth_without_pixels(opened, findings)
     return SceneReport(
         root=str(scene.root),
         kind=scene.kind,
@@ -117,7 +119,7 @@ def inspect(scene: Scene, *, read_pixels: bool | Literal["sample"] = True) -> Sc
         sizes=dict(sizes),
         focal_px=(float(focal.min()), float(focal.max())),
         depth=_depth(scene, opened),
-        masked=float(np.mean([item["masked"] for item in opened])) if opened else 0.0,
+        masked=float(np.mean([item.masked for item in opened])) if opened else 0.0,
         sparse_points=0 if scene.points is None else len(scene.points.positions),
         observations=0 if scene.points is None else len(scene.points.point_index),
         reprojection_px=float(np.nanmean(errors)) if np.isfinite(errors).any() else None,
@@ -138,31 +140,17 @@ def reprojection_errors(scene: Scene) -> np.ndarray:
         return np.zeros(0)
     cameras = scene.cameras
     errors = np.full(len(points.point_index), np.nan)
-    for rows, view in _rows_by_view(points):
+    for view in range(len(scene)):
+        rows = np.flatnonzero(points.view_index == view)
         xy, _ = cameras[view].project(points.positions[points.point_index[rows]])
         errors[rows] = np.linalg.norm(xy[0] - points.xy[rows], axis=1)
     return errors
 
 
-def _rows_by_view(points: SparsePoints) -> list[tuple[np.ndarray, int]]:
-    order = np.argsort(points.view_index, kind="stable")
-    views, start = np.unique(points.view_index[order], return_index=True)
-    return [(rows, int(view)) for view, rows in zip(views, np.split(order, start[1:]), strict=True)]
-
-
-def _views_to_open(scene: Scene, read_pixels: bool | str) -> list[View]:
-    if read_pixels is False:
-        return []
-    if read_pixels == "sample" and len(scene) > SAMPLED_VIEWS:
-        rows = np.linspace(0, len(scene) - 1, SAMPLED_VIEWS).round().astype(int)
-        return [scene.views[row] for row in rows]
-    return list(scene.views)
-
-
-def _open(views: list[View], findings: list[Finding]) -> list[dict[str, Any]]:
+def _open(scene: Scene, findings: list[Finding]) -> list[_Opened]:
     known = {finding.message for finding in findings}
-    opened = []
-    for view in views:
+    opened, empty = [], []
+    for view in scene.views:
         try:
             frame = view.load()
         except GvError as error:
@@ -170,18 +158,19 @@ def _open(views: list[View], findings: list[Finding]) -> list[dict[str, Any]]:
                 findings.append(Finding("error", str(error)))
             continue
         masked = 0.0 if frame.mask is None else 1.0 - float(frame.mask.mean())
-        item: dict[str, Any] = {"name": view.name, "masked": masked, "depth": None}
-        if frame.depth is not None:
-            valid = frame.depth[frame.depth > 0]
-            item["pixels"] = frame.depth.size
-            item["depth"] = valid.size
-            if valid.size:
-                item["range"] = (
-                    float(valid.min()),
-                    float(np.median(valid)),
-                    float(valid.max()),
-                )
-        opened.append(item)
+        if frame.depth is None:
+            opened.append(_Opened(masked))
+            continue
+        valid = frame.depth[frame.depth > 0]
+        if valid.size:
+            spread = float(valid.min()), float(np.median(valid)), float(valid.max())
+            opened.append(_Opened(masked, frame.depth.size, valid.size, spread))
+        else:
+            opened.append(_Opened(masked, frame.depth.size))
+            empty.append(view.name)
+    if empty:
+        message = f"{len(empty)} depth maps hold no valid pixel, first {empty[0]}"
+        findings.append(Finding("warning", message))
     return opened
 
 
@@ -229,26 +218,17 @@ def _doubtful_cameras(scene: Scene, errors: np.ndarray) -> list[Finding]:
     return findings
 
 
-def _depth_without_pixels(opened: list[dict[str, Any]], findings: list[Finding]) -> None:
-    empty = [item["name"] for item in opened if item["depth"] == 0]
-    if empty:
-        findings.append(
-            Finding("warning", f"{len(empty)} depth maps hold no valid pixel, first {empty[0]}")
-        )
-
-
-def _depth(scene: Scene, opened: list[dict[str, Any]]) -> DepthSummary | None:
+def _depth(scene: Scene, opened: list[_Opened]) -> DepthSummary | None:
     views = sum(view.has_depth for view in scene.views)
     if not views:
         return None
-    measured = [item for item in opened if item["depth"] is not None]
-    ranges = np.array([item["range"] for item in measured if "range" in item]).reshape(-1, 3)
+    pixels = sum(item.pixels for item in opened)
+    ranges = np.array([item.range for item in opened if item.valid]).reshape(-1, 3)
     if not len(ranges):
-        return DepthSummary(views, 0.0 if measured else None, None, None, None)
-    coverage = sum(item["depth"] for item in measured) / sum(item["pixels"] for item in measured)
+        return DepthSummary(views, 0.0 if pixels else None, None, None, None)
     return DepthSummary(
         views,
-        float(coverage),
+        sum(item.valid for item in opened) / pixels,
         float(ranges[:, 0].min()),
         float(np.median(ranges[:, 1])),
         float(ranges[:, 2].max()),

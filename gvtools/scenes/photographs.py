@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import ROTATION_ROUNDING, Cameras
 from gvtools.errors import ProjectError
-from gvtools.scenes.images import check_size, fit_depth, read_header, read_image, read_mask
+from gvtools.scenes.images import (
+    check_size,
+    fit_depth,
+    read_header,
+    read_image,
+    read_mask,
+    same_aspect,
+)
 from gvtools.scenes.scene import Finding, Frame, View
 from gvtools.scenes.undistort import Undistortion
 
@@ -161,6 +168,38 @@ def header_findings(pictures: Sequence[tuple[Path, tuple[int, int]]]) -> list[Fi
             kinds["with an EXIF orientation: not applied, cameras are of the stored pixels"] += 1
     findings += [Finding("info", f"{count} pictures {kind}") for kind, count in kinds.items()]
     return findings
+
+
+def depth_findings(
+    depths: Sequence[tuple[Path, tuple[int, int]]], size_of: Callable[[Path], tuple[int, int]]
+) -> list[Finding]:
+    """What the headers of depth maps tell before any is decoded.
+
+    Args:
+        depths: each file with the width and height of its picture.
+        size_of: reads a file's width and height; raises ProjectError.
+
+    Returns:
+        An error for each unreadable file or other aspect, and one line for each size that differs.
+    """
+    findings: list[Finding] = []
+    resized: Counter[str] = Counter()
+    for path, expected in depths:
+        try:
+            found = size_of(path)
+        except ProjectError as error:
+            findings.append(Finding("error", str(error)))
+            continue
+        line = f"{found[0]}x{found[1]} for pictures of {expected[0]}x{expected[1]}"
+        if found != expected and same_aspect(found, expected):
+            resized[f"depth maps of {line}: nearest pixel taken"] += 1
+        elif found != expected:
+            message = (
+                f"{path}: depth of {line}; expected the same aspect, or the depth camera's "
+                "intrinsics (depth_K of RGB-D)"
+            )
+            findings.append(Finding("error", message))
+    return findings + [Finding("info", f"{count} {line}") for line, count in resized.items()]
 
 
 def lens_findings(lenses: Sequence[Undistortion]) -> list[Finding]:

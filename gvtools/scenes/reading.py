@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gvtools.errors import OptionError
+from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.project import open_project
+from gvtools.scenes.rgbd_recording import RgbdOptions, load_matrix
 
 if TYPE_CHECKING:
-    from gvtools.scenes.rgbd_recording import RgbdOptions
     from gvtools.scenes.scene import Scene
 
 # Options of a project by name, with the name that RgbdOptions has for those of RGB-D folders.
@@ -57,24 +57,9 @@ def rgbd_options(reading: Mapping[str, Any]) -> RgbdOptions | None:
     if not options:
         return None
     if "color_from_depth" in options:
-        options["color_from_depth"] = _matrix(Path(options["color_from_depth"]))
-    from gvtools.scenes.rgbd_recording import RgbdOptions
-
+        path = Path(options["color_from_depth"])
+        try:
+            options["color_from_depth"] = load_matrix(path, (4, 4))
+        except ProjectError as error:
+            raise OptionError(f"--color-from-depth {error}") from None
     return RgbdOptions(**options)
-
-
-def _matrix(path: Path) -> list[list[float]]:
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        rows = [[float(word) for word in line.replace(",", " ").split()] for line in lines]
-    except (OSError, ValueError) as error:
-        raise OptionError(
-            f"--color-from-depth {path}: unreadable ({error}); expected a text file of 4x4 numbers"
-        ) from None
-    rows = [row for row in rows if row]
-    if [len(row) for row in rows] != [4, 4, 4, 4]:
-        raise OptionError(
-            f"--color-from-depth {path}: rows of {[len(row) for row in rows]} numbers; expected "
-            "four rows of four"
-        )
-    return rows

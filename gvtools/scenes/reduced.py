@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
+from gvtools.scenes.images import resize_nearest
 from gvtools.scenes.scene import Finding, Frame, Scene, View
 
 # Below this, nothing of a picture is left to work with.
@@ -63,16 +63,8 @@ def _reduced_frame(frame: Frame, width: int, height: int) -> Frame:
     from PIL import Image
 
     picture = Image.fromarray(frame.rgb).resize((width, height), Image.Resampling.BOX)
-    rows = _nearest(frame.rgb.shape[0], height)
-    columns = _nearest(frame.rgb.shape[1], width)
-    cut = np.ix_(rows, columns)
-    return Frame(
-        np.array(picture),
-        None if frame.depth is None else np.ascontiguousarray(frame.depth[cut]),
-        None if frame.mask is None else np.ascontiguousarray(frame.mask[cut]),
-    )
-
-
-def _nearest(old: int, new: int) -> NDArray[np.int64]:
-    """For each new pixel, the old one that its centre lies in."""
-    return np.minimum(((np.arange(new) + 0.5) * old / new).astype(np.int64), old - 1)
+    resized = [
+        None if array is None else np.ascontiguousarray(resize_nearest(array, width, height))
+        for array in (frame.depth, frame.mask)
+    ]
+    return Frame(np.array(picture), *resized)

@@ -89,29 +89,15 @@ def read_log(path: Path) -> tuple[list[int], list[Float64]]:
         Each block's first integer and its (4, 4) matrix, as read.
 
     Raises:
-        ProjectError: a block that is not of that form, with its line.
+        ProjectError: unreadable, or not of that form.
     """
     try:
-        text = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ProjectError(f"{path}: unreadable ({error})") from None
-    lines = [(number, line) for number, line in enumerate(text, start=1) if line.strip()]
-    numbers, poses = [], []
-    for start in range(0, len(lines), 5):
-        block = lines[start : start + 5]
-        try:
-            head = [int(token) for token in block[0][1].split()]
-            pose = np.array([[float(token) for token in line.split()] for _, line in block[1:]])
-        except ValueError:
-            head, pose = [], np.zeros(0)
-        if not head or pose.shape != (4, 4):
-            raise ProjectError(
-                f"{path}, line {block[0][0]}: expected three integers and then four lines of four "
-                f"numbers; found {block[0][1]!r} and {len(block) - 1} lines"
-            )
-        numbers.append(head[0])
-        poses.append(pose)
-    return numbers, poses
+        values = np.array(path.read_text(encoding="utf-8").split(), np.float64).reshape(-1, 19)
+    except (OSError, ValueError) as error:
+        raise ProjectError(
+            f"{path}: {error}; expected blocks of three integers and four lines of four numbers"
+        ) from None
+    return [int(number) for number in values[:, 0]], list(values[:, 3:].reshape(-1, 4, 4))
 
 
 def pair_by_name(colors: list[Path], depths: list[Path]) -> dict[Path, Path]:

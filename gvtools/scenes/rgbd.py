@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gvtools.cameras import invert_rigid, rigid_transform
-from gvtools.errors import GvError, OptionError, ProjectError
-from gvtools.scenes.images import read_depth, read_header, same_aspect
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.images import read_depth, read_header
 from gvtools.scenes.photographs import (
     Photograph,
     Registration,
+    depth_findings,
     header_findings,
     lens_findings,
-    named,
     rotation_findings,
 )
 from gvtools.scenes.rgbd_recording import Float64, Recording, RgbdFrame, RgbdOptions
@@ -224,32 +224,13 @@ def _depth_findings(
     if registration is not None:
         findings.append(Finding("info", "depth is registered into the colour camera"))
         return findings
-    wrong, resized, unreadable = [], 0, []
-    for path in with_depth:
-        try:
-            header = read_header(path)
-        except GvError as error:
-            unreadable.append(str(error))
-            continue
-        if header.mode in ("L", "P", "RGB", "RGBA"):
-            unreadable.append(f"{path}: 8-bit depth ({header.mode}); expected 16-bit grey")
-        found = (header.width, header.height)
-        if found != size and same_aspect(found, size):
-            resized += 1
-        elif found != size:
-            wrong.append(f"{path.name} ({found[0]}x{found[1]})")
-    findings += [Finding("error", message) for message in unreadable]
-    if wrong:
-        findings.append(
-            Finding(
-                "error",
-                f"depth maps of another aspect than the pictures' {size[0]}x{size[1]}: "
-                f"{named(wrong)}; give depth_K",
-            )
-        )
-    if resized:
-        findings.append(
-            Finding("warning", f"{resized} depth maps are of another size: nearest pixel taken")
-        )
+    findings += depth_findings([(path, size) for path in with_depth], _depth_size)
     findings.append(Finding("info", "depth is taken as seen by the colour camera (no depth_K)"))
     return findings
+
+
+def _depth_size(path: Path) -> tuple[int, int]:
+    header = read_header(path)
+    if header.mode in ("L", "P", "RGB", "RGBA"):
+        raise ProjectError(f"{path}: 8-bit depth ({header.mode}); expected 16-bit grey")
+    return header.width, header.height

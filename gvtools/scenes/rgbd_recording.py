@@ -163,9 +163,8 @@ def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
     """
     expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
     try:
-        matrix = np.array(
-            [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        ).astype(np.float64)
+        text = path.read_text(encoding="utf-8").replace(",", " ")
+        matrix = np.loadtxt(text.splitlines(), np.float64, ndmin=2)
     except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise ProjectError(f"{path}: unreadable ({reason}); expected {expected} numbers") from None

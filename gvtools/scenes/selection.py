@@ -2,7 +2,7 @@
 
 A selection is one of ``all``, ``every:K``, ``every:K+OFFSET``, ``first:N``, ``last:N``,
 ``range:A-B`` (indices from 0, both ends included), ``not:SPEC``, image names with commas between
-them, or ``@file`` with one name a line.
+them, or ``@file`` with one name a line. A name with a comma is given alone or in a file.
 """
 
 from __future__ import annotations
@@ -48,17 +48,15 @@ def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
     if spec.startswith("@"):
         return _by_name(names, _lines(Path(spec[1:])), f"{spec[1:]}")
     # Views' own names win over a form that looks like them.
-    listed = _listed(names, spec)
+    if spec in names:
+        return {names.index(spec)}
     keyword, colon, rest = spec.partition(":")
-    if listed or not colon:
-        listed = listed or [part.strip() for part in spec.split(",")]
-        return _by_name(names, listed, f"selection {whole!r}")
-    if keyword == "not":
+    if keyword == "not" and colon:
         return set(range(count)) - _chosen(names, rest.strip(), whole)
+    listed = [part.strip() for part in spec.split(",")]
+    if not colon or not set(names).isdisjoint(listed):
+        return _by_name(names, listed, f"selection {whole!r}")
     if keyword not in _FORMS:
-        listed = [part.strip() for part in spec.split(",")]
-        if not set(names).isdisjoint(listed):
-            return _by_name(names, listed, f"selection {whole!r}")
         near = difflib.get_close_matches(keyword, _KEYWORDS, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"expected {GRAMMAR}"
         raise OptionError(f"selection {whole!r}: unknown form {keyword!r}; {hint}")
@@ -67,22 +65,6 @@ def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
         raise OptionError(f"selection {whole!r}: {rest!r} after {keyword!r}; expected {GRAMMAR}")
     numbers = [int(group) for group in match.groups(default="0")]
     return _counted(keyword, numbers, count, whole)
-
-
-def _listed(names: Sequence[str], spec: str) -> list[str]:
-    """The names that a text lists, some of which may have commas; none where it lists others."""
-    known = {*names, ""}
-    longest = 1 + max((name.count(",") for name in names), default=0)
-    parts = spec.split(",")
-    # What the parts from each one on list, the longest names first.
-    rest: list[list[str] | None] = [*([None] * len(parts)), []]
-    for at in reversed(range(len(parts))):
-        for end in range(min(at + longest, len(parts)), at, -1):
-            name, after = ",".join(parts[at:end]).strip(), rest[end]
-            if name in known and after is not None:
-                rest[at] = [name, *after]
-                break
-    return [name for name in rest[0] or [] if name]
 
 
 def _counted(keyword: str, numbers: list[int], count: int, whole: str) -> set[int]:

@@ -7,11 +7,8 @@ point counts the first pixel's centre as (0.5, 0.5), as this project does.
 from __future__ import annotations
 
 import json
-import math
 import os
-import reprlib
-import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from gvtools.cameras import Cameras, invert_rigid, rigid_transform
-from gvtools.errors import ProjectError, ShapeError
+from gvtools.errors import ProjectError
 from gvtools.files import write_text
-from gvtools.scenes.images import read_depth, read_header
-from gvtools.scenes.lens_parameters import COEFFICIENTS, lens_parameters
+from gvtools.scenes.images import read_depth
 from gvtools.scenes.photographs import (
     Photograph,
     given_folder,
@@ -33,12 +29,12 @@ from gvtools.scenes.photographs import (
     rotation_findings,
 )
 from gvtools.scenes.scene import Finding, Scene, natural_key
+from gvtools.scenes.transforms_frame import LensParameters, frame_keys
 from gvtools.scenes.undistort import Undistortion, undistortion
 
 FILE = "transforms.json"
+EXPORTER = "gvtools"  # the value of ``exported_by`` in files written here
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-MILLIMETRES = 1e-3
-LARGEST = 1_000_000  # pixels; cameras of wider pictures are not read
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg")  # Blender's files name pictures without a suffix
 
 
@@ -105,35 +101,36 @@ def _photographs(
 
     ``files`` holds each frame's name and picture; ``findings`` is added to.
     """
-    lenses: dict[tuple[Any, ...], Undistortion] = {}
+    lenses: dict[LensParameters, Undistortion] = {}
     photographs, absent, defects, unmasked = [], [], [], 0
     for i, (frame, (name, file)) in enumerate(zip(data["frames"], files, strict=True)):
         what = f"{path}, frame {i} ({name})"
         if not os.path.isfile(file):
             absent.append(name)
             continue
-        values = {**data, **frame}
-        pose, defect = rigid_transform(_matrix(frame, what), what=what)
+        keys = frame_keys({**data, **frame}, what=what)
+        pose, defect = rigid_transform(_matrix(keys.transform_matrix, what), what=what)
         defects.append(defect)
-        lens = _lens(values, file, what, lenses)
-        mask = _beside(path.parent, frame, "mask_path", what)
-        depth = _beside(path.parent, frame, "depth_file_path", what)
+        params = keys.lens(file, what=what)
+        if params not in lenses:
+            lenses[params] = undistortion(params.model, params.values, params.size, what=what)
+        mask = _beside(path.parent, keys.mask_path)
+        depth = _beside(path.parent, keys.depth_file_path)
         lost = [item.name for item in (mask, depth) if item and not os.path.isfile(item)]
         if lost:
             findings.append(Finding("warning", f"{what}: {', '.join(lost)} is absent on disk"))
         if mask is None and masks is not None:
             mask = masks / f"{name}.png"
             unmasked += not os.path.isfile(mask)
-        unit = _number(values, "depth_unit_scale_factor", what, MILLIMETRES, positive=True)
         photographs.append(
             Photograph(
                 name,
                 file,
-                lens,
+                lenses[params],
                 invert_rigid(pose @ OPENCV_FROM_OPENGL),
                 mask if mask and os.path.isfile(mask) else None,
                 depth if depth and os.path.isfile(depth) else None,
-                partial(read_depth, unit=unit),
+                partial(read_depth, unit=keys.depth_unit_scale_factor),
             )
         )
     findings += mask_findings(unmasked, masks)
@@ -145,7 +142,7 @@ def write_transforms(
     cameras: Cameras,
     *,
     image_paths: Sequence[str | Path],
-    depth_paths: Sequence[str | Path] | None = None,
+    generated: Collection[str] = (),
 ) -> None:
     """Write cameras as a ``transforms.json`` that nerfstudio, instant-ngp and this project read.
 
@@ -153,21 +150,13 @@ def write_transforms(
         path: the file.
         cameras: V cameras; K without skew.
         image_paths: V pictures, absolute or relative to the file's folder.
-        depth_paths: V depth maps in scene units (``.npy``), likewise.
+        generated: names of the cameras whose pictures a completer made.
 
     Raises:
-        ShapeError: another number of paths than of cameras.
         ProjectError: the file cannot be written.
     """
-    path = Path(path)
-    depths = [None] * len(cameras) if depth_paths is None else list(depth_paths)
-    if len(image_paths) != len(cameras) or len(depths) != len(cameras):
-        raise ShapeError(
-            f"transforms: {len(image_paths)} images and {len(depths)} depths for "
-            f"{len(cameras)} cameras; expected one each"
-        )
     frames = []
-    for i, (image, depth) in enumerate(zip(image_paths, depths, strict=True)):
+    for i, image in enumerate(image_paths):
         K, pose = cameras.K[i], cameras.world_from_cam[i] @ OPENCV_FROM_OPENGL
         frame: dict[str, Any] = {
             "file_path": _relative(image, path.parent),
@@ -179,14 +168,11 @@ def write_transforms(
             "h": int(cameras.height[i]),
             "transform_matrix": pose.tolist(),
         }
-        if depth is not None:
-            frame["depth_file_path"] = _relative(depth, path.parent)
+        if cameras.names[i] in generated:
+            frame["generated"] = True
         frames.append(frame)
-    data: dict[str, Any] = {"camera_model": "PINHOLE"}
-    if depth_paths is not None:
-        data["depth_unit_scale_factor"] = 1.0
-    text = json.dumps({**data, "frames": frames}, indent=2)
-    write_text(path, text)
+    data = {"exported_by": EXPORTER, "camera_model": "PINHOLE", "frames": frames}
+    write_text(path, json.dumps(data, indent=2))
 
 
 def _relative(file: str | Path, folder: Path) -> str:
@@ -216,7 +202,7 @@ def _picture(folder: Path, frame: dict[str, Any], what: str) -> Path:
         raise ProjectError(f"{what}: no file_path; expected the picture's path")
     file = Path(os.path.normpath(folder / name.replace("\\", "/")))
     if not file.name:
-        raise _wrong("file_path", name, what, "the picture's path")
+        raise ProjectError(f"{what}: file_path is {name!r}; expected the picture's path")
     # Unlike Path.is_file, this takes names that no file can have for absent ones.
     if os.path.isfile(file) or file.suffix.lower() in GUESSED_SUFFIXES:
         return file
@@ -232,102 +218,15 @@ def _names(files: Sequence[Path]) -> list[str]:
     return [file.relative_to(shared).as_posix() for file in whole]
 
 
-def _matrix(frame: dict[str, Any], what: str) -> np.ndarray:
-    if "transform_matrix" not in frame:
+def _matrix(value: Any, what: str) -> np.ndarray:
+    if value is None:
         raise ProjectError(f"{what}: no transform_matrix; expected a 4x4 pose")
     try:
-        matrix = np.array(frame["transform_matrix"])
-    except ValueError:
-        matrix = np.array(None)
-    if matrix.dtype.kind not in "iuf":
-        raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers")
-    return matrix.astype(np.float64)
+        return np.array(value, np.float64)
+    except (TypeError, ValueError):
+        raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers") from None
 
 
-def _lens(
-    values: dict[str, Any], file: Path, what: str, known: dict[tuple[Any, ...], Undistortion]
-) -> Undistortion:
-    """The frame's camera; frames with equal intrinsics share one mapping."""
-    model = values.get("camera_model", "")
-    if not isinstance(model, str):
-        raise _wrong("camera_model", model, what, "a model's name")
-    if values.get("is_fisheye") not in (None, False, True):
-        raise _wrong("is_fisheye", values["is_fisheye"], what, "true or false")
-    width, height = _size(values, file, what)
-    params = lens_parameters(
-        values,
-        [_number(values, key, what, 0.0) for key in COEFFICIENTS],
-        focal=_focal(values, width, what),
-        center=(
-            _number(values, "cx", what, width / 2),
-            _number(values, "cy", what, height / 2),
-        ),
-        what=what,
-    )
-    camera = (model, params, width, height)
-    if camera not in known:
-        known[camera] = undistortion(params.model, params.values, (width, height), what=what)
-    return known[camera]
-
-
-def _size(values: dict[str, Any], file: Path, what: str) -> tuple[int, int]:
-    size = []
-    for key in ("w", "h"):
-        if key in values:
-            pixels = _number(values, key, what)
-            if not (1 <= pixels <= LARGEST and pixels.is_integer()):
-                raise _wrong(key, values[key], what, f"a whole number from 1 to {LARGEST}")
-            size.append(int(pixels))
-    if len(size) == 2:
-        return size[0], size[1]
-    header = read_header(file)
-    return header.width, header.height
-
-
-def _focal(values: dict[str, Any], width: int, what: str) -> tuple[float, float]:
-    if "fl_x" in values or "fl_y" in values:
-        x = _number(values, "fl_x" if "fl_x" in values else "fl_y", what, positive=True)
-        return x, _number(values, "fl_y", what, x, positive=True)
-    if "camera_angle_x" not in values:
-        raise ProjectError(f"{what}: neither fl_x nor camera_angle_x; expected one of them")
-    half = 0.5 * _number(values, "camera_angle_x", what)
-    if not 0 < half < 0.5 * math.pi:
-        angle = values["camera_angle_x"]
-        raise _wrong("camera_angle_x", angle, what, "radians between 0 and pi")
-    x = 0.5 * width / math.tan(half)
-    return x, x
-
-
-def _number(
-    values: dict[str, Any],
-    key: str,
-    what: str,
-    default: float | None = None,
-    *,
-    positive: bool = False,
-) -> float:
-    value = values.get(key, default)
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, (int, float))
-        # Also for NaN, infinity and whole numbers that no float can hold.
-        or not abs(value) <= sys.float_info.max
-        or (positive and value <= 0)
-    ):
-        raise _wrong(key, value, what, "a positive number" if positive else "a number")
-    return float(value)
-
-
-def _beside(folder: Path, frame: dict[str, Any], key: str, what: str) -> Path | None:
-    """The file that a frame names under ``key``, on disk or not; None when it names none."""
-    value = frame.get(key)
-    if value is not None and not isinstance(value, str):
-        raise _wrong(key, value, what, "a file's path")
-    return folder / value if value else None
-
-
-def _wrong(key: str, value: object, what: str, expected: str) -> ProjectError:
-    return ProjectError(
-        f"{what}: {key} is {reprlib.repr(value)}; expected {expected}; mend it or export the file "
-        "again"
-    )
+def _beside(folder: Path, name: str | None) -> Path | None:
+    """The file that a frame names, on disk or not; None when it names none."""
+    return folder / name if name else None

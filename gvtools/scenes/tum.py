@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.quaternions import rotation_from_quaternion
 from gvtools.scenes.rgbd import RgbdLayout
 from gvtools.scenes.rgbd_recording import (
     Recording,
@@ -26,6 +25,7 @@ from gvtools.scenes.rgbd_recording import (
     pinhole,
 )
 from gvtools.scenes.scene import Finding
+from gvtools.trajectory_files import read_poses
 
 Float64 = NDArray[np.float64]
 
@@ -54,14 +54,15 @@ def _matches(root: Path) -> bool:
 def _record(root: Path, options: RgbdOptions) -> Recording:
     findings = []
     colors, depths = _read_list(root / "rgb.txt"), _read_list(root / "depth.txt")
-    pose_times, poses = _read_poses(root / "groundtruth.txt")
+    truth = read_poses(root / "groundtruth.txt", layout="tum")
+    assert truth.stamps is not None
     limit = options.max_time_difference
     color_times = np.array([time for time, _ in colors])
     depth_of = associate(color_times, np.array([time for time, _ in depths]), limit)
     frames, absent, unposed = [], 0, 0
     for i, (time, name) in enumerate(colors):
-        nearest = int(np.argmin(np.abs(pose_times - time))) if len(pose_times) else -1
-        if nearest < 0 or abs(pose_times[nearest] - time) > limit:
+        nearest = int(np.argmin(np.abs(truth.stamps - time)))
+        if abs(truth.stamps[nearest] - time) > limit:
             unposed += 1
             continue
         if not (root / name).is_file():
@@ -71,8 +72,8 @@ def _record(root: Path, options: RgbdOptions) -> Recording:
         if depth is not None and not depth.is_file():
             absent += 1
             depth = None
-        where = f"{root / 'groundtruth.txt'}, time {pose_times[nearest]:.6f}"
-        frames.append(RgbdFrame(Path(name).name, root / name, depth, poses[nearest], where))
+        where = f"{root / 'groundtruth.txt'}, time {truth.stamps[nearest]:.6f}"
+        frames.append(RgbdFrame(Path(name).name, root / name, depth, truth.poses[nearest], where))
     if unposed:
         message = f"{unposed} of {len(colors)} pictures have no pose within {limit:g} s: dropped"
         findings.append(Finding("warning", message))
@@ -112,49 +113,23 @@ def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:
     return pairs
 
 
-def _rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
+def _read_list(path: Path) -> list[tuple[float, str]]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ProjectError(f"{path}: unreadable ({error})") from None
-    rows = []
+    entries = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        tokens = line.replace(",", " ").split(maxsplit=columns - 1)
-        if len(tokens) != columns:
-            raise ProjectError(f"{path}, line {number}: {line!r}; expected {columns} columns")
-        rows.append((number, tokens))
-    return rows
-
-
-def _read_list(path: Path) -> list[tuple[float, str]]:
-    entries = []
-    for number, (time, name) in _rows(path, 2):
         try:
+            time, name = line.replace(",", " ").split(maxsplit=1)
             entries.append((float(time), name.strip()))
         except ValueError:
             raise ProjectError(
-                f"{path}, line {number}: {time!r}; expected a time stamp in seconds and a file"
+                f"{path}, line {number}: {line!r}; expected a time stamp in seconds and a file"
             ) from None
     return entries
-
-
-def _read_poses(path: Path) -> tuple[Float64, list[Float64]]:
-    times, poses = [], []
-    for number, tokens in _rows(path, 8):
-        try:
-            values = np.array([float(token) for token in tokens])
-        except ValueError:
-            raise ProjectError(
-                f"{path}, line {number}: {' '.join(tokens)!r}; expected time tx ty tz qx qy qz qw"
-            ) from None
-        pose = np.eye(4)
-        pose[:3, :3] = rotation_from_quaternion(values[4:])
-        pose[:3, 3] = values[1:4]
-        times.append(values[0])
-        poses.append(pose)
-    return np.array(times), poses
 
 
 def _intrinsics(root: Path) -> tuple[Float64, tuple[float, ...], str]:

@@ -71,15 +71,15 @@ class Undistortion:
         )
         return np.asarray(bitmap.to_array(), np.uint8)
 
-    def nearest(self, array: NDArray[Any], *, outside: float | bool = 0) -> NDArray[Any]:
+    def nearest(self, array: NDArray[Any]) -> NDArray[Any]:
         """(h, w) recorded values as (H, W) of the pinhole camera, by nearest pixel.
 
-        Pixels that look past the recorded picture become ``outside``.
+        Pixels that look past the recorded picture become 0.
         """
         if self.untouched:
             return array
         values = array.reshape(-1)[np.maximum(self._source_pixel, 0)]
-        return np.where(self._source_pixel >= 0, values, np.asarray(outside, array.dtype))
+        return np.where(self._source_pixel >= 0, values, np.zeros((), array.dtype))
 
     @property
     def inside(self) -> NDArray[np.bool_] | None:

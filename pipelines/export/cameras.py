@@ -1,12 +1,14 @@
 """The cameras of a memory, with points or without, for COLMAP's and nerfstudio's readers.
 
-Pictures stay where they are. Which of the views a completer made stands in ``generated.txt``
-beside the export: one name a line and, where a run has it, the path of the picture. Its first line
-tells which exports of the folder it is for, so that nothing else is ever written over.
+Pictures stay where they are. Which of the views a completer made stands in ``generated.txt`` beside
+a model's files, one name a line and, where a run has it, the path of the picture; in a
+``transforms.json`` their frames have the key ``generated``. By the list, or by the key
+``exported_by``, an export is known, so that nothing else is ever written over.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
@@ -22,11 +24,11 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.thinning import thinned
 from gvtools.runs.target_files import completed_picture
 from gvtools.scenes.colmap_writer import write_colmap
+from gvtools.scenes.transforms_json import EXPORTER, write_transforms
 from gvtools.scenes.transforms_json import FILE as TRANSFORMS
-from gvtools.scenes.transforms_json import write_transforms
 
 GENERATED = "generated.txt"
-HEADER = "# views that a completer made: name, and its picture where the run kept it; exports:"
+HEADER = "# views that a completer made: name, and its picture where the run kept it"
 MODEL = "sparse/0"
 
 
@@ -100,7 +102,11 @@ def write_colmap_export(
         view_index=view,
         xy=xy,
     )
-    _write_generated(folder / GENERATED, MODEL, distinct.generated)
+    lines = [
+        name if picture is None else f"{name}\t{picture}"
+        for name, picture in distinct.generated.items()
+    ]
+    write_text(folder / MODEL / GENERATED, "\n".join([HEADER, *lines]) + "\n")
     return Written(
         views=len(distinct.cameras),
         generated=len(distinct.generated),
@@ -132,8 +138,7 @@ def write_transforms_export(
     for name in distinct.cameras.names:
         made = distinct.generated.get(name)
         paths.append(Path(images) / name if made is None else made)
-    write_transforms(file, distinct.cameras, image_paths=paths)
-    _write_generated(file.with_name(GENERATED), file.name, distinct.generated)
+    write_transforms(file, distinct.cameras, image_paths=paths, generated=distinct.generated.keys())
     return Written(len(distinct.cameras), len(distinct.generated), distinct.renamed)
 
 
@@ -144,22 +149,27 @@ def transforms_file(path: Path) -> Path:
 
 def foreign_model(folder: Path) -> Path | None:
     """What a model written to ``folder`` would replace or hide and no export wrote, if anything."""
+    try:
+        with (folder / MODEL / GENERATED).open(encoding="utf-8") as file:
+            if file.readline().rstrip() == HEADER:
+                return None
+    except (OSError, ValueError):
+        pass
     places = [folder / name for name in ("sparse", "cameras.bin", "cameras.txt")]
-    held = [path for path in places if path.is_file() or any(map(Path.is_file, path.rglob("*")))]
-    return _foreign(folder / GENERATED, MODEL, held)
+    held = (path for path in places if path.is_file() or any(map(Path.is_file, path.rglob("*"))))
+    return next(held, None)
 
 
 def foreign_transforms(path: Path) -> Path | None:
     """What a ``transforms.json`` written to ``path`` would replace and no export wrote, if any."""
     file = transforms_file(path)
-    return _foreign(file.with_name(GENERATED), file.name, [file] if file.is_file() else [])
-
-
-def _foreign(listing: Path, export: str, held: list[Path]) -> Path | None:
-    exports = _exports(listing)
-    if exports is None:
-        return held[0] if held else listing
-    return held[0] if held and export not in exports else None
+    if not file.is_file():
+        return None
+    try:
+        ours = json.loads(file.read_text(encoding="utf-8")).get("exported_by") == EXPORTER
+    except (OSError, ValueError, AttributeError):
+        ours = False
+    return None if ours else file
 
 
 def distinct_cameras(memory: SpatialMemory, run: Path) -> DistinctCameras:
@@ -262,24 +272,3 @@ def _picture(memory: SpatialMemory, view: int, run: Path) -> Path | None:
     """The picture that a run kept of a generated view, absolute."""
     source = memory.views[view]
     return completed_picture(run, source.round, source.camera.names[0])
-
-
-def _exports(listing: Path) -> list[str] | None:
-    """The exports that a list of generated views is for; None for a file that is no such list."""
-    try:
-        first = listing.read_text(encoding="utf-8").partition("\n")[0]
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-    except (OSError, ValueError):
-        return None
-    head, *exports = first.split("\t")
-    return exports if head == HEADER else None
-
-
-def _write_generated(path: Path, export: str, generated: dict[str, Path | None]) -> None:
-    others = [name for name in _exports(path) or [] if (path.parent / name).exists()]
-    header = "\t".join([HEADER, *sorted({*others, export})])
-    lines = [
-        name if picture is None else f"{name}\t{picture}" for name, picture in generated.items()
-    ]
-    write_text(path, "\n".join([header, *lines]) + "\n")

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from gvtools.files import replaced_when_written
 from gvtools.guidance import Guidance
-from gvtools.runs.arrays import save_arrays
 
 
 def write_view(folder: Path, stem: PurePosixPath, guidance: Guidance) -> None:
@@ -36,7 +35,7 @@ def write_view(folder: Path, stem: PurePosixPath, guidance: Guidance) -> None:
     _write_png(base.with_name(f"{base.name}.confidence.png"), grey)
     path = base.with_name(f"{base.name}.depth.npz")
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
-        save_arrays(file, depth=guidance.depth[0].astype(np.float32))
+        np.savez_compressed(file, depth=guidance.depth[0].astype(np.float32))
 
 
 def _write_png(path: Path, pixels: NDArray[np.uint8]) -> None:

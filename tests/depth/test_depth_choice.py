@@ -12,7 +12,7 @@ from tiny_scan import write_scan
 
 from gvtools.depth import choice, colmap_patch_match
 from gvtools.depth.choice import choose_source, rough_source
-from gvtools.depth.colmap_patch_match import ColmapPatchMatch, write_workspace
+from gvtools.depth.colmap_patch_match import ColmapPatchMatch
 from gvtools.depth.rectified_pair import RectifiedPair
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded
@@ -140,16 +140,6 @@ def test_a_rough_source_is_a_small_sweep_without_posing(scan, tmp_path):
     assert rough_source(bare, pair) is pair
 
 
-def test_a_sweep_tells_which_views_it_has_computed(scan):
-    """A view needs its sources' own estimates, and nothing is computed before it is asked for."""
-    stereo = PlaneSweepStereo(scan, options=StereoOptions(sources=2, align=False), views=scan.names)
-    assert stereo.computed == ()
-    view = scan.views[0]
-    stereo.depth(scan, view, view.load())
-    assert set(stereo.computed) == {view.name, *stereo.raw(view).sources}
-    assert len(stereo.computed) == 3
-
-
 def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):
     workspace(tmp_path)
     scene = read_colmap(tmp_path)
@@ -204,6 +194,8 @@ def test_patch_match_gets_a_workspace_of_the_given_views_alone(tmp_path, monkeyp
         assert {image.name for image in model.images.values()} == set(given)
         assert scene.points is not None
         assert len(model.points3D) == len(scene.points.positions)
+        assert model.compute_mean_reprojection_error() < 0.5
+        assert all(len(point.track.elements) == 3 for point in model.points3D.values())
         lines = (folder / "stereo" / "patch-match.cfg").read_text().split("\n")
         assert lines[:2] == [given[0], "__auto__, 20"]
         assert sorted(p.name for p in (folder / "images").rglob("*.*")) == sorted(
@@ -269,14 +261,3 @@ def test_the_scale_of_depth_is_that_of_the_sparse_points(scan, factor):
     assert not few.ok
     assert not disagrees(few)
     assert scale_to_points(scan, view.name, frame.depth) is None
-
-
-def test_the_workspace_keeps_positions_and_tracks(tmp_path):
-    import pycolmap
-
-    workspace(tmp_path / "project")
-    scene = read_colmap(tmp_path / "project")
-    write_workspace(tmp_path / "dense", scene, scene.names[1:3])
-    model = pycolmap.Reconstruction(tmp_path / "dense" / "sparse")
-    assert model.compute_mean_reprojection_error() < 0.5
-    assert all(len(point.track.elements) == 2 for point in model.points3D.values())

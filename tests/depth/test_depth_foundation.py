@@ -91,6 +91,11 @@ def weights(tmp_path):
     return str(tmp_path / "weights")
 
 
+def da3(scene: Scene, weights: str, **options) -> FoundationDepth:
+    given = FoundationOptions(weights=weights, longest=56, **options)
+    return FoundationDepth(scene, views=scene.names, options=given)
+
+
 def stand_in(monkeypatch, scene: Scene, **options) -> Oracle:
     oracle = Oracle(scene, **options)
     monkeypatch.setattr(module, "load_depth_anything", lambda path, device: oracle)
@@ -112,8 +117,7 @@ def relative_errors(scene: Scene, source: FoundationDepth) -> list[float]:
 def test_depth_gets_the_scale_of_the_sparse_points(tmp_path, monkeypatch, weights, cameras):
     scene = read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
     stand_in(monkeypatch, scene)
-    options = FoundationOptions(weights=weights, longest=56, cameras=cameras)
-    source = FoundationDepth(scene, views=scene.names, options=options)
+    source = da3(scene, weights, cameras=cameras)
     assert max(relative_errors(scene, source)) < 0.02
     fitted = source.scale(scene.names[0])
     assert fitted.ok and fitted.support == "points" and fitted.count >= 50
@@ -124,8 +128,7 @@ def test_depth_gets_the_scale_of_the_sparse_points(tmp_path, monkeypatch, weight
 def test_without_points_the_camera_centres_give_the_scale(tmp_path, monkeypatch, weights, cameras):
     scene = read_sevenscenes(write_scan(tmp_path / "scan"))
     stand_in(monkeypatch, scene)
-    options = FoundationOptions(weights=weights, longest=56, cameras=cameras)
-    source = FoundationDepth(scene, views=scene.names, options=options)
+    source = da3(scene, weights, cameras=cameras)
     assert max(relative_errors(scene, source)) < 0.02
     fitted = source.scale(scene.names[0])
     assert fitted.support == "cameras" and fitted.scale == pytest.approx(UNIT, rel=1e-3)
@@ -134,8 +137,7 @@ def test_without_points_the_camera_centres_give_the_scale(tmp_path, monkeypatch,
 def test_passes_share_one_scale_and_are_as_equal_as_can_be(tmp_path, monkeypatch, weights):
     scene = read_sevenscenes(write_scan(tmp_path / "scan", views=7))
     oracle = stand_in(monkeypatch, scene)
-    options = FoundationOptions(weights=weights, longest=56, views=3)
-    source = FoundationDepth(scene, views=scene.names, options=options)
+    source = da3(scene, weights, views=3)
     assert max(relative_errors(scene, source)) < 0.02
     assert sorted(oracle.calls) == [2, 2, 3]
     assert len({source.scale(name).scale for name in scene.names}) == 1
@@ -143,26 +145,19 @@ def test_passes_share_one_scale_and_are_as_equal_as_can_be(tmp_path, monkeypatch
 
 @pytest.mark.parametrize("wrong", ["centres", "depth"])
 def test_a_scale_without_support_is_refused(tmp_path, monkeypatch, weights, wrong):
+    """Points that fit no scale refuse it, whatever the centres say."""
     if wrong == "centres":
         scene = read_sevenscenes(write_scan(tmp_path / "scan"))
     else:
         scene = read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
-    oracle = stand_in(monkeypatch, scene, wrong=wrong)
-    if wrong == "depth":
-        oracle.wrong = "depth"
-        original = oracle.__class__.__call__
-
-        def both(self, *args, **known):
-            made = original(self, *args, **known)
-            noise = torch.randn(made.ray.shape, generator=torch.Generator())
-            return replace(made, ray=noise)
-
-        monkeypatch.setattr(Oracle, "__call__", both)
-    options = FoundationOptions(weights=weights, longest=56)
-    source = FoundationDepth(scene, views=scene.names, options=options)
+    stand_in(monkeypatch, scene, wrong=wrong)
+    source = da3(scene, weights)
     view = scene.views[0]
     with pytest.raises(DegenerateError, match="unsupported"):
         source.depth(scene, view, view.load())
+    fitted = source.scale(view.name)
+    assert not fitted.ok
+    assert wrong == "centres" or fitted.support == "points"
 
 
 class Recorder:
@@ -197,10 +192,9 @@ def test_the_scenes_unit_changes_the_depths_unit_alone(tmp_path, monkeypatch, we
     network = Recorder()
     monkeypatch.setattr(module, "load_depth_anything", lambda path, device: network)
     scene = read_sevenscenes(write_scan(tmp_path / "scan"))
-    options = FoundationOptions(weights=weights, longest=56)
     depths = []
     for other in (scene, in_another_unit(scene, factor)):
-        source = FoundationDepth(other, views=other.names, options=options)
+        source = da3(other, weights)
         view = other.views[-1]
         depths.append(source.depth(other, view, replace(view.load(), depth=None)).depth)
     before, after = network.given
@@ -223,8 +217,7 @@ def test_no_depth_lies_between_two_surfaces(tmp_path, monkeypatch, weights):
         return replace(made, depth=torch.where(nearer, unit * SQUARE, unit * WALL))
 
     monkeypatch.setattr(Oracle, "__call__", sharp)
-    options = FoundationOptions(weights=weights, longest=56)
-    source = FoundationDepth(scene, views=scene.names, options=options)
+    source = da3(scene, weights)
     view = scene.views[0]
     made = source.depth(scene, view, view.load()).depth
     assert oracle.calls and made.shape == view.load().rgb.shape[:2]
@@ -237,9 +230,7 @@ def test_no_depth_lies_between_two_surfaces(tmp_path, monkeypatch, weights):
 def test_unsure_pixels_and_masked_ones_stay_empty(tmp_path, monkeypatch, weights):
     scene = read_sevenscenes(write_scan(tmp_path / "scan"))
     stand_in(monkeypatch, scene)
-    source = FoundationDepth(
-        scene, views=scene.names, options=FoundationOptions(weights=weights, longest=56)
-    )
+    source = da3(scene, weights)
     view = scene.views[0]
     frame = view.load()
     mask = np.ones(frame.rgb.shape[:2], bool)
@@ -300,19 +291,9 @@ def test_the_released_small_model_is_known_by_its_width(tmp_path):
     assert next(network.parameters()).dtype == torch.float32
 
 
-def test_points_that_fit_no_scale_refuse_whatever_the_centres_say(tmp_path, monkeypatch, weights):
-    scene = read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
-    stand_in(monkeypatch, scene, wrong="depth")
-    options = FoundationOptions(weights=weights, longest=56)
-    source = FoundationDepth(scene, views=scene.names, options=options)
-    fitted = source.scale(scene.names[0])
-    assert not fitted.ok and fitted.support == "points"
-
-
 def test_two_centres_alone_are_no_support(tmp_path, monkeypatch, weights):
     scene = read_sevenscenes(write_scan(tmp_path / "scan", views=2))
     stand_in(monkeypatch, scene)
-    options = FoundationOptions(weights=weights, longest=56)
-    source = FoundationDepth(scene, views=scene.names, options=options)
+    source = da3(scene, weights)
     with pytest.raises(DegenerateError, match="at least 4"):
         source.depth(scene, scene.views[0], scene.views[0].load())

@@ -178,7 +178,7 @@ def test_a_disk_that_fills_up(scan, tmp_path):
 
 def test_a_model_without_images_is_refused(capsys, tmp_path):
     from gvtools.cameras import Cameras
-    from gvtools.scenes.colmap import write_colmap
+    from gvtools.scenes.colmap_writer import write_colmap
 
     K = np.array([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
     camera = Cameras(K, np.eye(4)[None], np.array([64]), np.array([48]), ("a.png",))

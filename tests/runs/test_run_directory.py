@@ -28,6 +28,22 @@ def reconstruct(scan, out, *options: object) -> int:
     return main(["reconstruct", str(scan), "--out", str(out), *RUN, *map(str, options)])
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A scan and a finished run of it, not to be changed."""
+    root = tmp_path_factory.mktemp("whole")
+    scan, out = write_scan(root / "scan"), root / "run"
+    assert reconstruct(scan, out) == 0
+    return scan, out
+
+
+@pytest.fixture
+def finished(whole, tmp_path):
+    """The scan and a copy of the finished run."""
+    shutil.copytree(whole[1], tmp_path / "run")
+    return whole[0], tmp_path / "run"
+
+
 def test_a_first_attempt_that_failed_does_not_bind_the_next(scan, tmp_path):
     out = tmp_path / "run"
     broken = scan / "frame-000001.color.png"
@@ -40,9 +56,8 @@ def test_a_first_attempt_that_failed_does_not_bind_the_next(scan, tmp_path):
     assert json.loads((out / "run.json").read_text())["settings"]["voxel"] == 0.03
 
 
-def test_the_settings_of_a_run_with_rounds_bind(scan, tmp_path, capsys):
-    out = tmp_path / "run"
-    assert reconstruct(scan, out) == 0
+def test_the_settings_of_a_run_with_rounds_bind(finished, capsys):
+    scan, out = finished
     shutil.rmtree(out / "round_002")
     assert reconstruct(scan, out, "--resume", "--voxel", "0.3") == 2
     assert "settings, derived differ" in capsys.readouterr().err
@@ -86,11 +101,9 @@ def test_changed_sparse_points_are_another_run(tmp_path, capsys):
     assert "(points differ)" in capsys.readouterr().err
 
 
-def test_removing_a_round_forgets_it_and_what_came_after(scan, tmp_path):
-    out, again = tmp_path / "run", tmp_path / "again"
-    assert reconstruct(scan, out) == 0
-    whole = (out / "memory.npz").read_bytes()
-    shutil.copytree(out, again)
+def test_removing_a_round_forgets_it_and_what_came_after(finished):
+    scan, again = finished
+    memory = (again / "memory.npz").read_bytes()
     shutil.rmtree(again / "round_001")
     directory = RunDirectory(again)
     record = json.loads((again / "run.json").read_text())
@@ -99,7 +112,7 @@ def test_removing_a_round_forgets_it_and_what_came_after(scan, tmp_path):
         assert done == 1
     assert reconstruct(scan, again, "--resume") == 0
     assert SpatialMemory.load(again / "memory.npz").rounds == (0, 1, 2)
-    assert (again / "memory.npz").read_bytes() == whole
+    assert (again / "memory.npz").read_bytes() == memory
 
 
 def test_a_folder_in_use_is_refused(tmp_path):
@@ -157,10 +170,9 @@ def test_a_demo_in_a_folder_with_files_is_refused_before_its_sample(tmp_path, ca
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
 
 
-def test_figures_split_the_picture_by_what_observations_support(scan, tmp_path):
+def test_figures_split_the_picture_by_what_observations_support(finished):
     """A target's support keeps observed and generated apart, also within a round."""
-    out = tmp_path / "run"
-    assert reconstruct(scan, out) == 0
+    _, out = finished
     metrics = json.loads((out / "metrics.json").read_text())
     for number in (1, 2):
         report = json.loads((out / f"round_00{number}" / "report.json").read_text())
@@ -194,9 +206,8 @@ def test_another_programs_record_is_refused_untouched(scan, tmp_path, capsys):
     assert json.loads((out / "run.json").read_text()) == {"experiment": "mine"}
 
 
-def test_a_run_whose_rounds_were_deleted_is_not_overwritten(scan, tmp_path, capsys):
-    out = tmp_path / "run"
-    assert reconstruct(scan, out) == 0
+def test_a_run_whose_rounds_were_deleted_is_not_overwritten(finished, capsys):
+    scan, out = finished
     memory = (out / "memory.npz").read_bytes()
     for folder in out.glob("round_*"):
         shutil.rmtree(folder)
@@ -209,9 +220,8 @@ def test_a_run_whose_rounds_were_deleted_is_not_overwritten(scan, tmp_path, caps
     assert (out / "memory.npz").read_bytes() == memory
 
 
-def test_a_run_without_its_first_round_is_done_anew(scan, tmp_path):
-    out = tmp_path / "run"
-    assert reconstruct(scan, out) == 0
+def test_a_run_without_its_first_round_is_done_anew(finished):
+    scan, out = finished
     memory = (out / "memory.npz").read_bytes()
     shutil.rmtree(out / "round_000")
     assert reconstruct(scan, out) == 2
@@ -228,18 +238,16 @@ def test_a_kill_while_the_record_is_written_leaves_a_usable_folder(scan, tmp_pat
     assert not (out / ".run.json.part").exists()
 
 
-def test_a_memory_that_went_with_a_removed_round_is_said(scan, tmp_path, capsys):
-    out = tmp_path / "run"
-    assert reconstruct(scan, out) == 0
+def test_a_memory_that_went_with_a_removed_round_is_said(finished, capsys):
+    scan, out = finished
     shutil.move(out / "memory.npz", out / "round_002" / "memory.npz")
     shutil.rmtree(out / "round_002")
     assert reconstruct(scan, out, "--resume") == 2
     assert "another --out" in capsys.readouterr().err
 
 
-def test_a_dry_run_tells_what_a_run_would_be_refused_for(scan, tmp_path, capsys):
-    out = tmp_path / "run"
-    assert reconstruct(scan, out) == 0
+def test_a_dry_run_tells_what_a_run_would_be_refused_for(finished, capsys):
+    scan, out = finished
     assert reconstruct(scan, out, "--dry-run") == 2
     assert reconstruct(scan, out, "--dry-run", "--resume") == 0
     assert reconstruct(scan, out, "--dry-run", "--resume", "--voxel", "0.3") == 2

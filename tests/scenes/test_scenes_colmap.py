@@ -38,6 +38,7 @@ def test_every_perspective_model_reprojects_its_own_points(tmp_path, model):
 def test_places_and_forms_give_one_scene(tmp_path, text, classic, place):
     reconstruction = workspace(tmp_path, text=text, classic=classic, place=place)
     scene = read_colmap(tmp_path / place if place == "model" else tmp_path)
+    assert read_colmap(tmp_path / place).names == scene.names
     assert scene.kind == "colmap"
     assert not scene.metric
     for view in scene:
@@ -53,11 +54,6 @@ def test_rig_with_several_cameras_composes_sensor_and_rig(tmp_path):
     scene = read_colmap(tmp_path)
     assert len(scene) == reconstruction.num_images() == 16
     assert reprojection_errors(scene).max() < 1e-3
-
-
-def test_model_folder_itself_finds_the_images_of_its_workspace(tmp_path):
-    workspace(tmp_path)
-    assert read_colmap(tmp_path / "sparse" / "0").names == read_colmap(tmp_path).names
 
 
 def test_images_in_subfolders_and_natural_order(tmp_path):
@@ -147,42 +143,35 @@ def test_mask_and_depth_go_through_the_mapping_of_the_image(tmp_path, model):
     assert "3 views have no mask" in messages
 
 
-def test_depth_map_of_a_smaller_size_is_taken_by_nearest_pixel(tmp_path):
+def test_depth_maps_of_another_size_are_taken_at_the_same_aspect_alone(tmp_path):
     reconstruction = workspace(tmp_path, "PINHOLE")
-    name = next(iter(reconstruction.images.values())).name
+    name, other = sorted(image.name for image in reconstruction.images.values())[:2]
     small = np.arange(HEIGHT * WIDTH / 9, dtype=np.float32).reshape(HEIGHT // 3, WIDTH // 3) + 1
     write_depth_map(tmp_path / "stereo/depth_maps" / f"{name}.geometric.bin", small)
+    write_depth_map(tmp_path / "stereo/depth_maps" / f"{other}.geometric.bin", np.ones((30, 30)))
     scene = read_colmap(tmp_path)
     np.testing.assert_array_equal(
         scene[name].load().depth, np.repeat(np.repeat(small, 3, axis=0), 3, axis=1)
     )
     assert any("32x24 for pictures of 96x72" in finding.message for finding in scene.findings)
-
-
-def test_depth_map_of_another_aspect_is_an_error_finding_and_raises_when_loaded(tmp_path):
-    reconstruction = workspace(tmp_path, "PINHOLE")
-    name = next(iter(reconstruction.images.values())).name
-    write_depth_map(tmp_path / "stereo/depth_maps" / f"{name}.geometric.bin", np.ones((30, 30)))
-    scene = read_colmap(tmp_path)
     assert [f.level for f in scene.findings if "30x30" in f.message] == ["error"]
     with pytest.raises(ProjectError, match="30x30 for a picture of 96x72"):
-        scene[name].load()
+        scene[other].load()
 
 
-def test_masks_images_and_depths_may_be_given(tmp_path):
+def test_masks_and_images_may_be_given(tmp_path):
     reconstruction = workspace(tmp_path / "project", "PINHOLE")
     name = next(iter(reconstruction.images.values())).name
     (tmp_path / "project" / "images").rename(tmp_path / "pictures")
     save(tmp_path / "ignore" / f"{name}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    (tmp_path / "deep").mkdir()
-    np.save(tmp_path / "deep" / f"{name}.npy", np.full((HEIGHT, WIDTH), 2.5))
+    (tmp_path / "project/stereo/depth_maps").mkdir(parents=True)
+    np.save(tmp_path / f"project/stereo/depth_maps/{name}.npy", np.full((HEIGHT, WIDTH), 2.5))
     with pytest.raises(ProjectError, match="without images"):
         read_colmap(tmp_path / "project")
     scene = read_colmap(
         tmp_path / "project",
         images=tmp_path / "pictures",
         masks=tmp_path / "ignore",
-        depths=tmp_path / "deep",
     )
     frame = scene[name].load()
     assert not frame.mask.any()

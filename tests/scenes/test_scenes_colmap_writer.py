@@ -1,12 +1,14 @@
 # mypy: no-check-untyped-defs
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError, ShapeError
-from gvtools.scenes.colmap import write_colmap
+from gvtools.scenes.colmap_writer import write_colmap
 
 VIEWS, POINTS = 5, 60
 
@@ -36,13 +38,12 @@ def tracks(scene):
     }
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_pycolmap_reads_back_what_was_written(tmp_path, text):
+def test_pycolmap_reads_back_what_was_written(tmp_path):
     import pycolmap
 
     written = cameras([f"dir/im{i}.png" for i in range(VIEWS)])
     data = tracks(written)
-    write_colmap(tmp_path / "sparse" / "0", written, **data, text=text)
+    write_colmap(tmp_path / "sparse" / "0", written, **data)
     model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
     assert len(model.cameras) == 2
     assert model.num_reg_images() == VIEWS
@@ -83,61 +84,30 @@ def test_same_input_gives_same_bytes_and_no_leftovers(tmp_path):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-def test_cameras_alone(tmp_path):
-    import pycolmap
-
-    write_colmap(tmp_path, cameras())
-    model = pycolmap.Reconstruction(tmp_path)
-    assert (model.num_reg_images(), model.num_points3D()) == (VIEWS, 0)
-
-
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        ({"xy": None}, "together"),
-        ({"view_index": [9]}, "view_index"),
-        ({"point_index": [[0]]}, "expected \\(M,\\)"),
-        ({"colors": [[0, 0, 0]]}, "uint8"),
-        ({"points": [[0, 0, np.nan]]}, "finite"),
-    ],
-)
-def test_arrays_that_do_not_fit_are_refused(tmp_path, change, told):
-    data = {"points": [[0, 0, 4]], "point_index": [0], "view_index": [0], "xy": [[1, 1]]}
-    with pytest.raises(ShapeError, match=told):
-        write_colmap(tmp_path / "model", cameras(), **{**data, **change})
-    assert not (tmp_path / "model").exists()
-
-
 def test_names_and_matrices_that_a_model_cannot_hold(tmp_path):
-    with pytest.raises(ShapeError, match="blank"):
-        write_colmap(tmp_path, cameras(["a b.png", *"wxyz"]), text=True)
+    data = tracks(cameras())
     with pytest.raises(ShapeError, match="share a name"):
-        write_colmap(tmp_path, cameras(["a", "a", *"xyz"]))
+        write_colmap(tmp_path, cameras(["a", "a", *"xyz"]), **data)
     skewed = cameras()
     skewed.K[0, 0, 1] = 3
     with pytest.raises(ShapeError, match="skew"):
-        write_colmap(tmp_path, skewed)
-
-
-def test_text_is_not_hidden_behind_a_binary_model(tmp_path):
-    write_colmap(tmp_path, cameras())
-    with pytest.raises(ProjectError, match="prefer"):
-        write_colmap(tmp_path, cameras(), text=True)
+        write_colmap(tmp_path, skewed, **data)
 
 
 def test_full_disk_leaves_the_earlier_model(tmp_path, monkeypatch):
     import pycolmap
 
-    write_colmap(tmp_path, cameras())
+    data = tracks(cameras())
+    write_colmap(tmp_path, cameras(), **data)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     real = pycolmap.Reconstruction.write_binary
 
     def short(self, folder):
         real(self, folder)
-        with (folder / "images.bin").open("r+b") as file:
+        with (Path(folder) / "images.bin").open("r+b") as file:
             file.truncate(100)
 
     monkeypatch.setattr(pycolmap.Reconstruction, "write_binary", short)
     with pytest.raises(ProjectError, match=r"images\.bin"):
-        write_colmap(tmp_path, cameras())
+        write_colmap(tmp_path, cameras(), **data)
     assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}

@@ -43,7 +43,7 @@ def test_reprojection_stays_at_the_models_own_error(shared, name, published, for
     own = models_own_error(shared / "data" / name / form)
     assert own == pytest.approx(published, abs=0.001)
     scene = read_colmap(shared / "data" / name / form)
-    report = inspect(scene, read_pixels=False)
+    report = inspect(scene)
     assert report.ok
     assert report.reprojection_px == pytest.approx(own, abs=0.05)
     # Back in the recorded camera, the detections of the pinhole views give the model's own figure.
@@ -62,7 +62,7 @@ def test_workspace_written_undistorted_by_pycolmap_reads_alike(shared, name, tmp
     np.testing.assert_allclose(dense.cameras.K, ours.cameras.K, atol=1e-9)
     np.testing.assert_array_equal(dense.cameras.width, ours.cameras.width)
     assert not any("undistorted to" in finding.message for finding in dense.findings)
-    report = inspect(dense, read_pixels=False)
+    report = inspect(dense)
     assert report.reprojection_px == pytest.approx(models_own_error(source / "sparse/0"), abs=0.05)
     first = ours.names[0]
     difference = np.abs(dense[first].load().rgb.astype(int) - ours[first].load().rgb.astype(int))
@@ -95,7 +95,7 @@ def test_kitchen_scan_is_read_whole(shared):
     scene = open_project(shared / "data/sevenscenes_reg")
     assert (len(scene), scene.metric, scene.kind) == (100, True, "rgbd")
     assert any("100 of 100 rotations" in finding.message for finding in scene.findings)
-    report = inspect(scene, read_pixels="sample")
+    report = inspect(scene)
     assert report.ok
     assert report.depth.coverage == pytest.approx(0.72, abs=0.03)
 

@@ -63,19 +63,6 @@ def test_sevenscenes_intrinsics_in_the_parent_or_nowhere(tmp_path):
     assert read_sevenscenes(root, options=RgbdOptions(color_K=K)).cameras.K[0, 0, 0] == 80
 
 
-def test_slightly_skewed_rotation_is_mended_and_reported(tmp_path):
-    root = sevenscenes(tmp_path)
-    pose = pose_matrix()
-    pose[0, :3] *= 1 + 2e-4
-    np.savetxt(root / "frame-000000.pose.txt", pose)
-    scene = read_sevenscenes(root)
-    rotation = scene.cameras.cam_from_world[0, :3, :3]
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert "1 of 3 rotations made orthonormal; largest entry of R Rᵀ − I was 0.0004" in messages(
-        scene
-    )
-
-
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -227,13 +214,13 @@ def test_tum_malformed_lists_name_the_line(tmp_path):
     root = tum(tmp_path / "sequence")
     text = (root / "groundtruth.txt").read_text()
     (root / "groundtruth.txt").write_text(text + "100.2 1 2 3 0 0 0\n")
-    with pytest.raises(ProjectError, match=r"groundtruth\.txt, line 5: .* expected 8 columns"):
+    with pytest.raises(ProjectError, match=r"groundtruth\.txt:5: 7 numbers; expected 8"):
         read_tum(root)
     (root / "groundtruth.txt").write_text(text.replace("0.300000000", "x", 1))
-    with pytest.raises(ProjectError, match=r"groundtruth\.txt, line 2"):
+    with pytest.raises(ProjectError, match=r"groundtruth\.txt:2"):
         read_tum(root)
     (root / "groundtruth.txt").write_text(text.replace(" 0.998750260", " 2", 1))
-    with pytest.raises(ShapeError, match=r"groundtruth\.txt, time .*scale 4"):
+    with pytest.raises(ProjectError, match=r"groundtruth\.txt:2: a quaternion of length"):
         read_tum(root)
 
 
@@ -280,7 +267,7 @@ def test_redwood_trajectory_that_does_not_fit(tmp_path):
     (root / "trajectory.log").write_text(text.replace("2 2 3", "9 9 9").replace("1 1 2", "0 0 0"))
     assert len(read_redwood(root)) == 3  # one pose a picture, whatever the numbers
     (root / "trajectory.log").write_text("\n".join(text.splitlines()[:13]))
-    with pytest.raises(ProjectError, match=r"trajectory\.log, line 11"):
+    with pytest.raises(ProjectError, match=r"trajectory\.log: .*expected blocks of three"):
         read_redwood(root)
     (root / "trajectory.log").write_text(text.split("1 1 2")[0].replace("0 0 1", "7 7 8"))
     with pytest.raises(ProjectError, match="1 poses numbered 7 for 3 pictures"):

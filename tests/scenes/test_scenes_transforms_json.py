@@ -23,7 +23,7 @@ from scenes_workspace import (
 )
 
 from gvtools.cameras import Cameras
-from gvtools.errors import GvError, ProjectError, ShapeError
+from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.scene import Finding
 from gvtools.scenes.transforms_json import read_transforms, write_transforms
@@ -137,18 +137,7 @@ def test_images_and_masks_may_be_given(tmp_path):
     assert not scene.views[0].load().mask.any()
 
 
-def test_a_mask_folder_that_is_not_there_is_refused_as_colmaps(tmp_path):
-    save(tmp_path / "images/a.png", ramp())
-    path = transforms(tmp_path, [frame()], **PINHOLE)
-    with pytest.raises(ProjectError, match=r"no such folder \(masks were expected there\)") as mine:
-        read_transforms(path, masks=tmp_path / "absent")
-    workspace(tmp_path / "colmap")
-    with pytest.raises(ProjectError) as theirs:
-        read_colmap(tmp_path / "colmap", masks=tmp_path / "absent")
-    assert str(mine.value) == str(theirs.value)
-
-
-def test_views_without_a_mask_are_found_as_colmaps(tmp_path):
+def test_masks_are_given_and_missed_as_those_of_colmap(tmp_path):
     names = ("a.png", "b.png", "c.png", "d.png")
     black = np.zeros((HEIGHT, WIDTH), np.uint8)
     for name in names:
@@ -159,14 +148,17 @@ def test_views_without_a_mask_are_found_as_colmaps(tmp_path):
     frames[1]["mask_path"] = "own.png"
     path = transforms(tmp_path, frames, **PINHOLE)
     scene = read_transforms(path, masks=tmp_path / "ignore")
-    assert Finding("warning", "2 views have no mask in ignore") in scene.findings
     assert [view.load().mask is None for view in scene] == [False, False, True, True]
     assert "no mask" not in messages(read_transforms(path))
     reconstruction = workspace(tmp_path / "colmap")
     for image in list(reconstruction.images.values())[2:]:
         save(tmp_path / "ignore" / f"{image.name}.png", black)
-    theirs = read_colmap(tmp_path / "colmap", masks=tmp_path / "ignore")
-    assert Finding("warning", "2 views have no mask in ignore") in theirs.findings
+    for found in (scene, read_colmap(tmp_path / "colmap", masks=tmp_path / "ignore")):
+        assert Finding("warning", "2 views have no mask in ignore") in found.findings
+    for read in (read_transforms, read_colmap):
+        root = tmp_path / "colmap" if read is read_colmap else path
+        with pytest.raises(ProjectError, match=r"no such folder \(masks were expected there\)"):
+            read(root, masks=tmp_path / "absent")
 
 
 @pytest.mark.parametrize(
@@ -174,8 +166,6 @@ def test_views_without_a_mask_are_found_as_colmaps(tmp_path):
     [
         ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR has no pinhole image"),
         ({"k4": 0.1}, "k4 = 0.1 of a perspective camera"),
-        ({"k1": "0.1"}, "k1 is '0.1'"),
-        ({"fl_x": None}, "fl_x is None"),
         ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix is no matrix"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "frame 0"),
         ({"transform_matrix": (np.eye(4) * np.nan).tolist()}, "NaN"),
@@ -196,6 +186,7 @@ WRONG: dict[str, tuple[Any, ...]] = {
     "fl_y": (0, -1.5, [91]),
     "w": (0, -96, 96.5, "96", None, 10**30),
     "h": (0, 71.9, math.inf),
+    "camera_angle_x": (0, -0.6, math.pi, 4, math.nan, "0.6", None),
     "cx": ("48", {}),
     "k2": (math.nan, 10**400),
     "depth_unit_scale_factor": (0, -1e-3, "1", math.inf),
@@ -226,17 +217,6 @@ def test_wrong_values_name_the_frame_the_key_and_the_value(tmp_path, capsys, key
     told = capsys.readouterr().err
     first = "frame 1 (b.png)" if key in frames[1] else "frame 0 (a.png)"
     assert f"transforms.json, {first}: {key} is {reprlib.repr(value)}; expected " in told
-    assert told.count("\n") == 1
-    assert "unexpected" not in told
-
-
-@pytest.mark.parametrize("angle", [0, -0.6, math.pi, 4, 5e-324, math.nan, "0.6", None])
-def test_an_angle_of_view_lies_between_0_and_pi(tmp_path, capsys, angle):
-    save(tmp_path / "images/a.png", ramp())
-    path = transforms(tmp_path, [frame()], camera_angle_x=angle)
-    assert main(["check", str(path)]) == 2
-    told = capsys.readouterr().err
-    assert f"frame 0 (a.png): camera_angle_x is {angle!r}; expected " in told
     assert told.count("\n") == 1
     assert "unexpected" not in told
 
@@ -296,20 +276,15 @@ def test_written_file_reads_back(tmp_path):
     )
     for i, name in enumerate(names):
         save(tmp_path / "images" / name, ramp(int(cameras.width[i]), int(cameras.height[i])))
-        np.save(tmp_path / f"{name}.npy", np.full((72, 96), 2.5))
     write_transforms(
         tmp_path / "transforms.json",
         cameras,
         image_paths=[(tmp_path / "images" / names[0]).resolve(), "images/b.png", "images/c.png"],
-        depth_paths=[f"{name}.npy" for name in names],
     )
     written = json.loads((tmp_path / "transforms.json").read_text())
     assert written["frames"][0]["file_path"] == "images/a.png"
     scene = read_transforms(tmp_path)
     np.testing.assert_allclose(scene.cameras.K, cameras.K, atol=1e-12)
     np.testing.assert_allclose(scene.cameras.cam_from_world, pose, atol=1e-12)
-    np.testing.assert_array_equal(scene.views[0].load().depth, 2.5)
     assert scene.names == names
     assert not list(tmp_path.glob("*.partial"))
-    with pytest.raises(ShapeError, match="1 images"):
-        write_transforms(tmp_path / "t.json", cameras, image_paths=["a"])

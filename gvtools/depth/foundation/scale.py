@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
+from gvtools.depth.scale_check import depth_of_points
 from gvtools.scenes.scene import Scene
 from gvtools.similarity import align_depth_scale
 
@@ -30,16 +31,12 @@ class FoundationScale:
         status: "aligned", or "unsupported: ..." with the reason.
         support: "points" or "cameras".
         scale: scene units per unit of the network (after the known cameras' own unit).
-        inlier_share: of the points; the centres' correlation where they are the support.
-        residual: median relative deviation of the points; NaN for cameras.
         count: points, or centres.
     """
 
     status: str
     support: str
     scale: float
-    inlier_share: float
-    residual: float
     count: int
 
     @property
@@ -80,40 +77,24 @@ def fit_scale(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
 
 
 def _fit_points(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
-    points = scene.points
-    if points is None:
-        return FoundationScale("unsupported: no sparse points", "points", *(np.nan,) * 3, 0)
-    made, known = [np.zeros(0)], [np.zeros(0)]
-    for part in passes:
-        for name in part.names:
-            camera = scene[name].camera
-            mine = points.view_index == scene.names.index(name)
-            _, z = camera.project(points.positions[points.point_index[mine]])
-            depth = part.depth[name]
-            rows, columns = depth.shape
-            x = points.xy[mine, 0] * (columns / int(camera.width[0]))
-            y = points.xy[mine, 1] * (rows / int(camera.height[0]))
-            inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows) & (z[0] > 0)
-            cell = y[inside].astype(np.int64), x[inside].astype(np.int64)
-            made.append(depth[cell].astype(np.float64) * part.unit)
-            known.append(z[0][inside])
-    depth, reference = np.concatenate(made), np.concatenate(known)
+    if scene.points is None:
+        return FoundationScale("unsupported: no sparse points", "points", np.nan, 0)
+    pairs = [
+        (measured.astype(np.float64) * part.unit, known)
+        for part in passes
+        for name in part.names
+        for measured, known in [depth_of_points(scene, name, part.depth[name])]
+    ]
+    depth, reference = (np.concatenate([np.zeros(0), *side]) for side in zip(*pairs, strict=True))
     fitted = align_depth_scale(
         depth, reference, valid=depth > 0, min_support=MIN_POINTS, inlier_band=0.1
     )
-    return FoundationScale(
-        fitted.status,
-        "points",
-        fitted.scale,
-        fitted.inlier_share,
-        fitted.residual,
-        fitted.support,
-    )
+    return FoundationScale(fitted.status, "points", fitted.scale, fitted.support)
 
 
 def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
     """The median of the passes' own fits, weighted by their views; see ``MIN_CENTRES``."""
-    scales, weights, correlations, reason = [], [], [], "no pass"
+    scales, weights, reason = [], [], "no pass"
     for part in passes:
         known = np.concatenate([scene[name].camera.centers for name in part.names])
         fitted = center_similarity(
@@ -126,7 +107,6 @@ def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
         else:
             scales.append(float(fitted.scale[0]))
             weights.append(len(part.names))
-            correlations.append(float(fitted.correlation[0]))
     if scales and max(weights) < MIN_CENTRES:
         # Each of them would fit by chance; several that agree do not.
         agree = len(scales) >= MIN_PASSES and max(scales) <= PASSES_AGREE * min(scales)
@@ -134,8 +114,6 @@ def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
             reason = f"{max(weights)} views a pass, at least {MIN_CENTRES} are needed"
             scales = []
     if not scales:
-        return FoundationScale(f"unsupported: {reason}", "cameras", np.nan, np.nan, np.nan, 0)
+        return FoundationScale(f"unsupported: {reason}", "cameras", np.nan, 0)
     scale = float(np.median(np.repeat(scales, weights)))
-    return FoundationScale(
-        "aligned", "cameras", scale, float(np.median(correlations)), np.nan, sum(weights)
-    )
+    return FoundationScale("aligned", "cameras", scale, sum(weights))

@@ -152,15 +152,8 @@ def _derivatives(
     du[..., 2] = -(K[..., 0, 0] * x + K[..., 0, 1] * y) / z**2
     dv = np.stack([zero, K[..., 1, 1] / z, -K[..., 1, 1] * y / z**2], -1)
     chain = np.stack([du, dv], axis=-2)  # (S, N, 2, 3)
-    spin = np.stack(
-        [
-            np.stack([zero, z, -y], -1),
-            np.stack([-z, zero, x], -1),
-            np.stack([y, -x, zero], -1),
-        ],
-        axis=-2,
-    )
-    turn = chain @ spin
+    # A rotation moves a point by its cross product with it.
+    turn = np.cross(np.stack([x, y, z], -1)[..., None, :], chain)
     shift = chain * w[None, :, None, None]
     along = np.einsum("snij,sj->sni", chain, relative[:, :3, 3])
     return np.concatenate([turn, shift], axis=-1), along

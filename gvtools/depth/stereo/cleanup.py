@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from gvtools.kernels import compiled
 
@@ -14,7 +16,6 @@ Float32 = NDArray[np.float32]
 LUMINANCE = 0.06
 
 
-@compiled()
 def without_speckles(depth: Float32, step: float, smallest: int) -> Float32:
     """Depth without patches smaller than ``smallest`` pixels.
 
@@ -26,35 +27,18 @@ def without_speckles(depth: Float32, step: float, smallest: int) -> Float32:
     Returns:
         (H, W) float32.
     """
-    height, width = depth.shape
-    kept = depth.copy()
-    label = np.zeros((height, width), np.bool_)
-    stack = np.empty(height * width, np.int32)
-    for start in range(height * width):
-        y, x = start // width, start % width
-        if label[y, x] or not depth[y, x] > 0:
-            continue
-        label[y, x] = True
-        stack[0] = start
-        done, found = 0, 1
-        while done < found:
-            cell = stack[done]
-            done += 1
-            y, x = cell // width, cell % width
-            here = depth[y, x]
-            for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-                ny, nx = y + dy, x + dx
-                if ny < 0 or nx < 0 or ny >= height or nx >= width or label[ny, nx]:
-                    continue
-                there = depth[ny, nx]
-                if there > 0 and abs(there - here) <= step * min(there, here):
-                    label[ny, nx] = True
-                    stack[found] = ny * width + nx
-                    found += 1
-        if found < smallest:
-            for i in range(found):
-                kept[stack[i] // width, stack[i] % width] = 0
-    return kept
+    cell = np.arange(depth.size).reshape(depth.shape)
+    first, second = [], []
+    for here, there in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        nearer = np.minimum(depth[here], depth[there])
+        joined = (nearer > 0) & (np.abs(depth[here] - depth[there]) <= step * nearer)
+        first.append(cell[here][joined])
+        second.append(cell[there][joined])
+    rows, columns = np.concatenate(first), np.concatenate(second)
+    edges = coo_array((np.ones(len(rows), bool), (rows, columns)), (depth.size, depth.size))
+    _, patch = connected_components(edges, directed=False)
+    size = np.bincount(patch)[patch].reshape(depth.shape)
+    return np.where(size >= smallest, depth, np.float32(0))
 
 
 @compiled(parallel=True)

@@ -64,13 +64,10 @@ class SeenPoints:
         row = np.full(len(self.points.positions), -1)
         row[self.index] = np.arange(len(self.index))
         mine = row[self.points.point_index]
-        seen = np.zeros((int(self.points.view_index.max(initial=-1)) + 1, len(self.index)), bool)
+        count = 1 + max([int(self.points.view_index.max(initial=-1)), *views])
+        seen = np.zeros((count, len(self.index)), bool)
         seen[self.points.view_index[mine >= 0], mine[mine >= 0]] = True
-        result = np.zeros((len(views), len(self.index)), bool)
-        for i, view in enumerate(views):
-            if view < len(seen):
-                result[i] = seen[view]
-        return result
+        return seen[views]
 
 
 def seen_points(scene: Scene, name: str) -> SeenPoints | None:

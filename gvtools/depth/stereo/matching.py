@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
-import numpy as np
 import torch
 
-from gvtools.depth.stereo import matching_torch
 from gvtools.depth.stereo.options import StereoOptions
-from gvtools.errors import OptionError
 
 # Semi-global aggregation (Hirschmueller, TPAMI 2008, equation 13): the penalties of a change by
 # one plane and by more, in units of the cost, and the contrast that halves the second.
@@ -41,9 +38,17 @@ class Level:
     weights: torch.Tensor
 
 
-class Matcher(Protocol):
+class Matcher(ABC):
     """A back end of the stages that cost time. Costs are 0 for a perfect match, 1 for none."""
 
+    def __init__(self, options: StereoOptions) -> None:
+        self.options = options
+
+    def best(self, level: Level) -> int:
+        """How many of the level's sources make the cost of a pixel."""
+        return min(self.options.best, len(level.sources))
+
+    @abstractmethod
     def sweep(self, level: Level, inverse_depths: torch.Tensor) -> torch.Tensor:
         """Photometric cost of planes parallel to the reference's image.
 
@@ -58,6 +63,7 @@ class Matcher(Protocol):
             (H, W, D) float32 in [0, 1].
         """
 
+    @abstractmethod
     def aggregate(self, volume: torch.Tensor, guide: torch.Tensor) -> torch.Tensor:
         """Semi-global aggregation along eight paths.
 
@@ -69,6 +75,7 @@ class Matcher(Protocol):
             (H, W, D) float32, mean of the paths' costs.
         """
 
+    @abstractmethod
     def score(self, level: Level, planes: torch.Tensor) -> torch.Tensor:
         """Photometric cost of one slanted plane for each pixel.
 
@@ -80,92 +87,3 @@ class Matcher(Protocol):
         Returns:
             (H, W) float32 in [0, 1].
         """
-
-
-class TorchMatcher:
-    """Matching by torch; see Matcher."""
-
-    def __init__(self, options: StereoOptions) -> None:
-        self.options = options
-
-    def sweep(self, level: Level, inverse_depths: torch.Tensor) -> torch.Tensor:
-        """See Matcher.sweep."""
-        options = self.options
-        return matching_torch.sweep(
-            level.reference, level.sources, level.sizes, level.matrix, level.offset,
-            inverse_depths, options.window, min(options.best, len(level.sources)), options.noise,
-        )  # fmt: skip
-
-    def aggregate(self, volume: torch.Tensor, guide: torch.Tensor) -> torch.Tensor:
-        """See Matcher.aggregate."""
-        directions = torch.tensor(DIRECTIONS)
-        return matching_torch.aggregate(volume, guide, directions, SMALL, LARGE, CONTRAST)
-
-    def score(self, level: Level, planes: torch.Tensor) -> torch.Tensor:
-        """See Matcher.score."""
-        options = self.options
-        return matching_torch.score(
-            level.reference, level.sources, level.sizes, level.matrix, level.offset,
-            planes, level.weights, level.taps,
-            min(options.best, len(level.sources)), options.noise,
-        )  # fmt: skip
-
-
-class CpuMatcher:
-    """Matching by compiled kernels; see Matcher."""
-
-    def __init__(self, options: StereoOptions) -> None:
-        self.options = options
-
-    def sweep(self, level: Level, inverse_depths: torch.Tensor) -> torch.Tensor:
-        """See Matcher.sweep."""
-        from gvtools.depth.stereo import matching_cpu
-
-        options = self.options
-        volume = np.empty((*level.reference.shape, len(inverse_depths)), np.float32)
-        matching_cpu.sweep(
-            level.reference.numpy(), level.sources.numpy(), level.sizes.numpy(),
-            level.matrix.numpy(), level.offset.numpy(), inverse_depths.numpy(),
-            options.window, min(options.best, len(level.sources)), options.noise, volume,
-        )  # fmt: skip
-        return torch.from_numpy(volume)
-
-    def aggregate(self, volume: torch.Tensor, guide: torch.Tensor) -> torch.Tensor:
-        """See Matcher.aggregate."""
-        from gvtools.depth.stereo import matching_cpu
-
-        directions = np.array(DIRECTIONS)
-        paths = np.empty((len(directions), *volume.shape), np.float32)
-        matching_cpu.aggregate(
-            volume.numpy(), guide.numpy(), directions, SMALL, LARGE, CONTRAST, paths
-        )
-        return torch.from_numpy(paths).mean(0)
-
-    def score(self, level: Level, planes: torch.Tensor) -> torch.Tensor:
-        """See Matcher.score."""
-        from gvtools.depth.stereo import matching_cpu
-
-        options = self.options
-        cost = np.empty(tuple(level.reference.shape), np.float32)
-        matching_cpu.score(
-            level.reference.numpy(), level.sources.numpy(), level.sizes.numpy(),
-            level.matrix.numpy(), level.offset.numpy(), planes.contiguous().numpy(),
-            level.weights.numpy(), level.taps.numpy(),
-            min(options.best, len(level.sources)), options.noise, cost,
-        )  # fmt: skip
-        return torch.from_numpy(cost)
-
-
-def make_matcher(options: StereoOptions) -> tuple[Matcher, torch.device]:
-    """The back end of the options, and where its tensors live.
-
-    Raises:
-        OptionError: CUDA is asked for and torch sees none.
-    """
-    if options.backend == "cpu":
-        return CpuMatcher(options), torch.device("cpu")
-    there = torch.cuda.is_available()
-    if options.device == "cuda" and not there:
-        raise OptionError("stereo device 'cuda': torch sees no CUDA device; choose 'auto' or 'cpu'")
-    cuda = options.device == "cuda" or (options.device == "auto" and there)
-    return TorchMatcher(options), torch.device("cuda" if cuda else "cpu")

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import torch
 from numba import prange
 from numpy.typing import NDArray
 
+from gvtools.depth.stereo.matching import CONTRAST, DIRECTIONS, LARGE, SMALL, Level, Matcher
 from gvtools.kernels import FAST, compiled
 
 Float32 = NDArray[np.float32]
@@ -15,6 +19,43 @@ UNSEEN = np.float32(1)
 ONE = np.float32(1)
 HALF = np.float32(0.5)
 ZERO = np.float32(0)
+
+
+class CpuMatcher(Matcher):
+    """Matching by compiled kernels, on all cores."""
+
+    def score(self, level: Level, planes: torch.Tensor) -> torch.Tensor:
+        """See Matcher.score."""
+        cost = np.empty(tuple(level.reference.shape), np.float32)
+        window = planes.contiguous().numpy(), level.weights.numpy(), level.taps.numpy()
+        _score(*_pictures(level), *window, self.best(level), self.options.noise, cost)
+        return torch.from_numpy(cost)
+
+    def sweep(self, level: Level, inverse_depths: torch.Tensor) -> torch.Tensor:
+        """See Matcher.sweep."""
+        volume = np.empty((*level.reference.shape, len(inverse_depths)), np.float32)
+        window, noise = self.options.window, self.options.noise
+        planes = inverse_depths.numpy()
+        _sweep(*_pictures(level), planes, window, self.best(level), noise, volume)
+        return torch.from_numpy(volume)
+
+    def aggregate(self, volume: torch.Tensor, guide: torch.Tensor) -> torch.Tensor:
+        """See Matcher.aggregate."""
+        directions = np.array(DIRECTIONS)
+        paths = np.empty((len(directions), *volume.shape), np.float32)
+        _aggregate(volume.numpy(), guide.numpy(), directions, SMALL, LARGE, CONTRAST, paths)
+        return torch.from_numpy(paths).mean(0)
+
+
+def _pictures(level: Level) -> tuple[Any, Any, Any, Any, Any]:
+    """A level's reference, sources, sizes, matrix and offset."""
+    return (
+        level.reference.numpy(),
+        level.sources.numpy(),
+        level.sizes.numpy(),
+        level.matrix.numpy(),
+        level.offset.numpy(),
+    )
 
 
 @compiled(fastmath=FAST, inline="always")
@@ -38,7 +79,7 @@ def _mean_of_best(costs: Float32, best: int) -> np.float32:
 
 
 @compiled(parallel=True, fastmath=FAST)
-def score(
+def _score(
     reference: Float32,
     sources: Float32,
     sizes: NDArray[np.int32],
@@ -51,7 +92,7 @@ def score(
     noise: float,
     cost: Float32,
 ) -> None:
-    """See gvtools.depth.stereo.matching.Matcher.score; the result goes to ``cost``."""
+    """See Matcher.score; the result goes to ``cost``."""
     height, width = reference.shape
     count, stride, n = len(sources), sources.shape[2], len(taps)
     floor = np.float32(noise * noise)
@@ -185,7 +226,7 @@ def _box_row(image: Float32, other: Float32, y: int, radius: int, columns: Float
 
 
 @compiled(parallel=True, fastmath=FAST)
-def sweep(
+def _sweep(
     reference: Float32,
     sources: Float32,
     sizes: NDArray[np.int32],
@@ -197,7 +238,7 @@ def sweep(
     noise: float,
     volume: Float32,
 ) -> None:
-    """See gvtools.depth.stereo.matching.Matcher.sweep; the result goes to ``volume``."""
+    """See Matcher.sweep; the result goes to ``volume``."""
     height, width = reference.shape
     count = len(sources)
     radius = window // 2
@@ -260,7 +301,7 @@ def _step(
 
 
 @compiled(parallel=True, fastmath=FAST)
-def aggregate(
+def _aggregate(
     volume: Float32,
     guide: Float32,
     directions: NDArray[np.int64],
@@ -269,7 +310,7 @@ def aggregate(
     contrast: float,
     paths: Float32,
 ) -> None:
-    """See gvtools.depth.stereo.matching.Matcher.aggregate; one path's costs go to each of paths."""
+    """See Matcher.aggregate; one path's costs go to each of paths."""
     height, width, _ = volume.shape
     for i in prange(len(directions)):
         dy, dx = directions[i]

@@ -9,123 +9,99 @@ import torch.nn.functional as F
 from kornia.filters import box_blur
 from kornia.geometry.transform import remap
 
+from gvtools.depth.stereo.matching import CONTRAST, DIRECTIONS, LARGE, SMALL, Level, Matcher
+
 UNSEEN = 1.0  # the cost of a pixel that a source does not show, and of one without any likeness
 
 
-def score(
-    reference: torch.Tensor,
-    sources: torch.Tensor,
-    sizes: torch.Tensor,
-    matrix: torch.Tensor,
-    offset: torch.Tensor,
-    planes: torch.Tensor,
-    weights: torch.Tensor,
-    taps: torch.Tensor,
-    best: int,
-    noise: float,
-) -> torch.Tensor:
-    """See gvtools.depth.stereo.matching.Matcher.score."""
-    height, width = reference.shape
-    v, u = pixel_centers(height, width, reference.device)
-    w, a, b = planes
-    rows = torch.arange(height, device=reference.device)
-    columns = torch.arange(width, device=reference.device)
-    r = torch.stack(
-        [
-            reference[(rows + dy).clamp(0, height - 1)][:, (columns + dx).clamp(0, width - 1)]
-            for dx, dy in taps.tolist()
-        ]
-    )  # (T, H, W)
-    r = r - reference  # sums of differences lose less to rounding
-    g = weights.permute(2, 0, 1)
-    sum_r = (g * r).sum(0)
-    variance_r = ((g * r * r).sum(0) - sum_r**2).clamp(min=0) + noise**2
-    costs = []
-    for source, size, A, o in zip(sources, sizes.tolist(), matrix, offset, strict=True):
-        z = A[2, 0] * u + A[2, 1] * v + A[2, 2] + w * o[2]
-        inverse = 1 / z.clamp(min=1e-6)
-        px = (A[0, 0] * u + A[0, 1] * v + A[0, 2] + w * o[0]) * inverse
-        py = (A[1, 0] * u + A[1, 1] * v + A[1, 2] + w * o[1]) * inverse
-        zu, zv = A[2, 0] + a * o[2], A[2, 1] + b * o[2]
-        xu, xv = (A[0, 0] + a * o[0] - px * zu) * inverse, (A[0, 1] + b * o[0] - px * zv) * inverse
-        yu, yv = (A[1, 0] + a * o[1] - py * zu) * inverse, (A[1, 1] + b * o[1] - py * zv) * inverse
-        sum_s, sum_ss, sum_rs = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u)
-        for t, (dx, dy) in enumerate(taps.tolist()):
-            value = bilinear(source, size, px + xu * dx + xv * dy, py + yu * dx + yv * dy)
-            value = value - reference
-            gs = g[t] * value
-            sum_s += gs
-            sum_ss += gs * value
-            sum_rs += gs * r[t]
-        variance_s = (sum_ss - sum_s**2).clamp(min=0) + noise**2
-        likeness = (sum_rs - sum_r * sum_s) / (variance_r * variance_s).sqrt()
-        costs.append(torch.where(_inside(px, py, z, size), 1 - likeness.clamp(min=0), UNSEEN))
-    return torch.stack(costs).sort(dim=0).values[:best].mean(0)
+class TorchMatcher(Matcher):
+    """Matching by torch, on any device."""
 
-
-def sweep(
-    reference: torch.Tensor,
-    sources: torch.Tensor,
-    sizes: torch.Tensor,
-    matrix: torch.Tensor,
-    offset: torch.Tensor,
-    inverse_depths: torch.Tensor,
-    window: int,
-    best: int,
-    noise: float,
-) -> torch.Tensor:
-    """See gvtools.depth.stereo.matching.Matcher.sweep."""
-    height, width = reference.shape
-    v, u = pixel_centers(height, width, reference.device)
-    mean = window_mean(reference, window)
-    variance = (window_mean(reference**2, window) - mean**2).clamp(min=0) + noise**2
-    planes = []
-    for w in inverse_depths:
+    def score(self, level: Level, planes: torch.Tensor) -> torch.Tensor:
+        """See Matcher.score."""
+        reference, taps, noise2 = level.reference, level.taps.tolist(), self.options.noise**2
+        height, width = reference.shape
+        v, u = pixel_centers(height, width, reference.device)
+        w, a, b = planes
+        rows = torch.arange(height, device=reference.device)
+        columns = torch.arange(width, device=reference.device)
+        r = torch.stack(
+            [
+                reference[(rows + dy).clamp(0, height - 1)][:, (columns + dx).clamp(0, width - 1)]
+                for dx, dy in taps
+            ]
+        )  # (T, H, W)
+        r = r - reference  # sums of differences lose less to rounding
+        g = level.weights.permute(2, 0, 1)
+        sum_r = (g * r).sum(0)
+        variance_r = ((g * r * r).sum(0) - sum_r**2).clamp(min=0) + noise2
         costs = []
-        for source, size, A, o in zip(sources, sizes.tolist(), matrix, offset, strict=True):
-            x, y, z = (A[i, 0] * u + A[i, 1] * v + A[i, 2] + w * o[i] for i in range(3))
+        for source, size, A, o in zip(
+            level.sources, level.sizes.tolist(), level.matrix, level.offset, strict=True
+        ):
+            z = A[2, 0] * u + A[2, 1] * v + A[2, 2] + w * o[2]
             inverse = 1 / z.clamp(min=1e-6)
-            inside = _inside(x * inverse, y * inverse, z, size)
-            image = bilinear(source, size, x * inverse, y * inverse) * inside
-            first = window_mean(image, window)
-            spread = (window_mean(image**2, window) - first**2).clamp(min=0) + noise**2
-            likeness = window_mean(image * reference, window) - first * mean
-            likeness = likeness / (spread * variance).sqrt()
-            costs.append(torch.where(inside, 1 - likeness.clamp(min=0), UNSEEN))
-        planes.append(torch.stack(costs).sort(dim=0).values[:best].mean(0))
-    return torch.stack(planes, dim=-1)
+            px = (A[0, 0] * u + A[0, 1] * v + A[0, 2] + w * o[0]) * inverse
+            py = (A[1, 0] * u + A[1, 1] * v + A[1, 2] + w * o[1]) * inverse
+            zu, zv = A[2, 0] + a * o[2], A[2, 1] + b * o[2]
+            xu, xv = (
+                (A[0, 0] + a * o[0] - px * zu) * inverse,
+                (A[0, 1] + b * o[0] - px * zv) * inverse,
+            )
+            yu, yv = (
+                (A[1, 0] + a * o[1] - py * zu) * inverse,
+                (A[1, 1] + b * o[1] - py * zv) * inverse,
+            )
+            sum_s, sum_ss, sum_rs = torch.zeros_like(u), torch.zeros_like(u), torch.zeros_like(u)
+            for t, (dx, dy) in enumerate(taps):
+                value = bilinear(source, size, px + xu * dx + xv * dy, py + yu * dx + yv * dy)
+                value = value - reference
+                gs = g[t] * value
+                sum_s += gs
+                sum_ss += gs * value
+                sum_rs += gs * r[t]
+            variance_s = (sum_ss - sum_s**2).clamp(min=0) + noise2
+            likeness = (sum_rs - sum_r * sum_s) / (variance_r * variance_s).sqrt()
+            costs.append(torch.where(_inside(px, py, z, size), 1 - likeness.clamp(min=0), UNSEEN))
+        return torch.stack(costs).sort(dim=0).values[: self.best(level)].mean(0)
+
+    def sweep(self, level: Level, inverse_depths: torch.Tensor) -> torch.Tensor:
+        """See Matcher.sweep."""
+        reference, window, noise2 = level.reference, self.options.window, self.options.noise**2
+        height, width = reference.shape
+        v, u = pixel_centers(height, width, reference.device)
+        mean = window_mean(reference, window)
+        variance = (window_mean(reference**2, window) - mean**2).clamp(min=0) + noise2
+        planes = []
+        for w in inverse_depths:
+            costs = []
+            for source, size, A, o in zip(
+                level.sources, level.sizes.tolist(), level.matrix, level.offset, strict=True
+            ):
+                x, y, z = (A[i, 0] * u + A[i, 1] * v + A[i, 2] + w * o[i] for i in range(3))
+                inverse = 1 / z.clamp(min=1e-6)
+                inside = _inside(x * inverse, y * inverse, z, size)
+                image = bilinear(source, size, x * inverse, y * inverse) * inside
+                first = window_mean(image, window)
+                spread = (window_mean(image**2, window) - first**2).clamp(min=0) + noise2
+                likeness = window_mean(image * reference, window) - first * mean
+                likeness = likeness / (spread * variance).sqrt()
+                costs.append(torch.where(inside, 1 - likeness.clamp(min=0), UNSEEN))
+            planes.append(torch.stack(costs).sort(dim=0).values[: self.best(level)].mean(0))
+        return torch.stack(planes, dim=-1)
+
+    def aggregate(self, volume: torch.Tensor, guide: torch.Tensor) -> torch.Tensor:
+        """See Matcher.aggregate."""
+        total = torch.zeros_like(volume)
+        for dy, dx in DIRECTIONS:
+            if dy:
+                total += _path(volume, guide, dy, dx)
+            else:
+                total += _path(volume.transpose(0, 1), guide.T, dx, 0).transpose(0, 1)
+        return total / len(DIRECTIONS)
 
 
-def aggregate(
-    volume: torch.Tensor,
-    guide: torch.Tensor,
-    directions: torch.Tensor,
-    small: float,
-    large: float,
-    contrast: float,
-) -> torch.Tensor:
-    """See gvtools.depth.stereo.matching.Matcher.aggregate."""
-    total = torch.zeros_like(volume)
-    for dy, dx in directions.tolist():
-        if dy:
-            total += _path(volume, guide, dy, dx, small=small, large=large, contrast=contrast)
-        else:
-            total += _path(
-                volume.transpose(0, 1), guide.T, dx, 0, small=small, large=large, contrast=contrast
-            ).transpose(0, 1)
-    return total / len(directions)
-
-
-def _path(
-    volume: torch.Tensor,
-    guide: torch.Tensor,
-    dy: int,
-    dx: int,
-    *,
-    small: float,
-    large: float,
-    contrast: float,
-) -> torch.Tensor:
+def _path(volume: torch.Tensor, guide: torch.Tensor, dy: int, dx: int) -> torch.Tensor:
     """Costs along one path that crosses the rows, all pixels of a row at once."""
     height, width, _ = volume.shape
     out = volume.clone()
@@ -133,11 +109,11 @@ def _path(
     here, there = slice(max(dx, 0), width + min(dx, 0)), slice(max(-dx, 0), width + min(-dx, 0))
     for y in order:
         before = out[y - dy, there]
-        edge = (guide[y, here] - guide[y - dy, there]).abs() / contrast
-        penalty = (large / (1 + edge)).clamp(min=small)[:, None]
+        edge = (guide[y, here] - guide[y - dy, there]).abs() / CONTRAST
+        penalty = (LARGE / (1 + edge)).clamp(min=SMALL)[:, None]
         least = before.min(dim=1, keepdim=True).values
         wide = F.pad(before, (1, 1), value=float("inf"))
-        near = torch.minimum(wide[:, :-2], wide[:, 2:]) + small
+        near = torch.minimum(wide[:, :-2], wide[:, 2:]) + SMALL
         cheapest = torch.minimum(torch.minimum(before, near), least + penalty) - least
         out[y, here] = volume[y, here] + cheapest
     return out

@@ -12,10 +12,10 @@ from gvtools.cameras import Cameras, concatenate
 from gvtools.depth.source import DepthMap
 from gvtools.depth.stereo import cleanup, silhouettes
 from gvtools.depth.stereo.alignment import PoseEquations, adjusted, pose_equations
+from gvtools.depth.stereo.back_ends import make_matcher
 from gvtools.depth.stereo.confidence import confidence_of
 from gvtools.depth.stereo.consistency import agreement
 from gvtools.depth.stereo.depth_range import DepthRange, estimate_range
-from gvtools.depth.stereo.matching import make_matcher
 from gvtools.depth.stereo.motion import enough_disparity, only_turned
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.pyramid import (
@@ -162,11 +162,6 @@ class PlaneSweepStereo:
             self._raw[view.name] = raw
         return raw
 
-    @property
-    def computed(self) -> tuple[str, ...]:
-        """Names of the views whose own estimate is kept, in the order in which they were asked."""
-        return tuple(self._raw)
-
     def _confirming(self, name: str) -> RawDepth | None:
         """A source's own estimate; None when no view of the pool shows what it does."""
         try:
@@ -256,10 +251,9 @@ class PlaneSweepStereo:
         return narrowed(depths, coarse)
 
     def _sources(self, view: View, depths: DepthRange) -> tuple[str, ...]:
-        chosen = choose_sources(
+        names = choose_sources(
             self._known(view), view.name, self.views, count=self.options.sources, depths=depths
         )
-        names = tuple(source.name for source in chosen)
         if names:
             # As large as the finest level, whose pixels are meant.
             camera, *others = (

@@ -66,20 +66,22 @@ def build_pyramid(
 
 
 def resampled(image: torch.Tensor, width: int, height: int) -> torch.Tensor:
-    """(H, W) image resampled without aliasing; the picture's outline stays where it is."""
-    if image.shape == (height, width):
+    """(..., H, W) image resampled without aliasing; the picture's outline stays where it is."""
+    if image.shape[-2:] == (height, width):
         return image
-    return F.interpolate(
-        image[None, None], (height, width), mode="bilinear", align_corners=False, antialias=True
-    )[0, 0].contiguous()
+    flat = image.reshape(1, -1, *image.shape[-2:])
+    small = F.interpolate(
+        flat, (height, width), mode="bilinear", align_corners=False, antialias=True
+    )
+    return small.reshape(*image.shape[:-2], height, width).contiguous()
 
 
 def resampled_colors(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
     """(height, width, 3) uint8 of an (H, W, 3) uint8 picture; see ``resampled``."""
     if rgb.shape[:2] == (height, width):
         return np.ascontiguousarray(rgb)
-    channels = [resampled(torch.from_numpy(rgb[..., c]).float(), width, height) for c in range(3)]
-    return torch.stack(channels, dim=-1).round().clamp(0, 255).to(torch.uint8).numpy()
+    colors = resampled(torch.from_numpy(rgb).permute(2, 0, 1).float(), width, height)
+    return colors.permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).contiguous().numpy()
 
 
 def window_taps(window: int) -> torch.Tensor:

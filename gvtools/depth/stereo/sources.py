@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,25 +25,10 @@ SAMPLES_ACROSS = 10
 SAMPLE_DEPTHS = 4
 
 
-@dataclass(frozen=True)
-class SourceView:
-    """A source of a reference view.
-
-    Attributes:
-        name: of the view.
-        overlap: share of the reference's points that it sees too.
-        angle: median parallax of these, degrees.
-    """
-
-    name: str
-    overlap: float
-    angle: float
-
-
 def choose_sources(
     scene: Scene, name: str, candidates: tuple[str, ...], *, count: int, depths: DepthRange
-) -> tuple[SourceView, ...]:
-    """The best source views for a reference view, best first.
+) -> tuple[str, ...]:
+    """Names of the best source views for a reference view, best first.
 
     Each candidate is rated by the points of the reference that it sees too, each weighted by its
     parallax: sparse points with their tracks when the reference has enough of them, else points
@@ -78,14 +61,11 @@ def choose_sources(
     spread = np.where(angle < BEST_ANGLE, BELOW, ABOVE)
     weight = np.exp(-((angle - BEST_ANGLE) ** 2) / (2 * spread**2)) * shared
     turned = reference.cam_from_world[0, 2, :3] @ sources.cam_from_world[:, 2, :3].T
-    overlap = shared.mean(1)
-    score = weight.mean(1) * (turned > np.cos(np.deg2rad(60))) * (overlap >= LEAST_OVERLAP)
+    score = weight.mean(1) * (turned > np.cos(np.deg2rad(60)))
+    score *= shared.mean(1) >= LEAST_OVERLAP
     baseline = baselines(scene, name)[rows]
     chosen = _spread_out(score * (baseline > 0), baseline, sources.centers, count)
-    return tuple(
-        SourceView(others[i], float(overlap[i]), float(np.median(angle[i][shared[i]])))
-        for i in chosen
-    )
+    return tuple(others[i] for i in chosen)
 
 
 def parallax(center: Float64, others: Float64, points: Float64) -> Float64:

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from stereo_scenes import plane_scene
 
+from gvtools.depth.source import DepthMap
 from gvtools.depth.stereo.cleanup import enlarged, weighted_median, without_speckles
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import DegenerateError, OptionError, ProjectError
-from gvtools.scenes.scene import Frame
+from gvtools.scenes.scene import Frame, Scene
 
 OPTIONS = StereoOptions(levels=2, align=False, speckle=20)
 
@@ -22,15 +23,19 @@ def slanted():
     return plane_scene(slope=(0.25, -0.15))
 
 
+def swept(scene: Scene, name: str = "v2", *, options: StereoOptions = OPTIONS) -> DepthMap:
+    """The depth of one view, all views being sources."""
+    stereo = PlaneSweepStereo(scene, options=options, views=scene.names)
+    return stereo.depth(scene, scene[name], scene[name].load())
+
+
 def error_and_share(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     known = found > 0
     return float(np.median(np.abs(found[known] / truth[known] - 1))), float(known.mean())
 
 
 def test_a_slanted_plane_is_measured(slanted):
-    scene = slanted.scene
-    stereo = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
-    found = stereo.depth(scene, scene["v2"], scene["v2"].load())
+    found = swept(slanted.scene)
     error, share = error_and_share(found.depth, slanted.depths[2])
     assert error < 0.005
     assert share > 0.8
@@ -41,22 +46,20 @@ def test_a_slanted_plane_is_measured(slanted):
 
 def test_the_same_twice_and_after_other_views(slanted):
     scene = slanted.scene
-    first = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
     second = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
     second.depth(scene, scene["v0"], scene["v0"].load())
-    one, two = (s.depth(scene, scene["v2"], scene["v2"].load()) for s in (first, second))
+    one, two = swept(scene), second.depth(scene, scene["v2"], scene["v2"].load())
     np.testing.assert_array_equal(one.depth, two.depth)
     np.testing.assert_array_equal(one.confidence, two.confidence)
 
 
 def test_torch_and_compiled_back_ends_agree():
-    made = plane_scene(slope=(0.25, -0.15), count=3)
-    scene = made.scene
-    maps = []
-    for backend in ("cpu", "torch"):
-        options = OPTIONS.replaced(backend=backend, device="cpu", sources=2, best=1)
-        stereo = PlaneSweepStereo(scene, options=options, views=scene.names)
-        maps.append(stereo.depth(scene, scene["v1"], scene["v1"].load()).depth)
+    scene = plane_scene(slope=(0.25, -0.15), count=3).scene
+    options = OPTIONS.replaced(device="cpu", sources=2, best=1)
+    maps = [
+        swept(scene, "v1", options=options.replaced(backend=backend)).depth
+        for backend in ("cpu", "torch")
+    ]
     both = (maps[0] > 0) & (maps[1] > 0)
     assert ((maps[0] > 0) == (maps[1] > 0)).mean() > 0.99
     assert np.quantile(np.abs(maps[0][both] / maps[1][both] - 1), 0.98) < 2e-3
@@ -86,10 +89,8 @@ def test_a_view_outside_the_pool_gets_depth_but_gives_none(slanted):
 
 def test_blank_surfaces_stay_unknown():
     made = plane_scene(blank=True)
-    scene = made.scene
-    stereo = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
-    view = scene["v2"]
-    found = stereo.depth(scene, view, view.load())
+    view = made.scene["v2"]
+    found = swept(made.scene)
     rays = view.camera.rays()
     x = view.camera.centers[0, 0] + made.depths[2] * rays[..., 0]
     assert (found.depth[x > 0.45] == 0).mean() > 0.98
@@ -97,10 +98,7 @@ def test_blank_surfaces_stay_unknown():
 
 
 def test_reduced_pictures_give_depth_at_full_size(slanted):
-    scene = slanted.scene
-    options = OPTIONS.replaced(max_side=96)
-    stereo = PlaneSweepStereo(scene, options=options, views=scene.names)
-    found = stereo.depth(scene, scene["v2"], scene["v2"].load())
+    found = swept(slanted.scene, options=OPTIONS.replaced(max_side=96))
     assert found.depth.shape == (120, 160)
     error, share = error_and_share(found.depth, slanted.depths[2])
     assert error < 0.01 and share > 0.7

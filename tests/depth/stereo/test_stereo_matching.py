@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from stereo_scenes import plane_depth, plane_scene
+from stereo_scenes import plane_scene
 
-from gvtools.cameras import concatenate
+from gvtools.depth.stereo.back_ends import make_matcher
 from gvtools.depth.stereo.depth_range import DepthRange
 from gvtools.depth.stereo.hypotheses import best_plane, parabola, plane_hypotheses
-from gvtools.depth.stereo.matching import CpuMatcher, Level, TorchMatcher, make_matcher
+from gvtools.depth.stereo.matching_cpu import CpuMatcher
+from gvtools.depth.stereo.matching_torch import TorchMatcher
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.pyramid import build_pyramid, level_of, window_taps, window_weights
 from gvtools.depth.stereo.refinement import fitted, refined, upsampled
@@ -196,13 +197,3 @@ def test_cuda_without_a_device_is_refused():
         pytest.skip("this machine has CUDA")
     with pytest.raises(OptionError, match="no CUDA device"):
         make_matcher(StereoOptions(backend="torch", device="cuda"))
-
-
-def test_plane_depth_of_the_fixture_is_exact(slanted):
-    made, level, _ = slanted
-    assert isinstance(level, Level)
-    cameras = concatenate([view.camera for view in made.scene])
-    depth = plane_depth(cameras[0], np.array([-0.25, 0.15, 1.0]), 2.0)
-    rays = cameras[0].rays()[7, 9]
-    point = cameras.world_from_cam[0] @ np.array([*(rays * depth[7, 9]), 1])
-    assert point[2] == pytest.approx(2 + 0.25 * point[0] - 0.15 * point[1])

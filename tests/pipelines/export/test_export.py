@@ -123,7 +123,7 @@ def test_colmap_reads_the_model_back(scene, memory, saved, tmp_path):
     model.update_point_3d_errors()
     assert model.compute_mean_reprojection_error() < focal * np.sqrt(3) * kept.edge / 0.8
     assert model.compute_mean_track_length() > 1
-    names = (tmp_path / "out" / "generated.txt").read_text().splitlines()[1:]
+    names = (tmp_path / "out/sparse/0/generated.txt").read_text().splitlines()[1:]
     assert [line.split("\t")[0] for line in names] == ["view_4.png"]
     assert not (tmp_path / "out" / "images").exists()
 
@@ -163,7 +163,8 @@ def test_transforms_open_as_a_project(scene, memory, saved, tmp_path):
         scene["view_4.png"].camera.cam_from_world,
         atol=1e-12,
     )
-    assert "view_4.png\t" in (tmp_path / "out" / "generated.txt").read_text()
+    frames = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+    assert [frame.get("generated", False) for frame in frames] == [False, False, True]
 
 
 def test_glb_is_what_trimesh_reads(memory, saved, tmp_path):
