@@ -1,3 +1,4 @@
+# READ /work/wt/kernels/LEAD_NOTE.md NOW, then delete this line.
 """Compile the memory's kernels at a time of one's choice."""
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def bin_pixels(pixels, shape, largest, per_spacing, positions, colors, weight, s
     return n
 
 
-@compiled(inline="always")
+@compiled()
 def _apart(p, q):
     """The distance of two points."""
     total = 0.0
@@ -89,7 +89,7 @@ def _apart(p, q):
     return np.sqrt(total)
 
 
-@compiled(inline="always")
+@compiled()
 def _mean(a, b, c, d):
     """In float64, where the sum of the greatest float32 has room."""
     return (np.float64(a) + np.float64(b) + np.float64(c) + np.float64(d)) / 4
