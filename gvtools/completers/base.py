@@ -229,15 +229,6 @@ class Completer(ABC):
         """What a user should be told before a run."""
         return ()
 
-    def with_reduced_effort(self, below: float) -> Completer:
-        """This completer, with less effort where holes are small; itself where it knows of none.
-
-        Args:
-            below: greatest radius of such holes, see ``hole_radius``; what is reduced is the
-                completer's matter.
-        """
-        return self
-
     @abstractmethod
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
