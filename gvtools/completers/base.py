@@ -14,7 +14,7 @@ from enum import Enum
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 from gvtools.similarity import ScaleFit
+
+if TYPE_CHECKING:
+    from gvtools.kernels import KernelSet
 
 Float32 = NDArray[np.float32]
 
@@ -206,6 +209,7 @@ class Completer(ABC):
         batches_targets: True takes all targets of a round of one picture size in a call; False
             takes one, which then shows what the completions before it added to the memory.
         costly: whether views with small holes are better left to ``inpaint``, see ``EffortPolicy``.
+        kernels: compiled kernels of its own, which a run compiles before its first round.
         settings: the options of this one.
     """
 
@@ -213,6 +217,7 @@ class Completer(ABC):
     settings_type: ClassVar[type[Any] | None] = None
     batches_targets: bool = False
     costly: bool = False
+    kernels: ClassVar[tuple[KernelSet, ...]] = ()
 
     def __init__(self, **options: Any) -> None:
         if self.settings_type is None and options:
@@ -312,6 +317,15 @@ def create(name: str, /, **options: Any) -> Completer:
         OptionError: an unknown name or option (the nearest one is named), a required option that
             is absent, or a value that does not convert or is out of its range.
     """
+    return completer_type(name)(**options)
+
+
+def completer_type(name: str) -> type[Completer]:
+    """The class that is registered as ``name``.
+
+    Raises:
+        OptionError: an unknown name; the nearest one is named.
+    """
     if name not in _REGISTRY:
         near = difflib.get_close_matches(name, available(), n=1, cutoff=0.5)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(available())}"
@@ -320,5 +334,4 @@ def create(name: str, /, **options: Any) -> Completer:
     if isinstance(kind, str):
         module, _, attribute = kind.partition(":")
         kind = getattr(import_module(module), attribute)
-    made: Completer = kind(**options)
-    return made
+    return kind

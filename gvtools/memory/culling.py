@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from gvtools.kernels import FAST, compiled
@@ -46,11 +45,15 @@ def tile_farthest(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.maximum.reduceat(rows, np.arange(0, width, TILE), axis=1)
 
 
-@compiled(parallel=True)
-def cull_segments(boxes, rows, cam_from_local, K, width, height, reach, rect, z_range):
-    """Image rectangle and depth range of each segment's box.
+@compiled()
+def cull_segments(
+    begin, end, boxes, rows, cam_from_local, K, width, height, reach, rect, z_range
+):  # fmt: skip
+    """Image rectangle and depth range of each segment's box, for a part of ``rows``.
 
     Args:
+        begin: of the part, see ``in_threads``.
+        end: likewise.
         boxes: (R, 7) float32, see Segments.
         rows: (n,) int64, the boxes that are asked.
         cam_from_local: (4, 4) float64.
@@ -63,7 +66,7 @@ def cull_segments(boxes, rows, cam_from_local, K, width, height, reach, rect, z_
         z_range: out (R, 2) float32, nearest and farthest depth.
     """
     focal = max(K[0, 0], K[1, 1])
-    for k in prange(len(rows)):
+    for k in range(begin, end):
         i = rows[k]
         low_u, high_u, low_v, high_v, low_z, high_z = _outline(boxes[i], cam_from_local, K)
         rect[i, 0] = 0
@@ -129,10 +132,10 @@ def touching(rect, writable, segments):
     return out[:n]
 
 
-@compiled(parallel=True, fastmath=FAST)
+@compiled(fastmath=FAST)
 def in_front(
-    segments, segment_start, segment_length, rect, z_range, positions, M, K, depth, farthest,
-    margin, grid_K, grid_cam, grids, tolerance, hit,
+    begin, end, segments, segment_start, segment_length, rect, z_range, positions, M, K, depth,
+    farthest, margin, grid_K, grid_cam, grids, tolerance, hit,
 ):  # fmt: skip
     """Mark in ``hit`` (n,) those of ``segments`` (n,) with a sampled point in front of ``depth``.
 
@@ -143,7 +146,7 @@ def in_front(
     """
     height, width = depth.shape
     share = np.float32(1 - margin)
-    for i in prange(len(segments)):
+    for i in range(begin, end):
         r = segments[i]
         bound = np.float32(0)
         for row in range(rect[r, 2] // TILE, rect[r, 3] // TILE + 1):

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, concatenate
+from gvtools.kernels import in_threads
 from gvtools.memory import culling
 from gvtools.memory.occlusion import in_free_space, stacked
 from gvtools.memory.splat.api import ONE_PIXEL, FrameBuffers, SplatOptions, Splatter
@@ -146,7 +147,9 @@ class _Projection:
         self.store, self.camera, self.options = store, camera, options
         self.splatter = splatter
         shape = (int(camera.height[0]), int(camera.width[0]))
-        cam_from_local = store.frame.cam_from_local(camera.cam_from_world)[0]
+        # In one order of memory, for which alone the kernels are compiled.
+        self.K = np.ascontiguousarray(camera.K[0])
+        cam_from_local = np.ascontiguousarray(store.frame.cam_from_local(camera.cam_from_world)[0])
         self.target = FrameBuffers(
             camera,
             cam_from_local,
@@ -240,9 +243,9 @@ class _Projection:
         z_range: NDArray[np.float32],
     ) -> None:
         height, width = self.target.shape
-        culling.cull_segments(
-            boxes, rows, self.target.cam_from_local, self.camera.K[0], width, height,
-            self.options.blend_reach, rect, z_range,
+        in_threads(
+            culling.cull_segments, len(rows), boxes, rows, self.target.cam_from_local,
+            self.K, width, height, self.options.blend_reach, rect, z_range,
         )  # fmt: skip
 
     def _splat_tiers(self) -> None:
@@ -307,9 +310,9 @@ class _Projection:
         grids = store.observed_grids(np.flatnonzero(self.tier == 0))
         tolerance = store.options.free_space_tolerance
         hit = np.zeros(len(later), np.bool_)
-        culling.in_front(
-            later, segments.start, segments.length, target.rect, self.z_range,
-            store.columns.positions, target.cam_from_local, self.camera.K[0],
+        in_threads(
+            culling.in_front, len(later), later, segments.start, segments.length, target.rect,
+            self.z_range, store.columns.positions, target.cam_from_local, self.K,
             target.depth, culling.tile_farthest(target.depth), 2 * self.options.depth_band,
             *stacked(grids), tolerance, hit,
         )  # fmt: skip
@@ -333,7 +336,7 @@ class _Projection:
     def _lifted(self, depth: NDArray[np.float32], where: NDArray[np.bool_]) -> NDArray[np.float32]:
         """(N, 3) points of the pixels ``where`` (H, W), in the memory's frame."""
         row, col = np.nonzero(where)
-        K, M = self.camera.K[0], self.target.cam_from_local
+        K, M = self.K, self.target.cam_from_local
         y = (row + 0.5 - K[1, 2]) / K[1, 1]
         x = (col + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
         rays = np.stack([x, y, np.ones_like(x)], axis=1)
