@@ -34,12 +34,14 @@ def in_threads(kernel: Callable[..., Any], count: int, *args: Any) -> list[Any]:
     ends = [count * part // parts for part in range(parts + 1)]
     if parts == 1:
         return [kernel(0, count, *args)]
-    jobs = [_pool().submit(kernel, a, b, *args) for a, b in pairwise(ends)]
+    pool = _pool(os.getpid())
+    jobs = [pool.submit(kernel, a, b, *args) for a, b in pairwise(ends)]
     return [job.result() for job in jobs]
 
 
 @cache
-def _pool() -> ThreadPoolExecutor:
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Of a process: a forked one has no threads of its parent's."""
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="kernel")
 
 
