@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from run_files import results
 from tiny_scan import write_scan
 
 from gvtools.errors import OptionError, ProjectError
@@ -41,16 +42,6 @@ def run(scan: Path, out: Path, *settings: str, resume: bool = False, dry_run: bo
     return reconstruct(
         open_project(scan), config, out, console=Console(quiet=True), resume=resume, dry_run=dry_run
     )
-
-
-def results(out: Path) -> dict[str, bytes]:
-    """Every file of a run whose bytes an interruption may not change."""
-    timed = ("report.json", "rounds.jsonl", "growth.png", "report.html")
-    return {
-        str(path.relative_to(out)): path.read_bytes()
-        for path in sorted(out.rglob("*"))
-        if path.is_file() and path.name not in timed
-    }
 
 
 def untimed(out: Path) -> list[dict]:
