@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -184,7 +185,7 @@ def _point(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _entry(trial: Trial) -> dict[str, Any]:
-    return {"label": trial.label, **trial.outcome.to_json()}
+    return {"label": trial.label, **asdict(trial.outcome)}
 
 
 def _rows(trials: Sequence[Trial]) -> tuple[tuple[Any, ...], ...]:
