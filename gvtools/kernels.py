@@ -60,11 +60,12 @@ class KernelSet(NamedTuple):
 
     @property
     def cached(self) -> bool:
-        """Whether numba's cache holds the last of them, as its source stands."""
+        """Whether numba's cache holds the last of them, compiled since its file was written."""
         function = self.last.py_func
-        name = f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}"
-        line = function.__code__.co_firstlineno
-        return any(Path(self.last.stats.cache_path).glob(f"{name}-{line}.*.nbi"))
+        source = Path(function.__code__.co_filename)
+        name = f"{source.stem}.{function.__qualname__}-{function.__code__.co_firstlineno}"
+        entries = Path(self.last.stats.cache_path).glob(f"{name}.*.nbi")
+        return any(entry.stat().st_mtime >= source.stat().st_mtime for entry in entries)
 
 
 def compile_side_by_side(sets: Sequence[KernelSet]) -> None:

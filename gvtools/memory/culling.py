@@ -22,7 +22,8 @@ REACHABLE = 3
 
 def summed_area(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
     """(H + 1, W + 1) summed-area table of a mask (H, W)."""
-    return cv2.integral(mask.view(np.uint8), sdepth=cv2.CV_32S)
+    table = cv2.integral(mask.view(np.uint8), sdepth=cv2.CV_32S)
+    return np.asarray(table, np.int32)
 
 
 def near_to(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
