@@ -67,7 +67,7 @@ def rank_views(
         cameras = concatenate([view.camera for view in context])
         # Those in whose pictures any of the points falls, hidden or not.
         inside = in_view(cameras, camera.centers[0] + rays * z[:, None]).any(axis=-1)
-        for index in np.flatnonzero(inside):
+        for index in np.flatnonzero(inside).tolist():
             scores[index] = _visible(context[index], *points)[2].sum()
     return [int(i) for i in np.argsort(-scores, kind="stable") if scores[i] > 0]
 
