@@ -14,7 +14,6 @@ import time
 from pathlib import Path
 
 from gvtools.evaluation.view_figures import view_figures
-from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scenes.project import open_project
 
@@ -31,8 +30,7 @@ def main() -> None:
     for view in scene.views[::2]:
         frame = view.load()
         assert frame.depth is not None
-        points = back_project(frame.rgb, frame.depth, view.camera, mask=frame.mask)
-        memory.fuse(points, round=0)
+        memory.observe(frame.rgb, frame.depth, view.camera, round=0, mask=frame.mask)
     rendering, measuring = [], []
     for view in (scene.views[0], *scene.views[: args.views]):
         frame = view.load()

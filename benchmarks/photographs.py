@@ -25,7 +25,6 @@ from gvtools.depth.choice import choose_source
 from gvtools.depth.source import DepthMap
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.evaluation.images import psnr
-from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.points import PointSet
 from gvtools.scenes.project import open_project
@@ -80,15 +79,14 @@ def from_depth(
     memory = SpatialMemory(voxel, origin=np.rint(scene.cameras.centers.mean(axis=0)))
     for name, found in depths.items():
         frame = scene[name].load()
-        points = back_project(
+        memory.observe(
             frame.rgb if exposures is None else exposures.common(frame.rgb, name),
             found.depth,
             scene[name].camera,
-            frame=memory.frame,
+            round=0,
             confidence=found.confidence,
             mask=frame.mask,
         )
-        memory.fuse(points, round=0)
     return memory
 
 

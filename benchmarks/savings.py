@@ -42,7 +42,6 @@ OFF: dict[str, dict[str, Any]] = {
     "four pixels a point where voxels are coarser": {"savings.pixel_binning": 0.0},
     "observed content projected once": {"savings.reuse": False},
     "small holes left to inpaint": {"effort.inpaint_below": 0.0},
-    "reduced effort for middle holes": {"effort.reduced_below": 0.0},
     "explained views without computed depth": {"savings.depth_from_memory": None},
 }
 
@@ -75,7 +74,7 @@ def rows_of(config: RunSettings, *, computed: bool) -> dict[str, Row]:
     """All savings off, each alone, all on; those that this run does not have are left out."""
     idle = set()
     if config.completer != "geoverse":
-        idle |= {"small holes left to inpaint", "reduced effort for middle holes"}
+        idle.add("small holes left to inpaint")
     if not computed:
         idle.add("explained views without computed depth")
 

@@ -1,10 +1,19 @@
-"""How kernels are compiled."""
+"""How kernels are compiled, and run in threads."""
 
 from __future__ import annotations
 
-from functools import partial
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from numba import njit, threading_layer
+from numba import get_num_threads, njit, threading_layer
 
 # Division by zero gives infinity, as in numpy; numba's default raises, and the branch that it
 # needs for that keeps loops from being vectorised (measured: ten times slower projection).
@@ -13,6 +22,72 @@ compiled = partial(njit, cache=True, error_model="numpy", nogil=True)
 
 # Relaxed rounding that still honours NaN and infinity.
 FAST = {"nsz", "arcp", "contract", "reassoc"}
+
+
+def in_threads(kernel: Callable[..., Any], count: int, *args: Any) -> list[Any]:
+    """``kernel(first, last, *args)`` for parts of ``range(count)``, each in a thread of its own.
+
+    For kernels that run for milliseconds: numba's ``parallel=True`` starts sooner, and doubles the
+    time that a kernel takes to compile. What parts return comes in their order.
+    """
+    parts = max(1, min(get_num_threads(), count))
+    ends = [count * part // parts for part in range(parts + 1)]
+    if parts == 1:
+        return [kernel(0, count, *args)]
+    pool = _pool(os.getpid())
+    jobs = [pool.submit(kernel, a, b, *args) for a, b in pairwise(ends)]
+    return [job.result() for job in jobs]
+
+
+@cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Of a process: a forked one has no threads of its parent's."""
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="kernel")
+
+
+class KernelSet(NamedTuple):
+    """Kernels that are compiled together.
+
+    Attributes:
+        name: as users are told of it.
+        compile: calls them with a little data; a function of a module, without arguments.
+        last: the kernel that ``compile`` calls last.
+    """
+
+    name: str
+    compile: Callable[[], object]
+    last: Any
+
+    @property
+    def cached(self) -> bool:
+        """Whether numba's cache holds the last of them, compiled since its file was written."""
+        function = self.last.py_func
+        source = Path(function.__code__.co_filename)
+        name = f"{source.stem}.{function.__qualname__}-{function.__code__.co_firstlineno}"
+        entries = Path(self.last.stats.cache_path).glob(f"{name}.*.nbi")
+        return any(entry.stat().st_mtime >= source.stat().st_mtime for entry in entries)
+
+
+def compile_side_by_side(sets: Sequence[KernelSet]) -> None:
+    """Compile sets of kernels in processes of their own, which leave the code in numba's cache.
+
+    Numba compiles one kernel of a process at a time. A process that fails leaves its kernels to be
+    compiled where they are called first.
+    """
+    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    command = [sys.executable, "-c", "import pickle, sys; pickle.load(sys.stdin.buffer)()"]
+
+    def compile_set(kernels: KernelSet) -> None:
+        subprocess.run(
+            command,
+            input=pickle.dumps(kernels.compile),
+            env={**os.environ, "PYTHONPATH": path},
+            capture_output=True,
+            check=False,
+        )
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(compile_set, sets))
 
 
 def run_beside_each_other() -> bool:

@@ -1,7 +1,4 @@
-"""Quality against steps: level 1 from 49 to 1 with one cascade step, and the cascade's own.
-
-Also against how small the holes are that are completed with reduced effort.
-"""
+"""Quality against steps: level 1 from 49 to 1 with one cascade step, and the cascade's own."""
 
 from __future__ import annotations
 
@@ -23,10 +20,7 @@ CASCADE = (1, 2, 4, 8, 24)
 SWEPT = {
     "level 1": "the level 1 steps",
     "cascade": "the cascade steps",
-    "reduced effort": "the holes that are completed with reduced effort",
 }
-# Hole radii, shares of the image diagonal.
-REDUCED_BELOW = (0.0, 0.1, 0.3, 1e6)
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
@@ -53,10 +47,6 @@ def _swept(
                 **{f"{n}+1, equal steps": geoverse(folder, steps=n) for n in LEVEL1},
             },
             "cascade": {f"3+{n}, own bounds": geoverse(folder, cascade_steps=n) for n in CASCADE},
-            "reduced effort": {
-                f"3+1, reduced up to {share:g}": geoverse(folder).with_reduced_effort(share)
-                for share in REDUCED_BELOW
-            },
         }
         for sweep, methods in sweeps.items():
             cases = held_out_cases(options.scenes, seed=options.seed, size=side)

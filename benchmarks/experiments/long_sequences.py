@@ -24,7 +24,6 @@ from gvtools.evaluation.pose_probe.located import Located
 from gvtools.evaluation.pose_probe.probe import PoseProbe
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.tables import Column, Table
-from gvtools.memory.back_projection import back_project
 from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.training.hints import Clip
@@ -118,8 +117,7 @@ def _follow(
     footprint = float(np.median(truth.depth[:CONTEXT])) / float(truth.cameras.K[0, 0, 0])
     memory = SpatialMemory(footprint, origin=truth.cameras.centers[0], options=config.memory)
     for i in range(CONTEXT):
-        points = back_project(truth.rgb[i], truth.depth[i], truth.cameras[i], frame=memory.frame)
-        memory.fuse(points, round=0)
+        memory.observe(truth.rgb[i], truth.depth[i], truth.cameras[i], round=0)
     known = list(context)
     for number in range(ROUNDS):
         rows = list(range(CONTEXT + number * PER_ROUND, CONTEXT + (number + 1) * PER_ROUND))

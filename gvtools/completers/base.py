@@ -14,7 +14,7 @@ from enum import Enum
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 from gvtools.similarity import ScaleFit
+
+if TYPE_CHECKING:
+    from gvtools.kernels import KernelSet
 
 Float32 = NDArray[np.float32]
 
@@ -210,6 +213,7 @@ class Completer(ABC):
         batches_targets: True takes all targets of a round of one picture size in a call; False
             takes one, which then shows what the completions before it added to the memory.
         costly: whether views with small holes are better left to ``inpaint``, see ``EffortPolicy``.
+        kernels: compiled kernels of its own, which a run compiles before its first round.
         settings: the options of this one.
     """
 
@@ -217,6 +221,7 @@ class Completer(ABC):
     settings_type: ClassVar[type[Any] | None] = None
     batches_targets: bool = False
     costly: bool = False
+    kernels: ClassVar[tuple[KernelSet, ...]] = ()
 
     def __init__(self, **options: Any) -> None:
         if self.settings_type is None and options:
@@ -232,15 +237,6 @@ class Completer(ABC):
     def notes(self) -> tuple[str, ...]:
         """What a user should be told before a run."""
         return ()
-
-    def with_reduced_effort(self, below: float) -> Completer:
-        """This completer, with less effort where holes are small; itself where it knows of none.
-
-        Args:
-            below: greatest radius of such holes, see ``hole_radius``; what is reduced is the
-                completer's matter.
-        """
-        return self
 
     @abstractmethod
     def complete(
@@ -362,16 +358,21 @@ def create(name: str, /, **options: Any) -> Completer:
             is absent, or a value that does not convert or is out of its range; or what was
             registered is no Completer.
     """
-    return _kind(name)(**options)
+    return completer_type(name)(**options)
 
 
 def options_of_all() -> list[Any]:
     """The default options of each completer that has some, to be listed."""
-    kinds = [_kind(name).settings_type for name in available()]
+    kinds = [completer_type(name).settings_type for name in available()]
     return [kind.model_construct() for kind in kinds if kind is not None]
 
 
-def _kind(name: str) -> type[Completer]:
+def completer_type(name: str) -> type[Completer]:
+    """The class that is registered as ``name``.
+
+    Raises:
+        OptionError: an unknown name (the nearest one is named), or no Completer.
+    """
     if name not in _REGISTRY:
         near = difflib.get_close_matches(name, available(), n=1, cutoff=0.5)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(available())}"

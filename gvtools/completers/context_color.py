@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, Float64, concatenate
 from gvtools.completers.base import ContextView
+from gvtools.view_selection import in_view
 
 # A filled depth is taken to err by this share, plus this share per pixel from the rim.
 DEPTH_ERROR, DEPTH_ERROR_PER_PIXEL = 0.01, 0.001
@@ -62,21 +63,13 @@ def rank_views(
     z = depth[rows, columns].astype(np.float64)
     points = (camera.centers[0], rays, z, error[rows, columns])
     scores = np.zeros(len(context))
-    for index in _in_view(context, camera.centers[0] + rays * z[:, None]):
-        scores[index] = _visible(context[index], *points)[2].sum()
+    if context:
+        cameras = concatenate([view.camera for view in context])
+        # Those in whose pictures any of the points falls, hidden or not.
+        inside = in_view(cameras, camera.centers[0] + rays * z[:, None]).any(axis=-1)
+        for index in np.flatnonzero(inside).tolist():
+            scores[index] = _visible(context[index], *points)[2].sum()
     return [int(i) for i in np.argsort(-scores, kind="stable") if scores[i] > 0]
-
-
-def _in_view(context: Sequence[ContextView], points: Float64) -> list[int]:
-    """The photographs in whose pictures any of the points (N, 3) falls, hidden or not."""
-    if not context:
-        return []
-    cameras = concatenate([view.camera for view in context])
-    xy, _ = cameras.project(points)
-    size = np.stack([cameras.width, cameras.height], axis=-1)[:, None]
-    with np.errstate(invalid="ignore"):
-        inside = ((xy > 0) & (xy < size)).all(axis=-1).any(axis=-1)
-    return [int(index) for index in np.flatnonzero(inside)]
 
 
 def look_up(

@@ -17,24 +17,16 @@ from gvtools.settings import Settings
 
 
 class EffortPolicy(Settings):
-    """Less effort for small holes: what stands around them says nearly everything about them.
-
-    Both thresholds are hole radii as shares of the image diagonal, see ``hole_radius``.
-    """
+    """Less effort for small holes: what stands around them says nearly everything about them."""
 
     section = "effort"
 
     inpaint_below: float = Field(0.02, ge=0)
-    """Views whose holes have at most this radius are left to ``inpaint`` by a costly completer
-    (geoverse); 0 leaves it none."""
-    reduced_below: float = Field(0.1, ge=0)
-    """A completer may make less effort for holes of at most this radius; 0 reduces nothing.
-    geoverse then takes one step, in pictures of half its size and without a video prior."""
+    """Views whose holes have at most this radius, as a share of the image diagonal (see
+    ``hole_radius``), are left to ``inpaint`` by a costly completer (geoverse); 0 leaves it none."""
 
     def applied(self, completer: Completer) -> Completer:
         """``completer`` under this policy."""
-        if self.reduced_below > 0:
-            completer = completer.with_reduced_effort(self.reduced_below)
         if self.inpaint_below > 0 and completer.costly:
             return SmallHolesInpainted(completer, self.inpaint_below)
         return completer

@@ -7,11 +7,11 @@ So a hole beside a nearer object is coloured by the background alone.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.completers.hole_depth import DIRECTIONS, HoleDepth
+from gvtools.kernels import compiled
 
 # A rim pixel colours a hole pixel when its plane meets the filled inverse depth to this share.
 SAME_DEPTH = 0.05
@@ -48,7 +48,13 @@ def fill_color(
         return filled
     result = filled.astype(np.float64)
     _seed_colors(
-        result, holes, surface.inverse, surface.hits, surface.planes, surface.plane_of, DIRECTIONS
+        result,
+        holes,
+        surface.inverse,
+        surface.hits,
+        surface.planes,
+        surface.plane_of.ravel(),
+        DIRECTIONS,
     )
     hint, weight = np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32)
     if evidence is not None:
@@ -57,17 +63,16 @@ def fill_color(
         seeds = result.reshape(-1, 3)
         seeds[holes] = seeds[holes] * (1 - share) + hint.reshape(-1, 3)[holes] * share
     neighbors, links = _links(holes, surface.inverse)
-    _relax(result.reshape(-1, 3), holes, neighbors, links, hint.reshape(-1, 3), weight.ravel(),
+    relax(result.reshape(-1, 3), holes, neighbors, links, hint.reshape(-1, 3), weight.ravel(),
            sweeps)  # fmt: skip
     filled.reshape(-1, 3)[holes] = np.clip(result.reshape(-1, 3)[holes], 0, 1)
     return filled
 
 
-@numba.njit(cache=True)
-def _seed_colors(rgb, holes, inverse, hits, planes, plane_of, directions):
+@compiled()
+def _seed_colors(rgb, holes, inverse, hits, planes, flat, directions):
     """Inverse-distance mean of the rim colours on the hole pixel's own surface."""
     width = inverse.shape[1]
-    flat = plane_of.ravel()
     for i in holes:
         y, x = i // width, i % width
         value = inverse[y, x]
@@ -96,7 +101,7 @@ def _seed_colors(rgb, holes, inverse, hits, planes, plane_of, directions):
                 rgb[y, x, c] = rgb[closest // width, closest % width, c]
 
 
-@numba.njit(cache=True)
+@compiled()
 def _links(holes, inverse):
     """(M, 4) row-major neighbours of hole pixels, and the strength of each link, 0 outside."""
     height, width = inverse.shape
@@ -117,8 +122,8 @@ def _links(holes, inverse):
     return neighbors, links
 
 
-@numba.njit(cache=True)
-def _relax(rgb, holes, neighbors, links, hint, weight, sweeps):
+@compiled()
+def relax(rgb, holes, neighbors, links, hint, weight, sweeps):
     """Successive over-relaxation of the membrane with data terms, in row-major order."""
     count = len(holes)
     hinted = len(weight) > 1
@@ -130,11 +135,12 @@ def _relax(rgb, holes, neighbors, links, hint, weight, sweeps):
     for m in range(count):
         i = holes[m]
         data = weight[i] if hinted else 0.0
-        total = links[m].sum() + data
+        total = links[m, 0] + links[m, 1] + links[m, 2] + links[m, 3] + data
         # A pixel cut off from all neighbours keeps its seed.
         if total > 1e-3:
             step[m] = RELAXATION
-            share[m] = links[m] / total
+            for k in range(4):
+                share[m, k] = links[m, k] / total
             for c in range(3):
                 given[m, c] = data * hint[i, c] / total if hinted else 0.0
     for _ in range(sweeps):

@@ -18,13 +18,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Float64
 from gvtools.completers.hole_median import median_of_fill
 from gvtools.completers.holes import rim_distance
+from gvtools.kernels import compiled, in_threads
 
 # Eight directions (dy, dx); direction k + 8 is the opposite of k.
 _HALF = ((0, 1), (1, 2), (1, 1), (2, 1), (1, 0), (2, -1), (1, -1), (1, -2))
@@ -92,7 +92,8 @@ def fill_depth(
     known = valid & (depth > 0) & np.isfinite(depth)
     inverse = np.zeros(depth.shape, np.float64)
     inverse[known] = 1.0 / depth[known].astype(np.float64)
-    hits = _first_hits(known, DIRECTIONS)
+    hits = np.full((len(DIRECTIONS), *known.shape), -1, np.int32)
+    in_threads(_first_hits, len(DIRECTIONS), known, DIRECTIONS, hits)
     plane_of = np.full(depth.shape, -1, np.int32)
     touched = np.zeros(known.size + 1, bool)
     touched[hits.reshape(len(hits), -1)[:, np.flatnonzero(~known)]] = True
@@ -103,24 +104,28 @@ def fill_depth(
     if not len(rim):
         return HoleDepth(inverse, hits, np.zeros((0, 5)), plane_of, spread, distance, 0)
     slope = math.tan(math.radians(steepest_deg)) / focal
-    planes = _fit_rim(inverse, rim, slope)
+    planes = np.zeros((len(rim), 5))
+    in_threads(_fit_rim, len(rim), inverse, rim, slope, planes)
     some = inverse[known]
     low, high = np.percentile(some[:: max(1, some.size // ENOUGH)], (1, 99))
     limits = np.array((FARTHEST * low, NEAREST * high))
-    clipped = _combine(inverse, known, hits, planes, plane_of, slope, limits, spread)
+    values, weights = np.zeros((len(depth), 8)), np.zeros((len(depth), 8))
+    clipped = in_threads(
+        _combine, len(depth), inverse, known, hits, planes, plane_of.ravel(), slope, limits, spread,
+        values, weights,
+    )  # fmt: skip
     if smoothing:
         for step in (8, 4, 2, 1, 1):
             inverse = median_of_fill(inverse, known, distance, step)
-    return HoleDepth(inverse, hits, planes, plane_of, spread, distance, int(clipped))
+    return HoleDepth(inverse, hits, planes, plane_of, spread, distance, sum(clipped))
 
 
-@numba.njit(cache=True, parallel=True)
-def _first_hits(known, directions):
-    """(16, H, W) int32: the first known pixel in each direction, by one sweep per direction."""
+@compiled()
+def _first_hits(first, last, known, directions, hits):
+    """Write the first known pixel in each direction, by one sweep per direction."""
     height, width = known.shape
-    hits = np.full((len(directions), height, width), -1, np.int32)
-    for k in numba.prange(len(directions)):
-        dy, dx = directions[k]
+    for k in range(first, last):
+        dy, dx = directions[k, 0], directions[k, 1]
         for row in range(height):
             y = height - 1 - row if dy >= 0 else row
             y1 = y + dy
@@ -138,27 +143,25 @@ def _first_hits(known, directions):
                         hits[k, y, x] = ya * width + xa
                         continue
                 hits[k, y, x] = y1 * width + x1 if known[y1, x1] else hits[k, y1, x1]
-    return hits
 
 
-@numba.njit(cache=True, parallel=True)
-def _fit_rim(inverse, rim, slope):
-    """(R, 5): a robust plane at each rim pixel, from the widest window that one plane explains."""
-    planes = np.zeros((len(rim), 5))
+@compiled()
+def _fit_rim(first, last, inverse, rim, slope, planes):
+    """A robust plane at each rim pixel, from the widest window that one plane explains."""
     width = inverse.shape[1]
-    for i in numba.prange(len(rim)):
-        trial = np.zeros(5)
+    trial = np.zeros(5)
+    for i in range(first, last):
         y, x = rim[i] // width, rim[i] % width
         for radius in (24, 12, 6):
             _fit_plane(inverse, y, x, radius, slope, trial)
             if radius == 24 or trial[3] > planes[i, 3]:
-                planes[i] = trial
+                for k in range(5):
+                    planes[i, k] = trial[k]
             if planes[i, 3] > 0.5:
                 break
-    return planes
 
 
-@numba.njit(cache=True)
+@compiled()
 def _fit_plane(inverse, y0, x0, radius, slope, out):
     """One window: three passes of least squares over the samples that the last pass explains."""
     height, width = inverse.shape
@@ -232,7 +235,7 @@ def _fit_plane(inverse, y0, x0, radius, slope, out):
     out[4] = relative
 
 
-@numba.njit(cache=True)
+@compiled()
 def _pair(p, q, px, py, qx, qy, x, y, slope):
     """Inverse depth at (x, y) between two rim pixels with planes p and q, and its weight."""
     dp = math.sqrt((x - px) ** 2 + (y - py) ** 2)
@@ -258,7 +261,7 @@ def _pair(p, q, px, py, qx, qy, x, y, slope):
     return at_q, 0.3 * q[3] / (dq * dq)
 
 
-@numba.njit(cache=True)
+@compiled()
 def _unhidden(planes, flat, hits, h, x, y, width, slope):
     """Weight left to rim pixel ``h``, which nothing faces, by farther surfaces seen from (x, y).
 
@@ -286,19 +289,23 @@ def _unhidden(planes, flat, hits, h, x, y, width, slope):
     return left
 
 
-@numba.njit(cache=True, parallel=True)
-def _combine(inverse, known, hits, planes, plane_of, slope, limits, spread):
-    """Write the answer of the eight pairs into each hole pixel; the number of clipped pixels."""
-    height, width = known.shape
-    flat = plane_of.ravel()
+@compiled()
+def _combine(
+    first, last, inverse, known, hits, planes, flat, slope, limits, spread, row_values, row_weights
+):  # fmt: skip
+    """Write the answer of the eight pairs into each hole pixel; the number of clipped pixels.
+
+    ``row_values`` and ``row_weights`` (H, 8) are scratch.
+    """
+    width = known.shape[1]
     clipped = 0
-    for y in numba.prange(height):
-        values = np.zeros(8)
-        weights = np.zeros(8)
+    for y in range(first, last):
+        values, weights = row_values[y], row_weights[y]
         for x in range(width):
             if known[y, x]:
                 continue
-            count = 0
+            # Of a type: numba compiles what takes a literal once for each of its values.
+            count = np.int64(0)
             for k in range(8):
                 h0, h1 = hits[k, y, x], hits[k + 8, y, x]
                 if h0 < 0 and h1 < 0:
@@ -318,28 +325,36 @@ def _combine(inverse, known, hits, planes, plane_of, slope, limits, spread):
                 count += 1
             if count == 0:
                 continue
-            value = _weighted_quantile(values[:count], weights[:count], FAR_QUANTILE)
+            value, weight = _weighted_quantile(values, weights, count, FAR_QUANTILE)
             bounded = min(max(value, limits[0]), limits[1])
             clipped += bounded != value
             inverse[y, x] = bounded
-            apart = np.abs(values[:count] - value) * weights[:count]
-            spread[y, x] = apart.sum() / (weights[:count].sum() * bounded)
+            apart = 0.0
+            for i in range(count):
+                apart += abs(values[i] - value) * weights[i]
+            spread[y, x] = apart / (weight * bounded)
     return clipped
 
 
-@numba.njit(cache=True)
-def _weighted_quantile(values, weights, share):
-    """The smallest value at which ``share`` of the weight is reached (the arrays are sorted)."""
-    for i in range(1, len(values)):
+@compiled()
+def _weighted_quantile(values, weights, count, share):
+    """The smallest of ``count`` values at which ``share`` of the weight is reached, and the weight.
+
+    The arrays are sorted.
+    """
+    for i in range(1, count):
         value, weight = values[i], weights[i]
         j = i - 1
         while j >= 0 and values[j] > value:
             values[j + 1], weights[j + 1] = values[j], weights[j]
             j -= 1
         values[j + 1], weights[j + 1] = value, weight
-    total = weights.sum() * share
-    for i in range(len(values)):
-        total -= weights[i]
-        if total <= 0:
-            return values[i]
-    return values[-1]
+    total = 0.0
+    for i in range(count):
+        total += weights[i]
+    left = total * share
+    for i in range(count):
+        left -= weights[i]
+        if left <= 0:
+            return values[i], total
+    return values[count - 1], total

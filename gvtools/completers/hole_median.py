@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.kernels import compiled, in_threads
 
 
-@numba.njit(cache=True)
+@compiled()
 def _middle(values, count):
     """The median of the first ``count`` values, an odd number; they are rearranged (Hoare 1961)."""
     middle = count // 2
@@ -30,22 +32,32 @@ def _middle(values, count):
     return values[middle]
 
 
-@numba.njit(cache=True, parallel=True)
-def median_of_fill(inverse, known, distance, step):
+def median_of_fill(
+    inverse: NDArray[np.float64],
+    known: NDArray[np.bool_],
+    distance: NDArray[np.float64],
+    step: int,
+) -> NDArray[np.float64]:
     """5x5 median with holes of ``step`` pixels between its taps, over the fill alone.
 
     The taps are point-symmetric sets of hole pixels, so planes stay exact. A wide one acts only
     deep inside, where directions far apart at the rim meet in shards.
     """
-    height, width = inverse.shape
     result = inverse.copy()
-    for y in numba.prange(height):
-        values = np.zeros(25)
+    in_threads(_median_rows, len(inverse), inverse, known, distance, step, result)
+    return result
+
+
+@compiled()
+def _median_rows(first, last, inverse, known, distance, step, result):
+    height, width = inverse.shape
+    values = np.zeros(25)
+    for y in range(first, last):
         for x in range(width):
             if inverse[y, x] == 0 or distance[y, x] < (1 if step == 1 else 4 * step):
                 continue
             values[0] = inverse[y, x]
-            count = 1
+            count = np.int64(1)
             for dy in range(3):
                 for dx in range(-2, 3):
                     if dy == 0 and dx <= 0:
@@ -62,4 +74,3 @@ def median_of_fill(inverse, known, distance, step):
                     count += 2
             # The sets have odd size: the centre and pairs.
             result[y, x] = _middle(values, count)
-    return result

@@ -18,10 +18,11 @@ from pydantic import Field
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completer, Completion, ContextView, check_views
 from gvtools.completers.context_color import depth_error, look_up
-from gvtools.completers.hole_color import fill_color
+from gvtools.completers.hole_color import fill_color, relax
 from gvtools.completers.hole_depth import HoleDepth, fill_depth
 from gvtools.completers.settings import CompleterSettings
 from gvtools.guidance import Guidance
+from gvtools.kernels import KernelSet
 
 # Weight of a reliable photograph against one neighbour, in the diffusion.
 EVIDENCE_WEIGHT = 8.0
@@ -49,12 +50,23 @@ class InpaintSettings(CompleterSettings):
     """Relaxation sweeps of the colour."""
 
 
+def compile_kernels() -> None:
+    """Compile, or load from numba's cache, what filling a hole needs."""
+    camera = Cameras.pinhole(16, 16, focal=16.0)
+    valid = np.ones((1, 16, 16), np.bool_)
+    valid[:, 6:10, 6:10] = False
+    weight = valid.astype(np.float32)
+    rgb = np.zeros((1, 16, 16, 3), np.float32)
+    InpaintCompleter().complete((), Guidance(camera, rgb, 2 * weight, valid, weight, ~valid))
+
+
 class InpaintCompleter(Completer):
     """Fills depth from the far side of each hole's rim, and colour along the filled surface."""
 
     name = "inpaint"
     settings_type = InpaintSettings
     settings: InpaintSettings
+    kernels = (KernelSet("inpaint", compile_kernels, relax),)
 
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0

@@ -95,7 +95,8 @@ def back_project(
     spacing = np.empty(height * width, np.float32)
     pixels = np.empty(height * width if levels and pixel_binning > 0 else 0, np.int64)
     count, invalid, edges, masked = _lift(
-        np.ascontiguousarray(rgb, np.uint8), z, trust, use, camera.K[0], local_from_cam,
+        np.ascontiguousarray(rgb, np.uint8), z, trust, use,
+        np.ascontiguousarray(camera.K[0]), np.ascontiguousarray(local_from_cam),
         options.edge, np.inf if options.depth_max is None else options.depth_max, options.grazing,
         positions, colors, weight, spacing, pixels,
     )  # fmt: skip

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from time import perf_counter
-
 import numpy as np
 
 from gvtools.cameras import Cameras
+from gvtools.kernels import KernelSet
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
+from gvtools.memory.splat.cpu_kernels import resolve
 
 
-def compile_kernels(backend: str = "cpu") -> float:
-    """Compile, or load from numba's cache, what a run needs; a step that can be named and timed.
+def compile_kernels(backend: str = "cpu") -> None:
+    """Compile, or load from numba's cache, what lifting, fusing and projecting need.
 
     A memory of a few points is lifted, fused, agreed with, completed and projected.
 
     Args:
         backend: of the projection, see SplatOptions.
-
-    Returns:
-        Seconds it took.
     """
-    began = perf_counter()
     side = np.array([16])
     K = np.array([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]])
     memory = SpatialMemory(0.1)
@@ -38,4 +34,6 @@ def compile_kernels(backend: str = "cpu") -> float:
             generated=number == 2, pixel_binning=1.0,
         )  # fmt: skip
         memory.project(camera, options=options)
-    return perf_counter() - began
+
+
+KERNELS = KernelSet("memory", compile_kernels, resolve)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from gvtools.kernels import compiled
+from gvtools.kernels import compiled, in_threads
 from gvtools.memory.back_projection import FREE_CELL
 from gvtools.memory.store.views import FreeGrid
 
@@ -47,9 +46,9 @@ def seen_through(x, y, z, K, cam_from_world, free_depth, tolerance):
 VIEWS_PER_CALL = 32
 
 
-@compiled(parallel=True)
-def _mark(positions, K, cam_from_world, grids, tolerance, out):
-    for i in prange(len(positions)):
+@compiled()
+def _mark(first, last, positions, K, cam_from_world, grids, tolerance, out):
+    for i in range(first, last):
         for t in range(len(grids)):
             if out[i]:
                 break
@@ -77,7 +76,8 @@ def in_free_space(
     """
     out = np.zeros(len(positions), np.bool_)
     for first in range(0, len(views), VIEWS_PER_CALL):
-        _mark(positions, *stacked(views[first : first + VIEWS_PER_CALL]), tolerance, out)
+        grids = stacked(views[first : first + VIEWS_PER_CALL])
+        in_threads(_mark, len(positions), positions, *grids, tolerance, out)
     return out
 
 

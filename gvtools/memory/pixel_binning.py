@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.kernels import compiled
 from gvtools.memory.store.voxel_levels import level_of
@@ -15,8 +16,16 @@ SIDE = 2
 SLANTED = 4.0
 
 
-@compiled()
-def bin_pixels(pixels, shape, largest, per_spacing, positions, colors, weight, spacing):
+def bin_pixels(
+    pixels: NDArray[np.int64],
+    shape: tuple[int, int],
+    largest: float,
+    per_spacing: float,
+    positions: NDArray[np.float32],
+    colors: NDArray[np.uint8],
+    weight: NDArray[np.float32],
+    spacing: NDArray[np.float32],
+) -> int:
     """Each block of 2 x 2 pixels that were all lifted becomes one point where it is small enough.
 
     Its width is that of its pixels across the line of sight; along the surface it may be SLANTED
@@ -37,21 +46,30 @@ def bin_pixels(pixels, shape, largest, per_spacing, positions, colors, weight, s
     """
     height, width = shape
     point = np.full((height + SIDE - 1, width + SIDE - 1), -1, np.int32)
+    return _bin(
+        pixels, point, width, largest, per_spacing, positions.copy(), colors.copy(), weight.copy(),
+        spacing.copy(), positions, colors, weight, spacing,
+    )  # fmt: skip
+
+
+@compiled()
+def _bin(
+    pixels, point, width, largest, per_spacing, old_positions, old_colors, old_weight, old_spacing,
+    positions, colors, weight, spacing,
+):  # fmt: skip
     for i in range(len(pixels)):
         point[pixels[i] // width, pixels[i] % width] = i
-    old_positions, old_colors = positions.copy(), colors.copy()
-    old_weight, old_spacing = weight.copy(), spacing.copy()
     n = 0
-    for row in range(0, height, SIDE):
-        for col in range(0, width, SIDE):
+    for row in range(0, point.shape[0] - 1, SIDE):
+        for col in range(0, point.shape[1] - 1, SIDE):
             a, b = point[row, col], point[row, col + 1]
             c, d = point[row + 1, col], point[row + 1, col + 1]
             if a >= 0 and b >= 0 and c >= 0 and d >= 0:
                 widest = max(
-                    _apart(old_positions[a], old_positions[b]),
-                    _apart(old_positions[c], old_positions[d]),
-                    _apart(old_positions[a], old_positions[c]),
-                    _apart(old_positions[b], old_positions[d]),
+                    _apart(old_positions, a, b),
+                    _apart(old_positions, c, d),
+                    _apart(old_positions, a, c),
+                    _apart(old_positions, b, d),
                 )
                 apart = _mean(old_spacing[a], old_spacing[b], old_spacing[c], old_spacing[d])
                 most = largest * (1 << level_of(apart, per_spacing))
@@ -61,35 +79,34 @@ def bin_pixels(pixels, shape, largest, per_spacing, positions, colors, weight, s
                             old_positions[a, k], old_positions[b, k],
                             old_positions[c, k], old_positions[d, k],
                         )  # fmt: skip
-                        colors[n, k] = np.uint8(
-                            _mean(
-                                old_colors[a, k], old_colors[b, k],
-                                old_colors[c, k], old_colors[d, k],
-                            ) + 0.5
-                        )  # fmt: skip
+                        color = _mean(
+                            old_colors[a, k], old_colors[b, k], old_colors[c, k], old_colors[d, k]
+                        )
+                        colors[n, k] = np.uint8(color + 0.5)
                     weight[n] = _mean(old_weight[a], old_weight[b], old_weight[c], old_weight[d])
                     spacing[n] = apart
                     n += 1
                     continue
             for i in (a, b, c, d):
                 if i >= 0:
-                    positions[n] = old_positions[i]
-                    colors[n] = old_colors[i]
+                    for k in range(3):
+                        positions[n, k] = old_positions[i, k]
+                        colors[n, k] = old_colors[i, k]
                     weight[n], spacing[n] = old_weight[i], old_spacing[i]
                     n += 1
     return n
 
 
-@compiled(inline="always")
-def _apart(p, q):
-    """The distance of two points."""
+@compiled()
+def _apart(positions, p, q):
+    """The distance of two points by their rows."""
     total = 0.0
     for k in range(3):
-        total += (np.float64(p[k]) - np.float64(q[k])) ** 2
+        total += (np.float64(positions[p, k]) - np.float64(positions[q, k])) ** 2
     return np.sqrt(total)
 
 
-@compiled(inline="always")
+@compiled()
 def _mean(a, b, c, d):
     """In float64, where the sum of the greatest float32 has room."""
     return (np.float64(a) + np.float64(b) + np.float64(c) + np.float64(d)) / 4

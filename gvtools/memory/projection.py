@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, concatenate
+from gvtools.kernels import in_threads
 from gvtools.memory import culling
-from gvtools.memory.occlusion import stacked
+from gvtools.memory.occlusion import in_free_space, stacked
 from gvtools.memory.splat.api import ONE_PIXEL, FrameBuffers, SplatOptions, Splatter
 from gvtools.memory.store.store import Store
 
@@ -146,7 +147,9 @@ class _Projection:
         self.store, self.camera, self.options = store, camera, options
         self.splatter = splatter
         shape = (int(camera.height[0]), int(camera.width[0]))
-        cam_from_local = store.frame.cam_from_local(camera.cam_from_world)[0]
+        # In one order of memory, for which alone the kernels are compiled.
+        self.K = np.ascontiguousarray(camera.K[0])
+        cam_from_local = np.ascontiguousarray(store.frame.cam_from_local(camera.cam_from_world)[0])
         self.target = FrameBuffers(
             camera,
             cam_from_local,
@@ -240,9 +243,9 @@ class _Projection:
         z_range: NDArray[np.float32],
     ) -> None:
         height, width = self.target.shape
-        culling.cull_segments(
-            boxes, rows, self.target.cam_from_local, self.camera.K[0], width, height,
-            self.options.blend_reach, rect, z_range,
+        in_threads(
+            culling.cull_segments, len(rows), boxes, rows, self.target.cam_from_local,
+            self.K, width, height, self.options.blend_reach, rect, z_range,
         )  # fmt: skip
 
     def _splat_tiers(self) -> None:
@@ -260,18 +263,15 @@ class _Projection:
             at += self.size
             self.size *= 2
         view = self.store.segments.view[self.seen]
-        open_ = np.empty(target.shape, np.bool_)
-        limit = np.empty(target.shape, np.float32)
         for number, views in enumerate(members, first):
-            culling.still_open(target.valid, open_, limit)
+            open_ = ~target.valid
+            limit = np.where(open_, np.float32(np.inf), np.float32(0))
             chosen = self.seen[self.tier[view] == number]
-            table = None
             if number:
-                table = culling.summed_area(open_)
-                if not table[-1, -1]:
+                if not open_.any():
                     return
-                chosen = culling.touching(target.rect, table, chosen)
-            self._write(chosen, limit, open_, members=views, table=table)
+                chosen = culling.touching(target.rect, culling.summed_area(open_), chosen)
+            self._write(chosen, limit, open_, members=views, few=number > 0)
 
     def _write(
         self,
@@ -280,12 +280,18 @@ class _Projection:
         open_: NDArray[np.bool_],
         *,
         members: NDArray[np.int64],
-        table: NDArray[np.int32] | None,
+        few: bool,
     ) -> None:
-        """Splat and write; the weight counts from the nearest of the views ``members``."""
+        """Splat and write the pixels ``open_``, which may be ``few``.
+
+        The weight counts from the nearest of the views ``members``.
+        """
         beyond = np.maximum(self.distance - self.distance[members].min(), 0)
         weight = np.exp(-self.options.view_weight * beyond).astype(np.float32)
-        self.splatter.splat(self.target, chosen, limit, weight=weight, table=table, blend=True)
+        writable = open_ if few else None
+        self.splatter.splat(
+            self.target, chosen, limit, weight=weight, writable=writable, blend=True
+        )
         made = bool(self.store.views.generated[members[0]])
         self.splatter.resolve(self.target, open_, generated=made)
 
@@ -296,29 +302,43 @@ class _Projection:
         first-tier view saw the object's place to be free, the object is noise or has moved.
         """
         store, target = self.store, self.target
-        segments, K = store.segments, self.camera.K[0]
+        segments = store.segments
         view = segments.view[self.seen]
         later = self.seen[self.tier[view] != 0]
         if not len(later):
             return
-        seen_free = stacked(store.observed_grids(np.flatnonzero(self.tier == 0)))
+        grids = store.observed_grids(np.flatnonzero(self.tier == 0))
         tolerance = store.options.free_space_tolerance
-        chosen = culling.in_front(
-            later, segments.start, segments.length, target.rect, self.z_range,
-            store.columns.positions, target.cam_from_local, K,
+        hit = np.zeros(len(later), np.bool_)
+        in_threads(
+            culling.in_front, len(later), later, segments.start, segments.length, target.rect,
+            self.z_range, store.columns.positions, target.cam_from_local, self.K,
             target.depth, culling.tile_farthest(target.depth), 2 * self.options.depth_band,
-            *seen_free, tolerance,
+            *stacked(grids), tolerance, hit,
         )  # fmt: skip
-        if not len(chosen):
+        if not hit.any():
             return
+        chosen = later[hit]
         limit = target.depth * np.float32(1 - 2 * self.options.depth_band)
         none = np.zeros(len(store.views), np.float32)
-        zbuffer = self.splatter.splat(target, chosen, limit, weight=none, table=None, blend=False)
-        front = culling.not_free(zbuffer, limit, target.cam_from_local, K, *seen_free, tolerance)
+        zbuffer = self.splatter.splat(
+            target, chosen, limit, weight=none, writable=None, blend=False
+        )
+        front = zbuffer < limit
+        front[front] = ~in_free_space(self._lifted(zbuffer, front), grids, tolerance=tolerance)
         # Slivers along silhouettes are what an error of a pixel in a pose looks like.
         front = culling.opened(front, OCCLUDER_SIDE)
-        table = culling.summed_area(front)
-        if table[-1, -1]:
-            chosen = culling.touching(target.rect, table, chosen)
+        if front.any():
+            chosen = culling.touching(target.rect, culling.summed_area(front), chosen)
             limit = np.where(front, limit, np.float32(0))
-            self._write(chosen, limit, front, members=self.ranked, table=table)
+            self._write(chosen, limit, front, members=self.ranked, few=True)
+
+    def _lifted(self, depth: NDArray[np.float32], where: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """(N, 3) points of the pixels ``where`` (H, W), in the memory's frame."""
+        row, col = np.nonzero(where)
+        K, M = self.K, self.target.cam_from_local
+        y = (row + 0.5 - K[1, 2]) / K[1, 1]
+        x = (col + 0.5 - K[0, 2] - K[0, 1] * y) / K[0, 0]
+        rays = np.stack([x, y, np.ones_like(x)], axis=1)
+        points = (rays * depth[where, None] - M[:3, 3]) @ M[:3, :3]
+        return points.astype(np.float32)

@@ -96,9 +96,10 @@ def leave_rooms(rooms, o, d, count, floats, codes, t, room, code):
     scratch.
     """
     total = len(rooms)
+    start = np.int64(0)
     for r in range(total):
         box_intervals(
-            rooms[r, 0], rooms[r, 1], o, d, 0, count, floats[2 * r], floats[2 * r + 1],
+            rooms[r, 0], rooms[r, 1], o, d, start, count, floats[2 * r], floats[2 * r + 1],
             codes[0], codes[1 + r],
         )  # fmt: skip
     for i in range(count):

@@ -8,11 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.kernels import FAST, compiled
+from gvtools.kernels import FAST, compiled, in_threads
 from gvtools.procedural.geometry import Geometry
 from gvtools.procedural.intervals import enter_solid, leave_rooms, turned
 
@@ -41,9 +40,9 @@ def cast(geometry: Geometry, cameras: Cameras) -> Surfaces:
     """The surfaces at the pixel centres of cameras of one size."""
     shape = (len(cameras), int(cameras.height[0]), int(cameras.width[0]))
     out = Surfaces(np.empty(shape), np.empty(shape, np.int64))
-    _cast_rows(
-        geometry, world_rays(cameras), cameras.centers, rectangles(geometry, cameras),
-        out.depth, out.solid,
+    in_threads(
+        _cast_rows, shape[0] * shape[1], geometry, world_rays(cameras), cameras.centers,
+        rectangles(geometry, cameras), 1, out.depth, out.solid,
     )  # fmt: skip
     return out
 
@@ -190,11 +189,11 @@ def _enter_plain_box(
         cutter[i] = -1 if on else cutter[i]
 
 
-@compiled(parallel=True)
-def _cast_rows(geometry, rays, centers, rects, depth, solid):
-    views, height, width = depth.shape
+@compiled()
+def _cast_rows(first, last, geometry, rays, centers, rects, samples, depth, solid):
+    _, height, width = depth.shape
     total = len(geometry.rooms)
-    for job in prange(views * height):
+    for job in range(first, last):
         v = job // height
         row = job % height
         ends = np.empty((6, width))
@@ -203,6 +202,6 @@ def _cast_rows(geometry, rays, centers, rects, depth, solid):
         codes = np.empty((CODES + total, width), np.int64)
         hits = np.empty((3, width), np.int64)
         trace_row(
-            geometry, v, rays, centers, rects, row, row + 0.5, 1, ends[:3], ends[3:], local,
+            geometry, v, rays, centers, rects, row, row + 0.5, samples, ends[:3], ends[3:], local,
             floats, codes, depth[v, row], hits[0], solid[v, row], hits[1], hits[2],
         )  # fmt: skip

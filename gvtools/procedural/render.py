@@ -7,11 +7,10 @@ through its centre, so that it is a surface's and not a mean of two.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.kernels import FAST, compiled
+from gvtools.kernels import FAST, compiled, in_threads
 from gvtools.procedural.color import encode_srgb
 from gvtools.procedural.geometry import Geometry
 from gvtools.procedural.light import light_on
@@ -41,11 +40,11 @@ def radiance(
         (V, H, W, 3) and (V, H, W) float32.
     """
     shape = (len(cameras), int(cameras.height[0]), int(cameras.width[0]))
-    color = np.empty((*shape, 3), np.float32)
+    color = np.zeros((*shape, 3), np.float32)
     focal = np.sqrt(cameras.K[:, 0, 0] * cameras.K[:, 1, 1])
-    _render_rows(
-        geometry, look, world_rays(cameras), cameras.centers, rectangles(geometry, cameras), focal,
-        supersample, color,
+    in_threads(
+        _render_rows, shape[0] * shape[1], geometry, look, world_rays(cameras), cameras.centers,
+        rectangles(geometry, cameras), focal, supersample, color,
     )  # fmt: skip
     return color, cast(geometry, cameras).depth.astype(np.float32)
 
@@ -53,20 +52,19 @@ def radiance(
 def developed(light: Float32, exposure: float) -> NDArray[np.uint8]:
     """(..., 3) linear light to 8-bit sRGB by the tone curve of ``color.encode_srgb``."""
     out = np.empty(light.shape, np.uint8)
-    _develop(light.reshape(-1), np.float32(exposure * (STEPS - 1) / BRIGHTEST), _TONES, out.ravel())
+    develop(light.reshape(-1), np.float32(exposure * (STEPS - 1) / BRIGHTEST), _TONES, out.ravel())
     return out
 
 
 _TONES = encode_srgb(np.linspace(0, BRIGHTEST, STEPS, dtype=np.float32))
 
 
-@compiled(parallel=True)
-def _render_rows(geometry, look, rays, centers, rects, focal, supersample, color):
-    views, height = color.shape[:2]
-    for job in prange(views * height):
+@compiled()
+def _render_rows(first, last, geometry, look, rays, centers, rects, focal, supersample, color):
+    height = color.shape[1]
+    for job in range(first, last):
         v = job // height
         row = job % height
-        color[v, row] = np.float32(0)
         _color_row(
             geometry, look, v, rays, centers, rects, row, supersample,
             1.0 / (supersample * focal[v]), color[v, row],
@@ -116,7 +114,8 @@ def _color_row(geometry, look, view, rays, centers, rects, row, supersample, pix
 
 
 @compiled()
-def _develop(light, factor, tones, out):
+def develop(light, factor, tones, out):
+    """Look light (N,) times ``factor`` up in the tone curve's table."""
     top = len(tones) - 1
     for i in range(len(light)):
         out[i] = tones[min(int(light[i] * factor + np.float32(0.5)), top)]

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.errors import OptionError
+from gvtools.kernels import KernelSet
 from gvtools.procedural.builder import ProceduralScene
 from gvtools.procedural.furnished_room import furnished_room
-from gvtools.procedural.render import developed, radiance
+from gvtools.procedural.render import develop, developed, radiance
 from gvtools.scenes.sample_workspace import SampleContent, is_written, write_sample
 from gvtools.trajectories import look_at
 
@@ -98,6 +99,19 @@ def write_room(
     )
     write_sample(folder, _photographed(room, cameras, rng), record=record)
     return sample
+
+
+def compile_kernels() -> None:
+    """Compile, or load from numba's cache, what photographing a room needs."""
+    room = furnished_room(0)
+    cameras = _path(
+        room.geometry.rooms[0, 1], ("a",), ("b",), width=16, height=16, rng=np.random.default_rng(0)
+    )
+    light, _ = radiance(room.geometry, room.look, cameras)
+    developed(light, 1.0)
+
+
+KERNELS = KernelSet("renderer", compile_kernels, develop)
 
 
 def _path(

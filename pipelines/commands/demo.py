@@ -34,12 +34,15 @@ def run(args: argparse.Namespace, console: Console) -> None:
     out = args.out.absolute() if args.out else free_folder(default, resume=args.resume)
     RunDirectory(out).refuse_foreign()
     sample = out.with_name(f"{out.name}-sample")
-    console.line(f"sample {args.sample}, seed {config.seed}: writing {sample}")
-    context, targets = _write(args.sample, sample, config.seed)
+    from gvtools.procedural.room_sample import KERNELS
     from gvtools.scenes.project import open_project
+    from pipelines.reconstruction.compile_kernels import compile_kernels
     from pipelines.reconstruction.run import reconstruct
     from pipelines.report.write import draw_run
 
+    compile_kernels(config, console, more=(KERNELS,) if args.sample == "room" else ())
+    console.line(f"sample {args.sample}, seed {config.seed}: writing {sample}")
+    context, targets = _write(args.sample, sample, config.seed)
     if args.context is None:
         config = config.replaced(context=",".join(context))
     if args.targets is None:

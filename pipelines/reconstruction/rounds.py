@@ -187,10 +187,10 @@ def complete_targets(
 
     if completer.batches_targets:
         with clock.stage("project"):
-            known = [target.guidance() for target in targets]
+            guidances = [target.guidance() for target in targets]
         with clock.stage("complete"):
-            made = _completed_together(completer, context, known, seed)
-        for pair in progress(list(zip(known, made, strict=True)), f"round {number}"):
+            completions = _completed_together(completer, context, guidances, seed)
+        for pair in progress(list(zip(guidances, completions, strict=True)), f"round {number}"):
             take(*pair)
         return results, total
     for target in progress(list(targets), f"round {number}"):
@@ -203,18 +203,19 @@ def complete_targets(
 
 
 def _completed_together(
-    completer: Completer, context: Sequence[ContextView], known: Sequence[Guidance], seed: int
+    completer: Completer, context: Sequence[ContextView], guidances: Sequence[Guidance], seed: int
 ) -> list[Completion]:
     """A batch of one for each target, of batches of all targets of one size."""
-    made: list[Completion | None] = [None] * len(known)
+    completions: dict[int, Completion] = {}
     sizes: dict[tuple[int, ...], list[int]] = {}
-    for index, guidance in enumerate(known):
+    for index, guidance in enumerate(guidances):
         sizes.setdefault(guidance.valid.shape[1:], []).append(index)
     for rows in sizes.values():
-        completion = completer.complete(context, concatenate([known[i] for i in rows]), seed=seed)
+        of_one_size = concatenate([guidances[index] for index in rows])
+        completion = completer.complete(context, of_one_size, seed=seed)
         for place, index in enumerate(rows):
-            made[index] = _row(completion, place)
-    return [completion for completion in made if completion is not None]
+            completions[index] = _row(completion, place)
+    return [completions[index] for index in range(len(guidances))]
 
 
 def _row(completion: Completion, index: int) -> Completion:
@@ -242,8 +243,8 @@ def _align_and_fuse(
     confidence = completion.confidence[0]
     with clock.stage("align"):
         alignment = _scale_alignment(guidance, completion, config)
-    made = ~valid & (depth > 0)
-    fused = made & (confidence >= config.fusion.min_confidence) & (confidence > 0)
+    filled = ~valid & (depth > 0)
+    fused = filled & (confidence >= config.fusion.min_confidence) & (confidence > 0)
     report = FuseReport()
     if not alignment.accepted:
         fused = np.zeros_like(fused)
@@ -264,7 +265,7 @@ def _align_and_fuse(
     figures = {
         "name": guidance.cameras.names[0],
         "observed": float((valid & ~guidance.generated[0]).mean()),
-        "completed": float((valid | made).mean()),
+        "completed": float((valid | filled).mean()),
         "fused_pixels": int(fused.sum()),
         "scale": alignment.to_json(),
         "fuse": asdict(report),

@@ -66,14 +66,12 @@ class RunSettings(Settings):
             "max_side": 480,
             "views_per_round": 12,
             "effort.inpaint_below": 0.05,
-            "effort.reduced_below": 0.3,
         },
         # The defaults.
         "balanced": {},
         "accurate": {
             "fusion.max_psnr_drop_db": 0.0,
             "effort.inpaint_below": 0.0,
-            "effort.reduced_below": 0.0,
             "savings.depth_from_memory": None,
             "memory.merge_angle_deg": 0.0,
             "memory.observations_per_voxel": 64,

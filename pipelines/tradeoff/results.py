@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import ProjectError
 from gvtools.evaluation.tables import Column, Table, csv_text, markdown
-from pipelines.tradeoff.sweep import EQUAL, Sweep, Trial, pareto_front
+from pipelines.tradeoff.sweep import Sweep, Trial, pareto_front
 from pipelines.tradeoff.trial import Outcome
 from viz.plots.pareto import TradeOff, draw_pareto
 
@@ -133,14 +134,6 @@ def _print_recommendation(
     )
     if sweep.smaller(outcome):
         console.warn("within the budget the pictures are smaller than what was asked for")
-    reduced = [t.outcome for t in sweep.trials if sweep.smaller(t.outcome)]
-    better = max(reduced, key=lambda o: o.psnr, default=outcome)
-    if better.psnr > outcome.psnr + EQUAL and better.seconds <= outcome.seconds:
-        console.line(
-            f"smaller pictures, enlarged again, are measured to be nearer to the true ones "
-            f"({better.psnr:.2f} dB in {better.seconds:.1f} s): "
-            f"max_side={better.settings['max_side']}"
-        )
 
 
 def read_trade_off(file: Path, *, of: Mapping[str, Any] | None = None) -> TradeOff | None:
@@ -186,7 +179,7 @@ def _point(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _entry(trial: Trial) -> dict[str, Any]:
-    return {"label": trial.label, **trial.outcome.to_json()}
+    return {"label": trial.label, **asdict(trial.outcome)}
 
 
 def _rows(trials: Sequence[Trial]) -> tuple[tuple[Any, ...], ...]:

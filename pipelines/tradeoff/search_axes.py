@@ -102,8 +102,6 @@ def _core_axes(config: RunSettings) -> list[SearchAxis]:
         _axis("model resolution, px", "completer.image_size", (core.image_size // 2, size), size),
         _axis("holes left to inpaint, share of the diagonal", "effort.inpaint_below",
               (0.1, 0.02, 0.0), config.effort.inpaint_below),
-        _axis("holes of reduced effort, share of the diagonal", "effort.reduced_below",
-              (0.3, 0.1, 0.0), config.effort.reduced_below),
     ]  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import json
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -54,15 +54,6 @@ class Outcome:
     ssim: float | None
     depth_rel: float | None
     coverage: float | None
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain data."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Outcome:
-        """From plain data, which may hold other keys besides."""
-        return cls(**{field.name: data[field.name] for field in fields(cls)})
 
 
 def applied(config: RunSettings, settings: Mapping[str, Any]) -> RunSettings:
@@ -121,14 +112,14 @@ class Trials:
             self._warm = True
             self._run({}, self.names[:1])
         outcome = self._run(settings, self.names)
-        write_json(self._file(settings), outcome.to_json())
+        write_json(self._file(settings), asdict(outcome))
         return outcome
 
     def kept(self, settings: Mapping[str, Any]) -> Outcome | None:
         """What this trial gave before; None if it was not made, or its file is damaged."""
         try:
-            return Outcome.from_json(json.loads(self._file(settings).read_text(encoding="utf-8")))
-        except (OSError, ValueError, KeyError, TypeError):
+            return Outcome(**json.loads(self._file(settings).read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
             return None
 
     def _file(self, settings: Mapping[str, Any]) -> Path:

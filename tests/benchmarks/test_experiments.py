@@ -234,5 +234,4 @@ def test_step_sweeps_say_which_bounds_they_take(weights, tmp_path):
     found = experiment("few-steps", weights, tmp_path, "--scenes", "1")
     rows = [row["method"] for row in found["student, level 1"]]
     assert rows[0] == "3+1, own bounds" and "3+1, equal steps" in rows and len(rows) == 8
-    assert len(found["student, reduced effort"]) == 4
     assert len(found["student, cascade"]) == 5

@@ -8,7 +8,6 @@ import pytest
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completer, Completion, ScaleAlignment, ScaleStatus, create
 from gvtools.completers.effort import EffortPolicy, SmallHolesInpainted
-from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.completers.holes import hole_radius
 from gvtools.completers.inpaint import InpaintCompleter
 from gvtools.errors import OptionError
@@ -113,24 +112,10 @@ def test_only_costly_completers_leave_views_to_inpaint():
     split = policy.applied(costly)
     assert isinstance(split, SmallHolesInpainted)
     assert (split.name, split.batches_targets) == ("recorder", True)
+    assert split.files == costly.files and split.notes == costly.notes
     assert off.applied(costly) is costly
     for cheap in map(create, ("inpaint", "none")):
         assert policy.applied(cheap) is cheap
-
-
-def test_reduced_effort_is_the_completers_matter():
-    core = create("geoverse")
-    assert isinstance(core, GeoVerseCompleter)
-    reduced = EffortPolicy(inpaint_below=0, reduced_below=0.1).applied(core)
-    assert isinstance(reduced, GeoVerseCompleter)
-    assert (reduced.reduced_below, core.reduced_below) == (0.1, 0)
-    assert reduced.settings is core.settings
-    assert EffortPolicy(inpaint_below=0, reduced_below=0).applied(core) is core
-    split = EffortPolicy().applied(core)
-    assert isinstance(split, SmallHolesInpainted)
-    assert isinstance(split.costly_one, GeoVerseCompleter)
-    assert split.costly_one.reduced_below == EffortPolicy().reduced_below
-    assert split.files == core.files and split.notes == core.notes
 
 
 def test_scale_alignment_is_absent_where_neither_has_a_scale_to_find():
@@ -138,12 +123,11 @@ def test_scale_alignment_is_absent_where_neither_has_a_scale_to_find():
     assert split.complete((), guidance_with(2, 20)).scale_alignment is None
 
 
-@pytest.mark.parametrize("name", ["inpaint_below", "reduced_below"])
-def test_a_faster_profile_makes_less_effort(name):
+def test_a_faster_profile_makes_less_effort():
     shares = [
-        getattr(with_profile(RunSettings(), profile).effort, name)
+        with_profile(RunSettings(), profile).effort.inpaint_below
         for profile in ("accurate", "balanced", "fast")
     ]
     assert shares == sorted(set(shares)) and shares[0] == 0
-    with pytest.raises(OptionError, match=rf"effort\.{name} -0\.1; expected at least 0"):
-        with_values(RunSettings(), {f"effort.{name}": -0.1})
+    with pytest.raises(OptionError, match=r"effort\.inpaint_below -0\.1; expected at least 0"):
+        with_values(RunSettings(), {"effort.inpaint_below": -0.1})

@@ -131,7 +131,8 @@ def test_hits_are_the_first_known_pixels_of_a_plain_march():
 
     rng = np.random.default_rng(2)
     known = rng.random((20, 26)) < 0.15
-    hits = _first_hits(known, DIRECTIONS)
+    hits = np.full((16, 20, 26), -1, np.int32)
+    _first_hits(0, 16, known, DIRECTIONS, hits)
     for k, (dy, dx) in enumerate(DIRECTIONS):
         if abs(dy) + abs(dx) == 3:
             continue

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 from collections.abc import Sequence
@@ -37,7 +36,6 @@ from gvtools.completers.geoverse.postprocess import (
 )
 from gvtools.completers.geoverse.resampling import model_size
 from gvtools.completers.geoverse.weights.folder import check_headers, from_pretrained
-from gvtools.completers.holes import hole_radius
 from gvtools.completers.push_pull import Filled
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
@@ -53,12 +51,10 @@ class _Effort:
     Attributes:
         bounds: of the level-1 steps.
         size: (H, W) of its pictures.
-        prior: whether a video prior is asked.
     """
 
     bounds: tuple[float, ...]
     size: tuple[int, int]
-    prior: bool
 
 
 class GeoVerseCompleter(Completer):
@@ -72,7 +68,6 @@ class GeoVerseCompleter(Completer):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.reduced_below = 0.0
         if self.settings.device == "cuda" and not torch.cuda.is_available():
             raise OptionError("completer.device = 'cuda', and torch sees no CUDA device here")
         if self.settings.weights is None and not self.folder.is_dir():
@@ -111,12 +106,6 @@ class GeoVerseCompleter(Completer):
     def files(self) -> tuple[Path, ...]:
         """Everything in the weights folder."""
         return tuple(sorted(path for path in self.folder.rglob("*") if path.is_file()))
-
-    def with_reduced_effort(self, below: float) -> GeoVerseCompleter:
-        """Passes whose holes have at most this radius take less; see ``_effort``."""
-        other = copy.copy(self)
-        other.reduced_below = below
-        return other
 
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
@@ -161,23 +150,13 @@ class GeoVerseCompleter(Completer):
         return surface_fill(context, guidance, shared=self.settings.shared_fill)
 
     def _effort(self, part: Guidance) -> _Effort:
-        """The model's own steps and picture size, or less where all holes of the pass are small.
-
-        That is one step, half the picture size, and no video prior.
-        """
-        reduced = False
-        if self.reduced_below > 0:
-            reduced = max(hole_radius(valid) for valid in part.valid) <= self.reduced_below
-        bounds = interval_bounds(1) if reduced else self.config.flow.level1
+        """The model's own steps and picture size, or those of the settings."""
+        bounds = self.config.flow.level1
         if self.settings.steps is not None:
             bounds = interval_bounds(self.settings.steps) if self.settings.steps else ()
         longest = min(self.settings.image_size or math.inf, self.config.image_size)
-        size = model_size(
-            *part.depth.shape[1:],
-            longest=int(longest) // 2 if reduced else int(longest),
-            patch=self.config.patch,
-        )
-        return _Effort(bounds, size, prior=not reduced)
+        size = model_size(*part.depth.shape[1:], longest=int(longest), patch=self.config.patch)
+        return _Effort(bounds, size)
 
     def _pass(
         self,
@@ -209,7 +188,6 @@ class GeoVerseCompleter(Completer):
                 cascade_bounds=interval_bounds(cascade) if cascade else self.config.flow.cascade,
                 cfg_scale=options.cfg_scale,
                 temperature=options.temperature,
-                prior=effort.prior,
                 targets_alone=complete_fill,
             )
 

@@ -94,7 +94,7 @@ class Splatter(Protocol):
         limit: NDArray[np.float32],
         *,
         weight: NDArray[np.float32],
-        table: NDArray[np.int32] | None,
+        writable: NDArray[np.bool_] | None,
         blend: bool,
     ) -> NDArray[np.float32]:
         """Splat the segments ``chosen`` and keep the sums until ``resolve``.
@@ -104,7 +104,7 @@ class Splatter(Protocol):
             chosen: (n,) rows of the memory's segments.
             limit: (H, W), only what is nearer is written; 0 shuts a pixel.
             weight: (views,) view weight.
-            table: summed-area table of the pixels to be written, where these are few.
+            writable: (H, W), the pixels to be written, where these are few; None for most.
             blend: False stops after the depth pass.
 
         Returns:

@@ -31,7 +31,7 @@ class CpuSplatter:
         limit: NDArray[np.float32],
         *,
         weight: NDArray[np.float32],
-        table: NDArray[np.int32] | None,
+        writable: NDArray[np.bool_] | None,
         blend: bool,
     ) -> NDArray[np.float32]:
         """See gvtools.memory.splat.api.Splatter."""
@@ -41,7 +41,9 @@ class CpuSplatter:
             self.total = np.empty((height, width, splat_kernels.CHANNELS), np.float32)
         columns, options = self.store.columns.arrays, self.options
         segments = self.store.segments
-        reachable = np.empty(0, np.bool_) if table is None else culling.near_to(table)
+        reachable = np.empty(0, np.bool_)
+        if writable is not None:
+            reachable = culling.near_to(writable).ravel()
         K, single = target.camera.K[0], np.float32
         lens = splat_kernels.Lens(
             target.cam_from_local.astype(single), single(K[0, 0]), single(K[1, 1]),

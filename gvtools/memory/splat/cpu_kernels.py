@@ -61,7 +61,7 @@ class SegmentColumns(NamedTuple):
     rect: NDArray[np.int32]
 
 
-@compiled(inline="always")
+@compiled()
 def closed_off(u, v, reach, width, height, reachable):
     """Whether a footprint certainly holds no pixel to be written."""
     if not reachable.size or reach > REACHABLE - 1:
@@ -157,22 +157,16 @@ def splat_segments(
         b = (task % bands) * threads + task // bands
         top = b * height // (bands * threads)
         bottom = (b + 1) * height // (bands * threads) - 1
-        x = np.empty(longest, np.float32)
-        y = np.empty(longest, np.float32)
-        z = np.empty(longest, np.float32)
-        u = np.empty(longest, np.float32)
-        v = np.empty(longest, np.float32)
-        depths = np.empty(longest, np.float32)
-        reach = np.empty(longest, np.float32)
-        c0 = np.empty(longest, np.int32)
-        c1 = np.empty(longest, np.int32)
-        r0 = np.empty(longest, np.int32)
-        r1 = np.empty(longest, np.int32)
-        part = (x, y, z, u, v, depths, reach, c0, c1, r0, r1)
+        floats = np.empty((7, longest), np.float32)
+        window = np.empty((4, longest), np.int32)
+        u, v, depths, reach = floats[3], floats[4], floats[5], floats[6]
+        c0, c1, r0, r1 = window[0], window[1], window[2], window[3]
+        part = (floats[0], floats[1], floats[2], u, v, depths, reach, c0, c1, r0, r1)
         for i in range(top * width, (bottom + 1) * width):
             depth[i] = limit[i]
             if blend and limit[i] > 0:
-                total[i] = 0
+                for c in range(CHANNELS):
+                    total[i, c] = 0
         for r in chosen:
             if rect[r, 3] < top or rect[r, 2] > bottom:
                 continue

@@ -16,6 +16,7 @@ import torch.utils.dlpack
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
+from gvtools.memory.culling import summed_area
 from gvtools.memory.splat.cpu_kernels import CHANNELS, FAINTEST, SMALLEST
 
 if TYPE_CHECKING:
@@ -71,13 +72,13 @@ class TorchSplatter:
         limit: NDArray[np.float32],
         *,
         weight: NDArray[np.float32],
-        table: NDArray[np.int32] | None,
+        writable: NDArray[np.bool_] | None,
         blend: bool,
     ) -> NDArray[np.float32]:
         """See gvtools.memory.splat.api.Splatter."""
         height, width = target.shape
         limits = self._tensor(limit.reshape(-1))
-        sums = None if table is None else self._tensor(table)
+        sums = None if writable is None else self._tensor(summed_area(writable))
         zbuffer = limits.clone()
         rows, view = self._observations(chosen)
         u, v, z, size = self._project(target, rows)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from run_files import results
 from tiny_scan import write_scan
 
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
@@ -60,16 +61,6 @@ def words(scan: Path, out: Path, *more: str) -> list[str]:
 
 def reconstruct(scan: Path, out: Path, *more: str) -> int:
     return main(words(scan, out, *more))
-
-
-def results(out: Path) -> dict[str, bytes]:
-    """Every file of a run, without times."""
-    timed = ("report.json", "rounds.jsonl", "growth.png", "report.html")
-    return {
-        str(path.relative_to(out)): path.read_bytes()
-        for path in sorted(out.rglob("*"))
-        if path.is_file() and path.name not in timed
-    }
 
 
 def first_report(out: Path) -> dict:

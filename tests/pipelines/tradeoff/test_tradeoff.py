@@ -56,22 +56,17 @@ def test_a_sweep_leaves_table_front_plot_and_profile(swept):
     assert all(path.suffix == ".json" for path in (swept / "trials").iterdir())
 
 
-def test_the_profile_is_what_reconstruct_takes_and_gives_its_figures(scan, swept, tmp_path):
-    best = json.loads((swept / "tradeoff.json").read_text())["recommended"]
+@pytest.mark.parametrize("label", ["recommended", "profile accurate"])
+def test_reconstruct_gives_the_figures_of_a_trial(scan, swept, tmp_path, label):
+    data = json.loads((swept / "tradeoff.json").read_text())
+    if label == "recommended":
+        tried = data[label]
+        chosen = ["--config", str(swept / "profile.json")]
+    else:
+        tried = next(trial for trial in data["trials"] if trial["label"] == label)
+        chosen = ["--profile", "accurate", *WIDER]
     arguments = ["reconstruct", str(scan), "--context", "every:2", "--targets", "every:2+1"]
-    arguments += ["--config", str(swept / "profile.json"), "--out", str(tmp_path / "run")]
-    assert main([*arguments, "--quiet"]) == 0
-    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert found["observations"] == best["observations"]
-    assert found["psnr"] == pytest.approx(best["psnr"], abs=1e-6)
-
-
-def test_a_profile_is_tried_as_reconstruct_runs_it(scan, swept, tmp_path):
-    trials = json.loads((swept / "tradeoff.json").read_text())["trials"]
-    tried = next(t for t in trials if t["label"] == "profile accurate")
-    arguments = ["reconstruct", str(scan), "--context", "every:2", "--targets", "every:2+1"]
-    arguments += ["--profile", "accurate", "--out", str(tmp_path / "run"), "--quiet"]
-    assert main([*arguments, *WIDER]) == 0
+    assert main([*arguments, "--out", str(tmp_path / "run"), "--quiet", *chosen]) == 0
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert found["observations"] == tried["observations"]
     assert found["psnr"] == pytest.approx(tried["psnr"], abs=1e-6)

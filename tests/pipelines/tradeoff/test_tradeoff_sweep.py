@@ -199,10 +199,10 @@ def test_a_value_of_ones_own_takes_its_place_among_the_others():
 
 
 def test_the_generative_cores_settings_are_swept_where_it_completes():
-    reduced = "holes of reduced effort, share of the diagonal"
-    assert reduced not in axes_of("recorded", RunSettings())
-    core = ["completer=geoverse", "completer.steps=2", "effort.reduced_below=0.2"]
+    small = "holes left to inpaint, share of the diagonal"
+    assert small not in axes_of("recorded", RunSettings())
+    core = ["completer=geoverse", "completer.steps=2", "effort.inpaint_below=0.05"]
     axes = axes_of("recorded", with_texts(RunSettings(), core))
-    assert list(axes[reduced]) == ["0.3", "0.2", "0.1", "0"] and axes[reduced]["0.2"] == {}
+    assert list(axes[small]) == ["0.1", "0.05", "0.02", "0"] and axes[small]["0.05"] == {}
     assert axes["generative steps"]["2"] == {} and "1" in axes["generative steps"]
     assert list(axes["completer"]) == ["none", "inpaint", "geoverse"]

@@ -1,0 +1,59 @@
+"""Kernels in threads, and sets of kernels compiled by other processes."""
+
+from __future__ import annotations
+
+import importlib
+import os
+
+import numba
+import numpy as np
+import pytest
+
+from gvtools.kernels import KernelSet, compile_side_by_side, in_threads
+
+MODULE = """
+from gvtools.kernels import compiled
+
+@compiled()
+def {name}(x):
+    return 2 * x
+
+def compile_it():
+    {name}(3)
+"""
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 1000])
+def test_threads_share_the_work(count):
+    seen = np.zeros(count, np.int64)
+
+    def part(first: int, last: int, step: int) -> int:
+        seen[first:last] += step
+        return last - first
+
+    sizes = in_threads(part, count, 2)
+    assert (seen == 2).all() and sum(sizes) == count
+    assert len(sizes) <= max(1, min(count, numba.get_num_threads()))
+
+
+def test_what_fails_in_a_thread_fails_in_the_caller():
+    with pytest.raises(ZeroDivisionError):
+        in_threads(lambda first, last: 1 // 0, 8)
+
+
+def test_other_processes_leave_kernels_in_the_cache(tmp_path, monkeypatch, capfd):
+    monkeypatch.syspath_prepend(tmp_path)
+    sets = []
+    for name in ("double_once", "double_twice"):
+        (tmp_path / f"module_{name}.py").write_text(MODULE.format(name=name), encoding="utf-8")
+        module = importlib.import_module(f"module_{name}")
+        sets.append(KernelSet(name, module.compile_it, getattr(module, name)))
+    # One that fails stops no other, and is compiled where it is called.
+    broken = KernelSet("broken", os.wait, sets[0].last)
+    assert not any(kernels.cached for kernels in sets)
+    compile_side_by_side([broken, *sets])
+    assert all(kernels.cached for kernels in sets)
+    assert capfd.readouterr() == ("", "")
+    for kernels in sets:
+        assert kernels.last(3) == 6
+        assert kernels.last.stats.cache_hits.total() == 1
