@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.procedural.geometry import BOX, Geometry
+from gvtools.procedural.geometry import BOX, Geometry, Solid
 from gvtools.procedural.shading import Look
-from gvtools.procedural.textures import level_starts, picture, stacked, texture
+from gvtools.procedural.textures import picture, stacked, texture
 
 Float64 = NDArray[np.float64]
 
@@ -59,9 +59,7 @@ class SceneBuilder:
     photographs: Sequence[str]
     rooms: list[tuple[Float64, Float64]] = field(default_factory=list)
     room_material: list[list[int]] = field(default_factory=list)
-    solids: list[tuple[int, Float64, Float64, Float64, int, bool]] = field(default_factory=list)
-    cutters: list[list[tuple[Float64, Float64]]] = field(default_factory=list)
-    cutter_material: list[int] = field(default_factory=list)
+    solids: list[Solid] = field(default_factory=list)
     textures: list[NDArray[np.uint8]] = field(default_factory=list)
     materials: list[tuple[int, Float64, Float64, Float64, float]] = field(default_factory=list)
 
@@ -150,19 +148,10 @@ class SceneBuilder:
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         c, s = np.cos(tilt), np.sin(tilt)
         lean = np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
-        self.solids.append(
-            (
-                kind,
-                lean @ turn,
-                np.asarray(centre, float),
-                np.asarray(half, float),
-                material,
-                shades,
-            )
-        )
-        boxes = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in cuts]
-        self.cutters.append(boxes)
-        self.cutter_material += [material if cut_material is None else cut_material] * len(boxes)
+        boxes = np.array([*cuts], np.float64).reshape(-1, 2, 3)
+        inner = material if cut_material is None else cut_material
+        middle, extent = np.asarray(centre, np.float64), np.asarray(half, np.float64)
+        self.solids.append(Solid(kind, lean @ turn, middle, extent, material, shades, boxes, inner))
 
     def block(self, low: ArrayLike, high: ArrayLike, *, material: int) -> None:
         """A box that stands straight between two corners."""
@@ -171,30 +160,12 @@ class SceneBuilder:
 
     def geometry(self) -> Geometry:
         """Everything put in so far, for rays."""
-        count = len(self.solids)
-        boxes = [box for boxes in self.cutters for box in boxes]
-        kind, rotation, centre, half, material, shades = (
-            zip(*self.solids, strict=True) if count else ((),) * 6
-        )
-        ends = np.cumsum([0, *(len(boxes) for boxes in self.cutters)])
-        return Geometry(
-            np.array(self.rooms, np.float64),
-            np.array(self.room_material, np.int64),
-            np.array(kind, np.int64),
-            np.array(rotation, np.float64).reshape(count, 3, 3),
-            np.array(centre, np.float64).reshape(count, 3),
-            np.array(half, np.float64).reshape(count, 3),
-            np.array(material, np.int64),
-            np.array(shades, np.bool_),
-            ends.astype(np.int64),
-            np.array(boxes, np.float64).reshape(len(boxes), 2, 3),
-            np.array(self.cutter_material, np.int64),
-        )
+        rooms, materials = np.array(self.rooms, np.float64), np.array(self.room_material, np.int64)
+        return Geometry(rooms, materials, tuple(self.solids))
 
     def look(self, light: Light) -> Look:
         """Materials and a light, for shading."""
         rows, tile, offset, gain, emission = zip(*self.materials, strict=True)
-        side = len(self.textures[0])
         return Look(
             np.array(rows, np.int64),
             np.array(tile, np.float64),
@@ -202,11 +173,5 @@ class SceneBuilder:
             np.array(gain, np.float64),
             np.array(emission, np.float64),
             stacked(self.textures),
-            level_starts(side),
-            side,
-            light.ambient,
-            light.sun,
-            light.lamps,
-            float(light.reach),
-            bool(light.shadows),
+            **vars(light),
         )

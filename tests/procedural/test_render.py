@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from reference_rays import first_surface, is_free
@@ -8,6 +10,7 @@ from gvtools.cameras import Cameras, invert_rigid
 from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
 from gvtools.procedural.geometry import BALL, BOX, TUBE, clearance
 from gvtools.procedural.layouts import scene
+from gvtools.procedural.mesh import mesh_of
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import cast
 from gvtools.procedural.render import developed, radiance
@@ -31,7 +34,7 @@ def _rays(cameras: Cameras, view: int) -> np.ndarray:
 def _white(look: Look, **changes) -> Look:
     """Every surface white and dark but for the light that is given."""
     black = {
-        "texels": np.ones_like(look.texels),
+        "levels": tuple(np.ones_like(level) for level in look.levels),
         "gain": np.ones_like(look.gain),
         "emission": np.zeros_like(look.emission),
         "ambient": np.zeros((2, 3)),
@@ -39,7 +42,14 @@ def _white(look: Look, **changes) -> Look:
         "lamps": np.zeros((1, 2, 3)),
         "shadows": False,
     }
-    return look._replace(**{**black, **changes})
+    return replace(look, **{**black, **changes})
+
+
+def _check_depth(found: np.ndarray, expected: np.ndarray) -> None:
+    """Flat surfaces to single precision; balls and tubes, which are polyhedra, nearly so."""
+    error = np.abs(found.ravel() / expected - 1)
+    assert np.quantile(error, 0.5) < 1e-6
+    assert (error > 2e-3).mean() < 0.01
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -48,7 +58,7 @@ def test_depth_is_where_rays_leave_free_space(seed: int) -> None:
     depth = cast(place.geometry, cameras).depth
     for view in range(len(cameras)):
         expected = first_surface(place.geometry, cameras.centers[view], _rays(cameras, view))
-        np.testing.assert_allclose(depth[view].ravel(), expected, rtol=1e-9)
+        _check_depth(depth[view], expected)
 
 
 def test_the_picture_has_the_same_depth() -> None:
@@ -73,9 +83,8 @@ def test_solids_on_their_own_and_from_within_their_hull() -> None:
     for eye in ([0.1, 0.2, 1.4], [-3.0, -3.0, 2.0], [2.0, -4.5, 2.2]):
         assert is_free(geometry, np.array(eye))
         camera = _towards(np.array(eye), rng.uniform([1, -1, 1], [3, 1, 3]))
-        depth = cast(geometry, camera).depth[0].ravel()
         expected = first_surface(geometry, np.array(eye), _rays(camera, 0))
-        np.testing.assert_allclose(depth, expected, rtol=1e-9)
+        _check_depth(cast(geometry, camera).depth[0], expected)
 
 
 def _towards(eye: np.ndarray, aim: np.ndarray) -> Cameras:
@@ -132,7 +141,7 @@ def test_the_lamp_lights_what_it_sees(seed: int) -> None:
     open_ = radiance(geometry, _white(place.look, lamps=lamp[None]), cameras, supersample=1)[0]
     facing = open_[0, ..., 0].ravel() > 1e-3
     rays = _rays(cameras, 0)
-    depth = cast(geometry, cameras).depth[0].reshape(-1, 1)
+    depth = first_surface(geometry, cameras.centers[0], rays)[:, None]
     start = cameras.centers[0] + depth * (1 - 1e-6) * rays
     clear = first_surface(geometry, start, lamp[0] - start) >= 1
     assert ((lit > 0) != clear)[facing].mean() < 0.005
@@ -210,11 +219,12 @@ def test_pictures_do_not_depend_on_threads() -> None:
 
 
 def test_scenes_are_those_of_their_seed() -> None:
-    def arrays(place: ProceduralScene) -> list[np.ndarray]:
-        return [*place.geometry, *(part for part in place.look if isinstance(part, np.ndarray))]
+    def corners(place: ProceduralScene) -> np.ndarray:
+        return mesh_of(place.geometry).corners
 
     first, again, other = (scene(np.random.default_rng(n), "train") for n in (7, 7, 8))
-    assert all(np.array_equal(a, b) for a, b in zip(arrays(first), arrays(again), strict=True))
+    np.testing.assert_array_equal(corners(first), corners(again))
+    np.testing.assert_array_equal(first.look.levels[0], again.look.levels[0])
     assert not np.array_equal(first.geometry.rooms[0], other.geometry.rooms[0])
 
 
@@ -244,7 +254,8 @@ def test_several_lamps_add_up_and_some_things_cast_no_shadow() -> None:
     camera = _towards(np.array([-2.0, -2.0, 1.5]), np.zeros(3))
 
     def light(lamps: np.ndarray, *, shades: bool) -> np.ndarray:
-        geometry = build.geometry()._replace(shades=np.array([shades]))
+        plain = build.geometry()
+        geometry = replace(plain, solids=(replace(plain.solids[0], shades=shades),))
         look = build.look(Light(np.zeros((2, 3)), np.zeros((2, 3)), lamps, 2.0, True))
         return radiance(geometry, look, camera)[0]
 

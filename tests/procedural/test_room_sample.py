@@ -69,7 +69,9 @@ def test_depth_is_where_rays_leave_free_space(scene: Scene, frames: list[Frame])
         pose = scene.cameras.cam_from_world[view, :3, :3]
         rays = scene.cameras.rays(view)[y, x] @ pose
         expected = first_surface(geometry, scene.cameras.centers[view], rays)
-        np.testing.assert_allclose(frame.depth[y, x], expected, rtol=1e-5)
+        error = np.abs(frame.depth[y, x] / expected - 1)
+        # Balls and tubes are polyhedra, nearly as round.
+        assert np.median(error) < 1e-6 and np.quantile(error, 0.95) < 1e-3
 
 
 def test_depth_carries_one_views_colours_into_another(scene: Scene, frames: list[Frame]) -> None:
@@ -173,7 +175,7 @@ def test_same_seed_same_bytes(sample: RoomSample, tmp_path: Path) -> None:
 def test_another_seed_is_another_room() -> None:
     one, other = furnished_room(1).geometry, furnished_room(2).geometry
     assert np.abs(one.rooms - other.rooms).max() > 0.05
-    assert len(one.kind) != len(other.kind)
+    assert len(one.solids) != len(other.solids)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -184,7 +186,8 @@ def test_cameras_stand_clear_of_furniture(seed: int) -> None:
     ring = half + (half - 1.2) * np.stack([np.cos(angle), np.sin(angle)], -1)
     eyes = np.concatenate([np.c_[ring, np.full(len(ring), up)] for up in (1.34, 1.56)])
     assert clearance(geometry, eyes).min() > 0.15
-    assert (geometry.centre > -1e-9).all() and (geometry.centre < geometry.rooms[0, 1] + 1e-9).all()
+    centre = np.array([solid.centre for solid in geometry.solids])
+    assert (centre > -1e-9).all() and (centre < geometry.rooms[0, 1] + 1e-9).all()
 
 
 @pytest.mark.parametrize("seed", range(3))
