@@ -1,6 +1,6 @@
 """Batches of a data set, made ahead by other processes; what they hold does not depend on those.
 
-A sample follows from its number, so that the only state of a loader is the number that comes next.
+A sample follows from its number, so that a loader has no state to save.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import numba
 import torch
 from numpy.typing import NDArray
 
-from gvtools.errors import GvError, OptionError
+from gvtools.errors import GvError
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.dataset import Samples
 from gvtools.training.view_sample import Sample, collated
 
+STEPS_AHEAD = 2
 # A sample on its way: its number, its context views, its tensors as arrays; or why there is none.
 _Made = tuple[int, int, dict[str, NDArray[Any]] | GvError]
 
@@ -28,17 +29,14 @@ _Made = tuple[int, int, dict[str, NDArray[Any]] | GvError]
 class BatchLoader:
     """Batches by the numbers of their samples.
 
-    Call it with the numbers of a batch, or iterate over it. Samples are made ahead in the order of
-    steps of ``batch`` samples, of which this process takes its ``share``; any other order gives
-    the same batches, but nothing is ready then.
+    Samples are made ahead in the order of steps of ``batch`` samples, of which this process takes
+    its ``share``; any other order gives the same batches, but nothing is ready then.
 
     Args:
         data: the data set; has to be picklable when there are workers.
         batch: samples a step, over all processes.
         workers: processes that make samples; 0 makes them when they are asked for.
-        ahead: steps that are made ahead.
         share: of a step's numbers, those of this process; None for all.
-        start: number of the first sample.
     """
 
     def __init__(
@@ -47,13 +45,9 @@ class BatchLoader:
         batch: int,
         *,
         workers: int = 0,
-        ahead: int = 2,
         share: Callable[[range], range] | None = None,
-        start: int = 0,
     ) -> None:
-        self.data, self.batch, self.workers, self.ahead = data, batch, workers, ahead
-        self.share = share
-        self.next_index = start
+        self.data, self.batch, self.workers, self.share = data, batch, workers, share
         self._stream: Iterator[_Made] | None = None
         self._expected = -1
 
@@ -61,44 +55,13 @@ class BatchLoader:
         """The batch of some samples.
 
         Raises:
-            OptionError: no numbers.
             ShapeError: their numbers of context views differ.
         """
-        if not len(numbers):
-            raise OptionError("a batch of no samples; expected at least one number")
-        samples = [self._take(number) for number in numbers]
-        self.next_index = numbers[-1] + 1
-        return collated(samples)
-
-    def __iter__(self) -> Iterator[TrainingBatch]:
-        """Endless batches of whole steps, from the next one on."""
-        while True:
-            step = self.next_index // self.batch
-            mine = self._share(step)
-            left = range(max(self.next_index, mine.start), mine.stop)
-            end = (step + 1) * self.batch
-            if len(left):
-                batch = self(left)
-                self.next_index = end
-                yield batch
-            self.next_index = end
-
-    def state_dict(self) -> dict[str, int]:
-        """What is needed to go on exactly here."""
-        return {"next_index": self.next_index}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on where ``state_dict`` was taken."""
-        self.next_index = int(state["next_index"])
+        return collated([self._take(number) for number in numbers])
 
     def close(self) -> None:
         """End the workers."""
         self._stream = None
-        self._expected = -1
-
-    def _share(self, step: int) -> range:
-        whole = range(step * self.batch, (step + 1) * self.batch)
-        return whole if self.share is None else self.share(whole)
 
     def _take(self, number: int) -> Sample:
         if not self.workers:
@@ -112,12 +75,9 @@ class BatchLoader:
             # Outside this process's share nothing is made ahead.
             self._expected = -1
             return self.data.sample(number)
-        self._expected = self._following(number)
+        self._expected = next(iter(_Order(self, number + 1)))
         tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in values.items()}
         return Sample(**tensors, context=context)
-
-    def _following(self, number: int) -> int:
-        return next(iter(_Order(self, number + 1)))
 
     def _loader(self, start: int) -> torch.utils.data.DataLoader:
         return torch.utils.data.DataLoader(
@@ -127,7 +87,7 @@ class BatchLoader:
             num_workers=self.workers,
             collate_fn=_unchanged,
             worker_init_fn=_begun,
-            prefetch_factor=max(2, -(-self.ahead * self.batch // self.workers)),
+            prefetch_factor=max(2, -(-STEPS_AHEAD * self.batch // self.workers)),
             # Threads of a compiled kernel do not survive a fork.
             multiprocessing_context="spawn",
             # Torch would otherwise draw a number from its global generator.
@@ -142,9 +102,11 @@ class _Order:
         self.loader, self.start = loader, start
 
     def __iter__(self) -> Iterator[int]:
-        step = self.start // self.loader.batch
+        batch, share = self.loader.batch, self.loader.share
+        step = self.start // batch
         while True:
-            yield from (n for n in self.loader._share(step) if n >= self.start)
+            whole = range(step * batch, (step + 1) * batch)
+            yield from (n for n in (share(whole) if share else whole) if n >= self.start)
             step += 1
 
 

@@ -125,7 +125,7 @@ class StageRun:
             self.folder.mkdir(parents=True, exist_ok=True)
             text = json.dumps(self.config.to_dict(), indent=2) + "\n"
             write_text(self.folder / SETTINGS, text)
-        samples.start(trainer, self.processes)
+        samples.start(self.options.optimizer.batch, self.processes)
         check_parts(self.options.optimizer, self.processes, samples.group)
         log = TrainingLog(self.folder, step=trainer.progress.step) if self.processes.first else None
 

@@ -26,7 +26,16 @@ from gvtools.training.view_sample import Sample
 
 COLORS, DEPTHS = ("images", "hint"), ("depth", "hint_depth")
 # Packages whose code makes samples, "" for the modules of the project's own folder.
-MAKERS = ("", "training", "memory", "completers", "completers/geoverse", "scenes", "depth")
+MAKERS = (
+    "",
+    "training",
+    "procedural",
+    "memory",
+    "completers",
+    "completers/geoverse",
+    "scenes",
+    "depth",
+)
 GREATEST = float(np.finfo(np.float16).max)
 
 

@@ -7,12 +7,11 @@ from pathlib import Path
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.procedural.photographs import photograph_names
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.context_choice import ContextOptions
+from gvtools.training.context_choice import ContextChoice
 from gvtools.training.dataset import MixedViews, ProceduralViews
 from gvtools.training.dataset import Samples as DataSet
 from gvtools.training.distributed import Processes
 from gvtools.training.loader import BatchLoader
-from gvtools.training.loop import Trainer
 from gvtools.training.options import TrainingSettings
 from gvtools.training.sample_pool import PooledViews
 from gvtools.training.view_sample import collated
@@ -32,7 +31,7 @@ class TrainingSamples:
     def __init__(self, config: TrainingSettings, model: GeoVerseConfig) -> None:
         self.config = config
         most = min(model.context, config.data.views - 1)
-        self._context = ContextOptions(most=most)
+        self._context = ContextChoice(most=most)
         self._fill = model.hints.fill
         self._loader: BatchLoader | None = None
         self._data = self._pooled(self._data_set("train"))
@@ -47,15 +46,13 @@ class TrainingSamples:
         """Those of the textures that are installed: they decide the samples."""
         return photograph_names("train")
 
-    def start(self, trainer: Trainer, processes: Processes) -> None:
-        """Make samples ahead, from the trainer's next step on."""
-        options = trainer.options
+    def start(self, batch: int, processes: Processes) -> None:
+        """Make samples ahead, of steps of ``batch`` samples that processes share."""
         self._loader = BatchLoader(
             self._data,
-            options.batch,
+            batch,
             workers=self.config.data.workers,
             share=processes.share,
-            start=trainer.progress.step * options.batch,
         )
 
     def batch(self, samples: range) -> TrainingBatch:

@@ -7,9 +7,9 @@ from reference_rays import is_free
 from gvtools.errors import OptionError
 from gvtools.procedural.geometry import clearance
 from gvtools.procedural.layouts import scene
-from gvtools.procedural.paths import PathOptions, camera_path
+from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import cast
-from gvtools.training.context_choice import ContextOptions, chosen_context
+from gvtools.training.context_choice import ContextChoice, chosen_context
 
 SIZE = (48, 64)
 
@@ -83,19 +83,11 @@ def test_context_rules(rule: str, count: int, expected: set[tuple[int, ...]]) ->
 
 
 def test_context_counts_come_in_groups() -> None:
-    options = ContextOptions(group=4)
+    options = ContextChoice(group=4)
     counts = np.array([options.count([0, 1], index) for index in range(400)]).reshape(-1, 4)
     assert (counts == counts[:, :1]).all()
     assert {int(c) for c in counts[:, 0]} == {1, 2, 3, 4}
     assert np.bincount(counts[:, 0])[1:].min() > 10
-
-
-def test_chances_choose_the_rule() -> None:
-    rng = np.random.default_rng(0)
-    first = ContextOptions(extrapolation=1.0)
-    assert {first.chosen(rng, 8, 2) for _ in range(50)} == {(0, 1)}
-    ends = ContextOptions(extrapolation=0.0, ends=1.0)
-    assert {ends.chosen(rng, 8, 2) for _ in range(50)} == {(0, 7)}
 
 
 def test_impossible_choices_are_refused() -> None:
@@ -104,7 +96,3 @@ def test_impossible_choices_are_refused() -> None:
         chosen_context(rng, 8, 8, "first")
     with pytest.raises(OptionError, match="every, ends, first"):
         chosen_context(rng, 8, 2, "last")
-    with pytest.raises(OptionError, match=r"paths\.fov"):
-        PathOptions(fov=(80.0, 50.0))
-    with pytest.raises(OptionError, match=r"context\.most"):
-        ContextOptions(least=3, most=2)

@@ -12,17 +12,16 @@ from tiny_scan import render, world_from_cam, write_colmap_scan
 from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.procedural.layouts import scene
-from gvtools.procedural.paths import PathOptions, camera_path
+from gvtools.procedural.paths import camera_path
 from gvtools.procedural.render import developed, radiance
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
-from gvtools.training.context_choice import ContextOptions
+from gvtools.training.context_choice import ContextChoice
 from gvtools.training.dataset import ProceduralViews
 from gvtools.training.scene_views import SceneViews, overlaps
 from gvtools.training.view_sample import collated
 
 TALL, WIDE = 96, 128
-GENTLE = PathOptions(travel=(0.2, 0.5), turn=(10.0, 40.0))
 
 
 class Loaded:
@@ -39,7 +38,7 @@ class Loaded:
 def _scene(seed: int = 0, *, count: int = 20, masked: bool = False) -> Scene:
     rng = np.random.default_rng([seed, 4])
     place = scene(rng, "train")
-    path = camera_path(rng, place.geometry, views=count, size=(TALL, WIDE), options=GENTLE)
+    path = camera_path(rng, place.geometry, views=count, size=(TALL, WIDE))
     light, depth = radiance(place.geometry, place.look, path.cameras)
     rgb = developed(light, place.key / light.mean())
     mask = np.ones((TALL, WIDE), bool)
@@ -141,8 +140,8 @@ def test_a_colmap_project_with_depth_maps_gives_samples(tmp_path):
         depth = render(world_from_cam(index))[1].astype(np.float32)
         np.save(folder / f"{view.name}.npy", depth)
     data = SceneViews(
-        scenes=(open_project(home),), faults=None, views=4, size=(32, 32), overlap=0.0, detail=1,
-        context=ContextOptions(most=2),
+        scenes=(open_project(home),), faults=None, views=4, size=(32, 32), overlap=0.0,
+        context=ContextChoice(most=2),
     )  # fmt: skip
     sample = data.sample(0)
     k = sample.context
@@ -168,10 +167,10 @@ def test_a_selection_limits_the_views(tmp_path):
     place = _scene(count=20)
     data = SceneViews(
         scenes=(place,), select="every:4", views=4, size=(32, 32), overlap=0.0,
-        context=ContextOptions(most=2),
+        context=ContextChoice(most=2),
     )  # fmt: skip
     listed = data.describe()["scenes"][0]["views"]
     assert listed == [view.name for view in place][::4]
     assert data.sample(3).images.shape == (4, 3, 32, 32)
     with pytest.raises(ProjectError, match="'every:10'"):
-        SceneViews(scenes=(place,), select="every:10", views=4, context=ContextOptions(most=2))
+        SceneViews(scenes=(place,), select="every:10", views=4, context=ContextChoice(most=2))
