@@ -9,24 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.procedural.geometry import BOX, Geometry, Solid
-from gvtools.procedural.shading import Look
+from gvtools.procedural.shading import Light, Look
 from gvtools.procedural.textures import picture, stacked, texture
 
 Float64 = NDArray[np.float64]
 
 # Order of a room's materials: walls -x, +x, -y, +y, floor, ceiling.
 FLOOR, CEILING = 4, 5
-
-
-@dataclass(frozen=True, eq=False)
-class Light:
-    """See ``shading.Look``."""
-
-    ambient: Float64
-    sun: Float64
-    lamps: Float64
-    reach: float
-    shadows: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,5 +162,5 @@ class SceneBuilder:
             np.array(gain, np.float64),
             np.array(emission, np.float64),
             stacked(self.textures),
-            **vars(light),
+            light,
         )

@@ -13,9 +13,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
+from gvtools.procedural.builder import ProceduralScene, SceneBuilder
 from gvtools.procedural.geometry import BALL, BOX, TUBE
 from gvtools.procedural.materials import PICTURES, Color, globe, paint, picture, planks, tiled
+from gvtools.procedural.shading import Light
 
 Float64 = NDArray[np.float64]
 

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
+from gvtools.procedural.builder import ProceduralScene, SceneBuilder
 from gvtools.procedural.clutter import add_clutter
 from gvtools.procedural.geometry import Geometry, clearance
 from gvtools.procedural.openings import add_frames, add_openings, add_side_room
 from gvtools.procedural.photographs import photograph_names
+from gvtools.procedural.shading import Light
 
 Float64 = NDArray[np.float64]
 Range = tuple[float, float]

@@ -20,6 +20,25 @@ LIFT = 2e-4
 
 
 @dataclass(frozen=True, eq=False)
+class Light:
+    """What lights a scene. Colours are linear light.
+
+    Attributes:
+        ambient: (2, 3) light from above and from below.
+        sun: (2, 3) direction towards it (unit length), and its light.
+        lamps: (L, 2, 3) position, and its light on a surface that faces it from half its reach.
+        reach: metres; a lamp's light falls off as 1 / (1 + (distance / reach)²).
+        shadows: whether solids and walls keep the lamps' light away.
+    """
+
+    ambient: Float64
+    sun: Float64
+    lamps: Float64
+    reach: float
+    shadows: bool
+
+
+@dataclass(frozen=True, eq=False)
 class Look:
     """Materials and light. Colours are linear light.
 
@@ -30,11 +49,7 @@ class Look:
         gain: (P, 3) factor on the texture.
         emission: (P,) light of the surface's own, for what lies outside windows.
         levels: of all textures, see ``textures.stacked``.
-        ambient: (2, 3) light from above and from below.
-        sun: (2, 3) direction towards it (unit length), and its light.
-        lamps: (L, 2, 3) position, and its light on a surface that faces it from half its reach.
-        reach: metres; a lamp's light falls off as 1 / (1 + (distance / reach)²).
-        shadows: whether solids and walls keep the lamps' light away.
+        light: see Light.
     """
 
     texture: Int64
@@ -43,11 +58,7 @@ class Look:
     gain: Float64
     emission: Float64
     levels: tuple[Float32, ...]
-    ambient: Float64
-    sun: Float64
-    lamps: Float64
-    reach: float
-    shadows: bool
+    light: Light
 
 
 def colors(geometry: Geometry, look: Look, rays: Float32, pixel: float) -> Float32:
@@ -79,7 +90,7 @@ def colors(geometry: Geometry, look: Look, rays: Float32, pixel: float) -> Float
     level = np.log2(np.maximum(t * np.sqrt(spread) * texel, np.float32(1e-6)))
     texels = _sampled(look.levels, look.texture[material], copies.astype(np.float32), level)
 
-    light = _light(geometry, look, points, normal)
+    light = _light(geometry, look.light, points, normal)
     light += look.emission.astype(np.float32)[material]
     light *= look.gain.T.astype(np.float32)[:, material]
     light[:, missed] = 0
@@ -127,21 +138,21 @@ def _texture_place(
     return place, length
 
 
-def _light(geometry: Geometry, look: Look, points: Float32, normal: Float32) -> Float32:
+def _light(geometry: Geometry, source: Light, points: Float32, normal: Float32) -> Float32:
     """(3, N) light on surface points (3, N)."""
-    above, below = look.ambient.astype(np.float32)[..., None]
-    direction, strength = look.sun.astype(np.float32)
+    above, below = source.ambient.astype(np.float32)[..., None]
+    direction, strength = source.sun.astype(np.float32)
     light = below + (above - below) * (0.5 + 0.5 * normal[2])
     light += np.maximum(direction @ normal, 0) * strength[:, None]
     lifted = points + np.float32(LIFT) * normal
-    for place, color in look.lamps.astype(np.float32)[..., None]:
+    for place, color in source.lamps.astype(np.float32)[..., None]:
         if not color.any():
             continue
         way = place - points
         squared = _dot(way, way)
         lit = np.maximum(_dot(way, normal), 0) / np.sqrt(squared + np.float32(1e-12))
-        lit *= np.float32(1.25) / (1 + squared / np.float32(look.reach**2))
-        if look.shadows:
+        lit *= np.float32(1.25) / (1 + squared / np.float32(source.reach**2))
+        if source.shadows:
             towards = np.flatnonzero(lit)
             start = lifted[:, towards]
             blocked = tracer(geometry).blocked(np.concatenate([start, place - start]).T.copy())

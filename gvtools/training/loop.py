@@ -14,10 +14,10 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from gvtools.errors import OptionError
 from gvtools.training.batch import TrainingBatch
@@ -27,18 +27,8 @@ from gvtools.training.ema import AveragedWeights
 from gvtools.training.options import OptimizerOptions
 from gvtools.training.state import Progress, StageState, load_state, save_state
 
-
-class Stage(Protocol):
-    """A module whose ``forward`` gives the loss of a batch and its terms."""
-
-    name: str
-
-    def __call__(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss and what is logged beside it."""
-        ...
-
-
 Batches = Callable[[range], TrainingBatch]
+Record = Callable[[int, dict[str, float]], None]
 
 # Saving takes at most one part in so many of the time.
 SAVING_SHARE = 20
@@ -51,16 +41,16 @@ class Reporting:
     Attributes:
         log_every: steps between records.
         save_seconds: seconds between checkpoints; more where saving takes long.
-        sheet_every: steps between sample sheets; 0 for none.
-        record: gets (step, values).
+        sheet_every: steps between sample sheets.
+        record: gets (step, values), means over all processes.
         sheet: gets the step, in every process; the averaged weights are in place meanwhile.
     """
 
     log_every: int = 20
     save_seconds: float = 60.0
     sheet_every: int = 0
-    record: Callable[[int, dict[str, float]], None] = lambda step, values: None
-    sheet: Callable[[int], None] = lambda step: None
+    record: Record | None = None
+    sheet: Callable[[int], None] | None = None
 
 
 class Trainer:
@@ -103,6 +93,11 @@ class Trainer:
         )
         self.ema = AveragedWeights(self.parameters, options.ema)
         self.progress = Progress()
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps are made."""
+        return self.progress.step >= self.options.steps
 
     def resume(self) -> bool:
         """Continue from the saved state; False where there is none."""
@@ -164,10 +159,10 @@ class Trainer:
                     "skipped": float(self.progress.skipped),
                     "seconds": self.progress.seconds,
                 }
-                if self.processes.first:
+                if reporting.record is not None:
                     reporting.record(step, values)
                 kept = []
-            if reporting.sheet_every and step % reporting.sheet_every == 0:
+            if reporting.sheet is not None and step % reporting.sheet_every == 0:
                 with self.ema.swapped_in(), torch.no_grad():
                     reporting.sheet(step)
             # The clocks of the processes differ, and all of them save.
@@ -189,7 +184,7 @@ class Trainer:
         good = True
         for part in _parts(mine, options.accumulate):
             batch = self.batches(part).to(self.processes.device)
-            draws = Draws(self.seed, str(self.stage.name), number, tuple(part))
+            draws = Draws(self.seed, self.stage.name, number, tuple(part))
             with self._precision():
                 loss, terms = self.stage(batch, draws)
             value = float(loss.detach())

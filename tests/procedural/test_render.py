@@ -7,14 +7,14 @@ import pytest
 from reference_rays import first_surface, is_free
 
 from gvtools.cameras import Cameras, invert_rigid
-from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
+from gvtools.procedural.builder import ProceduralScene, SceneBuilder
 from gvtools.procedural.geometry import BALL, BOX, TUBE, clearance
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.mesh import mesh_of
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import cast
 from gvtools.procedural.render import developed, radiance
-from gvtools.procedural.shading import Look
+from gvtools.procedural.shading import Light, Look
 from gvtools.trajectories import look_at
 
 SEEDS = range(8)
@@ -34,15 +34,18 @@ def _rays(cameras: Cameras, view: int) -> np.ndarray:
 def _white(look: Look, **changes) -> Look:
     """Every surface white and dark but for the light that is given."""
     black = {
-        "levels": tuple(np.ones_like(level) for level in look.levels),
-        "gain": np.ones_like(look.gain),
-        "emission": np.zeros_like(look.emission),
         "ambient": np.zeros((2, 3)),
         "sun": np.array([[0, 0, 1.0], [0, 0, 0]]),
         "lamps": np.zeros((1, 2, 3)),
         "shadows": False,
     }
-    return replace(look, **{**black, **changes})
+    return replace(
+        look,
+        levels=tuple(np.ones_like(level) for level in look.levels),
+        gain=np.ones_like(look.gain),
+        emission=np.zeros_like(look.emission),
+        light=replace(look.light, **{**black, **changes}),
+    )
 
 
 def _check_depth(found: np.ndarray, expected: np.ndarray) -> None:
@@ -133,7 +136,7 @@ def test_normals_are_those_of_neighbouring_surface_points(seed: int) -> None:
 def test_the_lamp_lights_what_it_sees(seed: int) -> None:
     place, cameras = _drawn(seed, views=1)
     geometry = place.geometry
-    lamp = np.stack([place.look.lamps[0, 0], np.ones(3)])
+    lamp = np.stack([place.look.light.lamps[0, 0], np.ones(3)])
     assert is_free(geometry, lamp[0])
     lit = radiance(
         geometry, _white(place.look, lamps=lamp[None], shadows=True), cameras, supersample=1

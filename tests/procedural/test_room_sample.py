@@ -193,7 +193,7 @@ def test_cameras_stand_clear_of_furniture(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_lamps_hang_in_free_space(seed: int) -> None:
     room = furnished_room(seed)
-    assert is_free(room.geometry, room.look.lamps[:, 0]).all()
+    assert is_free(room.geometry, room.look.light.lamps[:, 0]).all()
 
 
 def test_existing_sample_is_kept_and_others_refused(sample: RoomSample, tmp_path: Path) -> None:
