@@ -23,13 +23,11 @@ class ProceduralScene:
     """A scene to be rendered.
 
     Attributes:
-        kind: which layout it is.
         geometry: what rays meet.
         look: materials and light.
         key: what the mean of the pictures shall be, linear light.
     """
 
-    kind: str
     geometry: Geometry
     look: Look
     key: float

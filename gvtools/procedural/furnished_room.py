@@ -156,7 +156,7 @@ def furnished_room(seed: int) -> ProceduralScene:
         reach=3.0,
         shadows=True,
     )
-    return ProceduralScene("furnished", room.build.geometry(), room.build.look(light), KEY)
+    return ProceduralScene(room.build.geometry(), room.build.look(light), KEY)
 
 
 def _shell(room: _Furnisher, size: Float64) -> None:

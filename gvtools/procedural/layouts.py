@@ -80,13 +80,10 @@ def scene(rng: np.random.Generator, split: str) -> ProceduralScene:
     """
     build = SceneBuilder(rng, photograph_names(split))
     style = STYLES[split]
-    kind = rng.choice(len(_LAYOUTS), p=style.kinds)
-    _LAYOUTS[kind](build, style)
+    _LAYOUTS[rng.choice(len(_LAYOUTS), p=style.kinds)](build, style)
     geometry = build.geometry()
     light = _light(rng, geometry)
-    return ProceduralScene(
-        _LAYOUTS[kind].__name__[1:], geometry, build.look(light), rng.uniform(*style.key)
-    )
+    return ProceduralScene(geometry, build.look(light), rng.uniform(*style.key))
 
 
 def _skin(build: SceneBuilder) -> list[int]:

@@ -130,10 +130,9 @@ def _triangles(squares: Float64, solid: Int64, kind: Int64, material: Int64) -> 
 
 def _round(solid: Solid) -> Mesh:
     """A ball, or what is left of it beside its first cut; a tube is never cut."""
-    body = _unit_body(solid.kind)
+    corners = _unit_body(solid.kind)
     if len(solid.cuts):
-        body = _less_box(body, solid.cuts[0] / solid.half)
-    corners = _corners(body)
+        corners = _less_box(corners, solid.cuts[0] / solid.half)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     outwards = np.abs((across * corners.mean(1)).sum(-1))
     outwards /= np.linalg.norm(across, axis=-1) * np.linalg.norm(corners.mean(1), axis=-1)
@@ -148,33 +147,39 @@ def _round(solid: Solid) -> Mesh:
 
 
 @cache
-def _unit_body(kind: int) -> TriangleMesh:
-    """A ball of radius 1, or a tube of radius 1 and height 2."""
+def _unit_body(kind: int) -> Float64:
+    """(T, 3, 3) triangles of a ball of radius 1, or of a tube of radius 1 and height 2."""
     from open3d.t.geometry import TriangleMesh
 
     if kind == BALL:
-        return TriangleMesh.create_sphere(1.0, SEGMENTS // 2)
-    return TriangleMesh.create_cylinder(1.0, 2.0, SEGMENTS, 1)
+        return _corners(TriangleMesh.create_sphere(1.0, SEGMENTS // 2))
+    return _corners(TriangleMesh.create_cylinder(1.0, 2.0, SEGMENTS, 1))
 
 
 def _corners(body: TriangleMesh) -> Float64:
-    """(T, 3, 3); none of an empty mesh, which has no attributes."""
+    """(T, 3, 3), a copy; none of an empty mesh, which has no attributes."""
     if "indices" not in body.triangle:
         return np.empty((0, 3, 3))
     return body.vertex.positions.numpy().astype(np.float64)[body.triangle.indices.numpy()]
 
 
-def _less_box(ball: TriangleMesh, box: Float64) -> TriangleMesh:
-    """The unit ball less a box, with the faces of the cut."""
+def triangle_mesh(corners: Float64) -> TriangleMesh:
+    """Triangles (T, 3, 3) for Open3D."""
     from open3d.t.geometry import TriangleMesh
 
+    positions = corners.reshape(-1, 3).astype(np.float32)
+    return TriangleMesh(positions, np.arange(len(positions)).reshape(-1, 3))
+
+
+def _less_box(ball: Float64, box: Float64) -> Float64:
+    """(T, 3, 3) the unit ball less a box, with the faces of the cut."""
     planes = [
         (corner * unit, sign * unit)
         for corner, sign in zip(box, (-1.0, 1.0), strict=True)
         for unit in np.eye(3)
         if abs(corner @ unit) < 1
     ]
-    kept, rest = [], ball
+    kept, rest = [], triangle_mesh(ball)
     for number, (point, outwards) in enumerate(planes):
         kept.append(rest.clip_plane(point, outwards))
         rest = rest.clip_plane(point, -outwards)
@@ -183,8 +188,7 @@ def _less_box(ball: TriangleMesh, box: Float64) -> TriangleMesh:
             if other != number and len(_corners(face)):
                 face = face.clip_plane(through, -away)
         kept.append(face)
-    corners = np.concatenate([_corners(part) for part in kept]).reshape(-1, 3)
-    return TriangleMesh(corners.astype(np.float32), np.arange(len(corners)).reshape(-1, 3))
+    return np.concatenate([_corners(part) for part in kept])
 
 
 def _disc(point: Float64, normal: Float64) -> TriangleMesh:

@@ -29,29 +29,14 @@ CLEARANCE = 0.06  # least distance to anything
 NEAREST = 0.08  # least z-depth of a pixel
 
 
-@dataclass(frozen=True, eq=False)
-class CameraPath:
-    """Cameras in order along a path.
-
-    Attributes:
-        cameras: V of them.
-        kind: forward, orbit, pan, pull_back or walk.
-        attempts: how many paths were drawn for it.
-    """
-
-    cameras: Cameras
-    kind: str
-    attempts: int
-
-
 def camera_path(
     rng: np.random.Generator,
     geometry: Geometry,
     *,
     views: int,
     size: tuple[int, int],
-) -> CameraPath:
-    """A path through the free space of a scene.
+) -> Cameras:
+    """The cameras, in order, of a path through the free space of a scene.
 
     Args:
         rng: decides everything.
@@ -74,10 +59,10 @@ def camera_path(
         poses = _leaning(rng, *_KINDS[kind](move, start, forward, views))
         cameras = _cameras(K, poses, size)
         if _is_free(geometry, cameras, depth):
-            return CameraPath(cameras, _KINDS[kind].__name__[1:], attempt + 1)
+            return cameras
     move = _Move(rng, depth, 0.0, np.radians(TURN[1] / 2))
     poses = _leaning(rng, *_pan(move, start, forward, views))
-    return CameraPath(_cameras(K, poses, size), "pan", ATTEMPTS + 1)
+    return _cameras(K, poses, size)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.procedural.geometry import Geometry
-from gvtools.procedural.mesh import mesh_of
+from gvtools.procedural.mesh import mesh_of, triangle_mesh
 
 if TYPE_CHECKING:
     from open3d.t.geometry import RaycastingScene
@@ -64,10 +64,15 @@ class Tracer:
         return self._shading.test_occlusions(Tensor(rays), 0.0, 1.0).numpy()
 
 
-@lru_cache(maxsize=2)
+# As long as their scenes live: what Open3D holds at exit, it complains of.
+_TRACERS: WeakKeyDictionary[Geometry, Tracer] = WeakKeyDictionary()
+
+
 def tracer(geometry: Geometry) -> Tracer:
-    """The tracer of a scene; the last ones are kept, as paths and pictures ask in turn."""
-    return Tracer(geometry)
+    """The tracer of a scene, made once for its path and its pictures."""
+    if geometry not in _TRACERS:
+        _TRACERS[geometry] = Tracer(geometry)
+    return _TRACERS[geometry]
 
 
 def cast(geometry: Geometry, cameras: Cameras) -> Surfaces:
@@ -86,10 +91,8 @@ def world_rays(cameras: Cameras, view: int) -> Float32:
 
 
 def _scene(corners: Float64) -> RaycastingScene:
-    from open3d.t.geometry import RaycastingScene, TriangleMesh
+    from open3d.t.geometry import RaycastingScene
 
     scene = RaycastingScene()
-    positions = corners.reshape(-1, 3).astype(np.float32)
-    triangles = np.arange(len(positions)).reshape(-1, 3)
-    scene.add_triangles(TriangleMesh(positions, triangles))
+    scene.add_triangles(triangle_mesh(corners))
     return scene

@@ -43,6 +43,7 @@ def radiance(
     height, width = int(cameras.height[0]), int(cameras.width[0])
     fine = cameras.resized(width * supersample, height * supersample)
     pixel = 1 / np.sqrt(fine.K[:, 0, 0] * fine.K[:, 1, 1])
+    depth = cast(geometry, cameras).depth
     pictures = []
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
         for view in range(len(cameras)):
@@ -52,7 +53,7 @@ def radiance(
             light = np.concatenate(list(pool.map(follow, blocks)))
             light = light.reshape(height, supersample, width, supersample, 3)
             pictures.append(light.mean((1, 3)))
-    return np.stack(pictures), cast(geometry, cameras).depth
+    return np.stack(pictures), depth
 
 
 def developed(light: Float32, exposure: float) -> NDArray[np.uint8]:

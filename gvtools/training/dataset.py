@@ -104,10 +104,12 @@ class ProceduralViews:
     def clip(self, index: int) -> Clip:
         """The true views of a sample in order."""
         place = scene(self._rng(index, SCENE), self.split)
-        path = camera_path(self._rng(index, PATH), place.geometry, views=self.views, size=self.size)
-        light, depth = radiance(place.geometry, place.look, path.cameras)
+        cameras = camera_path(
+            self._rng(index, PATH), place.geometry, views=self.views, size=self.size
+        )
+        light, depth = radiance(place.geometry, place.look, cameras)
         exposure = place.key / max(float(light.mean()), 1e-6)
-        return Clip(developed(light, exposure), depth, path.cameras)
+        return Clip(developed(light, exposure), depth, cameras)
 
     def context_count(self, index: int) -> int:
         """How many views of a sample are given."""

@@ -1,6 +1,6 @@
-"""Batches of a data set, made ahead by other processes; what they hold does not depend on those.
+"""Batches of a data set in order, made ahead by other processes, which change nothing in them.
 
-A sample follows from its number, so that a loader has no state to save.
+A sample follows from its number, so that there is no state to save.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Generator, Iterable
 from dataclasses import fields
 from typing import Any
 
@@ -21,97 +21,44 @@ from gvtools.training.batch import TrainingBatch
 from gvtools.training.dataset import Samples
 from gvtools.training.view_sample import Sample, collated
 
-STEPS_AHEAD = 2
-# A sample on its way: its number, its context views, its tensors as arrays; or why there is none.
-_Made = tuple[int, int, dict[str, NDArray[Any]] | GvError]
+# A sample on its way: its context views, its tensors as arrays; or why there is none.
+_Made = tuple[int, dict[str, NDArray[Any]]] | GvError
 
 
-class BatchLoader:
-    """Batches by the numbers of their samples.
-
-    Samples are made ahead in the order of steps of ``batch`` samples, of which this process takes
-    its ``share``; any other order gives the same batches, but nothing is ready then.
+def batches(
+    data: Samples, parts: Iterable[range], *, workers: int
+) -> Generator[TrainingBatch, None, None]:
+    """Batches of the samples with these numbers; closing the iterator ends the workers.
 
     Args:
         data: the data set; has to be picklable when there are workers.
-        batch: samples a step, over all processes.
+        parts: numbers of each batch's samples, without end.
         workers: processes that make samples; 0 makes them when they are asked for.
-        share: of a step's numbers, those of this process; None for all.
+
+    Raises:
+        ShapeError: the numbers of context views of a batch differ.
     """
-
-    def __init__(
-        self,
-        data: Samples,
-        batch: int,
-        *,
-        workers: int = 0,
-        share: Callable[[range], range] | None = None,
-    ) -> None:
-        self.data, self.batch, self.workers, self.share = data, batch, workers, share
-        self._stream: Iterator[_Made] | None = None
-        self._expected = -1
-
-    def __call__(self, numbers: range) -> TrainingBatch:
-        """The batch of some samples.
-
-        Raises:
-            ShapeError: their numbers of context views differ.
-        """
-        return collated([self._take(number) for number in numbers])
-
-    def close(self) -> None:
-        """End the workers."""
-        self._stream = None
-
-    def _take(self, number: int) -> Sample:
-        if not self.workers:
-            return self.data.sample(number)
-        if self._stream is None or self._expected != number:
-            self._stream = iter(self._loader(number))
-        made, context, values = next(self._stream)
-        if isinstance(values, GvError):
-            raise values
-        if made != number:
-            # Outside this process's share nothing is made ahead.
-            self._expected = -1
-            return self.data.sample(number)
-        self._expected = next(iter(_Order(self, number + 1)))
-        tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in values.items()}
-        return Sample(**tensors, context=context)
-
-    def _loader(self, start: int) -> torch.utils.data.DataLoader:
-        return torch.utils.data.DataLoader(
-            _Numbered(self.data),  # type: ignore[arg-type]
-            batch_size=None,
-            sampler=_Order(self, start),  # type: ignore[arg-type]
-            num_workers=self.workers,
-            collate_fn=_unchanged,
-            worker_init_fn=_begun,
-            prefetch_factor=max(2, -(-STEPS_AHEAD * self.batch // self.workers)),
-            # Threads of a compiled kernel do not survive a fork.
-            multiprocessing_context="spawn",
-            # Torch would otherwise draw a number from its global generator.
-            generator=torch.Generator(),
-        )
+    if not workers:
+        for part in parts:
+            yield collated([data.sample(number) for number in part])
+        return
+    loader: torch.utils.data.DataLoader[list[_Made]] = torch.utils.data.DataLoader(
+        _Arrays(data),  # type: ignore[arg-type]
+        batch_sampler=parts,  # type: ignore[arg-type]
+        num_workers=workers,
+        collate_fn=_unchanged,
+        worker_init_fn=_begun,
+        # Threads of a compiled kernel do not survive a fork.
+        multiprocessing_context="spawn",
+        # Torch would otherwise draw a number from its global generator.
+        generator=torch.Generator(),
+    )
+    for items in loader:
+        yield collated([_restored(item) for item in items])
 
 
-class _Order:
-    """The numbers that a loader's process takes, from one of them on."""
-
-    def __init__(self, loader: BatchLoader, start: int) -> None:
-        self.loader, self.start = loader, start
-
-    def __iter__(self) -> Iterator[int]:
-        batch, share = self.loader.batch, self.loader.share
-        step = self.start // batch
-        while True:
-            whole = range(step * batch, (step + 1) * batch)
-            yield from (n for n in (share(whole) if share else whole) if n >= self.start)
-            step += 1
-
-
-class _Numbered:
-    """A data set's samples as arrays, with their numbers.
+class _Arrays:
+    """A data set's samples as arrays.
 
     Arrays travel through a pipe; tensors would take shared memory, of which containers have little.
     """
@@ -124,9 +71,17 @@ class _Numbered:
             sample = self.data.sample(number)
         except GvError as error:
             # Raised in this process it would reach the user as a traceback.
-            return number, 0, error
+            return error
         names = [entry.name for entry in fields(Sample) if entry.name != "context"]
-        return number, sample.context, {name: getattr(sample, name).numpy() for name in names}
+        return sample.context, {name: getattr(sample, name).numpy() for name in names}
+
+
+def _restored(made: _Made) -> Sample:
+    if isinstance(made, GvError):
+        raise made
+    context, values = made
+    tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in values.items()}
+    return Sample(**tensors, context=context)
 
 
 def _unchanged(item: Any) -> Any:

@@ -25,7 +25,7 @@ from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.distributed import Processes, Replicated, models_of
 from gvtools.training.encoder_stage import EncoderStage, measure_statistics
 from gvtools.training.heads_stage import HeadsStage
-from gvtools.training.loop import Record, Reporting, Trainer, check_parts
+from gvtools.training.loop import Record, Reporting, Trainer
 from gvtools.training.options import ReflowStageOptions, TrainingSettings
 from gvtools.training.records import STAGES, TrainingLog, read_log
 from gvtools.training.reflow_stage import ReflowStage
@@ -111,7 +111,7 @@ class StageRun:
         trainer = Trainer(
             distributed,
             self.options.optimizer,
-            samples.batch,
+            samples.batches,
             folder=self.folder,
             seed=self.config.seed,
             identity=self._identity(samples),
@@ -126,17 +126,13 @@ class StageRun:
             self.folder.mkdir(parents=True, exist_ok=True)
             text = json.dumps(self.config.to_dict(), indent=2) + "\n"
             write_text(self.folder / SETTINGS, text)
-        samples.start(self.options.optimizer.batch, self.processes)
-        check_parts(self.options.optimizer, self.processes, samples.group)
+        trainer.check_parts(samples.group)
         reporting = Reporting(
             record=self._recorder(trainer.progress.step, say),
             sheet_every=sheet_every,
             sheet=self._sheet_writer(model, distributed, samples) if sheet_every else None,
         )
-        try:
-            trainer.train(reporting, until=until)
-        finally:
-            samples.close()
+        trainer.train(reporting, until=until)
         if trainer.finished:
             self._write_weights(model, trainer, samples)
             say(f"{self.stage}: weights in {self.folder / WEIGHTS}")

