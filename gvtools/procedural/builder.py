@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.procedural.geometry import BOX, Geometry, Solid
+from gvtools.procedural.geometry import Geometry, Solid
 from gvtools.procedural.shading import Light, Look
 from gvtools.procedural.textures import picture, stacked, texture
 
@@ -16,6 +17,20 @@ Float64 = NDArray[np.float64]
 
 # Order of a room's materials: walls -x, +x, -y, +y, floor, ceiling.
 FLOOR, CEILING = 4, 5
+
+
+class Space(NamedTuple):
+    """An axis-aligned box of a scene, metres.
+
+    Attributes:
+        low: (3,) lowest corner.
+        high: (3,) highest corner.
+        skin: materials of its walls -x, +x, -y, +y, of its floor and of its ceiling.
+    """
+
+    low: Float64
+    high: Float64
+    skin: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +59,7 @@ class SceneBuilder:
 
     rng: np.random.Generator
     photographs: Sequence[str]
-    rooms: list[tuple[Float64, Float64]] = field(default_factory=list)
-    room_material: list[list[int]] = field(default_factory=list)
+    rooms: list[Space] = field(default_factory=list)
     solids: list[Solid] = field(default_factory=list)
     textures: list[NDArray[np.uint8]] = field(default_factory=list)
     materials: list[tuple[int, Float64, Float64, Float64, float]] = field(default_factory=list)
@@ -99,11 +113,11 @@ class SceneBuilder:
         self.materials.append((row, sides, place, tint * gain, emission))
         return len(self.materials) - 1
 
-    def room(self, low: ArrayLike, high: ArrayLike, materials: Sequence[int]) -> int:
-        """Free space between two corners, with a material a wall; returns its number."""
-        self.rooms.append((np.asarray(low, np.float64), np.asarray(high, np.float64)))
-        self.room_material.append(list(materials))
-        return len(self.rooms) - 1
+    def room(self, low: ArrayLike, high: ArrayLike, skin: Sequence[int]) -> Space:
+        """Free space between two corners, with a material a wall."""
+        space = Space(np.asarray(low, np.float64), np.asarray(high, np.float64), tuple(skin))
+        self.rooms.append(space)
+        return space
 
     def solid(
         self,
@@ -140,15 +154,11 @@ class SceneBuilder:
         middle, extent = np.asarray(centre, np.float64), np.asarray(half, np.float64)
         self.solids.append(Solid(kind, lean @ turn, middle, extent, material, shades, boxes, inner))
 
-    def block(self, low: ArrayLike, high: ArrayLike, *, material: int) -> None:
-        """A box that stands straight between two corners."""
-        low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-        self.solid(BOX, (low + high) / 2, (high - low) / 2, material=material)
-
     def geometry(self) -> Geometry:
         """Everything put in so far, for rays."""
-        rooms, materials = np.array(self.rooms, np.float64), np.array(self.room_material, np.int64)
-        return Geometry(rooms, materials, tuple(self.solids))
+        rooms = np.array([(room.low, room.high) for room in self.rooms])
+        skins = np.array([room.skin for room in self.rooms], np.int64)
+        return Geometry(rooms, skins, tuple(self.solids))
 
     def look(self, light: Light) -> Look:
         """Materials and a light, for shading."""

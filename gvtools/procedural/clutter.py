@@ -8,26 +8,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.procedural.builder import SceneBuilder
+from gvtools.procedural.builder import SceneBuilder, Space
 from gvtools.procedural.geometry import BALL, BOX, TUBE
 
 Float64 = NDArray[np.float64]
 
 
 def add_clutter(
-    build: SceneBuilder, low: Float64, high: Float64, count: int, *, scale: float, palette: int
+    build: SceneBuilder, room: Space, count: int, *, scale: float, palette: int
 ) -> None:
     """Put things on the floor of a room.
 
     Args:
         build: gets them.
-        low: (3,) lowest corner of the room.
-        high: (3,) highest corner.
+        room: on whose floor they stand.
         count: how many.
         scale: typical size of a thing, metres.
         palette: how many different materials they share.
     """
     rng = build.rng
+    low, high, _ = room
     materials = [build.material(scale * np.exp(rng.uniform(-0.7, 0.9))) for _ in range(palette)]
     taken: list[tuple[float, float, float]] = []
     for _ in range(count):

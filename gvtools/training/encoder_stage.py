@@ -63,9 +63,8 @@ class EncoderStage(Stage):
 
     def _pose_error(self, token: Tensor, batch: TrainingBatch, unit: Tensor) -> Tensor:
         """The camera decoder's L1 error, centres in units of the mean context depth."""
-        pose = batch.views.cam_from_world
-        relative = (pose.double() @ torch.linalg.inv(pose[:, :1].double())).float()
-        relative = torch.cat((relative[..., :3], relative[..., 3:] / _homogeneous(unit)), dim=-1)
+        relative = batch.relative.float()
+        relative[..., :3, 3] /= unit[:, None, None]
         truth = encode_cameras(relative, batch.views.K, batch.views.size)
         return (self.model.geometry.cam_dec(token.float()) - truth).abs().mean()
 
@@ -141,9 +140,7 @@ def true_rays(batch: TrainingBatch, unit: Tensor, grid: tuple[int, int]) -> Tens
 
     A ray belongs to the middle of its cell of the ray grid.
     """
-    pose = batch.views.cam_from_world
-    relative = (pose.double() @ torch.linalg.inv(pose[:, :1].double())).float()
-    rays = patch_rays(relative, batch.views.K, grid, batch.views.size)[..., :6]
+    rays = patch_rays(batch.relative.float(), batch.views.K, grid, batch.views.size)[..., :6]
     direction, origin = rays.unflatten(2, grid).split(3, dim=-1)
     return torch.cat((direction, origin / unit[:, None, None, None, None]), dim=-1)
 
@@ -199,12 +196,6 @@ def _gradient_error(predicted: Tensor, depth: Tensor) -> Tensor:
         gap = predicted.log().diff(dim=dim) - log.diff(dim=dim)
         total = total + masked_mean(gap.abs(), both)
     return total
-
-
-def _homogeneous(unit: Tensor) -> Tensor:
-    """(B, 1, 4, 1) divisors of a translation column."""
-    one = torch.ones_like(unit)
-    return torch.stack((unit, unit, unit, one), dim=-1)[:, None, :, None]
 
 
 @torch.no_grad()

@@ -20,6 +20,7 @@ from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER, WHOLE_FI
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text
 from gvtools.networks.config_json import to_json
+from gvtools.procedural.photographs import photograph_names
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.distributed import Processes, Replicated, models_of
@@ -114,7 +115,7 @@ class StageRun:
             samples.batches,
             folder=self.folder,
             seed=self.config.seed,
-            identity=self._identity(samples),
+            identity=self._identity(),
         )
         if resume and trainer.resume():
             if trainer.finished and (self.folder / WEIGHTS / WHOLE_FILE).is_file():
@@ -226,7 +227,7 @@ class StageRun:
             return Sharded(module, self.processes)
         return Replicated(module, self.processes)
 
-    def _identity(self, samples: TrainingSamples) -> dict[str, Any]:
+    def _identity(self) -> dict[str, Any]:
         """What may not change between the parts of a stage."""
         data = self.config.data.to_dict()
         for name in ("workers", "cache"):
@@ -240,7 +241,8 @@ class StageRun:
             "stage": self.stage,
             "seed": self.config.seed,
             "model": model,
-            "photographs": list(samples.photographs),
+            # Those that are installed decide the samples.
+            "photographs": list(photograph_names("train")),
             "options": self.options.to_dict(),
             "start": None if self._source is None else _fingerprint(self._source),
             "data": data,

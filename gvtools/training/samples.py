@@ -7,7 +7,6 @@ from contextlib import closing
 from pathlib import Path
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.procedural.photographs import photograph_names
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.context_choice import ContextChoice
 from gvtools.training.dataset import MixedViews, ProceduralViews
@@ -40,11 +39,6 @@ class TrainingSamples:
     def group(self) -> int:
         """So many samples in a row, from a multiple of it, have context views of one number."""
         return self._context.group
-
-    @property
-    def photographs(self) -> tuple[str, ...]:
-        """Those of the textures that are installed: they decide the samples."""
-        return photograph_names("train")
 
     def batches(self, parts: Iterable[range]) -> Generator[TrainingBatch, None, None]:
         """The batches of the samples with these numbers, made ahead."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from gvtools.training.view_sample import Sample, make_sample
 ATTEMPTS = 40
 MOST_STRIDE = 6  # steps between the views of a window
 DETAIL = 2  # memory is made at so many times the model's size, where a view is large enough
-KEPT_FRAMES = 512  # reduced frames that a data set keeps, so that files are read once
+KEPT_FRAMES = 512  # reduced frames that are kept, so that files are read once
 # Depths that differ by no more than this share belong to one surface.
 SAME_SURFACE = 0.1
 PROBE = 24  # points along a side of a picture that overlap is measured with
@@ -67,9 +67,6 @@ class SceneViews:
     context: ContextChoice = field(default_factory=ContextChoice)
     faults: CorruptionOptions | None = GENTLE
     fill: str = "none"
-    _kept: OrderedDict[tuple[int, int], _Reduced] = field(
-        init=False, repr=False, default_factory=OrderedDict
-    )
     _usable: tuple[tuple[View, ...], ...] = field(init=False, repr=False, default=())
 
     def __post_init__(self) -> None:
@@ -91,9 +88,6 @@ class SceneViews:
         if not usable:
             raise ProjectError("no scene to draw samples from; expected at least one")
         object.__setattr__(self, "_usable", usable)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_kept": OrderedDict()}
 
     def sample(self, index: int) -> Sample:
         """The sample of a number, 0 or more.
@@ -124,7 +118,7 @@ class SceneViews:
             rows = [start + step * i for i in range(self.views)]
             if rng.random() < 0.5:
                 rows.reverse()
-            frames = [self._frame(number, row) for row in rows]
+            frames = [_reduced(self._usable[number][row], self.size) for row in rows]
             truth = _joined([frame.truth for frame in frames])
             found = min(overlaps(truth))
             best = max(best, found)
@@ -146,14 +140,6 @@ class SceneViews:
             "overlap": self.overlap,
             **described(self),
         }
-
-    def _frame(self, scene: int, row: int) -> _Reduced:
-        key = (scene, row)
-        if key not in self._kept:
-            self._kept[key] = _reduced(self._usable[scene][row], self.size)
-            if len(self._kept) > KEPT_FRAMES:
-                self._kept.popitem(last=False)
-        return self._kept[key]
 
 
 def overlaps(clip: Clip) -> list[float]:
@@ -182,6 +168,7 @@ def overlaps(clip: Clip) -> list[float]:
     return out
 
 
+@lru_cache(KEPT_FRAMES)
 def _reduced(view: View, size: tuple[int, int]) -> _Reduced:
     """A view at ``DETAIL`` times the model's size (or less, if it is smaller) and at that size."""
     frame = view.load()

@@ -64,12 +64,6 @@ def test_depth_is_where_rays_leave_free_space(seed: int) -> None:
         _check_depth(depth[view], expected)
 
 
-def test_the_picture_has_the_same_depth() -> None:
-    place, cameras = _drawn(3)
-    _, depth = radiance(place.geometry, place.look, cameras)
-    np.testing.assert_allclose(depth, cast(place.geometry, cameras).depth, rtol=1e-6)
-
-
 def test_solids_on_their_own_and_from_within_their_hull() -> None:
     build = SceneBuilder(np.random.default_rng(0), ())
     paint = build.material()
@@ -175,21 +169,6 @@ def test_a_point_has_one_colour_in_all_views() -> None:
     # Half a pixel of misplacement at most, and textures that are finer than a pixel.
     assert np.median(found.mean(1)) < 4e-4
     assert found.mean() < 0.15 * expected.mean()
-
-
-def test_more_rays_a_pixel_converge() -> None:
-    place, cameras = _drawn(4, size=(32, 32))
-    light = [radiance(place.geometry, place.look, cameras, supersample=n)[0] for n in (1, 2, 6)]
-    coarse, fine = (np.abs(image - light[2]).mean() for image in light[:2])
-    assert fine < 0.7 * coarse
-
-
-def test_cameras_in_no_room_see_nothing() -> None:
-    place, cameras = _drawn(1)
-    away = cameras.cam_from_world.copy()
-    away[:, :3, 3] += 1e3
-    outside = Cameras(cameras.K, away, cameras.width, cameras.height, cameras.names)
-    assert (cast(place.geometry, outside).depth == 0).all()
 
 
 def test_clearance_is_the_distance_to_what_is_not_free() -> None:

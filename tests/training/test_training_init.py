@@ -214,8 +214,3 @@ def test_the_training_of_base_is_the_papers():
         assert options.precision == "bfloat16"
         assert stage.context_weight == 0.25
     assert config.reflow.bounds is None and config.network().flow.level1[0::3] == (1.0, 0.0)
-
-
-def test_an_unknown_way_of_sharing_is_refused(tmp_path, capsys):
-    assert main(["train", "micro", "--out", str(tmp_path), "--set", "parallel=fsdp"]) == 2
-    assert "parallel 'fsdp'; expected 'data' or 'sharded'" in capsys.readouterr().err

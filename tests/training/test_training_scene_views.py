@@ -17,9 +17,7 @@ from gvtools.procedural.render import developed, radiance
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.training.context_choice import ContextChoice
-from gvtools.training.dataset import ProceduralViews
 from gvtools.training.scene_views import SceneViews, overlaps
-from gvtools.training.view_sample import collated
 
 TALL, WIDE = 96, 128
 
@@ -99,17 +97,6 @@ def test_masked_pixels_have_no_depth() -> None:
     clip, truth = data.clips(0)
     assert not truth.depth[:, :5].any() and (truth.depth[:, 6:] > 0).all()
     assert not clip.depth[:, :10].any()
-
-
-def test_batches_of_recorded_and_of_procedural_samples_have_one_form() -> None:
-    recorded = collated([_views().sample(index) for index in range(2)])
-    made = collated([ProceduralViews(size=(48, 48)).sample(index) for index in range(2)])
-    for a, b in zip(
-        (recorded.views.images, recorded.views.depth, recorded.depth),
-        (made.views.images, made.views.depth, made.depth),
-        strict=True,
-    ):
-        assert a.shape[2:] == b.shape[2:] and a.dtype == b.dtype
 
 
 def test_overlap_counts_what_the_next_view_shows() -> None:
