@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.procedural.geometry import Geometry, Solid
-from gvtools.procedural.shading import Light, Look
-from gvtools.procedural.textures import picture, stacked, texture
+from gvtools.procedural.geometry import BOX, Geometry
+from gvtools.procedural.shading import Look
+from gvtools.procedural.textures import level_starts, picture, stacked, texture
 
 Float64 = NDArray[np.float64]
 
@@ -19,18 +18,15 @@ Float64 = NDArray[np.float64]
 FLOOR, CEILING = 4, 5
 
 
-class Space(NamedTuple):
-    """An axis-aligned box of a scene, metres.
+@dataclass(frozen=True, eq=False)
+class Light:
+    """See ``shading.Look``."""
 
-    Attributes:
-        low: (3,) lowest corner.
-        high: (3,) highest corner.
-        skin: materials of its walls -x, +x, -y, +y, of its floor and of its ceiling.
-    """
-
-    low: Float64
-    high: Float64
-    skin: tuple[int, ...] = ()
+    ambient: Float64
+    sun: Float64
+    lamps: Float64
+    reach: float
+    shadows: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +34,13 @@ class ProceduralScene:
     """A scene to be rendered.
 
     Attributes:
+        kind: which layout it is.
         geometry: what rays meet.
         look: materials and light.
         key: what the mean of the pictures shall be, linear light.
     """
 
+    kind: str
     geometry: Geometry
     look: Look
     key: float
@@ -59,8 +57,11 @@ class SceneBuilder:
 
     rng: np.random.Generator
     photographs: Sequence[str]
-    rooms: list[Space] = field(default_factory=list)
-    solids: list[Solid] = field(default_factory=list)
+    rooms: list[tuple[Float64, Float64]] = field(default_factory=list)
+    room_material: list[list[int]] = field(default_factory=list)
+    solids: list[tuple[int, Float64, Float64, Float64, int, bool]] = field(default_factory=list)
+    cutters: list[list[tuple[Float64, Float64]]] = field(default_factory=list)
+    cutter_material: list[int] = field(default_factory=list)
     textures: list[NDArray[np.uint8]] = field(default_factory=list)
     materials: list[tuple[int, Float64, Float64, Float64, float]] = field(default_factory=list)
 
@@ -113,11 +114,11 @@ class SceneBuilder:
         self.materials.append((row, sides, place, tint * gain, emission))
         return len(self.materials) - 1
 
-    def room(self, low: ArrayLike, high: ArrayLike, skin: Sequence[int]) -> Space:
-        """Free space between two corners, with a material a wall."""
-        space = Space(np.asarray(low, np.float64), np.asarray(high, np.float64), tuple(skin))
-        self.rooms.append(space)
-        return space
+    def room(self, low: ArrayLike, high: ArrayLike, materials: Sequence[int]) -> int:
+        """Free space between two corners, with a material a wall; returns its number."""
+        self.rooms.append((np.asarray(low, np.float64), np.asarray(high, np.float64)))
+        self.room_material.append(list(materials))
+        return len(self.rooms) - 1
 
     def solid(
         self,
@@ -149,20 +150,51 @@ class SceneBuilder:
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         c, s = np.cos(tilt), np.sin(tilt)
         lean = np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
-        boxes = np.array([*cuts], np.float64).reshape(-1, 2, 3)
-        inner = material if cut_material is None else cut_material
-        middle, extent = np.asarray(centre, np.float64), np.asarray(half, np.float64)
-        self.solids.append(Solid(kind, lean @ turn, middle, extent, material, shades, boxes, inner))
+        self.solids.append(
+            (
+                kind,
+                lean @ turn,
+                np.asarray(centre, float),
+                np.asarray(half, float),
+                material,
+                shades,
+            )
+        )
+        boxes = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in cuts]
+        self.cutters.append(boxes)
+        self.cutter_material += [material if cut_material is None else cut_material] * len(boxes)
+
+    def block(self, low: ArrayLike, high: ArrayLike, *, material: int) -> None:
+        """A box that stands straight between two corners."""
+        low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+        self.solid(BOX, (low + high) / 2, (high - low) / 2, material=material)
 
     def geometry(self) -> Geometry:
         """Everything put in so far, for rays."""
-        rooms = np.array([(room.low, room.high) for room in self.rooms])
-        skins = np.array([room.skin for room in self.rooms], np.int64)
-        return Geometry(rooms, skins, tuple(self.solids))
+        count = len(self.solids)
+        boxes = [box for boxes in self.cutters for box in boxes]
+        kind, rotation, centre, half, material, shades = (
+            zip(*self.solids, strict=True) if count else ((),) * 6
+        )
+        ends = np.cumsum([0, *(len(boxes) for boxes in self.cutters)])
+        return Geometry(
+            np.array(self.rooms, np.float64),
+            np.array(self.room_material, np.int64),
+            np.array(kind, np.int64),
+            np.array(rotation, np.float64).reshape(count, 3, 3),
+            np.array(centre, np.float64).reshape(count, 3),
+            np.array(half, np.float64).reshape(count, 3),
+            np.array(material, np.int64),
+            np.array(shades, np.bool_),
+            ends.astype(np.int64),
+            np.array(boxes, np.float64).reshape(len(boxes), 2, 3),
+            np.array(self.cutter_material, np.int64),
+        )
 
     def look(self, light: Light) -> Look:
         """Materials and a light, for shading."""
         rows, tile, offset, gain, emission = zip(*self.materials, strict=True)
+        side = len(self.textures[0])
         return Look(
             np.array(rows, np.int64),
             np.array(tile, np.float64),
@@ -170,5 +202,11 @@ class SceneBuilder:
             np.array(gain, np.float64),
             np.array(emission, np.float64),
             stacked(self.textures),
-            light,
+            level_starts(side),
+            side,
+            light.ambient,
+            light.sun,
+            light.lamps,
+            float(light.reach),
+            bool(light.shadows),
         )

@@ -13,10 +13,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.procedural.builder import ProceduralScene, SceneBuilder
+from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
 from gvtools.procedural.geometry import BALL, BOX, TUBE
 from gvtools.procedural.materials import PICTURES, Color, globe, paint, picture, planks, tiled
-from gvtools.procedural.shading import Light
 
 Float64 = NDArray[np.float64]
 
@@ -156,7 +155,7 @@ def furnished_room(seed: int) -> ProceduralScene:
         reach=3.0,
         shadows=True,
     )
-    return ProceduralScene(room.build.geometry(), room.build.look(light), KEY)
+    return ProceduralScene("furnished", room.build.geometry(), room.build.look(light), KEY)
 
 
 def _shell(room: _Furnisher, size: Float64) -> None:

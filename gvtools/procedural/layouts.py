@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.procedural.builder import ProceduralScene, SceneBuilder, Space
+from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
 from gvtools.procedural.clutter import add_clutter
 from gvtools.procedural.geometry import Geometry, clearance
 from gvtools.procedural.openings import add_frames, add_openings, add_side_room
 from gvtools.procedural.photographs import photograph_names
-from gvtools.procedural.shading import Light
 
 Float64 = NDArray[np.float64]
 Range = tuple[float, float]
@@ -80,10 +79,13 @@ def scene(rng: np.random.Generator, split: str) -> ProceduralScene:
     """
     build = SceneBuilder(rng, photograph_names(split))
     style = STYLES[split]
-    _LAYOUTS[rng.choice(len(_LAYOUTS), p=style.kinds)](build, style)
+    kind = rng.choice(len(_LAYOUTS), p=style.kinds)
+    _LAYOUTS[kind](build, style)
     geometry = build.geometry()
     light = _light(rng, geometry)
-    return ProceduralScene(geometry, build.look(light), rng.uniform(*style.key))
+    return ProceduralScene(
+        _LAYOUTS[kind].__name__[1:], geometry, build.look(light), rng.uniform(*style.key)
+    )
 
 
 def _skin(build: SceneBuilder) -> list[int]:
@@ -101,21 +103,22 @@ def _size(build: SceneBuilder, style: LayoutStyle, factor: float = 1.0) -> Float
     return factor * np.array([*rng.uniform(*style.side, 2), rng.uniform(*style.height)])
 
 
-def _furnish(build: SceneBuilder, style: LayoutStyle, room: Space) -> None:
+def _furnish(build: SceneBuilder, style: LayoutStyle, low: Float64, high: Float64) -> None:
     rng = build.rng
-    area = float(np.prod(room.high[:2] - room.low[:2]))
+    area = float(np.prod(high[:2] - low[:2]))
     scale = rng.uniform(*style.size)
     count = round(rng.uniform(*style.things) * np.clip(area / 15, 0.4, 1.8))
-    add_clutter(build, room, count, scale=scale, palette=int(rng.integers(3, 6)))
+    add_clutter(build, low, high, count, scale=scale, palette=int(rng.integers(3, 6)))
 
 
 def _room(build: SceneBuilder, style: LayoutStyle) -> None:
     high = _size(build, style)
     skin = _skin(build)
-    room = build.room(np.zeros(3), high, skin)
-    add_openings(build, room, int(build.rng.integers(0, style.openings + 1)))
-    add_frames(build, room, int(build.rng.integers(0, 4)))
-    _furnish(build, style, room)
+    low = np.zeros(3)
+    build.room(low, high, skin)
+    add_openings(build, low, high, skin, int(build.rng.integers(0, style.openings + 1)))
+    add_frames(build, low, high, int(build.rng.integers(0, 4)))
+    _furnish(build, style, low, high)
 
 
 def _corridor(build: SceneBuilder, style: LayoutStyle) -> None:
@@ -123,12 +126,13 @@ def _corridor(build: SceneBuilder, style: LayoutStyle) -> None:
     high = np.array([rng.uniform(2, 3.4) * style.side[1] / 2, rng.uniform(1.3, 2.3), 0])
     high[2] = rng.uniform(*style.height)
     skin = _skin(build)
-    room = build.room(np.zeros(3), high, skin)
+    low = np.zeros(3)
+    build.room(low, high, skin)
     for wall in rng.permutation([2, 3, 1])[: rng.integers(1, 4)]:
-        add_side_room(build, room, int(wall), _size(build, style, 0.7))
-    add_openings(build, room, int(rng.integers(0, style.openings + 1)))
-    add_frames(build, room, int(rng.integers(0, 4)))
-    add_clutter(build, room, int(rng.integers(1, 5)), scale=0.5, palette=3)
+        add_side_room(build, low, high, skin, int(wall), _size(build, style, 0.7))
+    add_openings(build, low, high, skin, int(rng.integers(0, style.openings + 1)))
+    add_frames(build, low, high, int(rng.integers(0, 4)))
+    add_clutter(build, low, high, int(rng.integers(1, 5)), scale=0.5, palette=3)
 
 
 def _corner(build: SceneBuilder, style: LayoutStyle) -> None:
@@ -137,14 +141,15 @@ def _corner(build: SceneBuilder, style: LayoutStyle) -> None:
     first, second = _size(build, style, 1.1), _size(build, style, 1.1)
     wide, deep = rng.uniform(0.4, 0.65, 2)
     skin = _skin(build)
+    low = np.zeros(3)
     end = np.array([first[0], deep * first[1], first[2]])
     wing = np.array([wide * first[0], deep * first[1] + 0.7 * second[1], first[2]])
-    hall = build.room(np.zeros(3), end, skin)
-    whole = build.room(np.zeros(3), wing, skin)
-    add_openings(build, hall, int(rng.integers(0, style.openings + 1)), walls=(1, 2))
-    add_frames(build, whole, int(rng.integers(0, 3)), walls=(0, 3))
-    _furnish(build, style, hall)
-    _furnish(build, style, Space(np.array([0, end[1], 0]), wing))
+    build.room(low, end, skin)
+    build.room(low, wing, skin)
+    add_openings(build, low, end, skin, int(rng.integers(0, style.openings + 1)), walls=(1, 2))
+    add_frames(build, low, wing, int(rng.integers(0, 3)), walls=(0, 3))
+    _furnish(build, style, low, end)
+    _furnish(build, style, np.array([0, end[1], 0]), wing)
 
 
 def _suite(build: SceneBuilder, style: LayoutStyle) -> None:
@@ -152,12 +157,13 @@ def _suite(build: SceneBuilder, style: LayoutStyle) -> None:
     rng = build.rng
     high = _size(build, style, 0.9)
     skin = _skin(build)
-    room = build.room(np.zeros(3), high, skin)
+    low = np.zeros(3)
+    build.room(low, high, skin)
     for wall in rng.permutation(4)[: rng.integers(1, 3)]:
-        side = add_side_room(build, room, int(wall), _size(build, style, 0.8))
-        _furnish(build, style, side)
-    add_frames(build, room, int(rng.integers(0, 3)))
-    _furnish(build, style, room)
+        side = add_side_room(build, low, high, skin, int(wall), _size(build, style, 0.8))
+        _furnish(build, style, *side)
+    add_frames(build, low, high, int(rng.integers(0, 3)))
+    _furnish(build, style, low, high)
 
 
 def _hall(build: SceneBuilder, style: LayoutStyle) -> None:
@@ -168,10 +174,11 @@ def _hall(build: SceneBuilder, style: LayoutStyle) -> None:
     skin = _skin(build)
     if rng.random() < 0.4:
         skin[5] = build.material(30, gain=rng.uniform(0.8, 1.6), emission=rng.uniform(0.5, 1.2))
-    room = build.room(np.zeros(3), high, skin)
-    add_openings(build, room, int(rng.integers(0, style.openings + 1)), scale=factor / 2)
+    low = np.zeros(3)
+    build.room(low, high, skin)
+    add_openings(build, low, high, skin, int(rng.integers(0, style.openings + 1)), scale=factor / 2)
     scale = factor * rng.uniform(*style.size)
-    add_clutter(build, room, int(rng.integers(4, 12)), scale=scale, palette=4)
+    add_clutter(build, low, high, int(rng.integers(4, 12)), scale=scale, palette=4)
 
 
 def _close_up(build: SceneBuilder, style: LayoutStyle) -> None:
@@ -179,10 +186,11 @@ def _close_up(build: SceneBuilder, style: LayoutStyle) -> None:
     rng = build.rng
     high = _size(build, style, rng.uniform(0.35, 0.6))
     skin = _skin(build)
-    room = build.room(np.zeros(3), high, skin)
-    add_frames(build, room, int(rng.integers(0, 3)), scale=0.4)
+    low = np.zeros(3)
+    build.room(low, high, skin)
+    add_frames(build, low, high, int(rng.integers(0, 3)), scale=0.4)
     scale = float(min(high)) * rng.uniform(0.15, 0.32)
-    add_clutter(build, room, int(rng.integers(5, 13)), scale=scale, palette=5)
+    add_clutter(build, low, high, int(rng.integers(5, 13)), scale=scale, palette=5)
 
 
 _LAYOUTS: tuple[Callable[[SceneBuilder, LayoutStyle], None], ...] = (

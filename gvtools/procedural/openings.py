@@ -10,8 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.procedural.builder import CEILING, SceneBuilder, Space
-from gvtools.procedural.geometry import BOX
+from gvtools.procedural.builder import CEILING, SceneBuilder
 
 Float64 = NDArray[np.float64]
 
@@ -20,7 +19,9 @@ OVERLAP = 0.02  # by which an opening reaches into its room, metres
 
 def add_openings(
     build: SceneBuilder,
-    room: Space,
+    low: Float64,
+    high: Float64,
+    skin: Sequence[int],
     count: int,
     *,
     walls: Sequence[int] = (0, 1, 2, 3),
@@ -30,13 +31,14 @@ def add_openings(
 
     Args:
         build: gets them.
-        room: whose walls they are in.
+        low: (3,) lowest corner of the room.
+        high: (3,) highest corner.
+        skin: the room's six materials.
         count: how many.
         walls: which may be opened, numbered as materials are.
         scale: of the openings; 1 for a living room.
     """
     rng = build.rng
-    low, high, skin = room
     for wall in rng.permutation(walls)[:count]:
         length = high[1 - wall // 2] - low[1 - wall // 2]
         width = min(scale * rng.uniform(0.6, 2.2), 0.7 * length)
@@ -60,20 +62,23 @@ def add_openings(
 
 def add_side_room(
     build: SceneBuilder,
-    room: Space,
+    low: Float64,
+    high: Float64,
+    skin: Sequence[int],
     wall: int,
     size: Float64,
-) -> Space:
-    """A room behind a wall and the door that leads to it; returns the side room.
+) -> tuple[Float64, Float64]:
+    """A room behind a wall and the door that leads to it; returns the side room's corners.
 
     Args:
         build: gets them.
-        room: whose walls they are in.
+        low: (3,) lowest corner of the room.
+        high: (3,) highest corner.
+        skin: the room's six materials.
         wall: which wall, numbered as materials are.
         size: (3,) of the side room.
     """
     rng = build.rng
-    low, high, skin = room
     across = 1 - wall // 2
     length = high[across] - low[across]
     width = min(rng.uniform(0.8, 1.6), 0.6 * length)
@@ -96,12 +101,14 @@ def add_side_room(
     side_low[2], side_high[2] = low[2], low[2] + max(float(size[2]), 1.02 * (top - low[2]))
     paint = build.material()
     floor = skin[4] if rng.random() < 0.5 else build.material()
-    return build.room(side_low, side_high, [paint] * 4 + [floor, skin[CEILING]])
+    build.room(side_low, side_high, [paint] * 4 + [floor, skin[CEILING]])
+    return side_low, side_high
 
 
 def add_frames(
     build: SceneBuilder,
-    room: Space,
+    low: Float64,
+    high: Float64,
     count: int,
     *,
     walls: Sequence[int] = (0, 1, 2, 3),
@@ -111,13 +118,13 @@ def add_frames(
 
     Args:
         build: gets them.
-        room: on whose walls they hang.
+        low: (3,) lowest corner of the room.
+        high: (3,) highest corner.
         count: how many.
         walls: which may have one, numbered as materials are.
         scale: of the pictures; 1 for a living room.
     """
     rng = build.rng
-    low, high, _ = room
     for _ in range(count):
         wall = int(walls[int(rng.integers(len(walls)))])
         across = 1 - wall // 2
@@ -137,7 +144,7 @@ def add_frames(
             (width, height), only="picture", offset=(-width / 2, -height / 2),
             gain=rng.uniform(0.8, 1.3),
         )  # fmt: skip
-        build.solid(BOX, corner, half, material=material)
+        build.block(corner - half, corner + half, material=material)
 
 
 def _beyond(

@@ -1,29 +1,31 @@
-"""What surfaces of a procedural scene look like: normals, light, filtered textures."""
+"""What surfaces of a procedural scene look like: normals, place on the texture, filtered colour."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.procedural.geometry import Geometry
-from gvtools.procedural.mesh import ROUND, Mesh
-from gvtools.procedural.ray_cast import tracer
+from gvtools.kernels import FAST, compiled
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-# A surface point is lifted by so much off its surface, or it would shade itself. [metres]
-LIFT = 2e-4
 
-
-@dataclass(frozen=True, eq=False)
-class Light:
-    """What lights a scene. Colours are linear light.
+class Look(NamedTuple):
+    """Materials and light. Colours are linear light.
 
     Attributes:
+        texture: (P,) row of ``texels``.
+        tile: (P, 2) length that one copy of the texture covers, metres.
+        offset: (P, 2) of the texture's corner, metres.
+        gain: (P, 3) factor on the texture.
+        emission: (P,) light of the surface's own, for what lies outside windows.
+        texels: (T, texels, 3) float32, see ``textures.stacked``.
+        starts: (levels + 1,), see ``textures.level_starts``.
+        side: texels along a side of the finest level.
         ambient: (2, 3) light from above and from below.
         sun: (2, 3) direction towards it (unit length), and its light.
         lamps: (L, 2, 3) position, and its light on a surface that faces it from half its reach.
@@ -31,6 +33,14 @@ class Light:
         shadows: whether solids and walls keep the lamps' light away.
     """
 
+    texture: Int64
+    tile: Float64
+    offset: Float64
+    gain: Float64
+    emission: Float64
+    texels: Float32
+    starts: Int64
+    side: int
     ambient: Float64
     sun: Float64
     lamps: Float64
@@ -38,162 +48,151 @@ class Light:
     shadows: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Look:
-    """Materials and light. Colours are linear light.
+@compiled(fastmath=FAST)
+def surface_places(geometry, look, d, p, room, solid, code, cutter, normal, what, place, spread):
+    """Normals, materials and texture places of what rays with directions ``d`` meet at ``p``.
 
-    Attributes:
-        texture: (P,) row of ``levels``.
-        tile: (P, 2) length that one copy of the texture covers, metres.
-        offset: (P, 2) of the texture's corner, metres.
-        gain: (P, 3) factor on the texture.
-        emission: (P,) light of the surface's own, for what lies outside windows.
-        levels: of all textures, see ``textures.stacked``.
-        light: see Light.
+    Upright flat surfaces have the texture's second axis downwards. ``d``, ``p`` and ``normal`` are
+    (3, count); ``place`` (2, count) is in copies of the texture; ``spread`` (count,) gets the
+    square of copies a metre, over the cosine between normal and ray (which has z-depth 1).
     """
+    for i in range(len(what)):
+        if solid[i] < 0:
+            c = code[i]
+            positive = d[c, i] < 0
+            facing = abs(d[c, i])
+            for k in range(3):
+                normal[k, i] = 0.0
+            normal[c, i] = 1.0 if positive else -1.0
+            m = geometry.room_material[room[i], 2 * c + (0 if positive else 1)]
+            u = p[1, i] if c == 0 else p[0, i]
+            v = p[1, i] if c == 2 else -p[2, i]
+            along = down = 1.0
+        else:
+            n = solid[i]
+            m = geometry.material[n] if cutter[i] < 0 else geometry.cutter_material[cutter[i]]
+            facing, u, v, along, down = _solid_place(geometry, n, code[i], i, d, p, normal)
+        # Round coordinates are in half turns, which a copy covers whatever the tile is.
+        tu = look.tile[m, 0] if along == 1.0 else 1.0
+        tv = look.tile[m, 1] if down == 1.0 else 1.0
+        what[i] = m
+        place[0, i] = (u - look.offset[m, 0]) / tu
+        place[1, i] = (v - look.offset[m, 1]) / tv
+        spread[i] = along * down / (tu * tv * max(facing, 1e-3))
 
-    texture: Int64
-    tile: Float64
-    offset: Float64
-    gain: Float64
-    emission: Float64
-    levels: tuple[Float32, ...]
-    light: Light
 
+@compiled(fastmath=FAST)
+def _solid_place(geometry, n, code, i, d, p, normal):
+    """Place of point i on solid n; writes its normal.
 
-def colors(geometry: Geometry, look: Look, rays: Float32, pixel: float) -> Float32:
-    """(N, 3) linear light that rays (N, 6) of z-depth 1 bring; black where they meet nothing.
-
-    Args:
-        geometry: of the scene.
-        look: of the scene.
-        rays: origins and directions.
-        pixel: width of a ray's share of the image at z-depth 1.
+    Returns the cosine between normal and ray, u and v before tile and offset, and their lengths a
+    metre (1 where they are metres).
     """
-    scene = tracer(geometry)
-    t, triangle, normal = scene.first(rays)
-    missed = ~np.isfinite(t)
-    t = np.where(missed, np.float32(1), t)
-    # From here on (3, N), whose rows numpy goes through fastest.
-    normal, origins, directions = normal.T.copy(), rays[:, :3].T, rays[:, 3:].T.copy()
-    points = origins + t * directions
-    place, length = _texture_place(geometry, scene.mesh, triangle, points, normal)
-    facing = -_dot(normal, directions)
-    normal *= np.sign(facing)
-
-    material = scene.mesh.material[triangle]
-    # Round coordinates are in half turns, which a copy covers whatever the tile is.
-    tile = np.where(length == 1, look.tile.T.astype(np.float32)[:, material], np.float32(1))
-    copies = (place - look.offset.T.astype(np.float32)[:, material]) / tile
-    spread = np.prod(length / tile, axis=0) / np.maximum(np.abs(facing), np.float32(1e-3))
-    texel = np.float32(pixel * look.levels[0].shape[1])
-    level = np.log2(np.maximum(t * np.sqrt(spread) * texel, np.float32(1e-6)))
-    texels = _sampled(look.levels, look.texture[material], copies.astype(np.float32), level)
-
-    light = _light(geometry, look.light, points, normal)
-    light += look.emission.astype(np.float32)[material]
-    light *= look.gain.T.astype(np.float32)[:, material]
-    light[:, missed] = 0
-    return texels * light.T
-
-
-def _texture_place(
-    geometry: Geometry, mesh: Mesh, triangle: Int64, points: Float32, normal: Float32
-) -> tuple[Float32, Float32]:
-    """Where points lie on their surfaces' textures; puts the normals of round ones into ``normal``.
-
-    Upright flat surfaces have the texture's second axis downwards.
-
-    Args:
-        geometry: of the scene.
-        mesh: of the scene.
-        triangle: (N,) that points lie on.
-        points: (3, N) world frame.
-        normal: (3, N), changed.
-
-    Returns:
-        The place (2, N) before tile and offset, and its lengths a metre (2, N), 1 where it is in
-        metres.
-    """
-    solid, kind = mesh.solid[triangle], mesh.kind[triangle]
-    x, y, z = local = points.copy()
-    for number in np.unique(solid[solid >= 0]):
-        own = np.flatnonzero(solid == number)
-        local[:, own] = geometry.solids[number].local(points[:, own].T).T
-    place = np.stack([np.where(kind == 0, y, x), np.where(kind == 2, y, -z)])
-    length = np.ones_like(place)
-    for number in np.unique(solid[kind >= ROUND]):
-        body = geometry.solids[number]
-        own = np.flatnonzero((solid == number) & (kind >= ROUND))
-        ball = kind[own[0]] == ROUND
-        scaled = local[:, own] / body.half[:, None]
-        gradient = scaled / body.half[:, None] * [[1], [1], [ball]]
-        normal[:, own] = body.rotation.T @ (gradient / np.linalg.norm(gradient, axis=0))
+    R = geometry.rotation
+    x = p[0, i] - geometry.centre[n, 0]
+    y = p[1, i] - geometry.centre[n, 1]
+    z = p[2, i] - geometry.centre[n, 2]
+    a = R[n, 0, 0] * x + R[n, 0, 1] * y + R[n, 0, 2] * z
+    b = R[n, 1, 0] * x + R[n, 1, 1] * y + R[n, 1, 2] * z
+    c = R[n, 2, 0] * x + R[n, 2, 1] * y + R[n, 2, 2] * z
+    along = down = 1.0
+    if code <= 2:
+        mx = 1.0 if code == 0 else 0.0
+        my = 1.0 if code == 1 else 0.0
+        mz = 1.0 if code == 2 else 0.0
+        u = b if code == 0 else a
+        v = b if code == 2 else -c
+    else:
+        hx = geometry.half[n, 0]
+        hy = geometry.half[n, 1]
+        hz = geometry.half[n, 2]
+        mx = a / (hx * hx)
+        my = b / (hy * hy)
+        mz = c / (hz * hz) if code == 3 else 0.0
+        scale = 1.0 / np.sqrt(mx * mx + my * my + mz * mz)
+        mx *= scale
+        my *= scale
+        mz *= scale
         # Two mirrored copies of half a turn close round the body without a seam.
-        place[0, own] = np.arctan2(scaled[1], scaled[0]) / np.pi
-        length[0, own] = 1 / (np.pi * np.sqrt(body.half[0] * body.half[1]))
-        if ball:
-            place[1, own] = np.arccos(np.clip(scaled[2], -1, 1)) / np.pi
-            length[1, own] = 1 / (np.pi * body.half[2])
-    return place, length
+        u = np.arctan2(b / hy, a / hx) / np.pi
+        along = 1.0 / (np.pi * np.sqrt(hx * hy))
+        v = -c
+        if code == 3:
+            v = np.arccos(min(max(c / hz, -1.0), 1.0)) / np.pi
+            down = 1.0 / (np.pi * hz)
+    x = R[n, 0, 0] * mx + R[n, 1, 0] * my + R[n, 2, 0] * mz
+    y = R[n, 0, 1] * mx + R[n, 1, 1] * my + R[n, 2, 1] * mz
+    z = R[n, 0, 2] * mx + R[n, 1, 2] * my + R[n, 2, 2] * mz
+    facing = -(x * d[0, i] + y * d[1, i] + z * d[2, i])
+    sign = 1.0 if facing > 0 else -1.0
+    normal[0, i] = sign * x
+    normal[1, i] = sign * y
+    normal[2, i] = sign * z
+    return abs(facing), u, v, along, down
 
 
-def _light(geometry: Geometry, source: Light, points: Float32, normal: Float32) -> Float32:
-    """(3, N) light on surface points (3, N)."""
-    above, below = source.ambient.astype(np.float32)[..., None]
-    direction, strength = source.sun.astype(np.float32)
-    light = below + (above - below) * (0.5 + 0.5 * normal[2])
-    light += np.maximum(direction @ normal, 0) * strength[:, None]
-    lifted = points + np.float32(LIFT) * normal
-    for place, color in source.lamps.astype(np.float32)[..., None]:
-        if not color.any():
-            continue
-        way = place - points
-        squared = _dot(way, way)
-        lit = np.maximum(_dot(way, normal), 0) / np.sqrt(squared + np.float32(1e-12))
-        lit *= np.float32(1.25) / (1 + squared / np.float32(source.reach**2))
-        if source.shadows:
-            towards = np.flatnonzero(lit)
-            start = lifted[:, towards]
-            blocked = tracer(geometry).blocked(np.concatenate([start, place - start]).T.copy())
-            lit[towards[blocked]] = 0
-        light += lit * color
-    return light
+@compiled(fastmath=FAST)
+def texture_levels(look, t, pixel, spread, squares, level):
+    """Level of resolution at which a texel is as wide as a ray's share of the surface.
+
+    ``pixel`` is the ray's share of the image at z-depth 1; ``squares`` (count,) float32 is scratch.
+    """
+    factor = (pixel * look.side) ** 2
+    for i in range(len(t)):
+        squares[i] = np.float32(max(t[i] * t[i] * spread[i] * factor, 1e-9))
+    coarsest = len(look.starts) - 1 - 1.001
+    bits = squares.view(np.int32)
+    for i in range(len(t)):
+        # A float's exponent is its logarithm's integer part; the mantissa's is near a parabola.
+        mantissa = np.float64(bits[i] & 0x7FFFFF) / 8388608.0
+        log = np.float64((bits[i] >> 23) - 127) + mantissa * (1.3465 - 0.3465 * mantissa)
+        level[i] = min(max(0.5 * log, 0.0), coarsest)
 
 
-def _dot(first: Float32, second: Float32) -> Float32:
-    """(N,) of (3, N) vectors."""
-    return np.einsum("kn,kn->n", first, second)
+@compiled(inline="always")
+def _mirrored(index, side):
+    """Texel of a plane tiled with mirrored copies; ``side`` is a power of two."""
+    index &= 2 * side - 1
+    return 2 * side - 1 - index if index >= side else index
 
 
-def _sampled(levels: tuple[Float32, ...], row: Int64, place: Float32, level: Float32) -> Float32:
-    """(N, 3) texels of textures at places, between the two nearest levels of resolution."""
-    level = np.clip(level, 0, len(levels) - 1.001)
-    fine = level.astype(np.int64)
-    share = level - fine
-    out = np.zeros((len(row), 3), np.float32)
-    for number, texels in enumerate(levels):
-        for weight, here in ((1 - share, fine == number), (share, fine == number - 1)):
-            own = np.flatnonzero(here)
-            if len(own):
-                found = _bilinear(texels, row[own], place[:, own])
-                out[own] += weight[own, None] * found
-    return out
-
-
-def _bilinear(texels: Float32, row: Int64, place: Float32) -> Float32:
-    """(N, 3) of textures (T, S, S, 3) that are tiled with mirrored copies."""
-    side = texels.shape[1]
-    corner = place * side - np.float32(0.5)
-    low = np.floor(corner)
-    right, lower = (corner - low)[..., None]
-    x, y = low.astype(np.int64)
-
-    def mirrored(index: Int64) -> Int64:
-        index = index % (2 * side)
-        return np.minimum(index, 2 * side - 1 - index)
-
-    x0, x1, y0, y1 = mirrored(x), mirrored(x + 1), mirrored(y), mirrored(y + 1)
-    upper_row = texels[row, y0, x0] * (1 - right) + texels[row, y0, x1] * right
-    lower_row = texels[row, y1, x0] * (1 - right) + texels[row, y1, x1] * right
-    return upper_row * (1 - lower) + lower_row * lower
+@compiled(fastmath=FAST)
+def add_colors(look, what, place, level, light, samples, color):
+    """Add texture times light of each ray to its pixel (W, 3); ``samples`` rays a pixel."""
+    texels = look.texels
+    for i in range(len(what)):
+        m = what[i]
+        row = look.texture[m]
+        fine = np.int64(level[i])
+        red = green = blue = np.float32(0)
+        for step in range(2):
+            coarse = np.float32(level[i] - fine)
+            share = coarse if step else np.float32(1) - coarse
+            side = look.side >> (fine + step)
+            x = place[0, i] * side - 0.5
+            y = place[1, i] * side - 0.5
+            left = np.floor(x)
+            top = np.floor(y)
+            fx = np.float32(x - left)
+            fy = np.float32(y - top)
+            c0 = _mirrored(np.int64(left), side)
+            c1 = _mirrored(np.int64(left) + 1, side)
+            r0 = look.starts[fine + step] + side * _mirrored(np.int64(top), side)
+            r1 = look.starts[fine + step] + side * _mirrored(np.int64(top) + 1, side)
+            lower = share * fy
+            upper = share - lower
+            a = upper - upper * fx
+            b = upper * fx
+            c = lower - lower * fx
+            e = lower * fx
+            red += a * texels[row, r0 + c0, 0] + b * texels[row, r0 + c1, 0]
+            red += c * texels[row, r1 + c0, 0] + e * texels[row, r1 + c1, 0]
+            green += a * texels[row, r0 + c0, 1] + b * texels[row, r0 + c1, 1]
+            green += c * texels[row, r1 + c0, 1] + e * texels[row, r1 + c1, 1]
+            blue += a * texels[row, r0 + c0, 2] + b * texels[row, r0 + c1, 2]
+            blue += c * texels[row, r1 + c0, 2] + e * texels[row, r1 + c1, 2]
+        own = look.emission[m]
+        col = i // samples
+        color[col, 0] += np.float32(red * look.gain[m, 0] * (light[0, i] + own))
+        color[col, 1] += np.float32(green * look.gain[m, 1] * (light[1, i] + own))
+        color[col, 2] += np.float32(blue * look.gain[m, 2] * (light[2, i] + own))

@@ -1,6 +1,7 @@
 """Textures of procedural scenes: crops of photographs and generated patterns, varied and filtered.
 
-Each is kept at halving resolutions, in linear light.
+Each is kept at halving resolutions in linear light, one row of texels after the other, so that a
+kernel finds all textures of a scene in one array.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.kernels import compiled
 from gvtools.procedural.color import decode_srgb
 from gvtools.procedural.patterns import color, pattern
 from gvtools.procedural.photographs import photograph
@@ -79,13 +81,44 @@ def _image(name: str) -> Image:
     return Image.fromarray(photograph(name))
 
 
-def stacked(images: Sequence[NDArray[np.uint8]]) -> tuple[NDArray[np.float32], ...]:
-    """(T, S, S, 3) float32 linear light of every texture, and its 2 x 2 means down to one texel.
+def level_starts(side: int) -> NDArray[np.int64]:
+    """(levels + 1,) where each level of a texture starts, and the number of all its texels."""
+    sizes = [(side >> level) ** 2 for level in range(side.bit_length())]
+    return np.cumsum([0, *sizes]).astype(np.int64)
+
+
+def stacked(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+    """(T, texels, 3) float32 linear light: every texture at all its levels, row by row.
 
     Textures are square, of one size, and their side is a power of two.
     """
-    levels = [decode_srgb(np.stack(images))]
-    while levels[-1].shape[1] > 1:
-        count, side = levels[-1].shape[:2]
-        levels.append(levels[-1].reshape(count, side // 2, 2, side // 2, 2, 3).mean((2, 4)))
-    return tuple(levels)
+    encoded = np.stack(images)
+    out = np.empty((len(encoded), level_starts(encoded.shape[1])[-1], 3), np.float32)
+    _fill(encoded, decode_srgb(np.arange(256, dtype=np.uint8)), out)
+    return out
+
+
+@compiled()
+def _fill(encoded, linear, out):
+    """Decode the finest level, then average 2 x 2 texels of each level for the next."""
+    count, side = encoded.shape[:2]
+    for t in range(count):
+        for row in range(side):
+            for col in range(side):
+                for c in range(3):
+                    out[t, row * side + col, c] = linear[encoded[t, row, col, c]]
+        above = 0
+        start = side * side
+        half = side // 2
+        while half:
+            for row in range(half):
+                for col in range(half):
+                    first = above + 4 * row * half + 2 * col
+                    below = first + 2 * half
+                    for c in range(3):
+                        total = out[t, first, c] + out[t, first + 1, c]
+                        total += out[t, below, c] + out[t, below + 1, c]
+                        out[t, start + row * half + col, c] = np.float32(0.25) * total
+            above = start
+            start += half * half
+            half //= 2

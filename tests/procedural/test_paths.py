@@ -5,7 +5,6 @@ import pytest
 from reference_rays import is_free
 
 from gvtools.errors import OptionError
-from gvtools.procedural.geometry import clearance
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import cast
@@ -25,7 +24,8 @@ def test_cameras_stand_in_free_space_and_see_something() -> None:
     for place, cameras in _paths(40):
         assert is_free(place.geometry, cameras.centers).all()
         # Not inside a hull either: nobody stands under a table.
-        assert clearance(place.geometry, cameras.centers).min() > 0
+        bare = place.geometry._replace(first_cutter=0 * place.geometry.first_cutter)
+        assert is_free(bare, cameras.centers).all()
         depth = cast(place.geometry, cameras.resized(16, 12)).depth
         assert depth.min() > 0.02 * depth.mean()
         rotation = cameras.cam_from_world[:, :3, :3]

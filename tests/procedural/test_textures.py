@@ -8,12 +8,22 @@ from gvtools.procedural import materials
 from gvtools.procedural.color import decode_srgb, encode_srgb
 from gvtools.procedural.patterns import color, noise, pattern
 from gvtools.procedural.photographs import LONGEST, PHOTOGRAPHS, photograph, photograph_names
-from gvtools.procedural.textures import SIDE, picture, stacked, texture
+from gvtools.procedural.textures import SIDE, level_starts, picture, stacked, texture
 
 
 def test_splits_share_no_photograph() -> None:
     train, held_out = (PHOTOGRAPHS[split] for split in ("train", "held-out"))
     assert not set(train) & set(held_out)
+    thumbnails = {
+        name: np.sort(photograph(name).reshape(-1, 3).mean(1))[:: photograph(name).size // 300][
+            :100
+        ]
+        for split in PHOTOGRAPHS
+        for name in photograph_names(split)
+    }
+    for a in photograph_names("train"):
+        for b in photograph_names("held-out"):
+            assert not np.array_equal(thumbnails[a], thumbnails[b])
 
 
 def test_photographs_of_installed_wheels_alone() -> None:
@@ -62,10 +72,14 @@ def test_noise_fills_its_range() -> None:
 def test_levels_are_block_means_in_linear_light() -> None:
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (2, SIDE, SIDE, 3), np.uint8)
+    texels = stacked(list(images))
     linear = decode_srgb(images).astype(np.float64)
-    for level, found in enumerate(stacked(list(images))):
-        side, block = SIDE >> level, 1 << level
+    starts = level_starts(SIDE)
+    for level in range(len(starts) - 1):
+        side = SIDE >> level
+        block = 1 << level
         expected = linear.reshape(2, side, block, side, block, 3).mean((2, 4))
+        found = texels[:, starts[level] : starts[level + 1]].reshape(2, side, side, 3)
         np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
