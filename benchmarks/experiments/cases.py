@@ -65,8 +65,8 @@ def held_out_cases(
         given = data.given(index)
         targets = [view for view in range(views) if view not in given.context]
         observation = observed(given.clip, given.context, given.strength, given.rng)
-        guidance = projected(observation, given.clip.cameras[targets], data.hints)
-        truth = given.truth
+        guidance = projected(observation, given.clip.cameras[targets])
+        truth = given.clip
         yield Case(
             f"held-out {index}",
             observation.views,

@@ -64,7 +64,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     )
     skipped = 0
     for index in range(options.scenes):
-        _, truth = data.clips(index)
+        truth = data.clip(index)
         context = _context(truth)
         try:
             probe = PoseProbe(

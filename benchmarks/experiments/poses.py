@@ -23,7 +23,7 @@ from gvtools.evaluation.tables import Column, Table
 from gvtools.networks.depth_anything.geometry_head import Geometry
 from gvtools.networks.depth_anything.rays import poses_least_squares
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.context_choice import ContextOptions
+from gvtools.training.context_choice import ContextChoice
 from gvtools.training.dataset import ProceduralViews
 from gvtools.training.encoder_stage import scene_unit
 from gvtools.training.view_sample import collated
@@ -39,7 +39,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         seed=options.seed,
         split="held-out",
         size=(side, side),
-        context=ContextOptions(most=model.config.context),
+        context=ContextChoice(most=model.config.context),
         fill=model.config.hints.fill,
     )
     device = next(model.parameters()).device

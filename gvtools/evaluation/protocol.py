@@ -20,7 +20,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gvtools.errors import OptionError
-from gvtools.options import check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,9 +80,10 @@ def protocol_split(
     Raises:
         OptionError: numbers below 1, or too few views.
     """
-    for what, number in {"context": context, "targets": targets, "rounds": rounds}.items():
-        check_range(what, number, least=1)
-    check_range("stride", stride, least=1)
+    counts = {"context": context, "targets": targets, "rounds": rounds, "stride": stride}
+    for what, number in counts.items():
+        if number is not None and number < 1:
+            raise OptionError(f"{what} {number}; expected at least 1")
     layout = "ends" if rounds == 1 else "first"
     window = context + targets * rounds
     if stride is None:

@@ -6,7 +6,7 @@ from: held-out rooms are somewhat larger and higher, with fewer and larger thing
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
 from gvtools.procedural.clutter import add_clutter
 from gvtools.procedural.geometry import Geometry, clearance
 from gvtools.procedural.openings import add_frames, add_openings, add_side_room
-from gvtools.procedural.photographs import check_split, photograph_names
+from gvtools.procedural.photographs import photograph_names
 
 Float64 = NDArray[np.float64]
 Range = tuple[float, float]
@@ -67,23 +67,18 @@ STYLES = {
 }
 
 
-def scene(
-    rng: np.random.Generator, split: str, *, photographs: Sequence[str] | None = None
-) -> ProceduralScene:
+def scene(rng: np.random.Generator, split: str) -> ProceduralScene:
     """A scene.
 
     Args:
         rng: decides everything.
         split: "train" or "held-out".
-        photographs: names that textures may be cut from; None for the split's.
 
     Raises:
         OptionError: no such split.
     """
-    check_split(split)
+    build = SceneBuilder(rng, photograph_names(split))
     style = STYLES[split]
-    names = photograph_names(split) if photographs is None else photographs
-    build = SceneBuilder(rng, names)
     kind = rng.choice(len(_LAYOUTS), p=style.kinds)
     _LAYOUTS[kind](build, style)
     geometry = build.geometry()

@@ -11,61 +11,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
 
 from gvtools.cameras import Cameras
-from gvtools.errors import OptionError
 from gvtools.procedural.geometry import Geometry, clearance
 from gvtools.procedural.ray_cast import cast
-from gvtools.settings import Settings
 
 Float64 = NDArray[np.float64]
 
 ATTEMPTS = 40
 # Rays along a side of the pictures that a path is judged by.
 PROBE = 8
-
-
-class PathOptions(Settings):
-    """Ranges that paths are drawn from, each with its lower end first."""
-
-    section = "paths"
-
-    fov: tuple[float, float] = (50.0, 80.0)
-    """Along the pictures' longer side, at most 170. [degrees]"""
-    travel: tuple[float, float] = (0.15, 1.3)
-    """Length of a path. [mean depths of its first view]"""
-    turn: tuple[float, float] = (5.0, 110.0)
-    """How far the view turns over a path, at most 360. [degrees]"""
-    clearance: float = Field(0.06, gt=0)
-    """Least distance to anything. [mean depths of the first view]"""
-    nearest: float = Field(0.08, ge=0)
-    """Least z-depth of a pixel. [mean depths of the first view]"""
-
-    @model_validator(mode="after")
-    def _check(self) -> PathOptions:
-        for name, most in (("fov", 170.0), ("travel", np.inf), ("turn", 360.0)):
-            low, high = getattr(self, name)
-            if not 0 <= low <= high <= most:
-                raise OptionError(
-                    f"paths.{name} [{low}, {high}]; expected 0 <= low <= high <= {most:g}"
-                )
-        return self
-
-
-@dataclass(frozen=True, eq=False)
-class CameraPath:
-    """Cameras in order along a path.
-
-    Attributes:
-        cameras: V of them.
-        kind: forward, orbit, pan, pull_back or walk.
-        attempts: how many paths were drawn for it.
-    """
-
-    cameras: Cameras
-    kind: str
-    attempts: int
+# Ranges that paths are drawn from, and limits, in mean depths of the first view but for angles.
+FOV = (50.0, 80.0)  # along the pictures' longer side, degrees
+TRAVEL = (0.15, 1.3)  # length of a path
+TURN = (5.0, 110.0)  # how far the view turns over a path, degrees
+CLEARANCE = 0.06  # least distance to anything
+NEAREST = 0.08  # least z-depth of a pixel
 
 
 def camera_path(
@@ -74,19 +35,16 @@ def camera_path(
     *,
     views: int,
     size: tuple[int, int],
-    options: PathOptions | None = None,
-) -> CameraPath:
-    """A path through the free space of a scene.
+) -> Cameras:
+    """The cameras, in order, of a path through the free space of a scene.
 
     Args:
         rng: decides everything.
         geometry: of the scene.
         views: number of cameras.
         size: (H, W) of the pictures.
-        options: see PathOptions.
     """
-    options = options or PathOptions()
-    K = _intrinsics(rng, size, options)
+    K = _intrinsics(rng, size)
     start, forward, depth = _start(rng, geometry, K, size)
     for attempt in range(ATTEMPTS):
         kind = int(rng.choice(len(_KINDS), p=_CHANCES))
@@ -95,16 +53,16 @@ def camera_path(
         move = _Move(
             rng,
             depth,
-            modesty * rng.uniform(*options.travel) * depth,
-            modesty * np.radians(rng.uniform(*options.turn)) * rng.choice([-1, 1]),
+            modesty * rng.uniform(*TRAVEL) * depth,
+            modesty * np.radians(rng.uniform(*TURN)) * rng.choice([-1, 1]),
         )
         poses = _leaning(rng, *_KINDS[kind](move, start, forward, views))
         cameras = _cameras(K, poses, size)
-        if _is_free(geometry, cameras, depth, options):
-            return CameraPath(cameras, _KINDS[kind].__name__[1:], attempt + 1)
-    move = _Move(rng, depth, 0.0, np.radians(options.turn[1] / 2))
+        if _is_free(geometry, cameras, depth):
+            return cameras
+    move = _Move(rng, depth, 0.0, np.radians(TURN[1] / 2))
     poses = _leaning(rng, *_pan(move, start, forward, views))
-    return CameraPath(_cameras(K, poses, size), "pan", ATTEMPTS + 1)
+    return _cameras(K, poses, size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +75,9 @@ class _Move:
     turn: float
 
 
-def _intrinsics(rng: np.random.Generator, size: tuple[int, int], options: PathOptions) -> Float64:
+def _intrinsics(rng: np.random.Generator, size: tuple[int, int]) -> Float64:
     height, width = size
-    focal = max(size) / (2 * np.tan(np.radians(rng.uniform(*options.fov)) / 2))
+    focal = max(size) / (2 * np.tan(np.radians(rng.uniform(*FOV)) / 2))
     offset = rng.normal(0, 0.01, 2) * (rng.random() < 0.5) * max(size)
     return np.array(
         [[focal, 0, width / 2 + offset[0]], [0, focal, height / 2 + offset[1]], [0, 0, 1]]
@@ -153,13 +111,11 @@ def _start(
     return places[best], forward[pick], float(mean[pick])
 
 
-def _is_free(geometry: Geometry, cameras: Cameras, depth: float, options: PathOptions) -> bool:
-    if clearance(geometry, cameras.centers).min() < options.clearance * depth:
+def _is_free(geometry: Geometry, cameras: Cameras, depth: float) -> bool:
+    if clearance(geometry, cameras.centers).min() < CLEARANCE * depth:
         return False
     seen = cast(geometry, cameras.resized(PROBE, PROBE)).depth
-    return bool(
-        seen.min() > options.nearest * depth and np.median(seen, (1, 2)).min() > 0.3 * depth
-    )
+    return bool(seen.min() > NEAREST * depth and np.median(seen, (1, 2)).min() > 0.3 * depth)
 
 
 _Poses = tuple[Float64, Float64]

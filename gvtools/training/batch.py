@@ -52,11 +52,15 @@ class TrainingBatch:
         return replace(self, views=views)
 
     @property
+    def relative(self) -> Tensor:
+        """(B, V, 4, 4) float64 cameras from the frame of the first view."""
+        pose = self.views.cam_from_world.double()
+        return pose @ torch.linalg.inv(pose[:, :1])
+
+    @property
     def centers(self) -> Tensor:
         """(B, V, 3) true camera centres in the frame of the first view."""
-        pose = self.views.cam_from_world
-        relative = pose.double() @ torch.linalg.inv(pose[:, :1].double())
-        rotation, translation = relative[..., :3, :3], relative[..., :3, 3:]
+        rotation, translation = self.relative[..., :3, :3], self.relative[..., :3, 3:]
         return -(rotation.mT @ translation)[..., 0].to(self.images.dtype)
 
     def samples(self, index: Tensor) -> TrainingBatch:

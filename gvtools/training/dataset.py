@@ -6,21 +6,19 @@ that is continued see what one process would have seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 
 from gvtools.errors import OptionError
-from gvtools.options import check_range
 from gvtools.procedural.layouts import scene
-from gvtools.procedural.paths import PathOptions, camera_path
+from gvtools.procedural.paths import camera_path
 from gvtools.procedural.photographs import check_split, photograph_names
-from gvtools.procedural.render import SUPERSAMPLE, developed, radiance
-from gvtools.settings import Settings
-from gvtools.training.context_choice import ContextOptions
+from gvtools.procedural.render import developed, radiance
+from gvtools.training.context_choice import ContextChoice
 from gvtools.training.corruption import CorruptionOptions, drawn
-from gvtools.training.hints import Clip, HintOptions
+from gvtools.training.hints import Clip
 from gvtools.training.view_sample import Sample, make_sample
 
 # Streams of random numbers of one sample.
@@ -46,15 +44,13 @@ class Given:
     """What a sample is made of.
 
     Attributes:
-        clip: its views in order, as they are observed.
-        truth: the same views at the model's size.
+        clip: its true views in order.
         context: which of them are given, ascending.
         strength: of its faults.
         rng: draws the faults; used up by one sample.
     """
 
     clip: Clip
-    truth: Clip
     context: tuple[int, ...]
     strength: CorruptionOptions
     rng: np.random.Generator
@@ -69,75 +65,51 @@ class ProceduralViews:
         split: "train" or "held-out": other photographs, layouts and numbers.
         views: of a sample, context and targets.
         size: (H, W) of the pictures.
-        detail: memory is made and projected at so many times the size, then reduced, as it is where
-            photographs are larger than the model's pictures.
         context: how many views are given, and which.
-        paths: see PathOptions.
         faults: see CorruptionOptions; None for clean observations.
-        hints: see HintOptions.
         fill: of the model's configuration, ``hints.fill``.
-        photographs: names that textures may be cut from; None for those of the split that are
-            installed. They decide the samples.
     """
 
     seed: int = 0
     split: str = "train"
     views: int = 8
     size: tuple[int, int] = (96, 96)
-    detail: int = 1
-    context: ContextOptions = field(default_factory=ContextOptions)
-    paths: PathOptions = field(default_factory=PathOptions)
+    context: ContextChoice = field(default_factory=ContextChoice)
     faults: CorruptionOptions | None = field(default_factory=CorruptionOptions)
-    hints: HintOptions = field(default_factory=HintOptions)
     fill: str = "none"
-    photographs: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         check_split(self.split)
-        check_range("data.seed", self.seed, least=0)
-        check_range("data.detail", self.detail, least=1)
-        check_range("data.views", self.views, least=self.context.most + 1)
-        if self.photographs is None:
-            object.__setattr__(self, "photographs", photograph_names(self.split))
 
     def sample(self, index: int) -> Sample:
         """The sample of a number, 0 or more."""
         given = self.given(index)
         return make_sample(
             given.clip,
-            given.truth,
+            given.clip,
             given.context,
             rng=given.rng,
             strength=given.strength,
-            hints=self.hints,
             fill=self.fill,
         )
 
     def given(self, index: int) -> Given:
         """What the sample of a number is made of."""
-        clip, truth = self.clips(index)
+        clip = self.clip(index)
         rng = self._rng(index, FAULTS)
         strength = drawn(rng, self.faults or CorruptionOptions(clean=1.0))
         context = self.context.chosen(rng, self.views, self.context_count(index))
-        return Given(clip, truth, context, strength, rng)
+        return Given(clip, context, strength, rng)
 
-    def clips(self, index: int) -> tuple[Clip, Clip]:
-        """The views of a sample in order: as they are observed, and at the model's size."""
-        place = scene(self._rng(index, SCENE), self.split, photographs=self.photographs)
-        path = camera_path(
-            self._rng(index, PATH), place.geometry, views=self.views, size=self.size,
-            options=self.paths,
-        )  # fmt: skip
-        light, depth = radiance(place.geometry, place.look, path.cameras)
-        exposure = place.key / max(float(light.mean()), 1e-6)
-        truth = Clip(developed(light, exposure), depth, path.cameras)
-        if self.detail == 1:
-            return truth, truth
-        cameras = path.cameras.resized(self.size[1] * self.detail, self.size[0] * self.detail)
-        light, depth = radiance(
-            place.geometry, place.look, cameras, supersample=max(1, SUPERSAMPLE // self.detail)
+    def clip(self, index: int) -> Clip:
+        """The true views of a sample in order."""
+        place = scene(self._rng(index, SCENE), self.split)
+        cameras = camera_path(
+            self._rng(index, PATH), place.geometry, views=self.views, size=self.size
         )
-        return Clip(developed(light, exposure), depth, cameras), truth
+        light, depth = radiance(place.geometry, place.look, cameras)
+        exposure = place.key / max(float(light.mean()), 1e-6)
+        return Clip(developed(light, exposure), depth, cameras)
 
     def context_count(self, index: int) -> int:
         """How many views of a sample are given."""
@@ -147,7 +119,8 @@ class ProceduralViews:
         """Everything that decides the samples, as plain data."""
         return {
             "source": "procedural",
-            **{f.name: plain(getattr(self, f.name)) for f in fields(self)},
+            **described(self),
+            "photographs": photograph_names(self.split),
         }
 
     @property
@@ -160,9 +133,11 @@ class ProceduralViews:
         return np.random.default_rng([*self._seed, index, stream])
 
 
-def plain(value: Any) -> Any:
-    """A part of a data set's description as plain data."""
-    return value.to_dict() if isinstance(value, Settings) else value
+def described(views: Any) -> dict[str, Any]:
+    """The settings that procedural and recorded views share, as plain data."""
+    plain = {name: getattr(views, name) for name in ("seed", "views", "size", "fill")}
+    faults = None if views.faults is None else views.faults.to_dict()
+    return {**plain, "context": asdict(views.context), "faults": faults}
 
 
 @dataclass(frozen=True)
@@ -182,10 +157,6 @@ class MixedViews:
     share: float
     group: int = 8
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_range("data.share", self.share, least=0, most=1)
-        check_range("data.group", self.group, least=1)
 
     def sample(self, index: int) -> Sample:
         """The sample of a number, 0 or more."""

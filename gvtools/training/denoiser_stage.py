@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor, nn
 
@@ -9,34 +11,27 @@ from gvtools.completers.geoverse.correction import composed
 from gvtools.completers.geoverse.flow import (
     clean_from_velocity,
     interpolate,
-    training_times,
     velocity_target,
 )
-from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective.objective import Prediction, Reference, objective
 from gvtools.completers.geoverse.passes import Prepared
 from gvtools.networks.depth_anything.rays import camera_centres
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 from gvtools.training.options import DenoiserStageOptions
+from gvtools.training.stage import Stage
 
 
-class DenoiserStage(nn.Module):
+class DenoiserStage(Stage):
     """Loss of stage 1; see the module."""
 
     name = "denoiser"
 
-    def __init__(self, model: GeoVerse, options: DenoiserStageOptions) -> None:
-        super().__init__()
-        self.model = model
-        self.options = options
-        model.requires_grad_(False)
-        for part in (model.level1, model.cascade, model.control, model.shared):
-            if part is not None:
-                part.requires_grad_(True)
-                for module in part.modules():
-                    if hasattr(module, "W"):
-                        module.W.requires_grad_(False)
+    options: DenoiserStageOptions
+
+    def learning_parts(self) -> Iterable[nn.Module | None]:
+        """Both denoisers and what they share."""
+        return self.model.level1, self.model.cascade, self.model.control, self.model.shared
 
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
@@ -48,7 +43,8 @@ class DenoiserStage(nn.Module):
         if bool(drop.any()):
             prepared = model.without_cameras(prepared, drop.to(device))
 
-        t1, noise1 = self._time(draws, "t1", device), draws.normal("eps1", clean1.shape, device)
+        t1 = self.time(draws, "t1").to(device)
+        noise1 = draws.normal("eps1", clean1.shape, device)
         state1 = interpolate(clean1, noise1, t1)
         velocity1 = model.velocity1(prepared, state1, t1)
         predicted = {"level1": velocity1}
@@ -56,7 +52,8 @@ class DenoiserStage(nn.Module):
 
         found0 = torch.zeros_like(clean1)
         if model.cascade is not None:
-            t0, noise0 = self._time(draws, "t0", device), draws.normal("eps0", clean0.shape, device)
+            t0 = self.time(draws, "t0").to(device)
+            noise0 = draws.normal("eps0", clean0.shape, device)
             state0 = interpolate(clean0, noise0, t0)
             amount = options.source_noise * draws.uniform("source", 1, 1, 1, 1).to(device)
             source = clean1 + amount * draws.normal("source_eps", clean1.shape, device)
@@ -105,9 +102,3 @@ class DenoiserStage(nn.Module):
             # A correction has the scale of the projection; a decoding has that of its centres.
             centers = camera_centres(decoded.geometry.ray, decoded.geometry.ray_confidence)
         return {"image": image, "depth": depth, "centers": centers}
-
-    def _time(self, draws: Draws, name: str, device: torch.device) -> Tensor:
-        """(B,) times, uniform before the shift."""
-        uniform = draws.uniform(name, 1)[:, 0]
-        flow = self.model.config.flow
-        return training_times(uniform, shift=flow.shift, most=flow.most_time).to(device)

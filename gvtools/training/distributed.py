@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.errors import OptionError
+from gvtools.training.stage import Stage
 
 # More rounds than a group has threads.
 SETTLING_ROUNDS = 4
@@ -158,7 +159,7 @@ class Replicated:
     # For the user; empty where there is nothing to say.
     about = ""
 
-    def __init__(self, stage: nn.Module, processes: Processes) -> None:
+    def __init__(self, stage: Stage, processes: Processes) -> None:
         self.stage, self.processes = stage, processes
         self._distribute()
 

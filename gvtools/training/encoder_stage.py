@@ -7,7 +7,8 @@ camera centres are in units of the mean context depth, in the frame of the first
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -21,32 +22,28 @@ from gvtools.networks.depth_anything.geometry_head import Geometry
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 from gvtools.training.options import EncoderStageOptions, HeadsStageOptions
+from gvtools.training.stage import Stage
 
 # Pull of the confidence towards certainty against the error (DA3, VGGT).
 CONFIDENCE_REWARD = 0.2
 
 
-class EncoderStage(nn.Module):
+class EncoderStage(Stage):
     """Loss of stage 0; see the module."""
 
     name = "encoder"
 
-    def __init__(self, model: GeoVerse, options: EncoderStageOptions) -> None:
-        super().__init__()
-        self.model = model
-        self.options = options
-        model.requires_grad_(False)
-        model.geometry.requires_grad_(True)
-        model.rgb_head.requires_grad_(True)
+    options: EncoderStageOptions
+
+    def learning_parts(self) -> Iterable[nn.Module | None]:
+        """The encoder and its heads."""
+        return self.model.geometry, self.model.rgb_head
 
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
         model, options = self.model, self.options
         features = noised_features(model, batch, draws, options)
-        grid = model.geometry.encoder.grid(*batch.views.size)
-        geometry = model.geometry.head(features.levels, grid)
-        rgb = model.rgb_head(torch.cat(features.levels, dim=-1).flatten(0, 1), grid)
-        rgb = rgb.unflatten(0, batch.images.shape[:2])
+        geometry, rgb = decoded(model, features, batch)
         unit = scene_unit(batch)
         depth = batch.depth[:, :, 0] / unit[:, None, None, None]
         terms = {
@@ -66,9 +63,8 @@ class EncoderStage(nn.Module):
 
     def _pose_error(self, token: Tensor, batch: TrainingBatch, unit: Tensor) -> Tensor:
         """The camera decoder's L1 error, centres in units of the mean context depth."""
-        pose = batch.views.cam_from_world
-        relative = (pose.double() @ torch.linalg.inv(pose[:, :1].double())).float()
-        relative = torch.cat((relative[..., :3], relative[..., 3:] / _homogeneous(unit)), dim=-1)
+        relative = batch.relative.float()
+        relative[..., :3, 3] /= unit[:, None, None]
         truth = encode_cameras(relative, batch.views.K, batch.views.size)
         return (self.model.geometry.cam_dec(token.float()) - truth).abs().mean()
 
@@ -104,10 +100,22 @@ def noised_features(
     drop = draws.uniform("level0", 1, 1, 1).to(level.device) < options.drop_level0
     mean = noisy[0].detach().mean(dim=(1, 2), keepdim=True)
     noisy[0] = torch.where(drop, mean, noisy[0])
+    return head_features(model, noisy, batch)
+
+
+def head_features(model: GeoVerse, levels: Sequence[Tensor], batch: TrainingBatch) -> Features:
+    """What the heads get of levels 0 and 1, the deeper levels made of level 1."""
     encoder = model.geometry.encoder
-    pyramid = [*noisy, *encoder.propagate(noisy[1], encoder.grid(*batch.views.size))]
+    pyramid = [*levels, *encoder.propagate(levels[1], encoder.grid(*batch.views.size))]
     normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
     return Features(normed, pyramid[-1][:, :, 0])
+
+
+def decoded(model: GeoVerse, features: Features, batch: TrainingBatch) -> tuple[Geometry, Tensor]:
+    """The geometry and the colour (B, V, 3, H, W) that the heads make of features."""
+    grid = model.geometry.encoder.grid(*batch.views.size)
+    rgb = model.rgb_head(torch.cat(features.levels, dim=-1).flatten(0, 1), grid)
+    return model.geometry.head(features.levels, grid), rgb.unflatten(0, batch.images.shape[:2])
 
 
 def _shown(model: GeoVerse, batch: TrainingBatch, draws: Draws, share: float) -> ViewBatch:
@@ -117,7 +125,7 @@ def _shown(model: GeoVerse, batch: TrainingBatch, draws: Draws, share: float) ->
     swap = draws.uniform("hints", views.images.shape[1]).to(hints.device) < share
     swap[:, : views.context] = False
     images = torch.where(swap[:, :, None, None, None], hints, views.images)
-    return ViewBatch(images, views.depth, views.valid, views.cam_from_world, views.K, views.context)
+    return replace(views, images=images)
 
 
 def scene_unit(batch: TrainingBatch) -> Tensor:
@@ -132,9 +140,7 @@ def true_rays(batch: TrainingBatch, unit: Tensor, grid: tuple[int, int]) -> Tens
 
     A ray belongs to the middle of its cell of the ray grid.
     """
-    pose = batch.views.cam_from_world
-    relative = (pose.double() @ torch.linalg.inv(pose[:, :1].double())).float()
-    rays = patch_rays(relative, batch.views.K, grid, batch.views.size)[..., :6]
+    rays = patch_rays(batch.relative.float(), batch.views.K, grid, batch.views.size)[..., :6]
     direction, origin = rays.unflatten(2, grid).split(3, dim=-1)
     return torch.cat((direction, origin / unit[:, None, None, None, None]), dim=-1)
 
@@ -190,12 +196,6 @@ def _gradient_error(predicted: Tensor, depth: Tensor) -> Tensor:
         gap = predicted.log().diff(dim=dim) - log.diff(dim=dim)
         total = total + masked_mean(gap.abs(), both)
     return total
-
-
-def _homogeneous(unit: Tensor) -> Tensor:
-    """(B, 1, 4, 1) divisors of a translation column."""
-    one = torch.ones_like(unit)
-    return torch.stack((unit, unit, unit, one), dim=-1)[:, None, :, None]
 
 
 @torch.no_grad()

@@ -8,11 +8,12 @@ features allow. The layers that depth and rays share stay as they are.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse.correction import composed
-from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective.losses import high_gradient_loss, rgb_loss
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
@@ -24,27 +25,22 @@ from gvtools.training.encoder_stage import (
     true_rays,
 )
 from gvtools.training.options import HeadsStageOptions
+from gvtools.training.stage import Stage
 
 
-class HeadsStage(nn.Module):
+class HeadsStage(Stage):
     """Loss of the heads; see the module."""
 
     name = "heads"
 
-    def __init__(self, model: GeoVerse, options: HeadsStageOptions) -> None:
-        super().__init__()
-        self.model = model
-        self.options = options
-        model.requires_grad_(False)
-        trained: list[nn.Module] = []
-        if options.ray:
-            trained += model.geometry.head.ray_chain()
-        if options.rgb:
-            trained.append(model.rgb_head)
-        if options.depth:
-            trained += model.geometry.head.depth_chain()
-        for part in trained:
-            part.requires_grad_(True)
+    options: HeadsStageOptions
+
+    def learning_parts(self) -> Iterable[nn.Module | None]:
+        """The heads that have a weight."""
+        model, options = self.model, self.options
+        rays = model.geometry.head.ray_chain() if options.ray else []
+        depth = model.geometry.head.depth_chain() if options.depth else []
+        return [*rays, model.rgb_head if options.rgb else None, *depth]
 
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""

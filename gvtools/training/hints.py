@@ -11,16 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import ContextView
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance
-from gvtools.memory.back_projection import BackProjectionOptions
-from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-from gvtools.memory.splat.api import SplatOptions
-from gvtools.settings import Settings
+from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.training.corruption import (
     CorruptionOptions,
     corrupted_camera,
@@ -29,16 +25,6 @@ from gvtools.training.corruption import (
 )
 
 Float32 = NDArray[np.float32]
-
-
-class HintOptions(Settings):
-    """How memory is made and projected; the defaults are those of a run."""
-
-    voxel_scale: float = Field(1.0, gt=0)
-    """Voxel edge. [median pixel footprints of the context]"""
-    back_projection: BackProjectionOptions = BackProjectionOptions()
-    memory: MemoryOptions = MemoryOptions()
-    splat: SplatOptions = SplatOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,17 +92,13 @@ def observed(
     return Observation(tuple(views), tuple(lifted))
 
 
-def projected(
-    observation: Observation, targets: Cameras, options: HintOptions | None = None
-) -> Guidance:
-    """The memory of some observed views, projected into target cameras.
+def projected(observation: Observation, targets: Cameras) -> Guidance:
+    """The memory of some observed views, with a run's defaults, projected into target cameras.
 
     Args:
         observation: views without depth are left out of the memory.
         targets: cameras of one size.
-        options: see HintOptions.
     """
-    options = options or HintOptions()
     lifted = [
         (np.rint(view.rgb * 255).astype(np.uint8), view.depth, camera)
         for view, camera in zip(observation.views, observation.lifted, strict=True)
@@ -126,8 +108,8 @@ def projected(
         np.median(depth[depth > 0]) / np.sqrt(camera.K[0, 0, 0] * camera.K[0, 1, 1])
         for _, depth, camera in lifted
     ]
-    voxel = options.voxel_scale * float(np.median(footprints)) if lifted else 1.0
-    memory = SpatialMemory(voxel, origin=targets.centers[0], options=options.memory)
+    voxel = float(np.median(footprints)) if lifted else 1.0
+    memory = SpatialMemory(voxel, origin=targets.centers[0])
     for rgb, depth, camera in lifted:
-        memory.observe(rgb, depth, camera, round=0, options=options.back_projection)
-    return memory.project(targets, options=options.splat)
+        memory.observe(rgb, depth, camera, round=0)
+    return memory.project(targets)

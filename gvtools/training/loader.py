@@ -1,6 +1,6 @@
-"""Batches of a data set, made ahead by other processes; what they hold does not depend on those.
+"""Batches of a data set in order, made ahead by other processes, which change nothing in them.
 
-A sample follows from its number, so that the only state of a loader is the number that comes next.
+A sample follows from its number, so that there is no state to save.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Generator, Iterable
 from dataclasses import fields
 from typing import Any
 
@@ -16,140 +16,49 @@ import numba
 import torch
 from numpy.typing import NDArray
 
-from gvtools.errors import GvError, OptionError
+from gvtools.errors import GvError
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.dataset import Samples
 from gvtools.training.view_sample import Sample, collated
 
-# A sample on its way: its number, its context views, its tensors as arrays; or why there is none.
-_Made = tuple[int, int, dict[str, NDArray[Any]] | GvError]
+# A sample on its way: its context views, its tensors as arrays; or why there is none.
+_Made = tuple[int, dict[str, NDArray[Any]]] | GvError
 
 
-class BatchLoader:
-    """Batches by the numbers of their samples.
-
-    Call it with the numbers of a batch, or iterate over it. Samples are made ahead in the order of
-    steps of ``batch`` samples, of which this process takes its ``share``; any other order gives
-    the same batches, but nothing is ready then.
+def batches(
+    data: Samples, parts: Iterable[range], *, workers: int
+) -> Generator[TrainingBatch, None, None]:
+    """Batches of the samples with these numbers; closing the iterator ends the workers.
 
     Args:
         data: the data set; has to be picklable when there are workers.
-        batch: samples a step, over all processes.
+        parts: numbers of each batch's samples, without end.
         workers: processes that make samples; 0 makes them when they are asked for.
-        ahead: steps that are made ahead.
-        share: of a step's numbers, those of this process; None for all.
-        start: number of the first sample.
+
+    Raises:
+        ShapeError: the numbers of context views of a batch differ.
     """
-
-    def __init__(
-        self,
-        data: Samples,
-        batch: int,
-        *,
-        workers: int = 0,
-        ahead: int = 2,
-        share: Callable[[range], range] | None = None,
-        start: int = 0,
-    ) -> None:
-        self.data, self.batch, self.workers, self.ahead = data, batch, workers, ahead
-        self.share = share
-        self.next_index = start
-        self._stream: Iterator[_Made] | None = None
-        self._expected = -1
-
-    def __call__(self, numbers: range) -> TrainingBatch:
-        """The batch of some samples.
-
-        Raises:
-            OptionError: no numbers.
-            ShapeError: their numbers of context views differ.
-        """
-        if not len(numbers):
-            raise OptionError("a batch of no samples; expected at least one number")
-        samples = [self._take(number) for number in numbers]
-        self.next_index = numbers[-1] + 1
-        return collated(samples)
-
-    def __iter__(self) -> Iterator[TrainingBatch]:
-        """Endless batches of whole steps, from the next one on."""
-        while True:
-            step = self.next_index // self.batch
-            mine = self._share(step)
-            left = range(max(self.next_index, mine.start), mine.stop)
-            end = (step + 1) * self.batch
-            if len(left):
-                batch = self(left)
-                self.next_index = end
-                yield batch
-            self.next_index = end
-
-    def state_dict(self) -> dict[str, int]:
-        """What is needed to go on exactly here."""
-        return {"next_index": self.next_index}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on where ``state_dict`` was taken."""
-        self.next_index = int(state["next_index"])
-
-    def close(self) -> None:
-        """End the workers."""
-        self._stream = None
-        self._expected = -1
-
-    def _share(self, step: int) -> range:
-        whole = range(step * self.batch, (step + 1) * self.batch)
-        return whole if self.share is None else self.share(whole)
-
-    def _take(self, number: int) -> Sample:
-        if not self.workers:
-            return self.data.sample(number)
-        if self._stream is None or self._expected != number:
-            self._stream = iter(self._loader(number))
-        made, context, values = next(self._stream)
-        if isinstance(values, GvError):
-            raise values
-        if made != number:
-            # Outside this process's share nothing is made ahead.
-            self._expected = -1
-            return self.data.sample(number)
-        self._expected = self._following(number)
-        tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in values.items()}
-        return Sample(**tensors, context=context)
-
-    def _following(self, number: int) -> int:
-        return next(iter(_Order(self, number + 1)))
-
-    def _loader(self, start: int) -> torch.utils.data.DataLoader:
-        return torch.utils.data.DataLoader(
-            _Numbered(self.data),  # type: ignore[arg-type]
-            batch_size=None,
-            sampler=_Order(self, start),  # type: ignore[arg-type]
-            num_workers=self.workers,
-            collate_fn=_unchanged,
-            worker_init_fn=_begun,
-            prefetch_factor=max(2, -(-self.ahead * self.batch // self.workers)),
-            # Threads of a compiled kernel do not survive a fork.
-            multiprocessing_context="spawn",
-            # Torch would otherwise draw a number from its global generator.
-            generator=torch.Generator(),
-        )
+    if not workers:
+        for part in parts:
+            yield collated([data.sample(number) for number in part])
+        return
+    loader: torch.utils.data.DataLoader[list[_Made]] = torch.utils.data.DataLoader(
+        _Arrays(data),  # type: ignore[arg-type]
+        batch_sampler=parts,  # type: ignore[arg-type]
+        num_workers=workers,
+        collate_fn=_unchanged,
+        worker_init_fn=_begun,
+        # Threads of a compiled kernel do not survive a fork.
+        multiprocessing_context="spawn",
+        # Torch would otherwise draw a number from its global generator.
+        generator=torch.Generator(),
+    )
+    for items in loader:
+        yield collated([_restored(item) for item in items])
 
 
-class _Order:
-    """The numbers that a loader's process takes, from one of them on."""
-
-    def __init__(self, loader: BatchLoader, start: int) -> None:
-        self.loader, self.start = loader, start
-
-    def __iter__(self) -> Iterator[int]:
-        step = self.start // self.loader.batch
-        while True:
-            yield from (n for n in self.loader._share(step) if n >= self.start)
-            step += 1
-
-
-class _Numbered:
-    """A data set's samples as arrays, with their numbers.
+class _Arrays:
+    """A data set's samples as arrays.
 
     Arrays travel through a pipe; tensors would take shared memory, of which containers have little.
     """
@@ -162,9 +71,17 @@ class _Numbered:
             sample = self.data.sample(number)
         except GvError as error:
             # Raised in this process it would reach the user as a traceback.
-            return number, 0, error
+            return error
         names = [entry.name for entry in fields(Sample) if entry.name != "context"]
-        return number, sample.context, {name: getattr(sample, name).numpy() for name in names}
+        return sample.context, {name: getattr(sample, name).numpy() for name in names}
+
+
+def _restored(made: _Made) -> Sample:
+    if isinstance(made, GvError):
+        raise made
+    context, values = made
+    tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in values.items()}
+    return Sample(**tensors, context=context)
 
 
 def _unchanged(item: Any) -> Any:
@@ -181,4 +98,4 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
-        os._exit(1)
+        os._exit(0)

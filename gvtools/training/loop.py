@@ -7,38 +7,29 @@ not depend on the processes either.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from gvtools.errors import OptionError
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.distributed import Processes, Replicated
+from gvtools.training.distributed import Replicated
 from gvtools.training.draws import Draws
 from gvtools.training.ema import AveragedWeights
 from gvtools.training.options import OptimizerOptions
 from gvtools.training.state import Progress, StageState, load_state, save_state
 
-
-class Stage(Protocol):
-    """A module whose ``forward`` gives the loss of a batch and its terms."""
-
-    name: str
-
-    def __call__(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss and what is logged beside it."""
-        ...
-
-
-Batches = Callable[[range], TrainingBatch]
+Batches = Callable[[Iterable[range]], Generator[TrainingBatch, None, None]]
+Record = Callable[[int, dict[str, float]], None]
 
 # Saving takes at most one part in so many of the time.
 SAVING_SHARE = 20
@@ -51,16 +42,16 @@ class Reporting:
     Attributes:
         log_every: steps between records.
         save_seconds: seconds between checkpoints; more where saving takes long.
-        sheet_every: steps between sample sheets; 0 for none.
-        record: gets (step, values).
+        sheet_every: steps between sample sheets.
+        record: gets (step, values), means over all processes.
         sheet: gets the step, in every process; the averaged weights are in place meanwhile.
     """
 
     log_every: int = 20
     save_seconds: float = 60.0
     sheet_every: int = 0
-    record: Callable[[int, dict[str, float]], None] = lambda step, values: None
-    sheet: Callable[[int], None] = lambda step: None
+    record: Record | None = None
+    sheet: Callable[[int], None] | None = None
 
 
 class Trainer:
@@ -70,7 +61,7 @@ class Trainer:
         distributed: what this process holds of a stage (see Stage); what it leaves trainable is
             trained.
         options: of the optimiser.
-        batches: gives the samples with these numbers.
+        batches: gives the samples with these numbers, part by part.
         folder: of the state.
         seed: of the draws.
         identity: what may not change when a training is continued.
@@ -103,6 +94,11 @@ class Trainer:
         )
         self.ema = AveragedWeights(self.parameters, options.ema)
         self.progress = Progress()
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps are made."""
+        return self.progress.step >= self.options.steps
 
     def resume(self) -> bool:
         """Continue from the saved state; False where there is none."""
@@ -148,13 +144,20 @@ class Trainer:
 
     def train(self, reporting: Reporting, *, until: int | None = None) -> None:
         """Make steps up to ``until`` (all of them by default) and save at the end."""
+        with closing(self.batches(self._parts_ahead())) as stream:
+            self._train(stream, reporting, until)
+        self.save()
+
+    def _train(
+        self, stream: Iterator[TrainingBatch], reporting: Reporting, until: int | None
+    ) -> None:
         last = min(until or self.options.steps, self.options.steps)
         saved = begun = time.monotonic()
         pause = reporting.save_seconds
         before = self.progress.seconds
         kept: list[dict[str, float]] = []
         while self.progress.step < last:
-            kept.append(self.step())
+            kept.append(self.step(stream))
             self.progress.seconds = before + time.monotonic() - begun
             step = self.progress.step
             if step % reporting.log_every == 0 or step == last:
@@ -164,10 +167,10 @@ class Trainer:
                     "skipped": float(self.progress.skipped),
                     "seconds": self.progress.seconds,
                 }
-                if self.processes.first:
+                if reporting.record is not None:
                     reporting.record(step, values)
                 kept = []
-            if reporting.sheet_every and step % reporting.sheet_every == 0:
+            if reporting.sheet is not None and step % reporting.sheet_every == 0:
                 with self.ema.swapped_in(), torch.no_grad():
                     reporting.sheet(step)
             # The clocks of the processes differ, and all of them save.
@@ -176,26 +179,58 @@ class Trainer:
                 self.save()
                 saved = time.monotonic()
                 pause = max(reporting.save_seconds, SAVING_SHARE * (saved - now))
-        self.save()
 
-    def step(self) -> dict[str, float]:
-        """One optimiser step; returns what it logs. A bad batch is skipped and counted."""
+    def parts(self, step: int) -> list[range]:
+        """Numbers of the samples of this process's parts of a step."""
+        start = step * self.options.batch
+        mine = self.processes.share(range(start, start + self.options.batch))
+        return _parts(mine, self.options.accumulate)
+
+    def check_parts(self, group: int) -> None:
+        """Whether the samples of each part of each step have context views of one number.
+
+        Args:
+            group: so many samples in a row, from a multiple of it, have.
+
+        Raises:
+            OptionError: a part would reach over the end of a group.
+        """
+        for part in itertools.chain.from_iterable(map(self.parts, range(group))):
+            if part[0] // group != part[-1] // group:
+                raise OptionError(
+                    f"optimizer.batch = {self.options.batch}, optimizer.accumulate = "
+                    f"{self.options.accumulate}, {self.processes.count} process(es): one part "
+                    f"would hold samples {part[0]} to {part[-1]}, whose numbers of context views "
+                    f"differ; expected parts within {group} samples, such as a batch of 1, 2, 4 or "
+                    f"{group}, or a multiple of {group} in as many parts"
+                )
+
+    def _parts_ahead(self) -> Iterator[range]:
+        for step in itertools.count(self.progress.step):
+            yield from self.parts(step)
+
+    def step(self, stream: Iterator[TrainingBatch]) -> dict[str, float]:
+        """One optimiser step; returns what it logs. A bad batch is skipped and counted.
+
+        Args:
+            stream: the batches of the parts of this step come next.
+        """
         options, number = self.options, self.progress.step
         for group in self.optimizer.param_groups:
             group["lr"] = self.options.rate_at(number)
-        start = number * options.batch
-        mine = self.processes.share(range(start, start + options.batch))
         values: list[dict[str, float]] = []
         good = True
-        for part in _parts(mine, options.accumulate):
-            batch = self.batches(part).to(self.processes.device)
-            draws = Draws(self.seed, str(self.stage.name), number, tuple(part))
+        parts = self.parts(number)
+        count = sum(map(len, parts))
+        for part in parts:
+            batch = next(stream).to(self.processes.device)
+            draws = Draws(self.seed, self.stage.name, number, tuple(part))
             with self._precision():
                 loss, terms = self.stage(batch, draws)
             value = float(loss.detach())
             good &= math.isfinite(value) and value <= options.largest_loss
             # Of a bad loss, too: processes that share parameters out meet in the backward pass.
-            (loss * (len(part) / len(mine))).backward()
+            (loss * (len(part) / count)).backward()
             values.append({"loss": value} | {k: float(v.detach()) for k, v in terms.items()})
         trained = [parameter for _, parameter in self.parameters]
         bad = self.processes.any(not good)
@@ -218,32 +253,6 @@ class Trainer:
         if self.options.precision == "float32":
             return nullcontext()
         return torch.autocast(self.processes.device.type, dtype=torch.bfloat16)
-
-
-def check_parts(options: OptimizerOptions, processes: Processes, group: int) -> None:
-    """Whether the samples of each part of each step have context views of one number.
-
-    Args:
-        options: of the optimiser.
-        processes: this process and the others.
-        group: so many samples in a row, from a multiple of it, have.
-
-    Raises:
-        OptionError: a part would reach over the end of a group.
-    """
-    for step in range(group):
-        start = step * options.batch
-        for part in _parts(
-            processes.share(range(start, start + options.batch)), options.accumulate
-        ):
-            if part[0] // group != part[-1] // group:
-                raise OptionError(
-                    f"optimizer.batch = {options.batch}, optimizer.accumulate = "
-                    f"{options.accumulate}, {processes.count} process(es): one part would hold "
-                    f"samples {part[0]} to {part[-1]}, whose numbers of context views differ; "
-                    f"expected parts within {group} samples, such as a batch of 1, 2, 4 or "
-                    f"{group}, or a multiple of {group} in as many parts"
-                )
 
 
 def _parts(samples: range, count: int) -> list[range]:

@@ -1,4 +1,4 @@
-"""A training's stages, and its log: one JSON line a record, and TensorBoard's file if installed."""
+"""A training's stages, and its log: one JSON line a record."""
 
 from __future__ import annotations
 
@@ -26,16 +26,11 @@ class TrainingLog:
         kept = [line for line in read_log(folder) if line["step"] <= step]
         text = "".join(json.dumps(line) + "\n" for line in kept)
         write_text(self.path, text)
-        self._board = _tensorboard(folder, step)
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """One record."""
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"step": step, **values}) + "\n")
-        if self._board is not None:
-            for name, value in values.items():
-                self._board.add_scalar(name, value, step)
-            self._board.flush()
 
 
 def read_log(folder: Path) -> list[dict[str, Any]]:
@@ -48,12 +43,3 @@ def read_log(folder: Path) -> list[dict[str, Any]]:
         except ValueError:
             continue
     return records
-
-
-def _tensorboard(folder: Path, step: int) -> Any:
-    """TensorBoard's writer, or None where tensorboard is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    return SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse.flow import (
     guided,
     interpolate,
-    training_times,
     velocity_target,
 )
 from gvtools.completers.geoverse.model import GeoVerse
@@ -19,12 +19,13 @@ from gvtools.completers.geoverse.reflow import fast_loss, interval_times, reflow
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 from gvtools.training.options import ReflowStageOptions
+from gvtools.training.stage import Stage
 
 # The floor of the teacher's times, below any that its steps begin at.
 LEAST = 1e-6
 
 
-class ReflowStage(nn.Module):
+class ReflowStage(Stage):
     """Loss of stage 2: rho L_PRF + (1 - rho) L_FM; see the module.
 
     The student starts as the teacher. The cascade and the heads are not touched.
@@ -32,20 +33,17 @@ class ReflowStage(nn.Module):
 
     name = "reflow"
 
+    options: ReflowStageOptions
+
     def __init__(self, model: GeoVerse, options: ReflowStageOptions) -> None:
-        super().__init__()
-        self.model = model
-        self.options = options
-        model.requires_grad_(False)
-        teacher = copy.deepcopy(model).eval()
+        super().__init__(model, options)
+        teacher = copy.deepcopy(model).eval().requires_grad_(False)
         # Not a submodule: its weights are no part of the stage's state.
         self._teacher = [teacher]
-        for part in (model.level1, model.control, model.shared):
-            if part is not None:
-                part.requires_grad_(True)
-                for module in part.modules():
-                    if hasattr(module, "W"):
-                        module.W.requires_grad_(False)
+
+    def learning_parts(self) -> Iterable[nn.Module | None]:
+        """Level 1, and what steers it."""
+        return self.model.level1, self.model.control, self.model.shared
 
     @property
     def bounds(self) -> tuple[float, ...]:
@@ -87,23 +85,18 @@ class ReflowStage(nn.Module):
             shift=model.config.flow.shift,
         )
         student = model.velocity1(prepared, pair.state, pair.t)
-        settings = model.config.flow
-        time = training_times(
-            draws.uniform("t", 1)[:, 0], shift=settings.shift, most=settings.most_time
-        ).to(device)
+        time = self.time(draws, "t").to(device)
         state = interpolate(clean, noise, time)
         plain = model.velocity1(prepared, state, time)
-        weight = options.context_weight
-        reflow = flow_matching_loss(
-            student,
-            model.velocity_wanted(pair.velocity, pair.t),
-            context=context,
-            context_weight=weight,
-        ).mean()
-        flow = flow_matching_loss(
-            plain,
-            model.velocity_wanted(velocity_target(clean, noise), time),
-            context=context,
-            context_weight=weight,
-        ).mean()
+
+        def error(found: Tensor, wanted: Tensor, at: Tensor) -> Tensor:
+            return flow_matching_loss(
+                found,
+                model.velocity_wanted(wanted, at),
+                context=context,
+                context_weight=options.context_weight,
+            ).mean()
+
+        reflow = error(student, pair.velocity, pair.t)
+        flow = error(plain, velocity_target(clean, noise), time)
         return fast_loss(reflow, flow, rho=options.rho), {"reflow": reflow, "flow": flow}

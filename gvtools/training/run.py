@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 
 from gvtools.completers.geoverse.config import FlowConfig, GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse
@@ -20,17 +19,19 @@ from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER, WHOLE_FI
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text
 from gvtools.networks.config_json import to_json
+from gvtools.procedural.photographs import photograph_names
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.distributed import Processes, Replicated, models_of
 from gvtools.training.encoder_stage import EncoderStage, measure_statistics
 from gvtools.training.heads_stage import HeadsStage
-from gvtools.training.loop import Reporting, Trainer, check_parts
+from gvtools.training.loop import Record, Reporting, Trainer
 from gvtools.training.options import ReflowStageOptions, TrainingSettings
 from gvtools.training.records import STAGES, TrainingLog, read_log
 from gvtools.training.reflow_stage import ReflowStage
 from gvtools.training.samples import TrainingSamples
 from gvtools.training.sheets import completion_sheet, encoder_sheet, write_png
+from gvtools.training.stage import Stage
 from gvtools.training.state import FILE
 
 WEIGHTS = "weights"
@@ -42,6 +43,9 @@ COUNTS = ("_pixels", "_empty", "_without_scale")
 # Stages whose weights complete views, and those of them that need others' to learn from.
 GENERATIVE = ("denoiser", "reflow", "heads")
 AFTER_DENOISER = ("reflow", "heads")
+STAGE_OF: dict[str, type[Stage]] = {
+    kind.name: kind for kind in (EncoderStage, DenoiserStage, ReflowStage, HeadsStage)
+}
 # Bytes at each end of a weights file that tell it from another.
 READ = 2**22
 
@@ -100,94 +104,101 @@ class StageRun:
                 "choose another --out"
             )
         model = self._start(say)
-        distributed = self._distributed(self._module(model), model.video)
+        distributed = self._distributed(STAGE_OF[self.stage](model, self.options), model.video)
         if distributed.about:
             say(f"{self.stage}: {distributed.about}")
         samples = TrainingSamples(self.config, self.model_config)
         trainer = Trainer(
             distributed,
             self.options.optimizer,
-            samples.batch,
+            samples.batches,
             folder=self.folder,
             seed=self.config.seed,
-            identity=self._identity(samples),
+            identity=self._identity(),
         )
-        resumed = trainer.resume() if resume else False
-        finished = trainer.progress.step >= self.options.optimizer.steps
-        if resumed and finished and (self.folder / WEIGHTS / WHOLE_FILE).is_file():
-            # Written again, they might differ in a digit, and the next stage's state would not fit.
-            say(f"{self.stage}: finished before, weights in {self.folder / WEIGHTS}")
-            return _last(self.folder)
-        if resumed:
+        if resume and trainer.resume():
+            if trainer.finished and (self.folder / WEIGHTS / WHOLE_FILE).is_file():
+                # Written again, they might differ in a digit; the next stage's state would not fit.
+                say(f"{self.stage}: finished before, weights in {self.folder / WEIGHTS}")
+                return _last(self.folder)
             say(f"{self.stage}: goes on after step {trainer.progress.step}")
         if self.processes.first:
             self.folder.mkdir(parents=True, exist_ok=True)
             text = json.dumps(self.config.to_dict(), indent=2) + "\n"
             write_text(self.folder / SETTINGS, text)
-        samples.start(trainer, self.processes)
-        check_parts(self.options.optimizer, self.processes, samples.group)
-        log = TrainingLog(self.folder, step=trainer.progress.step) if self.processes.first else None
-
-        def record(step: int, values: dict[str, float]) -> None:
-            if log is not None:
-                log.write(step, values)
-            shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if not k.endswith(COUNTS))
-            say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
-
-        drawing = sheet_every and (distributed.collective or log is not None)
-        held_out = samples.held_out(SHEET_SAMPLES) if drawing else None
-
-        def sheet(step: int) -> None:
-            if held_out is None:
-                return
-            batch = held_out.to(self.processes.device)
-            with distributed.usable():
-                # What processes hold parts of, all of them have to run.
-                draw = encoder_sheet if self.stage == "encoder" else completion_sheet
-                drawn = draw(model, batch)
-                if self.processes.first:
-                    write_png(self.folder / "sheets" / f"step_{step:06d}.png", drawn)
-
-        try:
-            trainer.train(
-                Reporting(sheet_every=sheet_every, record=record, sheet=sheet), until=until
-            )
-        finally:
-            samples.close()
-        if trainer.progress.step >= self.options.optimizer.steps:
+        trainer.check_parts(samples.group)
+        reporting = Reporting(
+            record=self._recorder(trainer.progress.step, say),
+            sheet_every=sheet_every,
+            sheet=self._sheet_writer(model, distributed, samples) if sheet_every else None,
+        )
+        trainer.train(reporting, until=until)
+        if trainer.finished:
             self._write_weights(model, trainer, samples)
             say(f"{self.stage}: weights in {self.folder / WEIGHTS}")
         return _last(self.folder)
 
+    def _recorder(self, step: int, say: Callable[[str], None]) -> Record | None:
+        """Writes and says a record; None in all processes but the first."""
+        if not self.processes.first:
+            return None
+        log = TrainingLog(self.folder, step=step)
+
+        def record(step: int, values: dict[str, float]) -> None:
+            log.write(step, values)
+            shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if not k.endswith(COUNTS))
+            say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
+
+        return record
+
+    def _sheet_writer(
+        self, model: GeoVerse, distributed: Replicated, samples: TrainingSamples
+    ) -> Callable[[int], None] | None:
+        """Draws held-out samples; None in a process that has no part in that."""
+        if not (distributed.collective or self.processes.first):
+            return None
+        held_out = samples.held_out(SHEET_SAMPLES).to(self.processes.device)
+        draw = encoder_sheet if self.stage == "encoder" else completion_sheet
+
+        def sheet(step: int) -> None:
+            # What processes hold parts of, all of them have to run.
+            with distributed.usable():
+                drawn = draw(model, held_out)
+            if self.processes.first:
+                write_png(self.folder / "sheets" / f"step_{step:06d}.png", drawn)
+
+        return sheet
+
     def _start(self, say: Callable[[str], None]) -> GeoVerse:
         """The model that the stage begins with; every process makes the same."""
-        before = [name for name in STAGES[: STAGES.index(self.stage)]]
-        if not self.init:
+        before = STAGES[: STAGES.index(self.stage)]
+        source = self.init
+        if source is None:
             self._refuse_unfinished(before)
-        sources = [self.init] if self.init else [self.out / n / WEIGHTS for n in reversed(before)]
-        for source in sources:
-            if source is not None and (self.init or source.exists()):
-                say(f"{self.stage}: starts from {source}")
-                self._source = source
-                if self.stage in AFTER_DENOISER:
-                    found = config_of(source)
-                    if not found.trained:
-                        raise CheckpointError(
-                            f"{source}: its denoisers are untrained, and stage {self.stage} learns "
-                            "from what they make; run --stage denoiser to its end first"
-                        )
-                    if self.stage == "heads":
-                        self.model_config = _sampled_as(self.model_config, found.flow)
-                return from_pretrained(source, config=self.model_config)
-        if before:
+            weights = [self.out / name / WEIGHTS for name in reversed(before)]
+            source = next((folder for folder in weights if folder.exists()), None)
+        if source is None and before:
             raise CheckpointError(
                 f"stage {self.stage} needs weights to start from; run --stage {before[-1]} first, "
                 "or give --init DIR"
             )
-        torch.manual_seed(self.config.seed)
-        return GeoVerse(self.model_config)
+        if source is None:
+            torch.manual_seed(self.config.seed)
+            return GeoVerse(self.model_config)
+        say(f"{self.stage}: starts from {source}")
+        self._source = source
+        if self.stage in AFTER_DENOISER:
+            found = config_of(source)
+            if not found.trained:
+                raise CheckpointError(
+                    f"{source}: its denoisers are untrained, and stage {self.stage} learns "
+                    "from what they make; run --stage denoiser to its end first"
+                )
+            if self.stage == "heads":
+                self.model_config = _sampled_as(self.model_config, found.flow)
+        return from_pretrained(source, config=self.model_config)
 
-    def _refuse_unfinished(self, before: list[str]) -> None:
+    def _refuse_unfinished(self, before: Sequence[str]) -> None:
         """A stage that was begun and not finished must not be passed over for one before it.
 
         Raises:
@@ -203,16 +214,7 @@ class StageRun:
                     f"--resume to its end, remove that folder, or name weights with --init DIR"
                 )
 
-    def _module(self, model: GeoVerse) -> nn.Module:
-        if self.stage == "encoder":
-            return EncoderStage(model, self.options)
-        if self.stage == "denoiser":
-            return DenoiserStage(model, self.options)
-        if self.stage == "heads":
-            return HeadsStage(model, self.options)
-        return ReflowStage(model, self.options)
-
-    def _distributed(self, module: nn.Module, video: VideoPrior | None) -> Replicated:
+    def _distributed(self, module: Stage, video: VideoPrior | None) -> Replicated:
         """What this process holds of the stage."""
         if video is not None:
             for model in models_of(module):
@@ -224,7 +226,7 @@ class StageRun:
             return Sharded(module, self.processes)
         return Replicated(module, self.processes)
 
-    def _identity(self, samples: TrainingSamples) -> dict[str, Any]:
+    def _identity(self) -> dict[str, Any]:
         """What may not change between the parts of a stage."""
         data = self.config.data.to_dict()
         for name in ("workers", "cache"):
@@ -238,7 +240,8 @@ class StageRun:
             "stage": self.stage,
             "seed": self.config.seed,
             "model": model,
-            "photographs": list(samples.photographs),
+            # Those that are installed decide the samples.
+            "photographs": list(photograph_names("train")),
             "options": self.options.to_dict(),
             "start": None if self._source is None else _fingerprint(self._source),
             "data": data,

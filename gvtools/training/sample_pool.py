@@ -25,8 +25,6 @@ from gvtools.training.dataset import Samples
 from gvtools.training.view_sample import Sample
 
 COLORS, DEPTHS = ("images", "hint"), ("depth", "hint_depth")
-# Packages whose code makes samples, "" for the modules of the project's own folder.
-MAKERS = ("", "training", "memory", "completers", "completers/geoverse", "scenes", "depth")
 GREATEST = float(np.finfo(np.float16).max)
 
 
@@ -79,12 +77,10 @@ class PooledViews:
 
 @cache
 def _code() -> bytes:
-    """Digest of the code that samples are made by."""
-    root = Path(gvtools.__file__).parent
+    """Digest of the library's code, by which samples are made."""
     digest = hashlib.sha256()
-    for folder in MAKERS:
-        for file in sorted((root / folder).glob("*.py")):
-            digest.update(file.read_bytes())
+    for file in sorted(Path(gvtools.__file__).parent.rglob("*.py")):
+        digest.update(file.read_bytes())
     return digest.digest()
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator, Iterable
+from contextlib import closing
 from pathlib import Path
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.procedural.photographs import photograph_names
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.context_choice import ContextOptions
+from gvtools.training.context_choice import ContextChoice
 from gvtools.training.dataset import MixedViews, ProceduralViews
 from gvtools.training.dataset import Samples as DataSet
-from gvtools.training.distributed import Processes
-from gvtools.training.loader import BatchLoader
-from gvtools.training.loop import Trainer
+from gvtools.training.loader import batches
 from gvtools.training.options import TrainingSettings
 from gvtools.training.sample_pool import PooledViews
 from gvtools.training.view_sample import collated
@@ -32,9 +31,8 @@ class TrainingSamples:
     def __init__(self, config: TrainingSettings, model: GeoVerseConfig) -> None:
         self.config = config
         most = min(model.context, config.data.views - 1)
-        self._context = ContextOptions(most=most)
+        self._context = ContextChoice(most=most)
         self._fill = model.hints.fill
-        self._loader: BatchLoader | None = None
         self._data = self._pooled(self._data_set("train"))
 
     @property
@@ -42,27 +40,15 @@ class TrainingSamples:
         """So many samples in a row, from a multiple of it, have context views of one number."""
         return self._context.group
 
-    @property
-    def photographs(self) -> tuple[str, ...]:
-        """Those of the textures that are installed: they decide the samples."""
-        return photograph_names("train")
-
-    def start(self, trainer: Trainer, processes: Processes) -> None:
-        """Make samples ahead, from the trainer's next step on."""
-        options = trainer.options
-        self._loader = BatchLoader(
-            self._data,
-            options.batch,
-            workers=self.config.data.workers,
-            share=processes.share,
-            start=trainer.progress.step * options.batch,
-        )
+    def batches(self, parts: Iterable[range]) -> Generator[TrainingBatch, None, None]:
+        """The batches of the samples with these numbers, made ahead."""
+        made = batches(self._data, parts, workers=self.config.data.workers)
+        with closing(made):
+            yield from map(self._shown, made)
 
     def batch(self, samples: range) -> TrainingBatch:
         """The samples with these numbers."""
-        if self._loader is None:
-            return self._shown(collated([self._data.sample(index) for index in samples]))
-        return self._shown(self._loader(samples))
+        return self._shown(collated([self._data.sample(index) for index in samples]))
 
     def aside(self, index: int, count: int) -> TrainingBatch:
         """Training scenes that no step sees."""
@@ -77,11 +63,6 @@ class TrainingSamples:
         return self._shown(
             collated([data.sample(index) for index in range(min(count, self._context.group))])
         )
-
-    def close(self) -> None:
-        """End the processes that make samples."""
-        if self._loader is not None:
-            self._loader.close()
 
     def _pooled(self, data: DataSet) -> DataSet:
         options = self.config.data

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.geoverse.resampling import resampled
 from gvtools.errors import DegenerateError, ProjectError
-from gvtools.options import check_range
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import select
-from gvtools.training.context_choice import ContextOptions
+from gvtools.training.context_choice import ContextChoice
 from gvtools.training.corruption import GENTLE, CorruptionOptions, drawn
-from gvtools.training.dataset import FAULTS, PATH, RECORDED, plain
-from gvtools.training.hints import Clip, HintOptions
+from gvtools.training.dataset import FAULTS, PATH, RECORDED, described
+from gvtools.training.hints import Clip
 from gvtools.training.view_sample import Sample, make_sample
 
 ATTEMPTS = 40
-KEPT_FRAMES = 512  # reduced frames that a data set keeps, so that files are read once
+MOST_STRIDE = 6  # steps between the views of a window
+DETAIL = 2  # memory is made at so many times the model's size, where a view is large enough
+KEPT_FRAMES = 512  # reduced frames that are kept, so that files are read once
 # Depths that differ by no more than this share belong to one surface.
 SAME_SURFACE = 0.1
 PROBE = 24  # points along a side of a picture that overlap is measured with
@@ -51,12 +52,9 @@ class SceneViews:
         seed: 0 or more.
         views: of a sample.
         size: (H, W) of the pictures; views are cropped about their centre to this aspect.
-        detail: memory is made at so many times the size, where a view is large enough.
-        stride: steps between the views of a window, drawn uniformly.
         overlap: least share of a view's depth that the next view of the window shows, too.
         context: how many views are given, and which.
         faults: see CorruptionOptions; None for none.
-        hints: see HintOptions.
         fill: of the model's configuration, ``hints.fill``.
     """
 
@@ -65,23 +63,13 @@ class SceneViews:
     seed: int = 0
     views: int = 8
     size: tuple[int, int] = (96, 96)
-    detail: int = 2
-    stride: tuple[int, int] = (1, 6)
     overlap: float = 0.4
-    context: ContextOptions = field(default_factory=ContextOptions)
+    context: ContextChoice = field(default_factory=ContextChoice)
     faults: CorruptionOptions | None = GENTLE
-    hints: HintOptions = field(default_factory=HintOptions)
     fill: str = "none"
-    _kept: OrderedDict[tuple[int, int], _Reduced] = field(
-        init=False, repr=False, default_factory=OrderedDict
-    )
     _usable: tuple[tuple[View, ...], ...] = field(init=False, repr=False, default=())
 
     def __post_init__(self) -> None:
-        check_range("data.seed", self.seed, least=0)
-        check_range("data.detail", self.detail, least=1)
-        check_range("data.overlap", self.overlap, least=0, below=1)
-        check_range("data.views", self.views, least=self.context.most + 1)
         usable = tuple(
             tuple(
                 scene[name]
@@ -101,9 +89,6 @@ class SceneViews:
             raise ProjectError("no scene to draw samples from; expected at least one")
         object.__setattr__(self, "_usable", usable)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_kept": OrderedDict()}
-
     def sample(self, index: int) -> Sample:
         """The sample of a number, 0 or more.
 
@@ -115,9 +100,7 @@ class SceneViews:
         strength = drawn(rng, self.faults or CorruptionOptions(clean=1.0))
         count = self.context.count([self.seed, RECORDED], index)
         context = self.context.chosen(rng, self.views, count)
-        return make_sample(
-            clip, truth, context, rng=rng, strength=strength, hints=self.hints, fill=self.fill
-        )
+        return make_sample(clip, truth, context, rng=rng, strength=strength, fill=self.fill)
 
     def clips(self, index: int) -> tuple[Clip, Clip]:
         """The window of a sample: as it is observed, and at the model's size."""
@@ -128,14 +111,14 @@ class SceneViews:
             number = int(rng.choice(len(share), p=share / share.sum()))
             total = len(self._usable[number])
             # Later attempts take smaller steps.
-            most = max(self.stride[0], round(self.stride[1] * (1 - attempt / ATTEMPTS)))
-            step = int(rng.integers(self.stride[0], most + 1))
+            most = max(1, round(MOST_STRIDE * (1 - attempt / ATTEMPTS)))
+            step = int(rng.integers(1, most + 1))
             step = max(1, min(step, (total - 1) // (self.views - 1)))
             start = int(rng.integers(0, total - step * (self.views - 1)))
             rows = [start + step * i for i in range(self.views)]
             if rng.random() < 0.5:
                 rows.reverse()
-            frames = [self._frame(number, row) for row in rows]
+            frames = [_reduced(self._usable[number][row], self.size) for row in rows]
             truth = _joined([frame.truth for frame in frames])
             found = min(overlaps(truth))
             best = max(best, found)
@@ -143,29 +126,20 @@ class SceneViews:
                 return _joined([frame.observed for frame in frames]), truth
         raise DegenerateError(
             f"no window of {self.views} views in {ATTEMPTS} attempts of which neighbours share "
-            f"{self.overlap:.0%} of their depth (best {best:.0%}); lower the overlap or the stride"
+            f"{self.overlap:.0%} of their depth (best {best:.0%}); lower the overlap"
         )
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides the samples, as plain data; scenes by folder and view names."""
-        names = ("seed", "views", "size", "detail", "stride", "overlap", "fill", "context",
-                 "faults", "hints")  # fmt: skip
         return {
             "source": "recorded",
             "scenes": [
                 {"root": str(scene.root), "views": [view.name for view in views]}
                 for scene, views in zip(self.scenes, self._usable, strict=True)
             ],
-            **{name: plain(getattr(self, name)) for name in names},
+            "overlap": self.overlap,
+            **described(self),
         }
-
-    def _frame(self, scene: int, row: int) -> _Reduced:
-        key = (scene, row)
-        if key not in self._kept:
-            self._kept[key] = _reduced(self._usable[scene][row], self.size, self.detail)
-            if len(self._kept) > KEPT_FRAMES:
-                self._kept.popitem(last=False)
-        return self._kept[key]
 
 
 def overlaps(clip: Clip) -> list[float]:
@@ -194,8 +168,9 @@ def overlaps(clip: Clip) -> list[float]:
     return out
 
 
-def _reduced(view: View, size: tuple[int, int], detail: int) -> _Reduced:
-    """A view at ``detail`` times the model's size (or less, if it is smaller) and at that size."""
+@lru_cache(KEPT_FRAMES)
+def _reduced(view: View, size: tuple[int, int]) -> _Reduced:
+    """A view at ``DETAIL`` times the model's size (or less, if it is smaller) and at that size."""
     frame = view.load()
     height, width = frame.rgb.shape[:2]
     aspect = size[0] / size[1]
@@ -208,7 +183,7 @@ def _reduced(view: View, size: tuple[int, int], detail: int) -> _Reduced:
     if frame.mask is not None:
         depth = np.where(frame.mask, depth, np.float32(0))
     camera = view.camera.cropped(left, top, width=columns, height=rows)
-    factor = max(1, min(detail, rows // size[0], columns // size[1]))
+    factor = max(1, min(DETAIL, rows // size[0], columns // size[1]))
     parts = [
         _resized(frame.rgb[window], depth[window], camera, (size[0] * times, size[1] * times))
         for times in (factor, 1)

@@ -14,6 +14,7 @@ from gvtools.completers.geoverse.correction import composed
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.files import replaced_when_written
 from gvtools.training.batch import TrainingBatch
+from gvtools.training.encoder_stage import decoded, head_features
 
 GAP = 4
 
@@ -68,18 +69,13 @@ def encoder_sheet(model: GeoVerse, batch: TrainingBatch) -> NDArray[np.uint8]:
     Returns:
         (H, W, 3).
     """
-    encoder = model.geometry.encoder
-    grid = encoder.grid(*batch.views.size)
     levels = encode_views(model.geometry, batch.true_views, slice(None), model.config.hints)
-    pyramid = [*levels, *encoder.propagate(levels[1], grid)]
-    normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
-    depth = model.geometry.head(normed, grid).depth[:, :, None]
-    rgb = model.rgb_head(torch.cat(normed, dim=-1).flatten(0, 1), grid)
-    rgb = rgb.unflatten(0, batch.images.shape[:2]).clamp(0, 1)
+    geometry, rgb = decoded(model, head_features(model, levels, batch), batch)
+    depth = geometry.depth[:, :, None]
     rows = []
     for index in range(len(batch)):
         rows += [
-            _band(rgb[index]),
+            _band(rgb[index].clamp(0, 1)),
             _band(batch.images[index]),
             _depth_band(depth[index]),
             _depth_band(batch.depth[index]),

@@ -18,7 +18,7 @@ from gvtools.completers.surface_fill import surface_fill
 from gvtools.errors import ShapeError
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.corruption import NOTHING, CorruptionOptions
-from gvtools.training.hints import Clip, HintOptions, observed, projected
+from gvtools.training.hints import Clip, observed, projected
 
 Float32 = NDArray[np.float32]
 
@@ -59,7 +59,6 @@ def make_sample(
     *,
     rng: np.random.Generator,
     strength: CorruptionOptions = NOTHING,
-    hints: HintOptions | None = None,
     fill: str = "none",
 ) -> Sample:
     """A sample from views in the order of their path, the same on any number of threads.
@@ -70,12 +69,11 @@ def make_sample(
         context: which of them are given, ascending.
         rng: draws the faults.
         strength: of this sample's faults.
-        hints: see HintOptions.
         fill: of the model's configuration, ``hints.fill``.
     """
     targets = [index for index in range(len(clip)) if index not in context]
     observation = observed(clip, context, strength, rng)
-    guidance = projected(observation, clip.cameras[targets], hints)
+    guidance = projected(observation, clip.cameras[targets])
     size = truth.depth.shape[1], truth.depth.shape[2]
     with _one_thread():
         over = surface_fill(observation.views, guidance) if fill == "surfaces" else None

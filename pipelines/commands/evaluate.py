@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
-from gvtools.options import check_range
 from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
 from pipelines.commands.scene_arguments import add_scene_arguments
 
@@ -98,7 +97,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     )
     from pipelines.evaluation.record import EvaluationOptions
 
-    check_range("--seed", args.seed, least=0)
+    if args.seed < 0:
+        raise OptionError(f"--seed {args.seed}; expected at least 0")
     shown = benchmark_names() if "all" in args.against else tuple(args.against)
     benchmarks = load_benchmarks(shown, args.data_set)
     if args.project is not None and len(args.runs) > 1:

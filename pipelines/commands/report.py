@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
-from gvtools.options import check_range
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -46,7 +45,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from pipelines.report.write import PAGE
     from viz.report.page import report_html
 
-    check_range("--pictures", args.pictures, least=1)
+    if args.pictures < 1:
+        raise OptionError(f"--pictures {args.pictures}; expected at least 1")
     out = args.out or args.run / PAGE
     _refuse_foreign(out)
     report = collect(args.run, project=args.project, most=args.pictures)

@@ -22,7 +22,7 @@ SUMMARY = "train the generative core: encoder, denoisers, distillation"
 EXAMPLES = (
     "gvtools train tiny --stage all --out training/tiny",
     "gvtools train my_training.json --stage denoiser --out training/mine --resume",
-    "gvtools train base --init gld weights/base --out training/base",
+    "gvtools train base --init weights/base --out training/base",
 )
 
 
@@ -44,11 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the training")
     parser.add_argument(
         "--init",
-        nargs="+",
-        metavar=("DIR|gld", "DIR"),
-        help="start from these weights: a GeoVerse folder, or one with GLD's published files; gld "
-        "DIR takes none but the latter. By default from the stage before. With published files, "
-        "--stage all leaves the encoder's stage out",
+        type=Path,
+        metavar="DIR",
+        help="start from these weights: a GeoVerse folder, or one with GLD's published files. By "
+        "default from the stage before. With published files, --stage all leaves the encoder's "
+        "stage out",
     )
     parser.add_argument(
         "--resume", action="store_true", help="continue the stage where its last state was saved"
@@ -85,6 +85,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: a wrong setting, a state of another training, or weights that do not fit.
     """
+    from gvtools.completers.geoverse.weights.published import WHOLE_FILE
     from gvtools.files import check_parent, make_folder, write_text
     from gvtools.settings import with_texts
     from gvtools.training.distributed import started
@@ -96,11 +97,10 @@ def run(args: argparse.Namespace, console: Console) -> None:
     config = with_texts(config, args.set)
     if args.until is not None and args.until < 1:
         raise OptionError(f"--until {args.until}; expected at least step 1")
-    init = _init_folder(args.init)
     stages: tuple[str, ...] = (args.stage,)
     if args.stage == "all":
         stages = tuple(stage for stage in STAGES if getattr(config, stage) is not None)
-        if init is not None and not _is_own(init):
+        if args.init is not None and not (args.init / WHOLE_FILE).is_file():
             # A published encoder has its training behind it.
             stages = tuple(stage for stage in stages if stage != "encoder")
     if args.json is not None:
@@ -115,7 +115,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
                 args.out,
                 processes=processes,
                 model_folder=folder,
-                init=init if stage == stages[0] else None,
+                init=args.init if stage == stages[0] else None,
             )
             figures[stage] = stage_run.train(
                 resume=args.resume,
@@ -128,30 +128,3 @@ def run(args: argparse.Namespace, console: Console) -> None:
                 break
         if args.json is not None and processes.first:
             write_text(args.json, json.dumps(figures, indent=2) + "\n")
-
-
-def _init_folder(words: list[str] | None) -> Path | None:
-    """The folder of ``--init``.
-
-    Raises:
-        OptionError: other words than DIR or gld DIR, or a folder of one's own for the latter.
-    """
-    if words is None:
-        return None
-    if len(words) == 1:
-        return Path(words[0])
-    if len(words) != 2 or words[0] != "gld":
-        raise OptionError(f"--init {' '.join(words)}; expected --init DIR, or --init gld DIR")
-    folder = Path(words[1])
-    if _is_own(folder):
-        raise OptionError(
-            f"--init gld {folder}: a model of one's own is there; expected GLD's published files "
-            f"(gvtools weights list base), or --init {folder}"
-        )
-    return folder
-
-
-def _is_own(folder: Path) -> bool:
-    from gvtools.completers.geoverse.weights.published import WHOLE_FILE
-
-    return (folder / WHOLE_FILE).is_file()

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
-from gvtools.options import check_range
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -95,7 +94,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
 def _check(args: argparse.Namespace) -> None:
     if args.live and (args.open3d or args.screenshot):
         raise OptionError("--live: the web page alone follows a run; leave the other option out")
-    check_range("--port", args.port, least=1, most=65535)
-    check_range("--max-points", args.max_points, least=1)
+    if args.port is not None and not 1 <= args.port <= 65535:
+        raise OptionError(f"--port {args.port}; expected at least 1 and at most 65535")
+    if args.max_points is not None and args.max_points < 1:
+        raise OptionError(f"--max-points {args.max_points}; expected at least 1")
     if args.screenshot is not None and args.screenshot.suffix.lower() != ".png":
         raise OptionError(f"--screenshot {args.screenshot}: expected a name that ends with .png")

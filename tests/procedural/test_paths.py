@@ -6,9 +6,9 @@ from reference_rays import is_free
 
 from gvtools.errors import OptionError
 from gvtools.procedural.layouts import scene
-from gvtools.procedural.paths import PathOptions, camera_path
+from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import cast
-from gvtools.training.context_choice import ContextOptions, chosen_context
+from gvtools.training.context_choice import ContextChoice, chosen_context
 
 SIZE = (48, 64)
 
@@ -21,12 +21,7 @@ def _paths(count: int):
 
 
 def test_cameras_stand_in_free_space_and_see_something() -> None:
-    layouts, kinds, attempts = set(), set(), []
-    for place, path in _paths(60):
-        cameras = path.cameras
-        layouts.add(place.kind)
-        kinds.add(path.kind)
-        attempts.append(path.attempts)
+    for place, cameras in _paths(40):
         assert is_free(place.geometry, cameras.centers).all()
         # Not inside a hull either: nobody stands under a table.
         bare = place.geometry._replace(first_cutter=0 * place.geometry.first_cutter)
@@ -41,18 +36,15 @@ def test_cameras_stand_in_free_space_and_see_something() -> None:
         assert 50 <= fov <= 80
         # Upright, up to the slant of a hand: the world's up is the image's up.
         assert (rotation[:, 1, 2] < 0).all()
-    assert layouts == {"room", "corridor", "corner", "suite", "hall", "close_up"}
-    assert kinds == {"forward", "pull_back", "orbit", "pan", "walk"}
-    assert np.mean(attempts) < 4
 
 
 def test_paths_move_and_turn() -> None:
     travel, turn = [], []
-    for _, path in _paths(40):
-        centers = path.cameras.centers
+    for _, cameras in _paths(40):
+        centers = cameras.centers
         depth = np.linalg.norm(np.ptp(centers, axis=0))
         travel.append(depth)
-        forward = path.cameras.cam_from_world[:, 2, :3]
+        forward = cameras.cam_from_world[:, 2, :3]
         turn.append(np.degrees(np.arccos(np.clip(forward[0] @ forward[-1], -1, 1))))
     assert np.quantile(travel, 0.1) > 0.01 and np.median(travel) > 0.3
     assert np.quantile(turn, 0.9) > 45 and np.median(turn) < 60
@@ -63,7 +55,7 @@ def test_the_same_generator_gives_the_same_path() -> None:
     first, again = (
         camera_path(np.random.default_rng(2), place.geometry, views=8, size=SIZE) for _ in range(2)
     )
-    assert np.array_equal(first.cameras.cam_from_world, again.cameras.cam_from_world)
+    assert np.array_equal(first.cam_from_world, again.cam_from_world)
 
 
 @pytest.mark.parametrize(
@@ -83,28 +75,14 @@ def test_context_rules(rule: str, count: int, expected: set[tuple[int, ...]]) ->
 
 
 def test_context_counts_come_in_groups() -> None:
-    options = ContextOptions(group=4)
+    options = ContextChoice(group=4)
     counts = np.array([options.count([0, 1], index) for index in range(400)]).reshape(-1, 4)
     assert (counts == counts[:, :1]).all()
     assert {int(c) for c in counts[:, 0]} == {1, 2, 3, 4}
     assert np.bincount(counts[:, 0])[1:].min() > 10
 
 
-def test_chances_choose_the_rule() -> None:
-    rng = np.random.default_rng(0)
-    first = ContextOptions(extrapolation=1.0)
-    assert {first.chosen(rng, 8, 2) for _ in range(50)} == {(0, 1)}
-    ends = ContextOptions(extrapolation=0.0, ends=1.0)
-    assert {ends.chosen(rng, 8, 2) for _ in range(50)} == {(0, 7)}
-
-
 def test_impossible_choices_are_refused() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(OptionError, match="8 context views of 8"):
         chosen_context(rng, 8, 8, "first")
-    with pytest.raises(OptionError, match="every, ends, first"):
-        chosen_context(rng, 8, 2, "last")
-    with pytest.raises(OptionError, match=r"paths\.fov"):
-        PathOptions(fov=(80.0, 50.0))
-    with pytest.raises(OptionError, match=r"context\.most"):
-        ContextOptions(least=3, most=2)

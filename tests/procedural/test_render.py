@@ -21,7 +21,7 @@ SIZE = (20, 20)
 def _drawn(seed: int, *, size: tuple[int, int] = SIZE, views: int = 3):
     rng = np.random.default_rng([seed, 5])
     place = scene(rng, ("train", "held-out")[seed % 2])
-    return place, camera_path(rng, place.geometry, views=views, size=size).cameras
+    return place, camera_path(rng, place.geometry, views=views, size=size)
 
 
 def _rays(cameras: Cameras, view: int) -> np.ndarray:

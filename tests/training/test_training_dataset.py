@@ -6,11 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from seen_surfaces import seen_by_context
 
 from gvtools.errors import OptionError, ShapeError
 from gvtools.procedural.photographs import photograph_names
-from gvtools.training.context_choice import ContextOptions
+from gvtools.training.context_choice import ContextChoice
 from gvtools.training.corruption import (
     NOTHING,
     CorruptionOptions,
@@ -24,7 +23,7 @@ from gvtools.training.hints import Clip, observed, projected
 from gvtools.training.view_sample import Sample, collated
 
 CLEAN = ProceduralViews(faults=None)
-COUNT = 24
+COUNT = 12
 
 
 @cache
@@ -158,35 +157,10 @@ def test_coverage_leaves_something_to_generate() -> None:
         cover = [float(v.float().mean()) for s in samples for v in s.valid[s.context :]]
         assert 0.5 < np.mean(cover) < 0.9
         assert np.quantile(cover, 0.1) < 0.6
-        unseen = [float((~seen_by_context(s)[s.context :]).float().mean()) for s in samples]
-        assert 0.05 < np.mean(unseen) < 0.5
-
-
-def test_what_context_shows_covers_the_hints() -> None:
-    told = known = 0
-    for sample in _samples("train", True):
-        seen = seen_by_context(sample)
-        valid = sample.valid[sample.context :]
-        told += int((seen[sample.context :] & valid).sum())
-        known += int(valid.sum())
-        assert bool(seen[: sample.context].all())
-    assert told > 0.97 * known
-
-
-def test_faults_do_harm_and_leave_the_truth_alone() -> None:
-    harmed = 0
-    for clean, faulty in zip(_samples("train", True), _samples("train", False), strict=True):
-        same = clean.place.equal(faulty.place)
-        assert torch.equal(
-            clean.images[clean.place.argsort()], faulty.images[faulty.place.argsort()]
-        )
-        if same and not torch.equal(clean.hint_depth, faulty.hint_depth):
-            harmed += 1
-    assert harmed > COUNT // 2
 
 
 def _plane() -> Clip:
-    return CLEAN.clips(3)[1]
+    return CLEAN.clip(3)
 
 
 @pytest.mark.parametrize(
@@ -286,30 +260,13 @@ def test_a_memory_without_points_projects_nothing() -> None:
     assert not guidance.valid.any()
 
 
-def test_detail_reduces_a_finer_memory() -> None:
-    coarse, fine = replace(CLEAN, size=(48, 48)), replace(CLEAN, size=(48, 48), detail=2)
-    errors = []
-    for data in (coarse, fine):
-        samples = [data.sample(index) for index in range(6)]
-        assert all(s.images.shape == (8, 3, 48, 48) for s in samples)
-        pairs = [
-            ((s.hint - s.images).square().mean(1, keepdim=True)[s.context :], s.valid[s.context :])
-            for s in samples
-        ]
-        errors.append(np.mean([float(e[v].mean()) for e, v in pairs]))
-    assert errors[1] < errors[0]
-    a, b = coarse.sample(0), fine.sample(0)
-    assert torch.equal(a.images, b.images)
-    torch.testing.assert_close(a.depth, b.depth, rtol=0.02, atol=0)
-
-
 def test_batches_are_what_the_model_takes() -> None:
     samples = _samples("train", False)[:8]
     batch = collated(samples)
     assert batch.views.images.shape == (8, 8, 3, 96, 96)
     assert batch.views.context == samples[0].context and batch.views.valid.dtype == torch.bool
     assert torch.equal(batch.images[3], samples[3].images)
-    data = ProceduralViews(context=ContextOptions(group=1), size=(24, 24))
+    data = ProceduralViews(context=ContextChoice(group=1), size=(24, 24))
     mixed = [data.sample(index) for index in range(12)]
     with pytest.raises(ShapeError, match="group"):
         collated(mixed)
@@ -328,7 +285,5 @@ def test_mixed_sources_keep_groups_together() -> None:
 
 
 def test_impossible_data_is_refused() -> None:
-    with pytest.raises(OptionError, match=r"data\.views"):
-        ProceduralViews(views=4)
     with pytest.raises(OptionError, match="sample -1"):
         CLEAN.sample(-1)

@@ -119,13 +119,10 @@ def gld_velocity(gld: GeoVerse, batch: ViewBatch, state: Tensor, t: Tensor) -> T
     return gld.level1(state, t, Conditions(latents, camera))
 
 
-@pytest.mark.parametrize("words", [(), ("gld",)])
-def test_a_training_that_learns_nothing_leaves_what_gld_is(
-    gld, published, training, tmp_path, words
-):
+def test_a_training_that_learns_nothing_leaves_what_gld_is(gld, published, training, tmp_path):
     """Every batch is skipped, so that the weights written are those of the start."""
     nothing = ["--set", "denoiser.optimizer.largest_loss=1e-9"]
-    init = ["--init", *words, str(published)]
+    init = ["--init", str(published)]
     assert train(training, tmp_path, "denoiser", *init, *nothing) == 0
     start = from_pretrained(tmp_path / "denoiser" / "weights")
     known = gld.state_dict()
@@ -150,7 +147,7 @@ def test_a_training_that_learns_nothing_leaves_what_gld_is(
 def test_a_training_goes_on_from_gld_without_the_encoders_stage(
     published, training, tmp_path, capsys
 ):
-    assert train(training, tmp_path, "all", "--init", "gld", str(published)) == 0
+    assert train(training, tmp_path, "all", "--init", str(published)) == 0
     said = capsys.readouterr().out
     assert not (tmp_path / "encoder").exists()
     assert f"denoiser: starts from {published}" in said
@@ -180,28 +177,22 @@ def test_a_training_goes_on_from_the_published_files_that_it_began_with(
     values = bytearray(changed.read_bytes())
     values[len(values) // 2] ^= 1
     changed.write_bytes(values)
-    init = ["--init", "gld", str(published)]
+    init = ["--init", str(published)]
     assert train(training, tmp_path / "out", "denoiser", *init, "--until", "1") == 0
-    again = ["--init", "gld", str(other), "--resume"]
+    again = ["--init", str(other), "--resume"]
     assert train(training, tmp_path / "out", "denoiser", *again) == 2
     assert "start" in capsys.readouterr().err
 
 
 def test_other_starts_are_one_clear_line(published, training, tmp_path, capsys):
-    own = tmp_path / "own"
-    save_pretrained(from_pretrained(published, config=small_base()), own)
     part = tmp_path / "part"
     (part / "checkpoints").mkdir(parents=True)
     (part / "checkpoints" / "da3_level1.pt").symlink_to(published / "checkpoints/da3_level1.pt")
-    for words, expected in (
-        (["vggt", str(published)], "expected --init DIR, or --init gld DIR"),
-        (["gld", str(published), "more"], "expected --init DIR, or --init gld DIR"),
-        (["gld", str(own)], "a model of one's own is there"),
-        (["gld", str(tmp_path / "absent")], "absent does not exist"),
-        (["gld"], "gld does not exist"),
-        ([str(part)], "pretrained_models/da3/model.safetensors"),
+    for folder, expected in (
+        (tmp_path / "absent", "absent does not exist"),
+        (part, "pretrained_models/da3/model.safetensors"),
     ):
-        assert train(training, tmp_path / "out", "denoiser", "--init", *words) == 2
+        assert train(training, tmp_path / "out", "denoiser", "--init", str(folder)) == 2
         said = capsys.readouterr().err
         assert expected in said
         assert said.count("\n") == 1
@@ -223,8 +214,3 @@ def test_the_training_of_base_is_the_papers():
         assert options.precision == "bfloat16"
         assert stage.context_weight == 0.25
     assert config.reflow.bounds is None and config.network().flow.level1[0::3] == (1.0, 0.0)
-
-
-def test_an_unknown_way_of_sharing_is_refused(tmp_path, capsys):
-    assert main(["train", "micro", "--out", str(tmp_path), "--set", "parallel=fsdp"]) == 2
-    assert "parallel 'fsdp'; expected 'data' or 'sharded'" in capsys.readouterr().err

@@ -25,8 +25,18 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SHORT = ["--device", "cpu", "--sheets", "0", "--quiet"]
 
 
+SAMPLES: list[str] = []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def samples(tmp_path_factory):
+    """The same few samples for every training, made once."""
+    SAMPLES[:] = ["--set", "data.pool=24", "--set", f"data.cache={tmp_path_factory.mktemp('pool')}"]
+
+
 def train(out: Path, stage: str, *more: str) -> int:
-    return main(["train", "micro", "--stage", stage, "--out", str(out), *SHORT, *more])
+    start = ["train", "micro", "--stage", stage, "--out", str(out)]
+    return main([*start, *SHORT, *SAMPLES, *more])
 
 
 def steps(stage: str, count: int) -> list[str]:
@@ -110,7 +120,7 @@ def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
 def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
     """Over many steps on the same few samples."""
     shutil.copytree(trained / "reflow", tmp_path / "reflow")
-    more = ["--set", "heads.ray=0", "--set", "data.pool=8", *steps("heads", 30)]
+    more = ["--set", "heads.ray=0", *steps("heads", 30)]
     more += ["--set", "heads.optimizer.batch=8"]
     assert train(tmp_path, "heads", *more) == 0
     records = read_log(tmp_path / "heads")
@@ -175,13 +185,13 @@ def test_finished_stages_are_left_as_they_are(trained, tmp_path, capsys):
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
     more = [word for stage, count in counts.items() for word in steps(stage, count)]
     loud = [word for word in SHORT if word != "--quiet"]
-    assert main(["train", "micro", "--out", str(out), *loud, *more, "--resume"]) == 0
+    assert main(["train", "micro", "--out", str(out), *loud, *SAMPLES, *more, "--resume"]) == 0
     assert capsys.readouterr().out.count("finished before") == len(counts)
     assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in files} == before
 
 
 def test_all_stages_until_a_step_end_there(tmp_path):
-    more = [*SHORT, *steps("encoder", 3), "--until", "2"]
+    more = [*SHORT, *SAMPLES, *steps("encoder", 3), "--until", "2"]
     assert main(["train", "micro", "--out", str(tmp_path), *more]) == 0
     assert read_log(tmp_path / "encoder")[-1]["step"] == 2
     assert not (tmp_path / "denoiser").exists()
@@ -217,7 +227,7 @@ def test_an_unfinished_stage_is_not_passed_over(trained, tmp_path, capsys):
 
 def test_every_stage_draws_what_it_makes(trained, tmp_path):
     shutil.copytree(trained / "encoder", tmp_path / "encoder")
-    sheets = [word for word in SHORT if word not in ("--sheets", "0")] + ["--sheets", "1"]
+    sheets = [word for word in SHORT if word not in ("--sheets", "0")] + ["--sheets", "1", *SAMPLES]
     for stage, out in (("encoder", tmp_path / "own"), ("denoiser", tmp_path)):
         command = ["train", "micro", "--stage", stage, "--out", str(out), *sheets]
         assert main([*command, *steps(stage, 2), "--until", "1"]) == 0

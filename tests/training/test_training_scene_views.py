@@ -12,17 +12,14 @@ from tiny_scan import render, world_from_cam, write_colmap_scan
 from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.procedural.layouts import scene
-from gvtools.procedural.paths import PathOptions, camera_path
+from gvtools.procedural.paths import camera_path
 from gvtools.procedural.render import developed, radiance
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
-from gvtools.training.context_choice import ContextOptions
-from gvtools.training.dataset import ProceduralViews
+from gvtools.training.context_choice import ContextChoice
 from gvtools.training.scene_views import SceneViews, overlaps
-from gvtools.training.view_sample import collated
 
 TALL, WIDE = 96, 128
-GENTLE = PathOptions(travel=(0.2, 0.5), turn=(10.0, 40.0))
 
 
 class Loaded:
@@ -39,15 +36,15 @@ class Loaded:
 def _scene(seed: int = 0, *, count: int = 20, masked: bool = False) -> Scene:
     rng = np.random.default_rng([seed, 4])
     place = scene(rng, "train")
-    path = camera_path(rng, place.geometry, views=count, size=(TALL, WIDE), options=GENTLE)
-    light, depth = radiance(place.geometry, place.look, path.cameras)
+    cameras = camera_path(rng, place.geometry, views=count, size=(TALL, WIDE))
+    light, depth = radiance(place.geometry, place.look, cameras)
     rgb = developed(light, place.key / light.mean())
     mask = np.ones((TALL, WIDE), bool)
     mask[:10] = False
     views = tuple(
         View(
             f"{i:03d}.png",
-            path.cameras[i],
+            cameras[i],
             Loaded(Frame(rgb[i], depth[i], mask if masked else None)),
             has_depth=True,
         )
@@ -102,17 +99,6 @@ def test_masked_pixels_have_no_depth() -> None:
     assert not clip.depth[:, :10].any()
 
 
-def test_batches_of_recorded_and_of_procedural_samples_have_one_form() -> None:
-    recorded = collated([_views().sample(index) for index in range(2)])
-    made = collated([ProceduralViews(size=(48, 48)).sample(index) for index in range(2)])
-    for a, b in zip(
-        (recorded.views.images, recorded.views.depth, recorded.depth),
-        (made.views.images, made.views.depth, made.depth),
-        strict=True,
-    ):
-        assert a.shape[2:] == b.shape[2:] and a.dtype == b.dtype
-
-
 def test_overlap_counts_what_the_next_view_shows() -> None:
     clip = _views().clips(0)[1]
     turned = clip.cameras.cam_from_world.copy()
@@ -141,8 +127,8 @@ def test_a_colmap_project_with_depth_maps_gives_samples(tmp_path):
         depth = render(world_from_cam(index))[1].astype(np.float32)
         np.save(folder / f"{view.name}.npy", depth)
     data = SceneViews(
-        scenes=(open_project(home),), faults=None, views=4, size=(32, 32), overlap=0.0, detail=1,
-        context=ContextOptions(most=2),
+        scenes=(open_project(home),), faults=None, views=4, size=(32, 32), overlap=0.0,
+        context=ContextChoice(most=2),
     )  # fmt: skip
     sample = data.sample(0)
     k = sample.context
@@ -168,10 +154,10 @@ def test_a_selection_limits_the_views(tmp_path):
     place = _scene(count=20)
     data = SceneViews(
         scenes=(place,), select="every:4", views=4, size=(32, 32), overlap=0.0,
-        context=ContextOptions(most=2),
+        context=ContextChoice(most=2),
     )  # fmt: skip
     listed = data.describe()["scenes"][0]["views"]
     assert listed == [view.name for view in place][::4]
     assert data.sample(3).images.shape == (4, 3, 32, 32)
     with pytest.raises(ProjectError, match="'every:10'"):
-        SceneViews(scenes=(place,), select="every:10", views=4, context=ContextOptions(most=2))
+        SceneViews(scenes=(place,), select="every:10", views=4, context=ContextChoice(most=2))

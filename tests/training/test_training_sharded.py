@@ -229,7 +229,7 @@ def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
         data[stage]["optimizer"]["steps"] = 1
     training = tmp_path / "training.json"
     training.write_text(json.dumps(data))
-    more = ["--init", "gld", str(folder), "--sheets", "1"]
+    more = ["--init", str(folder), "--sheets", "1"]
     # The same samples together: the video prior's noise goes by a sample's place among them.
     both = [f"{stage}.optimizer.accumulate=2" for stage in stages]
     parts = [*(word for text in both for word in ("--set", text)), "--quiet"]
