@@ -7,10 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from shared_data import shared_folder
 
 # As the command line has it: threads that spin while they wait are slow where others work, too.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# How long an example takes is the machine's matter.
+settings.register_profile("any machine", deadline=None)
+settings.load_profile("any machine")
 
 # Begun first, so that workers compile kernels of different rooms and no long file is left for last.
 FIRST = (
