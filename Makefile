@@ -17,7 +17,8 @@ demo: environment
 	$(BIN)/gvtools demo $(ARGS)
 
 test: environment
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile \
+		--no-loadscope-reorder $(ARGS)
 
 lint: environment
 	$(BIN)/python -m ruff check .

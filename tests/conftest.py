@@ -7,10 +7,27 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from shared_data import shared_folder
 
 # As the command line has it: threads that spin while they wait are slow where others work, too.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# How long an example takes is the machine's matter.
+settings.register_profile("any machine", deadline=None)
+settings.load_profile("any machine")
+
+# Begun first, so that workers compile kernels of different rooms and no long file is left for last.
+FIRST = (
+    "test_splat.py",
+    "test_room_sample.py",
+    "test_completers_inpaint.py",
+    "test_stereo_depth.py",
+    "test_training_run.py",
+    "test_bench_complete.py",
+    "test_experiments.py",
+    "test_geoverse_checkpoints.py",
+)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -23,6 +40,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if "slow" in item.keywords:
                 item.add_marker(slow)
+    items.sort(
+        key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST)
+    )
     gpu_items = [item for item in items if "gpu" in item.keywords]
     if gpu_items and not _cuda():
         gpu = pytest.mark.skip(reason="needs a CUDA device; torch sees none")

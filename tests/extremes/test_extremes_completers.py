@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gvtools.completers import Completion, ContextView, create
+from gvtools.completers import Completer, Completion, ContextView, create
 from gvtools.completers.geoverse.correction import MOST, corrected_color, corrected_depth
 from gvtools.completers.push_pull import push_pull, push_pull_depth
 from gvtools.errors import OptionError, ShapeError
@@ -37,15 +37,20 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     }
 
 
+@pytest.fixture(scope="module")
+def completers(folders: dict[str, Path]) -> dict[str, Completer]:
+    made = {"none": create("none"), "inpaint": create("inpaint", min_support=1)}
+    for name in GENERATIVE:
+        weights = str(folders[name])
+        made[name] = create("geoverse", weights=weights, device="cpu", alignment="hint")
+    return made
+
+
 def complete(
-    folders: dict[str, Path], name: str, context: Sequence[ContextView], known: Guidance
+    completers: dict[str, Completer], name: str, context: Sequence[ContextView], known: Guidance
 ) -> Completion:
-    if name in GENERATIVE:
-        completer = create("geoverse", weights=str(folders[name]), device="cpu", alignment="hint")
-    else:
-        completer = create(name, **({} if name == "none" else {"min_support": 1}))
     with np.errstate(all="raise", under="ignore"):
-        return completer.complete(context, known, seed=1)
+        return completers[name].complete(context, known, seed=1)
 
 
 def flat(valid: np.ndarray, *, color: float = 0.4, depth: float = 3.0) -> Guidance:
@@ -76,13 +81,13 @@ def check(made: Completion, known: Guidance) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 2), (1, 40), SIZE])
-def test_masks_of_nothing_everything_and_a_half_at_any_size(folders, name, size):
+def test_masks_of_nothing_everything_and_a_half_at_any_size(completers, name, size):
     half = np.zeros(size, np.bool_)
     half[:, : max(1, size[1] // 2)] = True
     context = micro.context_views(2)
     for valid in (np.zeros(size, np.bool_), np.ones(size, np.bool_), half):
         known = flat(valid)
-        made = complete(folders, name, context, known)
+        made = complete(completers, name, context, known)
         check(made, known)
         assert made.spent["holes"] == (~valid).sum()
         if valid.all():
@@ -94,45 +99,45 @@ def test_masks_of_nothing_everything_and_a_half_at_any_size(folders, name, size)
             assert not made.depth[~known.valid].any()
 
 
-def test_a_constant_picture_is_continued_as_it_is(folders):
+def test_a_constant_picture_is_continued_as_it_is(completers):
     valid = np.ones(SIZE, np.bool_)
     valid[8:16, 10:20] = False
     for color in (0.0, 0.4, 1.0):
         known = flat(valid, color=color)
-        made = complete(folders, "inpaint", [], known)
+        made = complete(completers, "inpaint", [], known)
         np.testing.assert_allclose(made.rgb, color, atol=1e-6)
         np.testing.assert_allclose(made.depth, 3, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_photograph_is_enough_or_said_and_one_is_enough(folders, name):
+def test_no_photograph_is_enough_or_said_and_one_is_enough(completers, name):
     known = micro.guidance(1, size=SIZE)
     for context in ([], micro.context_views(1), micro.context_views(1, depth=False)):
         if not context and name in GENERATIVE:
             with pytest.raises(OptionError, match="at least one context view"):
-                complete(folders, name, context, known)
+                complete(completers, name, context, known)
             continue
-        made = complete(folders, name, context, known)
+        made = complete(completers, name, context, known)
         check(made, known)
         assert name == "none" or (made.depth > 0).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_target_is_an_empty_completion(folders, name):
+def test_no_target_is_an_empty_completion(completers, name):
     plain = micro.guidance(1, size=SIZE)
     none = {f: getattr(plain, f)[:0] for f in ("rgb", "depth", "valid", "confidence", "generated")}
     nothing = Guidance(plain.cameras[:0], **none)
-    made = complete(folders, name, micro.context_views(1), nothing)
+    made = complete(completers, name, micro.context_views(1), nothing)
     assert made.rgb.shape == (0, *SIZE, 3)
     assert made.spent["holes"] == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("power", [-30, 30])
-def test_the_unit_of_the_scene_does_not_matter(folders, name, power):
+def test_the_unit_of_the_scene_does_not_matter(completers, name, power):
     context, known = micro.context_views(2), micro.guidance(1, size=SIZE)
     far = micro.moved(context, known, scale=10.0**power)
-    made, plain = complete(folders, name, *far), complete(folders, name, context, known)
+    made, plain = complete(completers, name, *far), complete(completers, name, context, known)
     check(made, far[1])
     np.testing.assert_allclose(made.depth / np.float32(10.0**power), plain.depth, rtol=1e-3)
     assert np.mean(np.abs(made.rgb - plain.rgb).max(-1) > 1e-3) < 0.005
@@ -143,7 +148,7 @@ def test_the_unit_of_the_scene_does_not_matter(folders, name, power):
     ("what", "bad"), [("rgb", np.nan), ("depth", np.inf), ("confidence", np.nan)]
 )
 def test_memory_that_is_not_finite_is_refused_and_named_and_holes_may_hold_it(
-    folders, name, what, bad
+    completers, name, what, bad
 ):
     known = micro.guidance(1, size=SIZE)
     context = micro.context_views(2)
@@ -151,38 +156,38 @@ def test_memory_that_is_not_finite_is_refused_and_named_and_holes_may_hold_it(
     damaged = {what: getattr(known, what).copy()}
     damaged[what][0, row, column] = bad
     with pytest.raises(ShapeError, match=r"view target_1_0: 1 pixel\(s\) hold NaN"):
-        complete(folders, name, context, replace(known, **damaged))
+        complete(completers, name, context, replace(known, **damaged))
     holes = {what: getattr(known, what).copy()}
     holes[what][~known.valid] = bad
-    made = complete(folders, name, context, replace(known, **holes))
-    plain = complete(folders, name, context, known)
+    made = complete(completers, name, context, replace(known, **holes))
+    plain = complete(completers, name, context, known)
     np.testing.assert_array_equal(made.rgb, plain.rgb)
     np.testing.assert_array_equal(made.depth, plain.depth)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("name", NAMES)
-def test_photographs_that_are_not_finite_are_refused_and_named(folders, name, bad):
+def test_photographs_that_are_not_finite_are_refused_and_named(completers, name, bad):
     context = micro.context_views(2)
     context[1].rgb[3, 4, 0] = bad
     with pytest.raises(ShapeError, match=r"view photo_0_1: 1 pixel\(s\) hold NaN"):
-        complete(folders, name, context, micro.guidance(1, size=SIZE))
+        complete(completers, name, context, micro.guidance(1, size=SIZE))
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_depth_of_a_photograph_that_is_none_counts_as_none(folders, name, bad):
+def test_depth_of_a_photograph_that_is_none_counts_as_none(completers, name, bad):
     known = micro.guidance(1, size=SIZE)
     views = micro.context_views(2)
     damaged = [replace(v, depth=np.full(v.rgb.shape[:2], bad, np.float32)) for v in views]
     without = [replace(v, depth=None) for v in views]
-    made, plain = (complete(folders, name, context, known) for context in (damaged, without))
+    made, plain = (complete(completers, name, context, known) for context in (damaged, without))
     np.testing.assert_array_equal(made.rgb, plain.rgb)
     np.testing.assert_array_equal(made.depth, plain.depth)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_arrays_that_do_not_fit_each_other_are_refused(folders, name):
+def test_arrays_that_do_not_fit_each_other_are_refused(completers, name):
     known = micro.guidance(1, size=SIZE)
     for changes in (
         {"rgb": known.rgb[..., :1]},
@@ -190,7 +195,7 @@ def test_arrays_that_do_not_fit_each_other_are_refused(folders, name):
         {"valid": known.valid[0]},
     ):
         with pytest.raises(ShapeError, match="guidance"):
-            complete(folders, name, micro.context_views(1), replace(known, **changes))
+            complete(completers, name, micro.context_views(1), replace(known, **changes))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])

@@ -54,6 +54,6 @@ def test_a_cell_with_an_unmeasured_pixel_frees_nothing():
 
 def test_no_view_and_no_grid_free_nothing():
     where = np.array([(0, 0, 2)], np.float32)
-    assert not in_free_space(where, [], tolerance=0).any()
+    assert not in_free_space(where, [], tolerance=0.0).any()
     nothing = np.zeros((0, 0), np.float32)
-    assert not in_free_space(where, [_view(camera(), nothing)], tolerance=0).any()
+    assert not in_free_space(where, [_view(camera(), nothing)], tolerance=0.0).any()

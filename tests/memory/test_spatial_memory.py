@@ -156,18 +156,6 @@ def test_what_cannot_be_stored_is_counted():
     assert report.rejected == 5
 
 
-def test_a_far_origin_keeps_a_millimetre():
-    origin = np.array([5e6, -5e6, 5e6])
-    rng = np.random.default_rng(0)
-    where = origin + rng.uniform(-20, 20, (500, 3))
-    source = camera(center=origin)
-    memory = SpatialMemory(1e-4, origin=origin)
-    memory.fuse(points(where, source=source, origin=origin), round=0)
-    assert len(memory) == 500
-    order, expected = np.lexsort(memory.positions.T), np.lexsort(where.T)
-    assert abs(memory.positions[order] - where[expected]).max() < 1e-5
-
-
 def test_points_of_another_origin_and_earlier_rounds_are_refused():
     memory = SpatialMemory(0.1, origin=(1, 2, 3))
     with pytest.raises(ShapeError, match="back-project with the memory's frame"):

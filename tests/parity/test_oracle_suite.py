@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import oracle_flow_cases
-import oracle_geometry_cases
 import pytest
 import torch
 from oracle import network_fixtures, oracle_folder, unclaimed, without_cases
@@ -87,27 +85,3 @@ def test_outputs_of_cases_that_nothing_runs_are_named(tmp_path):
     with pytest.raises(AssertionError, match=r"\['case7', 'extra'\]"):
         fixture.check_prefixes(["case0"])
     fixture.check_prefixes(["case0", "case7", "extra"])
-
-
-def test_an_unknown_output_of_a_camera_case_fails(tmp_path):
-    """One checker as a whole: the camera's, fed with its own Plücker map and a foreign tensor."""
-    pose = np.repeat(np.eye(4, dtype=np.float32)[None, None], 2, axis=1)
-    pose[0, 1, 0, 3] = 1
-    values = {
-        "case0.in.c2w": pose,
-        "case0.in.K": np.repeat(np.diag([4, 4, 1]).astype(np.float32)[None, None], 2, axis=1),
-        "case0.in.image_hw": np.array([4, 4]),
-        "case0.out.pose_scale": np.ones((1, 1, 1), np.float32),
-    }
-    known = Fixture(write(tmp_path, "gld_camera_known", values, cases=[{}]))
-    oracle_geometry_cases.check_camera(known, 0)
-    values["case0.out.moments"] = np.ones(1, np.float32)
-    other = Fixture(write(tmp_path, "gld_camera_other", values, cases=[{}]))
-    with pytest.raises(AssertionError, match="moments"):
-        oracle_geometry_cases.check_camera(other, 0)
-
-
-def test_an_unknown_array_of_the_time_grids_fails():
-    oracle_flow_cases.check_known(["grid.s0.N4", "train_shift.s1.t_uniform", "path.x_t"])
-    with pytest.raises(AssertionError, match=r"path\.score"):
-        oracle_flow_cases.check_known(["path.x_t", "path.score"])

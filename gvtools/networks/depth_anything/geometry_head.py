@@ -253,6 +253,8 @@ def _initialise(head: GeometryHead) -> None:
     With torch's own, each of the convolutions in a row takes three quarters of the power and adds a
     bias of that size: a constant is all that reaches the end, and training stays there long.
     """
+    if next(head.parameters()).is_meta:  # names and shapes alone; these calls are slow there
+        return
     for module in head.modules():
         if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
             # Transposed: kernels do not overlap, so that a pixel has one input of each channel.

@@ -1,15 +1,41 @@
-"""Weights that the tests of the generative core share."""
+"""Weights folders that the tests of the generative core share, and copies of them to damage."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import geoverse_models as micro
 import pytest
+from geoverse_folders import PLAIN, write_source
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Encodes with known cameras and fills holes, as ``tiny`` does."""
     hints = {"cameras": True, "fill": "push-pull", "mask": 0.0}
     return micro.weights_folder(tmp_path_factory.mktemp("micro"), micro.config(hints=hints))
+
+
+@pytest.fixture(scope="session")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of published files."""
+    return write_source(tmp_path_factory.mktemp("published"))
+
+
+@pytest.fixture(scope="session")
+def own_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of one's own."""
+    return micro.weights_folder(tmp_path_factory.mktemp("own"), PLAIN)
+
+
+@pytest.fixture
+def folder(source: Path, tmp_path: Path) -> Path:
+    """Published files to be damaged."""
+    return Path(shutil.copytree(source, tmp_path / "published"))
+
+
+@pytest.fixture
+def own(own_source: Path, tmp_path: Path) -> Path:
+    """A folder of one's own to be damaged."""
+    return Path(shutil.copytree(own_source, tmp_path / "own"))

@@ -32,7 +32,6 @@ from gvtools.completers.geoverse.weights.published import PARTS, expected_of
 from gvtools.networks.tensor_files import STORED_TYPES, TensorFiles
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-pytest_plugins = ("geoverse_folder_fixtures",)
 
 
 @pytest.mark.parametrize("config", [PLAIN, CONTROL, SHARED], ids=lambda c: c.injection)
@@ -66,8 +65,9 @@ def test_a_fresh_extension_changes_no_bit_and_is_the_same_each_time(
     assert torch.equal(torch.get_rng_state(), state)
 
 
-@pytest.mark.parametrize("start", ["", "module."])
-@pytest.mark.parametrize("wrapper", ["ema", "model", None])
+@pytest.mark.parametrize(
+    ("wrapper", "start"), [("ema", "module."), ("ema", ""), ("model", ""), (None, "module.")]
+)
 def test_the_wrappings_of_published_tensors(
     folder: Path, source: Path, wrapper: str | None, start: str
 ) -> None:

@@ -24,7 +24,6 @@ from gvtools.completers.geoverse.weights.published import WHOLE_FILE
 from gvtools.errors import CheckpointError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-pytest_plugins = ("geoverse_folder_fixtures",)
 
 
 def tensors_changed(file: Path, change: Callable[[dict[str, Tensor]], Any]) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 import torch
 
 from gvtools.cameras import Cameras
-from gvtools.completers import Completion, ContextView, ScaleStatus, create
+from gvtools.completers import Completer, Completion, ContextView, ScaleStatus, create
 from gvtools.completers.geoverse import completer as completer_module
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.completers.geoverse.conditioning import ViewBatch
@@ -36,7 +37,12 @@ def complete(
     **options: Any,
 ) -> Completion:
     options = {"alignment": "hint", "device": "cpu", **options}
-    return create("geoverse", weights=str(weights), **options).complete(context, known, seed=seed)
+    return loaded(weights, **options).complete(context, known, seed=seed)
+
+
+@cache
+def loaded(weights: Path, **options: Any) -> Completer:
+    return create("geoverse", weights=str(weights), **options)
 
 
 def statuses(result: Completion) -> list[ScaleStatus]:

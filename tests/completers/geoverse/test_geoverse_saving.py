@@ -18,7 +18,6 @@ from gvtools.errors import CheckpointError, GvError, ProjectError
 from gvtools.networks.tensors import save_tensors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-pytest_plugins = ("geoverse_folder_fixtures",)
 
 
 @pytest.mark.parametrize("dtype", ["float16", "bfloat16"])

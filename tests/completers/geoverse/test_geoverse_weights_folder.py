@@ -17,7 +17,6 @@ from gvtools.errors import CheckpointError
 from gvtools.networks.config_json import to_json
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-pytest_plugins = ("geoverse_folder_fixtures",)
 
 
 def test_what_is_no_folder_is_refused(tmp_path: Path, own: Path) -> None:
