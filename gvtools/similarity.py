@@ -18,8 +18,6 @@ COLLINEAR = 1e-3
 COINCIDENT = 1e-13
 # Squares below this share of the spread's are sums of cancelling terms.
 ROUNDING = 1e-12
-# Below it float64 loses digits.
-TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +61,6 @@ class SimilarityFit:
         return self.scale * centered @ self.rotation.T + self.target_center
 
 
-@np.errstate(over="ignore", under="ignore", invalid="ignore")
 def fit_similarity(
     source: ArrayLike,
     target: ArrayLike,
@@ -77,8 +74,8 @@ def fit_similarity(
     patterns", PAMI 13(4), 1991; equation numbers are its own. Without weights the solution is
     pycolmap's, about the centroids, wherever it gives one; whether the points determine a solution
     is found out here. Camera centres on a line (a straight dolly) leave the rotation about that
-    line open and are reported as degenerate; so are mirror images that several rotations fit alike
-    and scales that float64 does not hold. The unit of the coordinates changes no digit.
+    line open and are reported as degenerate; so are mirror images that several rotations fit alike.
+    The unit of the coordinates changes no digit.
 
     Args:
         source: (N, 3).
@@ -89,6 +86,47 @@ def fit_similarity(
     Raises:
         ShapeError: the shapes do not match, or a value is not finite.
     """
+    source, target, weight = _checked(source, target, weights)
+    row = weight > 0
+    if row.sum() < 3:
+        return _degenerate(len(source), f"{row.sum()} point pair(s), at least 3 are needed")
+    weight = weight[row] / weight.sum()
+    x, x_unit, source_center, x_defect = _centered(source, row, weight)  # (34)
+    y, y_unit, target_center, y_defect = _centered(target, row, weight)  # (35)
+    if x_defect or y_defect:
+        defect = f"{x_defect} source" if x_defect else f"{y_defect} target"
+        return _degenerate(len(source), f"{defect} points")
+    variance, size = (float(weight @ (part[row] ** 2).sum(axis=1)) for part in (x, y))  # (36)
+    covariance = (y[row] * weight[:, None]).T @ x[row]  # (38)
+    u, d, vt = np.linalg.svd(covariance)
+    if d[1] < COLLINEAR**2 * d[0] or d[0] <= ROUNDING * np.sqrt(variance * size):
+        return _degenerate(len(source), "source and target do not correspond in two directions")
+    sign = np.array([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0])  # (39), (43)
+    if d[1] + sign[2] * d[2] < COLLINEAR**2 * d[0]:
+        return _degenerate(len(source), "a mirror image, which several rotations fit alike")
+    rotation = (u * sign) @ vt  # (40)
+    kept = x_unit / y_unit
+    scale = float((d * sign).sum() / variance) if with_scale else kept  # (42)
+    if weights is None:
+        rotation, free = _by_pycolmap(x, y, with_scale=with_scale) or (rotation, scale)
+        scale = free if with_scale else kept
+    residuals = np.linalg.norm(y - scale * x @ rotation.T, axis=1)
+    square = float(weight @ residuals[row] ** 2)
+    best = d.sum() / variance if with_scale else kept
+    other = size - 2 * best * d.sum() + best**2 * variance  # (33), of the reflection
+    mirrored = bool(sign[2] < 0 and other < square / 4 and square > ROUNDING * size)
+    scale *= y_unit / x_unit
+    translation = target_center - scale * rotation @ source_center  # (41)
+    return SimilarityFit(
+        "aligned", scale, rotation, translation, residuals * y_unit,
+        float(np.sqrt(square)) * y_unit, source_center, target_center, mirrored,
+    )  # fmt: skip
+
+
+def _checked(
+    source: ArrayLike, target: ArrayLike, weights: ArrayLike | None
+) -> tuple[Float64, Float64, Float64]:
+    """Points and weights as float64; raises as ``fit_similarity`` says."""
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
         raise ShapeError(
@@ -99,69 +137,24 @@ def fit_similarity(
         raise ShapeError(f"similarity: weights {weight.shape}; expected ({len(source)},), >= 0")
     if not (np.isfinite(source).all() and np.isfinite(target).all()):
         raise ShapeError("similarity: points hold NaN or infinity; leave those rows out")
-    used = int((weight > 0).sum())
-    if used < 3:
-        return _degenerate(len(source), f"{used} point pair(s), at least 3 are needed")
-    row = weight > 0
-    weight = weight[row] / weight.max()
-    weight /= weight.sum()
-
-    x, x_power, source_center, x_defect = _centered(source, row, weight)  # (34)
-    y, y_power, target_center, y_defect = _centered(target, row, weight)  # (35)
-    for name, defect in (("source", x_defect), ("target", y_defect)):
-        if defect:
-            return _degenerate(len(source), f"{defect} {name} points")
-    variance = float(weight @ (x[row] ** 2).sum(axis=1))  # (36)
-    size = float(weight @ (y[row] ** 2).sum(axis=1))
-    covariance = (y[row] * weight[:, None]).T @ x[row]  # (38)
-    u, d, vt = np.linalg.svd(covariance)
-    if d[1] < COLLINEAR**2 * d[0] or d[0] <= ROUNDING * np.sqrt(variance * size):
-        return _degenerate(len(source), "source and target do not correspond in two directions")
-    sign = np.ones(3)
-    sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0  # (39), (43)
-    if d[1] + sign[2] * d[2] < COLLINEAR**2 * d[0]:
-        return _degenerate(len(source), "a mirror image, which several rotations fit alike")
-    rotation = (u * sign) @ vt  # (40)
-    kept = float(np.ldexp(1.0, x_power - y_power))
-    scale = float((d * sign).sum() / variance) if with_scale else kept  # (42)
-    if weights is None:
-        rotation, free = _by_pycolmap(x, y, with_scale=with_scale) or (rotation, scale)
-        scale = free if with_scale else kept
-    residuals = np.linalg.norm(y - scale * x @ rotation.T, axis=1)
-    square = float(weight @ residuals[row] ** 2)
-    mirrored = False
-    if sign[2] < 0:
-        best = d.sum() / variance if with_scale else kept
-        other = size - 2 * best * d.sum() + best**2 * variance  # (33), of the reflection
-        mirrored = bool(other < square / 4 and square > ROUNDING * size)
-    residuals, rmse = np.ldexp(residuals, y_power), float(np.ldexp(np.sqrt(square), y_power))
-    scale = float(np.ldexp(scale, y_power - x_power))
-    translation = target_center - scale * rotation @ source_center  # (41)
-    if not (np.isfinite([rmse, *translation]).all() and TINY <= scale < np.inf):
-        return _degenerate(len(source), "units whose ratio float64 does not hold")
-    return SimilarityFit(
-        "aligned", scale, rotation, translation, residuals, rmse, source_center, target_center,
-        mirrored,
-    )  # fmt: skip
+    return source, target, weight
 
 
 def _centered(
     points: Float64, row: NDArray[np.bool_], weight: Float64
-) -> tuple[Float64, int, Float64, str]:
-    """Points about their centroid, a power of two divided out so that no square leaves float64.
+) -> tuple[Float64, float, Float64, str]:
+    """Points about their centroid, in a power of two near their extent.
 
     Returns:
-        The points (N, 3), the power, the centroid in the points' own unit, and what is wrong with
+        The points (N, 3), the unit, the centroid in the points' own unit, and what is wrong with
         the spread of those in ``row``, see ``_spread_defect``.
     """
-    center = _centroid(points[row], weight)
+    # About the first point, so that large offsets keep their digits.
+    center = points[row][0] + weight @ (points[row] - points[row][0])
     moved = points - center
-    if not np.isfinite(moved[row]).all():
-        return moved, 0, center, "overflowing"
-    power = int(np.frexp(np.abs(moved[row]).max())[1])
-    moved = np.ldexp(moved, -power)
-    magnitude = float(np.ldexp(np.abs(points[row]).max(), -power))
-    return moved, power, center, _spread_defect(moved[row], weight, magnitude)
+    unit = 2.0 ** int(np.frexp(np.abs(moved[row]).max())[1])
+    magnitude = float(np.abs(points[row]).max()) / unit
+    return moved / unit, unit, center, _spread_defect(moved[row] / unit, weight, magnitude)
 
 
 def _by_pycolmap(
@@ -178,11 +171,6 @@ def _by_pycolmap(
     if fit is None:
         return None
     return np.asarray(fit.rotation.matrix()), float(getattr(fit, "scale", 1.0))
-
-
-def _centroid(points: Float64, weight: Float64) -> Float64:
-    """Weighted mean, summed about the first point so that large offsets keep their digits."""
-    return points[0] + weight @ (points - points[0])
 
 
 def _spread_defect(centered: Float64, weight: Float64, magnitude: float) -> str:
@@ -263,6 +251,42 @@ def align_depth_scale(
     Raises:
         ShapeError: shapes differ.
     """
+    ratio, weight = _log_ratios(depth, reference_depth, valid, confidence)
+    support = len(ratio)
+    if support < max(min_support, 1):
+        return ScaleFit(
+            f"unsupported: {support} common pixels, at least {max(min_support, 1)} are needed",
+            np.nan, 0, 0.0, np.nan, support,
+        )  # fmt: skip
+    weight = weight / weight.sum()
+    # A completer that leaves the known pixels alone has a depth equal to the memory's.
+    equal = not ratio.any()
+    center = 0.0 if equal else _tukey_center(ratio, weight)
+    deviation = np.abs(np.expm1(ratio - center))
+    inlier = deviation <= inlier_band
+    share = float(weight[inlier].sum())
+    residual = 0.0 if equal else _weighted_median(deviation, weight)
+    reason = ""
+    if share < min_inlier_share:
+        reason = f"{share:.0%} of the pixels agree within {inlier_band:.0%}, " + (
+            f"at least {min_inlier_share:.0%} are needed"
+        )
+    elif residual > max_residual:
+        reason = f"median deviation {residual:.1%}, at most {max_residual:.1%} is accepted"
+    return ScaleFit(
+        f"unsupported: {reason}" if reason else "aligned",
+        np.nan if reason else float(np.exp(center)),
+        int(inlier.sum()),
+        share,
+        residual,
+        support,
+    )
+
+
+def _log_ratios(
+    depth: ArrayLike, reference_depth: ArrayLike, valid: ArrayLike, confidence: ArrayLike | None
+) -> tuple[Float64, Float64]:
+    """log(reference / depth) of the pixels that both know, and their weights, (N,) each."""
     depth, reference = np.asarray(depth, np.float64), np.asarray(reference_depth, np.float64)
     mask = np.asarray(valid, bool)
     weight = np.ones(depth.shape) if confidence is None else np.asarray(confidence, np.float64)
@@ -274,50 +298,23 @@ def align_depth_scale(
     with np.errstate(invalid="ignore"):
         mask = mask & np.isfinite(depth) & np.isfinite(reference) & (depth > 0) & (reference > 0)
         mask &= np.isfinite(weight) & (weight > 0)
-    support = int(mask.sum())
-    if support < max(min_support, 1):
-        return ScaleFit(
-            f"unsupported: {support} common pixels, at least {max(min_support, 1)} are needed",
-            np.nan, 0, 0.0, np.nan, support,
-        )  # fmt: skip
-    ratio = np.log(reference[mask]) - np.log(depth[mask])
-    weight = weight[mask] / weight[mask].max()
-    weight /= weight.sum()
-    # A completer that leaves the known pixels alone has a depth equal to the memory's.
-    equal = not ratio.any()
-    center = 0.0 if equal else _weighted_median(ratio, weight)
-    for _ in range(0 if equal else 20):
-        gap = np.abs(ratio - center)
+    return np.log(reference[mask]) - np.log(depth[mask]), weight[mask]
+
+
+def _tukey_center(values: Float64, weight: Float64) -> float:
+    """A robust mean: the weighted median, then Tukey's re-weighting."""
+    center = _weighted_median(values, weight)
+    for _ in range(20):
+        gap = np.abs(values - center)
         # 1.4826 · median is the standard deviation of a normal core; Tukey's 4.685 keeps 95 %
         # of its efficiency. The floor keeps exact data from dividing by zero.
         width = 4.685 * max(1.4826 * _weighted_median(gap, weight), 1e-6)
         kernel = weight * np.clip(1 - (gap / width) ** 2, 0, None) ** 2
-        update = float((kernel @ ratio) / kernel.sum())
+        update = float((kernel @ values) / kernel.sum())
         moved, center = abs(update - center), update
         if moved < 1e-9:
             break
-    with np.errstate(over="ignore", under="ignore"):
-        deviation, scale = np.abs(np.expm1(ratio - center)), float(np.exp(center))
-    inlier = deviation <= inlier_band
-    share = float(weight[inlier].sum())
-    residual = 0.0 if equal else _weighted_median(deviation, weight)
-    reason = ""
-    if share < min_inlier_share:
-        reason = f"{share:.0%} of the pixels agree within {inlier_band:.0%}, " + (
-            f"at least {min_inlier_share:.0%} are needed"
-        )
-    elif residual > max_residual:
-        reason = f"median deviation {residual:.1%}, at most {max_residual:.1%} is accepted"
-    elif not TINY <= scale < np.inf:
-        reason = f"the scale is exp({center:.1f}), which float64 does not hold"
-    return ScaleFit(
-        f"unsupported: {reason}" if reason else "aligned",
-        np.nan if reason else scale,
-        int(inlier.sum()),
-        share,
-        residual,
-        support,
-    )
+    return center
 
 
 def _weighted_median(values: Float64, weight: Float64) -> float:

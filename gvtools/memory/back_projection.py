@@ -61,43 +61,26 @@ def back_project(
         options: see BackProjectionOptions.
         levels: the voxels that the points are for (``memory.levels``); for ``pixel_binning``.
         pixel_binning: where 2 x 2 pixels together are at most so many voxel edges wide, they become
-            one point, their mean, unless the surface is steep; 0 keeps every pixel's, and so does
-            leaving ``levels`` out.
+            one point, their mean, unless the surface is steep; 0, or no ``levels``, keeps all.
 
     Raises:
         ShapeError: the images and the camera disagree in size, or the camera is unusable.
     """
-    check_usable(camera)
+    height, width = _checked_size(rgb, depth, confidence, mask, camera)
     options = options or BackProjectionOptions()
-    height, width = int(camera.height[0]), int(camera.width[0])
-    for name, array, shape in (
-        ("rgb", rgb, (height, width, 3)),
-        ("depth", depth, (height, width)),
-        ("confidence", confidence, (height, width)),
-        ("mask", mask, (height, width)),
-    ):
-        if array is not None and array.shape != shape:
-            raise ShapeError(
-                f"{camera.names[0]}: {name} has shape {array.shape}; its camera needs {shape}"
-            )
+    far = np.inf if options.depth_max is None else options.depth_max
     frame = frame or LocalFrame.at()
-    local_from_cam = frame.local_from_cam(camera.world_from_cam[0])
     z = np.ascontiguousarray(depth, np.float32)
     use = np.ones((0, 0), np.bool_) if mask is None else np.ascontiguousarray(mask, np.bool_)
-    trust = (
-        np.ones((0, 0), np.float32)
-        if confidence is None
-        else np.ascontiguousarray(confidence, np.float32)
-    )
-    positions = np.empty((height * width, 3), np.float32)
-    colors = np.empty((height * width, 3), np.uint8)
-    weight = np.empty(height * width, np.float32)
-    spacing = np.empty(height * width, np.float32)
-    pixels = np.empty(height * width if levels and pixel_binning > 0 else 0, np.int64)
+    trust = np.ascontiguousarray(np.ones((0, 0)) if confidence is None else confidence, np.float32)
+    total, single = height * width, np.float32
+    positions, colors = np.empty((total, 3), single), np.empty((total, 3), np.uint8)
+    weight, spacing = np.empty(total, single), np.empty(total, single)
+    pixels = np.empty(total if levels and pixel_binning > 0 else 0, np.int64)
     count, invalid, edges, masked = _lift(
-        np.ascontiguousarray(rgb, np.uint8), z, trust, use,
-        np.ascontiguousarray(camera.K[0]), np.ascontiguousarray(local_from_cam),
-        options.edge, np.inf if options.depth_max is None else options.depth_max, options.grazing,
+        np.ascontiguousarray(rgb, np.uint8), z, trust, use, np.ascontiguousarray(camera.K[0]),
+        np.ascontiguousarray(frame.local_from_cam(camera.world_from_cam[0])),
+        options.edge, far, options.grazing,
         positions, colors, weight, spacing, pixels,
     )  # fmt: skip
     if levels and pixel_binning > 0:
@@ -105,19 +88,33 @@ def back_project(
             pixels[:count], (height, width), pixel_binning * levels.edge, levels.per_spacing,
             positions[:count], colors[:count], weight[:count], spacing[:count],
         )  # fmt: skip
-    far = np.inf if options.depth_max is None else options.depth_max
     # A depth that is not trusted says nothing of the space before it.
     sure = z if confidence is None else np.where(trust > 0, z, np.float32(0))
     return PointSet(
-        positions[:count].copy(),
-        colors[:count].copy(),
-        weight[:count].copy(),
-        spacing[:count].copy(),
-        camera,
-        frame,
-        _free_depth(sure, use, np.float32(far)),
+        positions[:count].copy(), colors[:count].copy(), weight[:count].copy(),
+        spacing[:count].copy(), camera, frame, _free_depth(sure, use, np.float32(far)),
         {"no depth": invalid, "depth edge": edges, "masked": masked},
-    )
+    )  # fmt: skip
+
+
+def _checked_size(
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    confidence: NDArray[np.float32] | None,
+    mask: NDArray[np.bool_] | None,
+    camera: Cameras,
+) -> tuple[int, int]:
+    """Height and width of the camera, which all images must have."""
+    check_usable(camera)
+    size = (int(camera.height[0]), int(camera.width[0]))
+    images = {"rgb": rgb, "depth": depth, "confidence": confidence, "mask": mask}
+    for name, array in images.items():
+        shape = (*size, 3) if name == "rgb" else size
+        if array is not None and array.shape != shape:
+            raise ShapeError(
+                f"{camera.names[0]}: {name} has shape {array.shape}; its camera needs {shape}"
+            )
+    return size
 
 
 @compiled(inline="always")

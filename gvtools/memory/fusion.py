@@ -16,7 +16,7 @@ from gvtools.memory.store.columns import LAST_ROUND
 from gvtools.memory.store.points import PointSet
 from gvtools.memory.store.store import Store
 from gvtools.memory.store.views import SourceView
-from gvtools.memory.store.voxel_index import EMPTY_KEY, voxel_keys
+from gvtools.memory.store.voxel_index import EMPTY_KEY, group_by_block, voxel_keys
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def _fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> FuseR
         return FuseReport()
     index, views, segments = store.index, store.views, store.segments
     blocks = index.block_numbers(keys)
-    touched, starts, order = kernels.group_by_block(blocks, index.blocks)
+    touched, starts, order = group_by_block(blocks, index.blocks)
     index.reserve_voxels(count, touched)
     index.top = max(index.top, int(levels.max()))
     store.columns.reserve(count)

@@ -90,37 +90,6 @@ class FusionOutput(NamedTuple):
     report: NDArray[np.int64]
 
 
-@compiled()
-def group_by_block(blocks, total):
-    """Counting sort of the points by block, blocks in the order of their first point.
-
-    Returns (touched blocks, start of each in the order, order).
-    """
-    counts = np.zeros(total, np.int32)
-    for b in blocks:
-        counts[b] += 1
-    rank = np.full(total, -1, np.int32)
-    touched = np.empty(min(len(blocks), total), np.int32)
-    starts = np.empty(min(len(blocks), total) + 1, np.int64)
-    n = 0
-    at = np.int64(0)
-    for b in blocks:
-        if rank[b] < 0:
-            rank[b] = n
-            touched[n] = b
-            starts[n] = at
-            at += counts[b]
-            n += 1
-    starts[n] = at
-    cursor = starts[:n].copy()
-    order = np.empty(len(blocks), np.int64)
-    for i in range(len(blocks)):
-        r = rank[blocks[i]]
-        order[cursor[r]] = i
-        cursor[r] += 1
-    return touched[:n], starts[: n + 1], order
-
-
 @compiled(fastmath={"nsz", "arcp", "contract"})
 def _most_similar(head, p, spacing, source, columns):
     """The chain's observation seen from the most similar direction: (record, cosine, length).

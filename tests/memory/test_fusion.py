@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from memory_scenes import camera, points
 from reference_fusion import ReferenceMemory, chains_of
 
-from gvtools.memory.fusion_kernels import group_by_block
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-from gvtools.memory.store.voxel_index import EMPTY_KEY, MAX_VOXEL, voxel_keys
+from gvtools.memory.store.voxel_index import EMPTY_KEY, MAX_VOXEL, group_by_block, voxel_keys
 
 ONE_EDGE = MemoryOptions(voxels_per_footprint=0.0)
 
