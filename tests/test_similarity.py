@@ -60,26 +60,6 @@ def test_a_rigid_fit_agrees_with_scipy_and_keeps_the_scale(planar):
     np.testing.assert_allclose(fit.rotation, other.as_matrix(), atol=1e-7)
 
 
-def test_a_mirrored_target_still_gives_a_rotation():
-    source = _points(5)
-    fit = fit_similarity(source, source * (1, 1, -1))
-    assert fit.ok
-    assert np.linalg.det(fit.rotation) == pytest.approx(1)
-    assert fit.rmse > 0.1
-
-
-def test_weights_of_zero_leave_rows_out():
-    source = _points(6)
-    target = 2 * source + 1
-    target[0] += 100
-    weights = np.ones(12)
-    weights[0] = 0
-    fit = fit_similarity(source, target, weights=weights)
-    assert fit.scale == pytest.approx(2)
-    assert fit.residuals[0] == pytest.approx(np.sqrt(3) * 100)
-    assert fit.rmse < 1e-12
-
-
 def test_large_offsets_keep_millimetres():
     rng = np.random.default_rng(7)
     source = rng.standard_normal((20, 3)) * 20
@@ -92,25 +72,6 @@ def test_large_offsets_keep_millimetres():
     assert np.abs(back.apply(target) - source).max() < 1e-7
     formula = back.scale * target @ back.rotation.T + back.translation
     assert np.abs(formula - source).max() < 1e-6
-
-
-@pytest.mark.parametrize(
-    ("source", "reason"),
-    [
-        (np.zeros((0, 3)), "0 point pair"),
-        (np.eye(3)[:2], "at least 3"),
-        (np.full((5, 3), 1e6 + 0.1), "coincident"),
-        (np.linspace(0, 1, 9)[:, None] * (1, 2, 3) + 1e6, "collinear"),
-    ],
-)
-def test_degenerate_input_says_why_and_gives_no_number(source, reason):
-    target = np.random.default_rng(0).standard_normal(source.shape)
-    for pair in ((source, target), (target, source)):
-        fit = fit_similarity(*pair)
-        assert not fit.ok
-        assert fit.status.startswith("degenerate: ") and reason in fit.status
-        numbers = [fit.scale, fit.rmse, *fit.rotation.ravel(), *fit.translation, *fit.residuals]
-        assert np.isnan(numbers).all()
 
 
 def test_shapes_and_values_are_checked():

@@ -16,7 +16,7 @@ from pipelines.bench.flops import PassFlops, pass_flops
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
 from pipelines.bench.side_by_side import Comparison
-from pipelines.bench.stage_clock import PeakMemory, total, within
+from pipelines.bench.stage_clock import PEAK, forget_peak, peak_bytes, total, within
 from pipelines.bench.timing import (
     BETWEEN,
     EXPLICIT,
@@ -56,10 +56,13 @@ def complete_figures(options: CompleteOptions) -> dict[str, Any]:
             rounded=options.rounded,
             video=None if video else random_features(config, batch.to(options.place)),
         )
-        with PeakMemory(options.place) as peak:
-            figures["first_pass_s"] = timed.run()
-        figures["memory"] = {"weights_bytes": weight_bytes(timed.model), "peak_bytes": peak.bytes}
-        notes["memory"] = peak.said
+        forget_peak(options.place)
+        figures["first_pass_s"] = timed.run()
+        figures["memory"] = {
+            "weights_bytes": weight_bytes(timed.model),
+            "peak_bytes": peak_bytes(options.place),
+        }
+        notes["memory"] = PEAK[options.place.type]
         times = timed.times(options.repeat)
         compared = compare_attention(timed, repeat=options.repeat)
         if isinstance(compared, Comparison):
@@ -196,10 +199,9 @@ def show(figures: dict[str, Any], console: Console) -> None:
     )
     memory = figures["memory"]
     if memory["weights_bytes"] is not None:
-        peak = memory["peak_bytes"]
-        said = "unknown" if peak is None else f"{peak / 2**20:,.0f} MiB"
         console.line(
-            f"weights {memory['weights_bytes'] / 2**20:,.0f} MiB, peak {said} "
+            f"weights {memory['weights_bytes'] / 2**20:,.0f} MiB, "
+            f"peak {memory['peak_bytes'] / 2**20:,.0f} MiB "
             f"({figures['notes']['memory']}); first pass {figures['first_pass_s']:.3g} s"
         )
     for row in figures["results"]:

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
-import gc
-import sys
+import resource
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 
 import torch
 
 from gvtools.completers.geoverse.stages import DECODE, DECODING
 
-STATUS = Path("/proc/self/status")
-CLEAR = Path("/proc/self/clear_refs")
-FORGET_PEAK = "5"
 # Before the name of a part of the decoding.
 INSIDE = f"{DECODE}: "
 
@@ -85,58 +79,21 @@ def seconds(device: torch.device) -> Callable[[], float]:
     return now
 
 
-class PeakMemory:
-    """Most memory within a ``with`` block.
-
-    On CUDA: what tensors held, weights included. On a CPU: by how much the process grew, which
-    Linux alone tells.
-
-    Attributes:
-        bytes: known after the block; None where it cannot be told.
-        said: what the bytes are.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self.bytes: int | None = None
-        self.said = "what tensors held on the device, weights included"
-        self._before: int | None = None
-
-    def __enter__(self) -> PeakMemory:
-        """Forget earlier peaks, and give back what is held unused: what grows would hide in it."""
-        gc.collect()
-        _trim()
-        if self.device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(self.device)
-            return self
-        self.said = "by how much the process grew"
-        try:
-            CLEAR.write_text(FORGET_PEAK)
-            self._before = _resident("VmRSS")
-        except OSError as error:
-            self.said = f"not known: on a CPU, Linux alone tells ({error})"
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Read the peak."""
-        if self.device.type == "cuda":
-            self.bytes = torch.cuda.max_memory_allocated(self.device)
-        elif self._before is not None:
-            self.bytes = max(0, _resident("VmHWM") - self._before)
+# What ``peak_bytes`` is, by the device's type.
+PEAK = {
+    "cuda": "what tensors held on the device, weights included",
+    "cpu": "the most that the process ever held",
+}
 
 
-def _trim() -> None:
-    """Freed memory that the C library kept for later goes back to the system, where glibc is it."""
-    if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim is not None:
-            trim(0)
+def forget_peak(device: torch.device) -> None:
+    """Before what ``peak_bytes`` is asked for."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
 
 
-def _resident(field: str) -> int:
-    """A line of this process's status, bytes."""
-    for line in STATUS.read_text().splitlines():
-        name, _, value = line.partition(":")
-        if name == field:
-            return int(value.split()[0]) * 1024
-    raise OSError(f"{STATUS}: no {field}")
+def peak_bytes(device: torch.device) -> int:
+    """See ``PEAK``."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

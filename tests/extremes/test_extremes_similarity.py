@@ -59,15 +59,10 @@ def test_any_units_give_the_similarity_between_them(first, second, count, axes, 
     assert fit.scale * 10.0 ** (first - second) == pytest.approx(1, rel=1e-12)
     np.testing.assert_allclose(fit.rotation, rotation, atol=1e-11)
     assert fit.rmse <= 1e-13 * 10.0**second
-
-
-@pytest.mark.parametrize("unit", [1e-30, 1e-9, 1e9, 1e30])
-def test_a_rigid_motion_is_found_in_any_unit(unit):
-    points, rotation = spread(6, SPACE) * unit, turn()
-    fit = fit_similarity(points, points @ rotation.T, with_scale=False)
-    assert fit.scale == 1
-    np.testing.assert_allclose(fit.rotation, rotation, atol=1e-12)
-    assert fit.rmse < 1e-13 * unit
+    unit = 10.0**first
+    rigid = fit_similarity(points * unit, points @ rotation.T * unit, with_scale=False)
+    assert rigid.scale == 1
+    np.testing.assert_allclose(rigid.rotation, rotation, atol=1e-11)
 
 
 @pytest.mark.parametrize("unit", [1e-30, 1.0, 1e30])
@@ -103,6 +98,7 @@ def test_the_limit_of_a_line_is_a_share_of_its_length(unit):
 
 
 def test_points_without_correlation_have_no_fit():
+    assert is_degenerate(fit_similarity(CUBE[:0], CUBE[:0]), "0 point pair(s)")
     assert is_degenerate(fit_similarity(CUBE, UNRELATED), "correspond")
     weighted = fit_similarity(CUBE, UNRELATED, weights=np.ones(8))
     assert is_degenerate(weighted, "correspond")
@@ -181,12 +177,6 @@ def test_depth_scales_of_any_size_are_found(power):
     assert fit.ok
     assert fit.scale == pytest.approx(10.0**power, rel=1e-11)
     assert fit.inliers == DEPTH.size
-
-
-def test_wild_depths_do_not_pull_the_scale():
-    depth = np.where(np.arange(30) % 3 == 0, DEPTH * 1e-30, DEPTH)
-    fit = align_depth_scale(depth, DEPTH * 2, valid=ALL)
-    assert fit.scale == pytest.approx(2, rel=1e-9)
 
 
 @pytest.mark.parametrize("weight", [1e-30, 1e30])
