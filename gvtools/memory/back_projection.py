@@ -88,11 +88,9 @@ def back_project(
             pixels[:count], (height, width), pixel_binning * levels.edge, levels.per_spacing,
             positions[:count], colors[:count], weight[:count], spacing[:count],
         )  # fmt: skip
-    # A depth that is not trusted says nothing of the space before it.
-    sure = z if confidence is None else np.where(trust > 0, z, np.float32(0))
     return PointSet(
         positions[:count].copy(), colors[:count].copy(), weight[:count].copy(),
-        spacing[:count].copy(), camera, frame, _free_depth(sure, use, np.float32(far)),
+        spacing[:count].copy(), camera, frame, _free_depth(z, trust, use, np.float32(far)),
         {"no depth": invalid, "depth edge": edges, "masked": masked},
     )  # fmt: skip
 
@@ -222,8 +220,11 @@ def _surface_cosine(depth, row, col, edge, fx, fy, cx, cy):
 
 
 @compiled()
-def _free_depth(depth, mask, depth_max):
-    """(ceil(H/4), ceil(W/4)): the nearest depth of each cell, 0 unless every pixel has one."""
+def _free_depth(depth, trust, mask, depth_max):
+    """(ceil(H/4), ceil(W/4)): the nearest depth of each cell, 0 unless every pixel has one.
+
+    A depth that is not trusted says nothing of the space before it.
+    """
     height, width = depth.shape
     rows = (height + FREE_CELL - 1) // FREE_CELL
     cols = (width + FREE_CELL - 1) // FREE_CELL
@@ -234,7 +235,8 @@ def _free_depth(depth, mask, depth_max):
             for row in range(i * FREE_CELL, min((i + 1) * FREE_CELL, height)):
                 for col in range(j * FREE_CELL, min((j + 1) * FREE_CELL, width)):
                     z = depth[row, col]
-                    if not _usable(z) or (mask.size and not mask[row, col]):
+                    known = _usable(z) and (not mask.size or mask[row, col])
+                    if not known or (trust.size and not trust[row, col] > 0):
                         nearest = np.float32(0)
                     elif z < nearest:
                         nearest = min(z, depth_max)
