@@ -251,7 +251,7 @@ def align_depth_scale(
     Raises:
         ShapeError: shapes differ.
     """
-    ratio, weight = _log_ratios(depth, reference_depth, valid, confidence)
+    ratio, weight = _log_ratios(depth, reference_depth, valid, confidence=confidence)
     support = len(ratio)
     if support < max(min_support, 1):
         return ScaleFit(
@@ -284,7 +284,7 @@ def align_depth_scale(
 
 
 def _log_ratios(
-    depth: ArrayLike, reference_depth: ArrayLike, valid: ArrayLike, confidence: ArrayLike | None
+    depth: ArrayLike, reference_depth: ArrayLike, valid: ArrayLike, *, confidence: ArrayLike | None
 ) -> tuple[Float64, Float64]:
     """log(reference / depth) of the pixels that both know, and their weights, (N,) each."""
     depth, reference = np.asarray(depth, np.float64), np.asarray(reference_depth, np.float64)

@@ -128,7 +128,7 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
         if repeats[name]:
             name = f"{name}_{repeats[name]}"
         names.append(name)
-    return _with_intrinsics(track.poses, like, names, path)
+    return _with_intrinsics(track.poses, like, names, path=path)
 
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
@@ -173,7 +173,7 @@ def _rotation(quaternion: Float64, *, where: str) -> Float64:
     return np.asarray(Rotation.from_quat(quaternion).as_matrix())
 
 
-def _with_intrinsics(poses: Float64, like: Cameras, names: list[str], path: Path) -> Cameras:
+def _with_intrinsics(poses: Float64, like: Cameras, names: list[str], *, path: Path) -> Cameras:
     """The poses with the intrinsics of ``like``: one for all, or one each."""
     if len(like) < 1:
         raise ProjectError(f"{path}: no camera to take the intrinsics from; give at least one")

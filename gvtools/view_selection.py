@@ -71,8 +71,8 @@ def covisible_views(
     cameras: Cameras,
     targets: Cameras,
     target_depth: NDArray[np.float32],
-    count: int,
     *,
+    count: int,
     depths: Sequence[NDArray[np.float32] | None],
 ) -> list[int]:
     """The cameras that together see most of what the targets show, the very best first.
@@ -89,7 +89,7 @@ def covisible_views(
         depths: for each camera its own z-depth (H, W), scene units, 0 = none; None without any.
     """
     points, directions = _surface_samples(targets, target_depth)
-    seen = _visibility(cameras, points, directions, depths)
+    seen = _visibility(cameras, points, directions, depths=depths)
     best = np.zeros(seen.shape[1])
     chosen: list[int] = []
     while len(chosen) < min(count, len(cameras)):
@@ -136,6 +136,7 @@ def _visibility(
     cameras: Cameras,
     points: Float64,
     directions: Float64,
+    *,
     depths: Sequence[NDArray[np.float32] | None],
 ) -> Float64:
     """(V, N) in [0, 1]: how well each camera shows the points as seen along the directions."""

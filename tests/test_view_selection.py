@@ -32,7 +32,7 @@ def covisible(
 ) -> list[str]:
     """``own`` is the depth of the first view; the others have none."""
     depths = [own, *[None] * (len(context) - 1)]
-    rows = covisible_views(context, target, depth, count, depths=depths)
+    rows = covisible_views(context, target, depth, count=count, depths=depths)
     return [context.names[row] for row in rows]
 
 

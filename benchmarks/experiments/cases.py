@@ -64,7 +64,7 @@ def held_out_cases(
     for index in range(count):
         given = data.given(index)
         targets = [view for view in range(views) if view not in given.context]
-        observation = observed(given.clip, given.context, given.strength, given.rng)
+        observation = observed(given.clip, given.context, given.strength, rng=given.rng)
         guidance = projected(observation, given.clip.cameras[targets])
         truth = given.clip
         yield Case(

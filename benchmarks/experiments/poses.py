@@ -105,7 +105,7 @@ def _of_pictures(
     hints = model.config.hints
     if not cameras:
         hints = replace(hints, cameras=False)
-    levels = encode_views(model.geometry, views, slice(None), hints)
+    levels = encode_views(model.geometry, views, slice(None), config=hints)
     return model.geometry.geometry(
         [*levels, *model.geometry.encoder.propagate(levels[1], grid)], grid
     )

@@ -61,14 +61,14 @@ def rank_views(
     rows, columns = rows[some], columns[some]
     rays = _rays(camera, rows, columns)
     z = depth[rows, columns].astype(np.float64)
-    points = (camera.centers[0], rays, z, error[rows, columns])
+    points = {"center": camera.centers[0], "rays": rays, "z": z, "error": error[rows, columns]}
     scores = np.zeros(len(context))
     if context:
         cameras = concatenate([view.camera for view in context])
         # Those in whose pictures any of the points falls, hidden or not.
         inside = in_view(cameras, camera.centers[0] + rays * z[:, None]).any(axis=-1)
         for index in np.flatnonzero(inside).tolist():
-            scores[index] = _visible(context[index], *points)[2].sum()
+            scores[index] = _visible(context[index], **points)[2].sum()
     return [int(i) for i in np.argsort(-scores, kind="stable") if scores[i] > 0]
 
 
@@ -101,16 +101,12 @@ def look_up(
         return colors, weights
     rows, columns = np.nonzero(holes & (depth > 0))
     rays = _rays(camera, rows, columns)
-    points = (
-        camera.centers[0],
-        rays,
-        depth[rows, columns].astype(np.float64),
-        error[rows, columns],
-    )
+    z = depth[rows, columns].astype(np.float64)
+    points = {"center": camera.centers[0], "rays": rays, "z": z, "error": error[rows, columns]}
     found = np.zeros((len(best), len(rows), 3))
     trust = np.zeros((len(best), len(rows)))
     for row, index in enumerate(best):
-        xy, inside, weight = _visible(context[index], *points)
+        xy, inside, weight = _visible(context[index], **points)
         found[row, inside] = _bilinear(context[index].rgb, xy[inside])
         trust[row] = weight
     # Each photograph gathers the votes of those that show much the same; the strongest group
@@ -142,7 +138,7 @@ def _agreement(found: Float64, reference: Float64, trust: Float64) -> Float64:
 
 
 def _visible(
-    view: ContextView, center: Float64, rays: Float64, z: Float64, error: Float64
+    view: ContextView, center: Float64, rays: Float64, *, z: Float64, error: Float64
 ) -> tuple[Float64, NDArray[np.bool_], Float64]:
     """Where points fall in a photograph (N, 2), whether inside (N,), and their weight (N,)."""
     xy, local_z = (part[0] for part in view.camera.project(center + rays * z[:, None]))

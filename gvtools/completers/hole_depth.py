@@ -116,7 +116,7 @@ def fill_depth(
     )  # fmt: skip
     if smoothing:
         for step in (8, 4, 2, 1, 1):
-            inverse = median_of_fill(inverse, known, distance, step)
+            inverse = median_of_fill(inverse, known, distance, step=step)
     return HoleDepth(inverse, hits, planes, plane_of, spread, distance, sum(clipped))
 
 

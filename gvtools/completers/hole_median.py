@@ -36,6 +36,7 @@ def median_of_fill(
     inverse: NDArray[np.float64],
     known: NDArray[np.bool_],
     distance: NDArray[np.float64],
+    *,
     step: int,
 ) -> NDArray[np.float64]:
     """5x5 median with holes of ``step`` pixels between its taps, over the fill alone.

@@ -89,7 +89,7 @@ class InpaintCompleter(Completer):
                 spent["views_without_support"] += 1
                 continue
             view = (rgb[index], depth[index], confidence[index])
-            counts = self._fill(view, valid[index], guidance.cameras[index], context)
+            counts = self._fill(view, valid[index], guidance.cameras[index], context=context)
             for key, count in counts.items():
                 spent[key] += float(count)
         spent["seconds"] = time.perf_counter() - start
@@ -100,6 +100,7 @@ class InpaintCompleter(Completer):
         view: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
         valid: NDArray[np.bool_],
         camera: Cameras,
+        *,
         context: Sequence[ContextView],
     ) -> dict[str, Any]:
         """Write depth, then colour, then confidence into a view's holes; counts of pixels.

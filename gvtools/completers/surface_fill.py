@@ -92,7 +92,7 @@ def _shared(
                 completion.confidence[index] = again.confidence[0]
                 known[index] = view.valid[0]
         if index != order[-1]:
-            memory = _lifted(memory, view, completion, index)
+            memory = _lifted(memory, view, completion, index=index)
     return known
 
 
@@ -108,7 +108,7 @@ def _with(view: Guidance, carried: Guidance, where: NDArray[np.bool_]) -> Guidan
 
 
 def _lifted(
-    memory: SpatialMemory | None, view: Guidance, completion: Completion, index: int
+    memory: SpatialMemory | None, view: Guidance, completion: Completion, *, index: int
 ) -> SpatialMemory | None:
     """The memory of the fills, with what this view filled itself."""
     confidence = completion.confidence[index]

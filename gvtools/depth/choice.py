@@ -66,7 +66,9 @@ def choose_source(
         ProjectError: no view has depth, and none can be computed.
         CheckpointError: a network's weights are needed.
     """
-    chosen = _chosen(scene, views, choice, stereo, foundation or FoundationOptions())
+    chosen = _chosen(
+        scene, views, choice, stereo=stereo, foundation=foundation or FoundationOptions()
+    )
     return replace(chosen, ignored=_ignored(chosen.source, stereo))
 
 
@@ -97,6 +99,7 @@ def _chosen(
     scene: Scene,
     views: Sequence[str],
     choice: str,
+    *,
     stereo: StereoOptions | None,
     foundation: FoundationOptions,
 ) -> ChosenSource:
@@ -107,7 +110,7 @@ def _chosen(
         source = _foundation(scene, views, foundation)
         return ChosenSource(source, f"asked for; weights of {foundation.weights}")
     if choice in ("sensor", "colmap"):
-        return _asked_recorded(scene, views, choice, recorded)
+        return _asked_recorded(scene, views, choice, recorded=recorded)
     if choice == "plane-sweep":
         source = _stereo(scene, views, stereo)
         paired = f"asked for plane-sweep; {PAIRED}"
@@ -132,7 +135,9 @@ def _chosen(
     )
 
 
-def _asked_recorded(scene: Scene, views: Sequence[str], choice: str, recorded: int) -> ChosenSource:
+def _asked_recorded(
+    scene: Scene, views: Sequence[str], choice: str, *, recorded: int
+) -> ChosenSource:
     """Depth of a sensor or of COLMAP, which a project of the other kind does not have."""
     if (choice == "colmap") != (scene.kind == "colmap"):
         raise OptionError(f"depth {choice!r}: {scene.root} is a {scene.kind} project; use auto")

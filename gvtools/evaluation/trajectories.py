@@ -130,7 +130,7 @@ def absolute_errors(
     ('aligned', 2.0, 0.0)
     """
     first, second = _poses(reference, estimate)
-    status, fit = _aligned(first, second, align, refuse_mirrored)
+    status, fit = _aligned(first, second, align, refuse_mirrored=refuse_mirrored)
     extent = _extent(first)
     if not (status in (ALIGNED, UNALIGNED) and len(first)):
         return _none(status, extent)
@@ -141,7 +141,7 @@ def absolute_errors(
     else:
         translation = np.linalg.norm(centers - first[:, :3, 3], axis=1)
     rotation = _angles_deg(np.swapaxes(first[:, :3, :3], 1, 2) @ rotations)
-    return _figures(status, translation, rotation, extent, fit)
+    return _figures(status, translation, rotation, extent=extent, fit=fit)
 
 
 def relative_errors(
@@ -181,7 +181,7 @@ def relative_errors(
     if delta < 1:
         raise OptionError(f"RPE delta {delta}; expected 1 frame or more")
     first, second = _poses(reference, estimate)
-    status, fit = _aligned(first, second, align, refuse_mirrored)
+    status, fit = _aligned(first, second, align, refuse_mirrored=refuse_mirrored)
     extent = _extent(first)
     start = np.arange(0, max(len(first) - delta, 0), 1 if all_pairs else delta)
     if status not in (ALIGNED, UNALIGNED):
@@ -193,7 +193,7 @@ def relative_errors(
     other_motion, other_rotation = _motions(second, start, start + delta)
     translation = np.linalg.norm(scale * other_motion - motion, axis=1)
     angle = _angles_deg(np.swapaxes(rotation, 1, 2) @ other_rotation)
-    return _figures(status, translation, angle, extent, fit)
+    return _figures(status, translation, angle, extent=extent, fit=fit)
 
 
 @dataclass(frozen=True)
@@ -300,7 +300,7 @@ def _check_poses(name: str, poses: Float64) -> None:
 
 
 def _aligned(
-    reference: Float64, estimate: Float64, align: str, refuse_mirrored: bool
+    reference: Float64, estimate: Float64, align: str, *, refuse_mirrored: bool
 ) -> tuple[str, SimilarityFit | None]:
     if align not in ALIGNMENTS:
         raise OptionError(f"alignment {align!r}; expected one of {', '.join(ALIGNMENTS)}")
@@ -353,6 +353,7 @@ def _figures(
     status: str,
     translation: Float64,
     rotation: Float64,
+    *,
     extent: float,
     fit: SimilarityFit | None,
 ) -> PoseErrors:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -66,7 +68,7 @@ def back_project(
     Raises:
         ShapeError: the images and the camera disagree in size, or the camera is unusable.
     """
-    height, width = _checked_size(rgb, depth, confidence, mask, camera)
+    height, width = _checked_size(rgb, depth, confidence, mask=mask, camera=camera)
     options = options or BackProjectionOptions()
     far = np.inf if options.depth_max is None else options.depth_max
     frame = frame or LocalFrame.at()
@@ -85,8 +87,9 @@ def back_project(
     )  # fmt: skip
     if levels and pixel_binning > 0:
         count = bin_pixels(
-            pixels[:count], (height, width), pixel_binning * levels.edge, levels.per_spacing,
-            positions[:count], colors[:count], weight[:count], spacing[:count],
+            pixels[:count], (height, width), pixel_binning * levels.edge,
+            per_spacing=levels.per_spacing, positions=positions[:count], colors=colors[:count],
+            weight=weight[:count], spacing=spacing[:count],
         )  # fmt: skip
     return PointSet(
         positions[:count].copy(), colors[:count].copy(), weight[:count].copy(),
@@ -99,13 +102,19 @@ def _checked_size(
     rgb: NDArray[np.uint8],
     depth: NDArray[np.float32],
     confidence: NDArray[np.float32] | None,
+    *,
     mask: NDArray[np.bool_] | None,
     camera: Cameras,
 ) -> tuple[int, int]:
     """Height and width of the camera, which all images must have."""
     check_usable(camera)
     size = (int(camera.height[0]), int(camera.width[0]))
-    images = {"rgb": rgb, "depth": depth, "confidence": confidence, "mask": mask}
+    images: dict[str, NDArray[Any] | None] = {
+        "rgb": rgb,
+        "depth": depth,
+        "confidence": confidence,
+        "mask": mask,
+    }
     for name, array in images.items():
         shape = (*size, 3) if name == "rgb" else size
         if array is not None and array.shape != shape:

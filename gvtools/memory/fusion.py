@@ -152,7 +152,7 @@ def _fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> FuseR
     )
     index.voxels += int(out.report[kernels.NEW_VOXELS])
     segments.append(
-        out.start[:added], out.length[:added], np.full(added, view, np.int32), out.box[:added],
+        out.start[:added], out.length[:added], np.full(added, view, np.int32), box=out.box[:added],
         changed=int(out.report[kernels.FIRST_SEGMENT]),
     )  # fmt: skip
     if agreed:

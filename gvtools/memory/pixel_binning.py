@@ -20,6 +20,7 @@ def bin_pixels(
     pixels: NDArray[np.int64],
     shape: tuple[int, int],
     largest: float,
+    *,
     per_spacing: float,
     positions: NDArray[np.float32],
     colors: NDArray[np.uint8],

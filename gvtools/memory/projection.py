@@ -69,7 +69,7 @@ def project(store: Store, cameras: Cameras, *, options: SplatOptions | None = No
     splatter = _splatter(store, options)
     views = []
     for camera in cameras:
-        projection = _Projection(store, camera, options, splatter)
+        projection = _Projection(store, camera, options, splatter=splatter)
         projection.observe()
         views.append(projection.guidance())
     return concatenate(views)
@@ -111,7 +111,7 @@ def project_again(
         The same guidance, to the bit, as ``project`` gives, and what the observed views show.
     """
     check_usable(camera)
-    projection = _Projection(store, camera, options, _splatter(store, options))
+    projection = _Projection(store, camera, options, splatter=_splatter(store, options))
     if observed is None:
         projection.observe()
         observed = projection.observed()
@@ -123,7 +123,7 @@ def project_again(
 def observed_of(store: Store, camera: Cameras, *, options: SplatOptions) -> Observed:
     """What observed views show of a camera, a batch of one; for ``project_again``."""
     check_usable(camera)
-    projection = _Projection(store, camera, options, _splatter(store, options))
+    projection = _Projection(store, camera, options, splatter=_splatter(store, options))
     projection.observe()
     return projection.observed()
 
@@ -142,7 +142,7 @@ class _Projection:
     """The steps that write one target camera's images: what was observed, then the rest."""
 
     def __init__(
-        self, store: Store, camera: Cameras, options: SplatOptions, splatter: Splatter
+        self, store: Store, camera: Cameras, options: SplatOptions, *, splatter: Splatter
     ) -> None:
         self.store, self.camera, self.options = store, camera, options
         self.splatter = splatter
@@ -215,12 +215,12 @@ class _Projection:
         groups = np.arange(segments.groups)
         group_rect = np.empty((segments.groups, 4), np.int32)
         group_z = np.empty((segments.groups, 2), np.float32)
-        self._cull_boxes(segments.group_box, groups, group_rect, group_z)
+        self._cull_boxes(segments.group_box, groups, group_rect, z_range=group_z)
         rows = groups[group_rect[:, 1] >= 0, None] * segments.GROUP + np.arange(segments.GROUP)
         rows = rows.ravel()
         rows = rows[rows < segments.count]
         rows = rows[store.views.generated[segments.view[rows]] == generated]
-        self._cull_boxes(segments.box, rows, target.rect, self.z_range)
+        self._cull_boxes(segments.box, rows, target.rect, z_range=self.z_range)
         self.seen = rows[target.rect[rows, 1] >= 0]
         if not len(self.seen):
             return False
@@ -240,6 +240,7 @@ class _Projection:
         boxes: NDArray[np.float32],
         rows: NDArray[np.int64],
         rect: NDArray[np.int32],
+        *,
         z_range: NDArray[np.float32],
     ) -> None:
         height, width = self.target.shape

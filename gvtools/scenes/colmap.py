@@ -61,7 +61,9 @@ def read_colmap(root: Path, *, images: Path | None = None, masks: Path | None = 
     )
     depth_folder = _first([*homes, beside], "stereo/depth_maps")
     findings = list(model.findings)
-    photographs, ids = _photographs(model, image_folder, mask_folder, depth_folder, findings)
+    photographs, ids = _photographs(
+        model, image_folder, mask_folder, depth_folder=depth_folder, findings=findings
+    )
     points, dropped = sparse_points(model, {key: i for i, key in enumerate(ids)})
     lenses = [photograph.lens for photograph in photographs]
     findings += dropped + lens_findings(lenses)
@@ -100,6 +102,7 @@ def _photographs(
     model: ColmapModel,
     image_folder: Path,
     mask_folder: Path | None,
+    *,
     depth_folder: Path | None,
     findings: list[Finding],
 ) -> tuple[list[Photograph], list[int]]:

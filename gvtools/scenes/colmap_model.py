@@ -193,7 +193,7 @@ def sparse_points(
     if not len(points):
         return None, [Finding("info", "the model has no sparse points")]
     ids = np.array(sorted(points), np.uint64)
-    tracks = [_observations(model, image, view_of_image, ids) for image in model.images]
+    tracks = [_observations(model, image, view_of_image, ids=ids) for image in model.images]
     point = np.concatenate([track[0] for track in tracks])
     view = np.concatenate([track[1] for track in tracks])
     xy = np.concatenate([track[2] for track in tracks])
@@ -234,6 +234,7 @@ def _observations(
     model: ColmapModel,
     image: RegisteredImage,
     view_of_image: dict[int, int],
+    *,
     ids: NDArray[np.uint64],
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
     """Point index, view index and pinhole pixels of all that one image saw."""

@@ -53,7 +53,9 @@ def write_colmap(
         raise ShapeError("cameras: two views share a name; a model needs unique image names")
     if colors is None:
         colors = np.zeros(points.shape, np.uint8)
-    model = _reconstruction(cameras, points, colors, point_index, view_index, xy)
+    model = _reconstruction(
+        cameras, points, colors, point_index=point_index, view_index=view_index, xy=xy
+    )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".model-", dir=folder) as partial:
@@ -70,6 +72,7 @@ def _reconstruction(
     cameras: Cameras,
     positions: NDArray[np.float64],
     colors: NDArray[np.uint8],
+    *,
     point_index: NDArray[np.integer[Any]],
     view_index: NDArray[np.integer[Any]],
     xy: NDArray[np.float64],

@@ -108,7 +108,7 @@ def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:
     unit = recording.depth_unit if options.depth_unit is None else float(options.depth_unit)
     reader = partial(read_depth, unit=unit, maximum=options.depth_max)
     size = _common_size(frames)
-    lens = _lens(K, recording, options, size)
+    lens = _lens(K, recording, options, size=size)
     photographs, defects = [], []
     for frame in frames:
         pose, defect = rigid_transform(frame.world_from_cam, what=frame.where)
@@ -131,7 +131,7 @@ def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:
         *lens_findings([item.lens for item in photographs]),
         *header_findings([(item.image, size) for item in photographs]),
         *_intrinsics_findings(K, size),
-        *_depth_findings(photographs, size, registration, unit),
+        *_depth_findings(photographs, size, registration, unit=unit),
     ]
     views = tuple(item.view() for item in photographs)
     return Scene(root, "rgbd", views, None, tuple(findings), metric=True)
@@ -184,7 +184,7 @@ def _common_size(frames: Sequence[RgbdFrame]) -> tuple[int, int]:
     raise ProjectError(f"{frames[0].color}: unreadable, like all {len(frames)} pictures beside it")
 
 
-def _lens(K: Float64, recording: Recording, options: RgbdOptions, size: tuple[int, int]) -> Any:
+def _lens(K: Float64, recording: Recording, options: RgbdOptions, *, size: tuple[int, int]) -> Any:
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     what = f"{recording.root}, colour camera"
     if recording.distortion and options.color_K is None:
@@ -210,6 +210,7 @@ def _depth_findings(
     photographs: Sequence[Photograph],
     size: tuple[int, int],
     registration: Registration | None,
+    *,
     unit: float,
 ) -> list[Finding]:
     with_depth = [item.depth for item in photographs if item.depth is not None]

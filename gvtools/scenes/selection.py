@@ -64,10 +64,10 @@ def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
     if match is None:
         raise OptionError(f"selection {whole!r}: {rest!r} after {keyword!r}; expected {GRAMMAR}")
     numbers = [int(group) for group in match.groups(default="0")]
-    return _counted(keyword, numbers, count, whole)
+    return _counted(keyword, numbers, count, whole=whole)
 
 
-def _counted(keyword: str, numbers: list[int], count: int, whole: str) -> set[int]:
+def _counted(keyword: str, numbers: list[int], count: int, *, whole: str) -> set[int]:
     if keyword == "every":
         step, offset = numbers
         if step < 1:

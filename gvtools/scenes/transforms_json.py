@@ -72,7 +72,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
             raise ProjectError(f"{images}: no such image folder")
         files = [Path(images) / name for name in names]
     photographs, absent, defects = _photographs(path, data, list(zip(names, files, strict=True)),
-                                                masks, findings)  # fmt: skip
+                                                masks=masks, findings=findings)  # fmt: skip
     if not photographs:
         raise ProjectError(
             f"{path}: none of the pictures of its {len(frames)} frames is on disk (looked for "
@@ -94,6 +94,7 @@ def _photographs(
     path: Path,
     data: dict[str, Any],
     files: list[tuple[str, Path]],
+    *,
     masks: Path | None,
     findings: list[Finding],
 ) -> tuple[list[Photograph], list[str], list[float]]:

@@ -35,10 +35,12 @@ class ContextChoice:
         rule = "first"
         if rng.random() >= EXTRAPOLATION:
             rule = "ends" if rng.random() < ENDS else "every"
-        return chosen_context(rng, views, count, rule)
+        return chosen_context(rng, views, count, rule=rule)
 
 
-def chosen_context(rng: np.random.Generator, views: int, count: int, rule: str) -> tuple[int, ...]:
+def chosen_context(
+    rng: np.random.Generator, views: int, count: int, *, rule: str
+) -> tuple[int, ...]:
     """Which views of a path are given, ascending.
 
     Args:

@@ -119,7 +119,7 @@ def corrupted_color(
 
 
 def corrupted_camera(
-    rng: np.random.Generator, camera: Cameras, unit: float, strength: CorruptionOptions
+    rng: np.random.Generator, camera: Cameras, unit: float, *, strength: CorruptionOptions
 ) -> Cameras:
     """A camera that is turned and shifted a little.
 

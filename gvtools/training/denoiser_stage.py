@@ -65,7 +65,7 @@ class DenoiserStage(Stage):
         if draws.chance("decode", options.decode):
             found1 = clean_from_velocity(velocity1, state1, t1)
             context = batch.views.context
-            predicted |= self._decoded(prepared, found0, found1, batch)
+            predicted |= self._decoded(prepared, found0, found1, batch=batch)
             wanted |= {
                 "image": batch.images[:, context:],
                 "depth": batch.depth[:, context:, 0],
@@ -85,7 +85,7 @@ class DenoiserStage(Stage):
         return result.total, {**result.terms, **result.counts}
 
     def _decoded(
-        self, prepared: Prepared, level0: Tensor, level1: Tensor, batch: TrainingBatch
+        self, prepared: Prepared, level0: Tensor, level1: Tensor, *, batch: TrainingBatch
     ) -> dict[str, Tensor]:
         """Target pictures and depth with all camera centres, composed as inference does."""
         model = self.model

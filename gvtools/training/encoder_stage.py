@@ -42,7 +42,7 @@ class EncoderStage(Stage):
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
         model, options = self.model, self.options
-        features = noised_features(model, batch, draws, options)
+        features = noised_features(model, batch, draws, options=options)
         geometry, rgb = decoded(model, features, batch)
         unit = scene_unit(batch)
         depth = batch.depth[:, :, 0] / unit[:, None, None, None]
@@ -86,11 +86,12 @@ def noised_features(
     model: GeoVerse,
     batch: TrainingBatch,
     draws: Draws,
+    *,
     options: EncoderStageOptions | HeadsStageOptions,
 ) -> Features:
     """Features of all views; noise on levels 0 and 1, level 0 of some samples at its mean."""
-    views = _shown(model, batch, draws, options.hints)
-    levels = encode_views(model.geometry, views, slice(None), model.config.hints)
+    views = _shown(model, batch, draws, share=options.hints)
+    levels = encode_views(model.geometry, views, slice(None), config=model.config.hints)
     amount = options.noise * draws.uniform("noise", 1, 1, 1).to(views.images.device)
     noisy = []
     for index, level in enumerate(levels):
@@ -118,7 +119,7 @@ def decoded(model: GeoVerse, features: Features, batch: TrainingBatch) -> tuple[
     return model.geometry.head(features.levels, grid), rgb.unflatten(0, batch.images.shape[:2])
 
 
-def _shown(model: GeoVerse, batch: TrainingBatch, draws: Draws, share: float) -> ViewBatch:
+def _shown(model: GeoVerse, batch: TrainingBatch, draws: Draws, *, share: float) -> ViewBatch:
     """True pictures; a share of the targets shows its projection, filled as inference fills it."""
     views = batch.true_views
     hints = filled(batch.views, model.config.hints).images
@@ -140,7 +141,7 @@ def true_rays(batch: TrainingBatch, unit: Tensor, grid: tuple[int, int]) -> Tens
 
     A ray belongs to the middle of its cell of the ray grid.
     """
-    rays = patch_rays(batch.relative.float(), batch.views.K, grid, batch.views.size)[..., :6]
+    rays = patch_rays(batch.relative.float(), batch.views.K, grid, size=batch.views.size)[..., :6]
     direction, origin = rays.unflatten(2, grid).split(3, dim=-1)
     return torch.cat((direction, origin / unit[:, None, None, None, None]), dim=-1)
 
@@ -206,7 +207,9 @@ def measure_statistics(model: GeoVerse, batches: list[TrainingBatch]) -> None:
     squares = torch.zeros_like(sums)
     count = 0
     for batch in batches:
-        levels = encode_views(model.geometry, batch.true_views, slice(None), model.config.hints)
+        levels = encode_views(
+            model.geometry, batch.true_views, slice(None), config=model.config.hints
+        )
         for index, level in enumerate(levels):
             patches = level[:, :, 1:].double()
             sums[index] += patches.sum(dim=(0, 1, 2)).cpu()

@@ -61,7 +61,7 @@ class HeadsStage(Stage):
     def _rays(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         model, options = self.model, self.options
         with torch.no_grad():
-            levels = noised_features(model, batch, draws, options).levels
+            levels = noised_features(model, batch, draws, options=options).levels
         found = model.geometry.head(levels, model.geometry.encoder.grid(*batch.views.size))
         with torch.no_grad():
             cells = (found.ray.shape[-3], found.ray.shape[-2])

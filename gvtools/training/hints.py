@@ -66,7 +66,7 @@ class Observation:
 
 
 def observed(
-    clip: Clip, context: Sequence[int], strength: CorruptionOptions, rng: np.random.Generator
+    clip: Clip, context: Sequence[int], strength: CorruptionOptions, *, rng: np.random.Generator
 ) -> Observation:
     """Context views of a clip with their faults.
 
@@ -86,7 +86,7 @@ def observed(
         own = strength if number else strength.replaced(exposure=0.0, color=0.0, dropped=0.0)
         rgb = corrupted_color(rng, rgb, own)
         dropped = rng.random() < own.dropped
-        lifted.append(corrupted_camera(rng, camera, unit, strength))
+        lifted.append(corrupted_camera(rng, camera, unit, strength=strength))
         picture = (rgb / np.float32(255)).astype(np.float32)
         views.append(ContextView(camera.names[0], camera, picture, None if dropped else depth))
     return Observation(tuple(views), tuple(lifted))

@@ -185,14 +185,14 @@ def _reduced(view: View, size: tuple[int, int]) -> _Reduced:
     camera = view.camera.cropped(left, top, width=columns, height=rows)
     factor = max(1, min(DETAIL, rows // size[0], columns // size[1]))
     parts = [
-        _resized(frame.rgb[window], depth[window], camera, (size[0] * times, size[1] * times))
+        _resized(frame.rgb[window], depth[window], camera, size=(size[0] * times, size[1] * times))
         for times in (factor, 1)
     ]
     return _Reduced(*parts)
 
 
 def _resized(
-    rgb: NDArray[np.uint8], depth: NDArray[np.float32], camera: Cameras, size: tuple[int, int]
+    rgb: NDArray[np.uint8], depth: NDArray[np.float32], camera: Cameras, *, size: tuple[int, int]
 ) -> Clip:
     """A clip of one view: filtered colours, and the depth of the pixel under each centre."""
     picture = torch.from_numpy(np.ascontiguousarray(rgb)).permute(2, 0, 1)[None].float()

@@ -69,7 +69,7 @@ def encoder_sheet(model: GeoVerse, batch: TrainingBatch) -> NDArray[np.uint8]:
     Returns:
         (H, W, 3).
     """
-    levels = encode_views(model.geometry, batch.true_views, slice(None), model.config.hints)
+    levels = encode_views(model.geometry, batch.true_views, slice(None), config=model.config.hints)
     geometry, rgb = decoded(model, head_features(model, levels, batch), batch)
     depth = geometry.depth[:, :, None]
     rows = []

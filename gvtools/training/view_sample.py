@@ -72,7 +72,7 @@ def make_sample(
         fill: of the model's configuration, ``hints.fill``.
     """
     targets = [index for index in range(len(clip)) if index not in context]
-    observation = observed(clip, context, strength, rng)
+    observation = observed(clip, context, strength, rng=rng)
     guidance = projected(observation, clip.cameras[targets])
     size = truth.depth.shape[1], truth.depth.shape[2]
     with _one_thread():

@@ -154,7 +154,7 @@ def _hints(config: GeoVerseConfig, batch: ViewBatch) -> Hints:
         encoder = _Encoder(config.geometry)
     channels = config.geometry.encoder.channels
     statistics = LatentStatistics(channels), LatentStatistics(channels)
-    return encode_hints(encoder, *statistics, batch, config.hints)
+    return encode_hints(encoder, *statistics, batch=batch, config=config.hints)
 
 
 def _prepared(config: GeoVerseConfig, batch: ViewBatch, hints: Hints) -> Prepared:

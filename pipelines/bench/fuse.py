@@ -71,6 +71,6 @@ def compare_fusing(memory: SpatialMemory, frames: list[Frame], *, repeat: int) -
     seconds = alternate([ours, concatenate, integrate], repeat)
     name = f"fuse {frames[0][0].shape[1]}x{frames[0][0].shape[0]} into {voxels:,} voxels"
     return [
-        compared(name, "Open3D concatenate + voxel_down_sample", seconds[0], seconds[1]),
-        compared(name, "Open3D VoxelBlockGrid integrate", seconds[0], seconds[2]),
+        compared(name, "Open3D concatenate + voxel_down_sample", seconds[0], peer_s=seconds[1]),
+        compared(name, "Open3D VoxelBlockGrid integrate", seconds[0], peer_s=seconds[2]),
     ]

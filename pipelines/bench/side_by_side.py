@@ -85,7 +85,7 @@ def alternate(
 
 
 def compared(
-    name: str, peer: str, ours_s: list[float], peer_s: list[float], *, note: str = ""
+    name: str, peer: str, ours_s: list[float], *, peer_s: list[float], note: str = ""
 ) -> Comparison:
     """Medians and minima of two lists of seconds."""
     return Comparison(

@@ -48,13 +48,13 @@ def compare_splatting(
 ) -> Comparison:
     """A memory into cameras against ray_cast into the same; the first camera is the warm-up."""
     camera = cameras[0]
-    seconds = alternate(
+    ours_s, peer_s = alternate(
         [lambda turn: memory.project(cameras[turn]), lambda turn: volume.ray_cast(cameras[turn])],
         len(cameras) - 1,
         steady=True,
     )
     name = f"project {memory.voxels:,} voxels into {camera.width[0]}x{camera.height[0]}"
-    return compared(name, "Open3D VoxelBlockGrid ray_cast", *seconds)
+    return compared(name, "Open3D VoxelBlockGrid ray_cast", ours_s, peer_s=peer_s)
 
 
 def one_pixel_rows(count: int, *, repeat: int) -> list[Comparison]:
@@ -106,6 +106,6 @@ def compare_one_pixel(
     name = f"one pixel a point, {count:,} points into {camera.width[0]}x{camera.height[0]}"
     peer = "Open3D project_to_rgbd_image"
     return [
-        compared(name, f"{peer}, same order", seconds[0], seconds[1], note=note),
-        compared(name, f"{peer}, random order", seconds[0], seconds[2]),
+        compared(name, f"{peer}, same order", seconds[0], peer_s=seconds[1], note=note),
+        compared(name, f"{peer}, random order", seconds[0], peer_s=seconds[2]),
     ]

@@ -137,10 +137,10 @@ def compare_attention(timed: TimedPass, *, repeat: int) -> Comparison | str:
 
     ours, theirs = fused(0).float(), explicit(0).float()
     apart = (ours - theirs).abs().max() / ours.abs().max()
-    spent = alternate([fused, explicit], repeat, steady=True)
+    ours_s, explicit_s = alternate([fused, explicit], repeat, steady=True)
     name = f"level-1 step, {tokens:,} tokens, fused attention"
     note = f"they differ by at most {float(apart):.1e} of the largest velocity"
-    return compared(name, EXPLICIT, *spent, note=note)
+    return compared(name, EXPLICIT, ours_s, peer_s=explicit_s, note=note)
 
 
 @contextmanager

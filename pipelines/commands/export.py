@@ -104,9 +104,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
     limit = args.max_points if args.max_points is not None else MAX_POINTS.get(args.format)
     if args.format == "ply":
-        _ply(memory, args.out, limit, console)
+        _ply(memory, args.out, limit, console=console)
     elif args.format == "glb":
-        _glb(memory, args.out, limit, console)
+        _glb(memory, args.out, limit, console=console)
     elif args.format == "colmap":
         from pipelines.export.cameras import write_colmap_export
 
@@ -128,7 +128,7 @@ def _views(written: Written) -> str:
     return f"{written.views} views ({written.generated} generated{renamed * bool(written.renamed)})"
 
 
-def _ply(memory: SpatialMemory, path: Path, limit: int | None, console: Console) -> None:
+def _ply(memory: SpatialMemory, path: Path, limit: int | None, *, console: Console) -> None:
     from gvtools.memory.io.ply import export_memory_ply
 
     points, edge = export_memory_ply(memory, path, max_points=limit)
@@ -136,7 +136,7 @@ def _ply(memory: SpatialMemory, path: Path, limit: int | None, console: Console)
     console.line(f"{points} of {len(memory)} observations{thinned} in {path}")
 
 
-def _glb(memory: SpatialMemory, path: Path, limit: int | None, console: Console) -> None:
+def _glb(memory: SpatialMemory, path: Path, limit: int | None, *, console: Console) -> None:
     from pipelines.export.glb import write_glb
 
     points, edge = write_glb(memory, path, max_points=limit)

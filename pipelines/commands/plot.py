@@ -87,7 +87,7 @@ def _figure(what: str, folder: Path) -> Figure:
 
         sources = open_sources(run)
         found = read_measures(run).poses
-        poses = report_poses(rounds, sources.scene, run.context, found).drawn
+        poses = report_poses(rounds, sources.scene, run.context, found=found).drawn
         if poses is None:
             raise ProjectError(f"{folder}: no cameras to draw ({sources.problem or 'no rounds'})")
         return draw_trajectories(poses, title=title)

@@ -145,7 +145,7 @@ def _check(args: argparse.Namespace, console: Console) -> None:
         write_json(args.json, {**report, "ok": not bad, "parts": found, "problem": problem})
         console.line(f"report written to {args.json}")
     else:
-        print_parts(folder, config, parts, console)
+        print_parts(folder, config, parts, console=console)
     if problem:
         raise CheckpointError(problem)
 

@@ -84,11 +84,11 @@ def evaluate_run(
         "seconds_per_view": _seconds_per_view(run),
     }
     if "images" in parts:
-        out["images"] = _images(targets, lpips, no_lpips, seed, console)
+        out["images"] = _images(targets, lpips, no_lpips, seed=seed, console=console)
     if "consistency" in parts:
-        out["consistency"] = _consistency(targets, control, seed, console)
+        out["consistency"] = _consistency(targets, control, seed, console=console)
     if "poses" in parts:
-        out["poses"] = _poses(run, targets, matcher, control, seed, console)
+        out["poses"] = _poses(run, targets, matcher, control=control, seed=seed, console=console)
     return out
 
 
@@ -96,6 +96,7 @@ def _images(
     targets: Sequence[_Target],
     lpips: Lpips | None,
     no_lpips: str | None,
+    *,
     seed: int,
     console: Console,
 ) -> dict[str, Any]:
@@ -157,14 +158,15 @@ def _consistency(
     targets: Sequence[_Target],
     control: bool,
     seed: int,
+    *,
     console: Console,
 ) -> dict[str, Any]:
     pictures = [target.picture for target in targets]
-    out = {"generated": _consistent(pictures, seed, console, "consistency")}
+    out = {"generated": _consistent(pictures, seed, console, label="consistency")}
     true = _true_pictures(targets)
     if control and len(true) > 1:
         label = "consistency of the true pictures"
-        out["true_pictures"] = _consistent(true, seed, console, label)
+        out["true_pictures"] = _consistent(true, seed, console, label=label)
     return out
 
 
@@ -186,6 +188,7 @@ def _consistent(
     pictures: Sequence[PosedPicture],
     seed: int,
     console: Console,
+    *,
     label: str,
 ) -> dict[str, Any]:
     """The three measures of one set of pictures; pairs are consecutive ones."""
@@ -235,6 +238,7 @@ def _poses(
     run: Run,
     targets: Sequence[_Target],
     matcher: FeatureMatcher | None,
+    *,
     control: bool,
     seed: int,
     console: Console,

@@ -92,7 +92,9 @@ def write_colmap_export(
     """
     distinct = distinct_cameras(memory, run)
     kept = thinned(memory, max_points)
-    point, view, xy = _tracks(memory, distinct.cameras, kept.group, distinct.row_of_view)
+    point, view, xy = _tracks(
+        memory, distinct.cameras, kept.group, row_of_view=distinct.row_of_view
+    )
     write_colmap(
         folder / MODEL,
         distinct.cameras,
@@ -247,6 +249,7 @@ def _tracks(
     memory: SpatialMemory,
     cameras: Cameras,
     group: NDArray[np.int64],
+    *,
     row_of_view: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Point, view and pixel of each track element: one observation for each point and view."""

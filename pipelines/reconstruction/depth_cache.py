@@ -43,8 +43,8 @@ class DepthCache:
         scene: Scene,
         names: Sequence[str],
         source: DepthSource,
-        folder: Path,
         *,
+        folder: Path,
         unfinished: bool = False,
         fallback: Callable[[View, Frame], DepthMap | None] = lambda view, frame: None,
     ) -> None:

@@ -22,7 +22,7 @@ NO_LPIPS = "lpips is null here: gvtools evaluate measures it, where its weights 
 
 
 def measure_run(
-    plan: Plan, memory: SpatialMemory, directory: RunDirectory, console: Console
+    plan: Plan, memory: SpatialMemory, directory: RunDirectory, *, console: Console
 ) -> dict[str, Any]:
     """Means over the targets that have a truth, and the figures of each view.
 

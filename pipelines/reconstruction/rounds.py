@@ -180,7 +180,9 @@ def complete_targets(
 
     def take(guidance: Guidance, completion: Completion) -> None:
         nonlocal total
-        result, report = _align_and_fuse(guidance, completion, number, memory, config, clock)
+        result, report = _align_and_fuse(
+            guidance, completion, number, memory=memory, config=config, clock=clock
+        )
         done(len(results), result)
         results.append(result)
         total += report
@@ -189,7 +191,7 @@ def complete_targets(
         with clock.stage("project"):
             guidances = [target.guidance() for target in targets]
         with clock.stage("complete"):
-            completions = _completed_together(completer, context, guidances, seed)
+            completions = _completed_together(completer, context, guidances, seed=seed)
         for pair in progress(list(zip(guidances, completions, strict=True)), f"round {number}"):
             take(*pair)
         return results, total
@@ -203,7 +205,11 @@ def complete_targets(
 
 
 def _completed_together(
-    completer: Completer, context: Sequence[ContextView], guidances: Sequence[Guidance], seed: int
+    completer: Completer,
+    context: Sequence[ContextView],
+    guidances: Sequence[Guidance],
+    *,
+    seed: int,
 ) -> list[Completion]:
     """A batch of one for each target, of batches of all targets of one size."""
     completions: dict[int, Completion] = {}
@@ -235,6 +241,7 @@ def _align_and_fuse(
     guidance: Guidance,
     completion: Completion,
     number: int,
+    *,
     memory: SpatialMemory,
     config: RunSettings,
     clock: Clock,

@@ -65,9 +65,11 @@ def reconstruct(
         console.line(f"dry run: {out}: {state}")
         return out
     with directory.open_or_resume(identity, resume=resume) as done:
-        memory = _last_memory(plan, directory, done, console) if done else _empty_memory(plan)
-        _run_rounds(plan, memory, directory, done, console)
-        _finish(plan, memory, directory, console, draw)
+        memory = (
+            _last_memory(plan, directory, done, console=console) if done else _empty_memory(plan)
+        )
+        _run_rounds(plan, memory, directory, done=done, console=console)
+        _finish(plan, memory, directory, console=console, draw=draw)
     return out
 
 
@@ -82,7 +84,9 @@ def _empty_memory(plan: Plan) -> SpatialMemory:
     )
 
 
-def _last_memory(plan: Plan, directory: RunDirectory, done: int, console: Console) -> SpatialMemory:
+def _last_memory(
+    plan: Plan, directory: RunDirectory, done: int, *, console: Console
+) -> SpatialMemory:
     """The memory after the last of ``done`` complete rounds."""
     from gvtools.memory.spatial_memory import SpatialMemory
 
@@ -95,7 +99,7 @@ def _last_memory(plan: Plan, directory: RunDirectory, done: int, console: Consol
 
 
 def _run_rounds(
-    plan: Plan, memory: SpatialMemory, directory: RunDirectory, done: int, console: Console
+    plan: Plan, memory: SpatialMemory, directory: RunDirectory, *, done: int, console: Console
 ) -> None:
     """The rounds from number ``done`` on."""
     from pipelines.reconstruction.depth_cache import DepthCache
@@ -107,10 +111,14 @@ def _run_rounds(
     with RoundTargets(plan, memory) as targets:
         for number in range(done, len(plan.schedule) + 1):
             if number and context is None:
-                cache = DepthCache(plan.scene, plan.context, plan.source, directory.round_path(0))
+                cache = DepthCache(
+                    plan.scene, plan.context, plan.source, folder=directory.round_path(0)
+                )
                 context = load_context(plan.scene, plan.context, cache)
             with directory.writing_round(number) as folder:
-                report = run_round(plan, targets, number, context or [], folder, console)
+                report = run_round(
+                    plan, targets, number, context=context or [], folder=folder, console=console
+                )
                 memory.save(folder / MEMORY)
                 write_json(folder / REPORT, report)
             console.line(_round_line(report))
@@ -131,6 +139,7 @@ def _finish(
     plan: Plan,
     memory: SpatialMemory,
     directory: RunDirectory,
+    *,
     console: Console,
     draw: Draw | None,
 ) -> None:
@@ -141,7 +150,7 @@ def _finish(
     from viz.plots.growth import growth_text
 
     export_memory_ply(memory, directory.path / "memory.ply")
-    metrics = measure_run(plan, memory, directory, console)
+    metrics = measure_run(plan, memory, directory, console=console)
     directory.finish(len(plan.schedule), metrics)
     drawn = draw(plan, directory) if draw else ()
     reports = directory.reports()

@@ -31,6 +31,7 @@ def run_round(
     plan: Plan,
     targets: RoundTargets,
     number: int,
+    *,
     context: Sequence[ContextView],
     folder: Path,
     console: Console,
@@ -42,9 +43,11 @@ def run_round(
     about: dict[str, Any] = {"dropped": {}, "depth": [], "views": []}
     about |= {"coverage_before": None, "coverage_after": None}
     if number == 0:
-        total, entries = _lift_context(plan, memory, folder, clock, console)
+        total, entries = _lift_context(plan, memory, folder, clock=clock, console=console)
     else:
-        total, entries = _complete(plan, targets, number, context, folder, clock, console)
+        total, entries = _complete(
+            plan, targets, number, context=context, folder=folder, clock=clock, console=console
+        )
     about |= entries
     generated = int(memory.generated.sum())
     return {
@@ -72,6 +75,7 @@ def _lift_context(
     plan: Plan,
     memory: SpatialMemory,
     folder: Path,
+    *,
     clock: rounds.Clock,
     console: Console,
 ) -> tuple[FuseReport, dict[str, Any]]:
@@ -87,7 +91,7 @@ def _lift_context(
         return None if fit and disagrees(fit) else depth_map
 
     source = DepthCache(
-        plan.scene, plan.context, plan.source, folder, unfinished=True, fallback=from_memory
+        plan.scene, plan.context, plan.source, folder=folder, unfinished=True, fallback=from_memory
     )
     if source.kept:
         console.line(
@@ -111,6 +115,7 @@ def _complete(
     plan: Plan,
     followed: RoundTargets,
     number: int,
+    *,
     context: Sequence[ContextView],
     folder: Path,
     clock: rounds.Clock,

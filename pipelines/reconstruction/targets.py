@@ -68,7 +68,7 @@ def resolve_targets(
     if name in PATHS and spec not in scene.names:
         if not count.isdecimal() or int(count) < 1:
             raise OptionError(f"targets {spec!r}; expected {name}:N with N >= 1")
-        return _path(scene, context, name, int(count))
+        return _path(scene, context, name, count=int(count))
     path, at, selection = spec.partition("@")
     if path and _exists(path) and spec not in scene.names:
         if Path(path).is_dir() or Path(path).suffix == ".json":
@@ -95,7 +95,7 @@ def _exists(text: str) -> bool:
         return False  # A long list of names is longer than any file's.
 
 
-def _path(scene: Scene, context: tuple[str, ...], name: str, count: int) -> Targets:
+def _path(scene: Scene, context: tuple[str, ...], name: str, *, count: int) -> Targets:
     from gvtools import trajectories
     from gvtools.errors import DegenerateError
 

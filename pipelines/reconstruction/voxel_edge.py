@@ -63,7 +63,7 @@ def automatic_voxel(
         depths = _recorded(view) if is_recorded(source, view) else _of_points(scene, rows[name])
         footprints += _footprint(view, depths, percentile)
     if not footprints:
-        footprints = _computed(scene, context, source, percentile, say)
+        footprints = _computed(scene, context, source, percentile=percentile, say=say)
     return float(np.median(footprints))
 
 
@@ -71,6 +71,7 @@ def _computed(
     scene: Scene,
     context: Sequence[str],
     source: DepthSource,
+    *,
     percentile: float,
     say: Callable[[str], None] | None,
 ) -> list[float]:

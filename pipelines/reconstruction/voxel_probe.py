@@ -70,7 +70,7 @@ def sufficient_scale(
         return 1.0
     frames: dict[str, Frame] = {}
     probes = [
-        _probe(scene, name, _nearest(scene, names, name), frames)
+        _probe(scene, name, _nearest(scene, names, name), frames=frames)
         for name in evenly_spread(names, PROBES)
     ]
     shown: dict[float, list[tuple[NDArray[np.float32], NDArray[np.bool_]]]] = {}
@@ -185,7 +185,7 @@ class _Probe:
     seen: list[tuple[Cameras, Frame, NDArray[np.bool_]]]
 
 
-def _probe(scene: Scene, name: str, others: Sequence[str], frames: dict[str, Frame]) -> _Probe:
+def _probe(scene: Scene, name: str, others: Sequence[str], *, frames: dict[str, Frame]) -> _Probe:
     """``frames`` keeps the pictures."""
     for other in (name, *others):
         if other not in frames:
@@ -198,7 +198,7 @@ def _probe(scene: Scene, name: str, others: Sequence[str], frames: dict[str, Fra
         (
             scene[other].camera,
             frames[other],
-            _falls_on(scene[other].camera, frames[other], camera, wanted),
+            _falls_on(scene[other].camera, frames[other], camera, wanted=wanted),
         )
         for other in others
     ]
@@ -208,7 +208,7 @@ def _probe(scene: Scene, name: str, others: Sequence[str], frames: dict[str, Fra
 
 
 def _falls_on(
-    camera: Cameras, frame: Frame, onto: Cameras, wanted: NDArray[np.bool_]
+    camera: Cameras, frame: Frame, onto: Cameras, *, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """(H, W), the pixels with depth that fall on the ``wanted`` pixels of another camera.
 

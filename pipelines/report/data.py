@@ -91,7 +91,7 @@ def collect(
         ],
         measures=measures,
         sheets=sheets,
-        poses=report_poses(reports, scene, record["context"], measures.poses),
+        poses=report_poses(reports, scene, record["context"], found=measures.poses),
         trade_off=trade_off,
     )
 

@@ -96,6 +96,7 @@ def report_poses(
     reports: Sequence[Mapping[str, Any]],
     scene: Scene | None,
     context: Sequence[str],
+    *,
     found: Mapping[str, Any] | None,
 ) -> Poses:
     """Requested cameras of the rounds that are done, those of the context, and estimated ones.

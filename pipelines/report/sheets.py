@@ -85,7 +85,7 @@ def contact_sheets(
         if psnr.get(name) is not None:
             heading += f", PSNR {psnr[name]:.2f} dB"
         try:
-            pictures = _pictures(path, number, entry, truths.get(name), nearest)
+            pictures = _pictures(path, number, entry, truth=truths.get(name), nearest=nearest)
             return SheetRow(heading, contact_row(pictures))
         except (GvError, OSError, ValueError) as error:
             return f"pictures of {name} (round {number}) cannot be shown: {error}"
@@ -115,6 +115,7 @@ def _pictures(
     path: Path,
     number: int,
     entry: Mapping[str, Any],
+    *,
     truth: View | None,
     nearest: Callable[[Mapping[str, Any]], tuple[str, Any] | None],
 ) -> TargetPictures:

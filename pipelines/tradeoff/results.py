@@ -100,7 +100,7 @@ def write_results(
             f"{len(sweep.left_out)} trials were left out for --limit: "
             f"{', '.join(sweep.left_out[:4])}; the same command with a longer one goes on"
         )
-    _print_recommendation(sweep, chosen, budget_of, console)
+    _print_recommendation(sweep, chosen, budget_of, console=console)
     return chosen
 
 
@@ -118,7 +118,7 @@ def _draw(drawn: TradeOff, path: Path, title: str) -> None:
 
 
 def _print_recommendation(
-    sweep: Sweep, chosen: Trial | None, budget_of: str, console: Console
+    sweep: Sweep, chosen: Trial | None, budget_of: str, *, console: Console
 ) -> None:
     if chosen is None:
         cheapest = min((t.outcome for t in sweep.trials), key=lambda o: getattr(o, budget_of))

@@ -45,37 +45,40 @@ def search_axes(plan: Plan) -> list[SearchAxis]:
     side = longest_side(plan)
     sides = [size for size in (side // 2,) if size >= 2 * SMALLEST]
     axes = [
-        _axis("voxel edge", "voxel", [float(f"{share * voxel:.4g}") for share in EDGES], voxel),
+        _axis("voxel edge", "voxel", [float(f"{share * voxel:.4g}") for share in EDGES],
+              start=voxel),
         _axis("far voxels, footprints", "memory.voxels_per_footprint",
-              (2 * far or 1.0, far, 0.0), far),
+              (2 * far or 1.0, far, 0.0), start=far),
         _axis("observations a voxel", "memory.observations_per_voxel", (4, 12, 48),
-              config.memory.observations_per_voxel),
+              start=config.memory.observations_per_voxel),
         _axis("merging angle, degrees", "memory.merge_angle_deg", (8.0, 2.0, 0.0),
-              config.memory.merge_angle_deg),
+              start=config.memory.merge_angle_deg),
         SearchAxis("projection", (
             ("one pixel a point", {"splat.backend": "nearest"}),
             ("as given", {}),
             ("blended, 4 views first", {"splat.nearest_views": 4}),
         )),
         _completers(config),
-        _axis("views a round", "views_per_round", (3, 6, 12), config.views_per_round),
+        _axis("views a round", "views_per_round", (3, 6, 12), start=config.views_per_round),
         SearchAxis("picture size", (
             *((f"{size} px", {"max_side": size}) for size in sides), (f"{side} px", {}))),
     ]  # fmt: skip
     if config.completer != "none":
         axes.append(_axis("least confidence that is fused", "fusion.min_confidence",
-                          (0.35, 0.08), config.fusion.min_confidence))  # fmt: skip
+                          (0.35, 0.08), start=config.fusion.min_confidence))  # fmt: skip
     if config.completer == "geoverse":
         axes += _core_axes(config)
     if plan.source.name != RecordedDepth.name:
         axes.append(_axis("views explained, share of pixels", "savings.depth_from_memory",
-                          (0.8, 0.9, None), config.savings.depth_from_memory))  # fmt: skip
+                          (0.8, 0.9, None), start=config.savings.depth_from_memory))  # fmt: skip
     if plan.source.name == "plane-sweep":
         axes += [
-            _axis("stereo planes", "stereo.planes", (32, None), config.stereo.planes),
-            _axis("stereo sources", "stereo.sources", (2, 4), config.stereo.sources),
-            _axis("stereo picture size", "stereo.max_side", (320, 640), config.stereo.max_side),
-            _axis("stereo iterations", "stereo.iterations", (0, 1), config.stereo.iterations),
+            _axis("stereo planes", "stereo.planes", (32, None), start=config.stereo.planes),
+            _axis("stereo sources", "stereo.sources", (2, 4), start=config.stereo.sources),
+            _axis(
+                "stereo picture size", "stereo.max_side", (320, 640), start=config.stereo.max_side
+            ),
+            _axis("stereo iterations", "stereo.iterations", (0, 1), start=config.stereo.iterations),
         ]
     return [axis for axis in axes if len(axis.values) > 1]
 
@@ -98,14 +101,15 @@ def _core_axes(config: RunSettings) -> list[SearchAxis]:
     steps = int(given.get("steps") or len(core.flow.level1))
     size = int(given["image_size"]) if given.get("image_size") else None
     return [
-        _axis("generative steps", "completer.steps", (1, 3, 6), steps),
-        _axis("model resolution, px", "completer.image_size", (core.image_size // 2, size), size),
+        _axis("generative steps", "completer.steps", (1, 3, 6), start=steps),
+        _axis("model resolution, px", "completer.image_size", (core.image_size // 2, size),
+              start=size),
         _axis("holes left to inpaint, share of the diagonal", "effort.inpaint_below",
-              (0.1, 0.02, 0.0), config.effort.inpaint_below),
+              (0.1, 0.02, 0.0), start=config.effort.inpaint_below),
     ]  # fmt: skip
 
 
-def _axis(name: str, key: str, values: Sequence[Any], start: Any) -> SearchAxis:
+def _axis(name: str, key: str, values: Sequence[Any], *, start: Any) -> SearchAxis:
     """One setting; the start's own value takes its place among the numbers, or comes last."""
     values = list(dict.fromkeys(values))
     if start not in values:

@@ -54,7 +54,7 @@ def serve(
         if lacking:
             console.line(lacking)
             viewer.set_note(lacking)
-        following = Following(source, shown, viewer.update, console)
+        following = Following(source, shown, viewer.update, console=console)
         while True:
             time.sleep(POLL_SECONDS)
             if live:
@@ -97,6 +97,7 @@ class Following:
         source: ViewSource,
         shown: RunView,
         update: Callable[[RunView], None],
+        *,
         console: Console,
     ) -> None:
         self._source, self._update, self._console = source, update, console

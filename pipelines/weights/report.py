@@ -74,7 +74,7 @@ def _print_part(part: Part, expected: Shapes, console: Console) -> None:
     note = part.note
     if part is WHOLE:
         note = f"every tensor, beside {CONFIG_FILE}; half as large in float16 or bfloat16"
-    _print_file(part.files[0], figures, (note, f"from {part.source}"), console)
+    _print_file(part.files[0], figures, (note, f"from {part.source}"), console=console)
 
 
 def _print_video(config: VideoPriorConfig, console: Console) -> None:
@@ -88,17 +88,19 @@ def _print_video(config: VideoPriorConfig, console: Console) -> None:
         "the video prior, made by gvtools weights truncate-wan and empty-prompt; needs diffusers "
         "(pip install 'gvtools[wan]')"
     )
-    _print_file(f"{VIDEO_FOLDER}/", figures, (note, f"from {source}"), console)
+    _print_file(f"{VIDEO_FOLDER}/", figures, (note, f"from {source}"), console=console)
 
 
-def _print_file(path: str, figures: Sequence[str], notes: Sequence[str], console: Console) -> None:
+def _print_file(
+    path: str, figures: Sequence[str], notes: Sequence[str], *, console: Console
+) -> None:
     console.line(f"  {path}")
     for line in (", ".join(filter(None, figures)), *notes):
         console.line(f"      {line}")
 
 
 def print_parts(
-    folder: Path, config: GeoVerseConfig, parts: Sequence[PartReport], console: Console
+    folder: Path, config: GeoVerseConfig, parts: Sequence[PartReport], *, console: Console
 ) -> None:
     """A line a part, and whether the folder can be loaded."""
     console.line(f"{folder}, configuration {config.name}")

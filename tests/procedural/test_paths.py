@@ -71,7 +71,7 @@ def test_the_same_generator_gives_the_same_path() -> None:
 )
 def test_context_rules(rule: str, count: int, expected: set[tuple[int, ...]]) -> None:
     rng = np.random.default_rng(0)
-    assert {chosen_context(rng, 8, count, rule) for _ in range(60)} == expected
+    assert {chosen_context(rng, 8, count, rule=rule) for _ in range(60)} == expected
 
 
 def test_context_counts_come_in_groups() -> None:
@@ -85,4 +85,4 @@ def test_context_counts_come_in_groups() -> None:
 def test_impossible_choices_are_refused() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(OptionError, match="8 context views of 8"):
-        chosen_context(rng, 8, 8, "first")
+        chosen_context(rng, 8, 8, rule="first")

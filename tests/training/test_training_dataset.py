@@ -169,8 +169,8 @@ def _plane() -> Clip:
 def test_every_fault_by_itself(fault: str) -> None:
     clip = _plane()
     strength = NOTHING.replaced(**{fault: 1.0 if fault in ("flying", "dropped") else 0.2})
-    perfect = observed(clip, (0, 2), NOTHING, np.random.default_rng(0))
-    harmed = observed(clip, (0, 2), strength, np.random.default_rng(0))
+    perfect = observed(clip, (0, 2), NOTHING, rng=np.random.default_rng(0))
+    harmed = observed(clip, (0, 2), strength, rng=np.random.default_rng(0))
     first, second = harmed.views
     kept = perfect.views[1]
     assert kept.depth is not None and np.array_equal(kept.depth, clip.depth[2])
@@ -225,7 +225,7 @@ def test_gains_are_gains() -> None:
 def test_wrong_cameras_are_rigid() -> None:
     camera = _plane().cameras[0]
     strength = NOTHING.replaced(rotation=1.0, translation=0.01)
-    moved = corrupted_camera(np.random.default_rng(0), camera, 2.0, strength)
+    moved = corrupted_camera(np.random.default_rng(0), camera, 2.0, strength=strength)
     rotation = moved.cam_from_world[0, :3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert 0 < np.linalg.norm(moved.centers - camera.centers) < 0.2
@@ -256,7 +256,9 @@ def test_strengths_are_drawn_within_their_ranges() -> None:
 def test_a_memory_without_points_projects_nothing() -> None:
     clip = _plane()
     blind = Clip(clip.rgb, np.zeros_like(clip.depth), clip.cameras)
-    guidance = projected(observed(blind, (0,), NOTHING, np.random.default_rng(0)), clip.cameras[1:])
+    guidance = projected(
+        observed(blind, (0,), NOTHING, rng=np.random.default_rng(0)), clip.cameras[1:]
+    )
     assert not guidance.valid.any()
 
 

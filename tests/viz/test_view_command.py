@@ -173,7 +173,9 @@ def test_a_round_that_came_while_the_viewer_started_is_shown(small_run, tmp_path
     shown = source.read()
     later.rename(growing / "round_002")
     rounds: list[int] = []
-    following = serve.Following(source, shown, lambda r: rounds.append(r.last_round), Console())
+    following = serve.Following(
+        source, shown, lambda r: rounds.append(r.last_round), console=Console()
+    )
     following.look()
     following.look()
     assert rounds == [2]
@@ -187,7 +189,7 @@ def test_a_report_that_cannot_be_read_does_not_end_the_viewer(small_run, tmp_pat
     (growing / "round_002").rename(kept)
     source, rounds = ViewSource(growing), list[int]()
     following = serve.Following(
-        source, source.read(), lambda run: rounds.append(run.last_round), Console()
+        source, source.read(), lambda run: rounds.append(run.last_round), console=Console()
     )
     (growing / "round_002").mkdir()
     (growing / "round_002" / "report.json").write_text(report)

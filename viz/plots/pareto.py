@@ -69,7 +69,7 @@ def draw_pareto(
         raise OptionError("a trade-off without trials; expected one at least")
 
     def panel(axes: Axes, key: str) -> None:
-        _points(axes, key, found.trials, found.recommended)
+        _points(axes, key, found.trials, recommended=found.recommended)
         limit: list[float] = []
         if key == "seconds":
             _front(axes, found)
@@ -81,7 +81,7 @@ def draw_pareto(
     return figure_of(chosen(known, panels), title=title)
 
 
-def _points(axes: Axes, key: str, trials: Sequence[Trial], recommended: Trial | None) -> None:
+def _points(axes: Axes, key: str, trials: Sequence[Trial], *, recommended: Trial | None) -> None:
     scale = SCALES[key]
     for kind, style in STYLES.items():
         of_kind = [trial for trial in trials if trial["kind"] == kind]

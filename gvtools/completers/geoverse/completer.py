@@ -128,7 +128,9 @@ class GeoVerseCompleter(Completer):
             fill = None if filled is None else filled.rows(range(first, first + len(rows)))
             depth = part.depth if fill is None else fill.depth
             selection = self.settings.context_selection
-            chosen = chosen_views(context, part.cameras, depth, photographs, selection=selection)
+            chosen = chosen_views(
+                context, part.cameras, depth, count=photographs, selection=selection
+            )
             effort = self._effort(part)
             canvas.put(rows, self._pass(chosen, part, fill, effort=effort, seed=seed), part)
             passes += 1

@@ -181,6 +181,7 @@ def encode_hints(
     network: DepthAnything3,
     level0: LatentStatistics,
     level1: LatentStatistics,
+    *,
     batch: ViewBatch,
     config: HintConfig,
 ) -> Hints:
@@ -200,8 +201,8 @@ def encode_hints(
     informative = mask.flatten(2).any(2) & batch.valid.flatten(2).any(2)
     informative[:, :context] = True
     # Only where it is asked for: with everything encoded jointly it is not.
-    alone = cache(lambda: encode_views(network, batch, slice(0, context), config))
-    joint = _encode_jointly(network, batch, informative, config, alone=alone)
+    alone = cache(lambda: encode_views(network, batch, slice(0, context), config=config))
+    joint = _encode_jointly(network, batch, informative, config=config, alone=alone)
     if config.encode == "alone":
         for level, features in zip(joint, alone(), strict=True):
             level[:, :context] = features
@@ -212,7 +213,7 @@ def encode_hints(
         token = torch.where(informative[:, :, None], token, mean)
     else:
         one = slice(0, 1)
-        first = alone() if context == 1 else encode_views(network, batch, one, config)
+        first = alone() if context == 1 else encode_views(network, batch, one, config=config)
         token = first[1][:, :, 0].expand_as(token)
 
     features = level1.normalise(_maps(joint[1], grid)) * informative[:, :, None, None, None]
@@ -226,8 +227,8 @@ def _encode_jointly(
     network: DepthAnything3,
     batch: ViewBatch,
     informative: Tensor,
-    config: HintConfig,
     *,
+    config: HintConfig,
     alone: Callable[[], list[Tensor]],
 ) -> list[Tensor]:
     """Raw levels 0 and 1, token 0 included, of each sample's ``informative`` (B, V) views; else 0.
@@ -249,7 +250,7 @@ def _encode_jointly(
         if len(views) == batch.context:
             part = [features[samples] for features in alone()]
         else:
-            part = encode_views(network, batch.samples(samples), views, config)
+            part = encode_views(network, batch.samples(samples), views, config=config)
         for level, features in zip(joint, part, strict=True):
             level[samples[:, None], views] = features
     return joint
@@ -260,6 +261,7 @@ def encode_latents(
     network: DepthAnything3,
     level0: LatentStatistics,
     level1: LatentStatistics,
+    *,
     batch: ViewBatch,
     config: HintConfig,
 ) -> tuple[Tensor, Tensor]:
@@ -276,12 +278,12 @@ def encode_latents(
         Two (B, V, C, h, w) tensors, normalised.
     """
     grid = network.encoder.grid(*batch.size)
-    both = encode_views(network, batch, slice(None), config)
+    both = encode_views(network, batch, slice(None), config=config)
     return level0.normalise(_maps(both[0], grid)), level1.normalise(_maps(both[1], grid))
 
 
 def encode_views(
-    network: DepthAnything3, batch: ViewBatch, views: slice | Tensor, config: HintConfig
+    network: DepthAnything3, batch: ViewBatch, views: slice | Tensor, *, config: HintConfig
 ) -> list[Tensor]:
     """Raw levels 0 and 1 of some views, token 0 included; gradients reach the encoder.
 

@@ -16,8 +16,8 @@ def chosen_views(
     context: Sequence[ContextView],
     targets: Cameras,
     depth: NDArray[np.float32],
-    count: int,
     *,
+    count: int,
     selection: str,
 ) -> list[ContextView]:
     """At most ``count`` context views, the best first.
@@ -34,7 +34,7 @@ def chosen_views(
     cameras = concatenate([view.camera for view in context])
     if selection == "covisible":
         depths = [view.depth for view in context]
-        rows = covisible_views(cameras, targets, depth, count, depths=depths)
+        rows = covisible_views(cameras, targets, depth, count=count, depths=depths)
     else:
         rows = nearest_views(cameras, targets, count)
     return [context[row] for row in rows]

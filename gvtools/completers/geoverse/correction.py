@@ -61,7 +61,7 @@ def seamless(made: Generated, patch: int) -> Generated:
     return replace(made, decoded=joined(made.decoded), hint=hint)
 
 
-def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
+def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, *, valid: Tensor) -> Tensor:
     """The filled projection plus what the model changed; not clipped to [0, 1].
 
     A pixel that is not finite in either decoding stays so, alone.
@@ -81,8 +81,8 @@ def corrected_depth(
     filled: Tensor,
     made: Tensor,
     hint: Tensor,
-    valid: Tensor,
     *,
+    valid: Tensor,
     certain: float = CERTAIN,
     most: float = MOST,
 ) -> Tensor:
@@ -124,10 +124,10 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
         value[:, batch.context :].flatten(0, 1)
         for value in (batch.images, batch.depth, batch.valid)
     )
-    color = corrected_color(filled, rgb.flatten(0, 1), hint.rgb.float().flatten(0, 1), valid)
+    color = corrected_color(filled, rgb.flatten(0, 1), hint.rgb.float().flatten(0, 1), valid=valid)
     first, second = (found.depth.flatten(0, 1)[:, None] for found in (made, hint))
     # The smallest corrections and the worst would have no gradient.
-    length = corrected_depth(known, first, second, valid, certain=0.0, most=FAR)
+    length = corrected_depth(known, first, second, valid=valid, certain=0.0, most=FAR)
     told = (known > 0).unflatten(0, shape)
     color, length = color.unflatten(0, shape), length.unflatten(0, shape)
     return torch.where(told, color, rgb), torch.where(told[:, :, 0], length[:, :, 0], depth)

@@ -110,7 +110,12 @@ class Positions:
         size = camera.size if square is None else (square, square)
         self.encoder, self.head = (
             Projective(
-                camera.cam_from_world, camera.K, size, grid, head_dim, invert_K=config.invert_K
+                camera.cam_from_world,
+                camera.K,
+                size,
+                grid=grid,
+                head_dim=head_dim,
+                invert_K=config.invert_K,
             )
             for head_dim in (
                 config.width // config.heads,

@@ -13,6 +13,7 @@ def video_keys(
     shared: SharedAttention | None,
     denoiser: DenoiserConfig,
     camera: CameraCondition,
+    *,
     features: VideoFeatures,
     grid: tuple[int, int],
 ) -> dict[int, VideoKeys] | None:
@@ -32,8 +33,8 @@ def video_keys(
             camera.cam_from_world,
             camera.K,
             camera.size,
-            (level.shape[-2], level.shape[-1]),
-            denoiser.width // denoiser.heads,
+            grid=(level.shape[-2], level.shape[-1]),
+            head_dim=denoiser.width // denoiser.heads,
             position_scale=(grid[0] / level.shape[-2], grid[1] / level.shape[-1]),
             invert_K=denoiser.invert_K,
         )

@@ -126,7 +126,7 @@ class GeoVerseNetworks(nn.Module):
                 pixel_offset=config.camera.pixel_offset,
             )
             level0, level1 = self.level_statistics
-            hints = encode_hints(self.geometry, level0, level1, batch, config.hints)
+            hints = encode_hints(self.geometry, level0, level1, batch=batch, config=config.hints)
             depth = None
             if config.level1.depth_condition:
                 # Filled depth keeps the true validity beside it.
@@ -146,7 +146,7 @@ class GeoVerseNetworks(nn.Module):
     def clean_latents(self, batch: ViewBatch) -> tuple[Tensor, Tensor]:
         """Level-0 and level-1 latents, (B, V, C, h, w) each, of true pictures of all views."""
         level0, level1 = self.level_statistics
-        return encode_latents(self.geometry, level0, level1, batch, self.config.hints)
+        return encode_latents(self.geometry, level0, level1, batch=batch, config=self.config.hints)
 
     def with_video(self, prepared: Prepared, features: VideoFeatures) -> Prepared:
         """``prepared`` with video features; gradients reach the adapters."""
@@ -154,7 +154,9 @@ class GeoVerseNetworks(nn.Module):
         grid = (latents.shape[-2], latents.shape[-1])
         if self.control is not None:
             return replace(prepared, adapted=self.control.adapted(features.tensors, grid))
-        keys = video_keys(self.shared, self.config.level1, prepared.level1.camera, features, grid)
+        keys = video_keys(
+            self.shared, self.config.level1, prepared.level1.camera, features=features, grid=grid
+        )
         return replace(prepared, video=features, keys=keys)
 
     def _video_features(
@@ -298,5 +300,5 @@ class GeoVerseNetworks(nn.Module):
             positions=Positions(self.config.level1, camera, grid),
             keys=None
             if video is None
-            else video_keys(self.shared, self.config.level1, camera, video, grid),
+            else video_keys(self.shared, self.config.level1, camera, features=video, grid=grid),
         )

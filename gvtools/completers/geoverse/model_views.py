@@ -57,7 +57,7 @@ def view_batch(
         cameras.append(camera.resized(size[1], size[0]))
     rgb, projected, valid = _reduced(targets, size)
     if fill is not None:
-        rgb, projected = _over(rgb, projected, valid, fill)
+        rgb, projected = _over(rgb, projected, valid, fill=fill)
     cameras.append(targets.cameras.resized(size[1], size[0]))
     joined = concatenate(cameras)
     seen = torch.ones((len(context), 1, *size), dtype=torch.bool)
@@ -113,7 +113,7 @@ def _cropped(
     return view.rgb[window], depth[window], camera
 
 
-def _over(rgb: Tensor, depth: Tensor, valid: Tensor, fill: Filled) -> tuple[Tensor, Tensor]:
+def _over(rgb: Tensor, depth: Tensor, valid: Tensor, *, fill: Filled) -> tuple[Tensor, Tensor]:
     """Projections (T, 3, h, w) and (T, 1, h, w) over a fill of any size, where that has depth."""
     size = (rgb.shape[-2], rgb.shape[-1])
     color = resampled(torch.from_numpy(fill.rgb).permute(0, 3, 1, 2).float(), size).clamp(0, 1)

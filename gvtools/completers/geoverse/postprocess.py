@@ -90,7 +90,9 @@ def to_scene_scale(
     found = scaled.scale[np.isfinite(scaled.scale)]
     rays = None
     if len(found):
-        rays = _plucker(geometry.ray[0, context:], world_from_cam[0], float(np.median(found)), full)
+        rays = _plucker(
+            geometry.ray[0, context:], world_from_cam[0], float(np.median(found)), full=full
+        )
     picture = rgb.nan_to_num().permute(0, 2, 3, 1).numpy()
     return Completed(picture, scaled.depth, confidence, rays, scaled.scale, scaled.alignment)
 
@@ -132,9 +134,9 @@ def corrected(
         for found in (generated.decoded, generated.hint)
     ]
     valid = torch.from_numpy(guidance.valid)[:, None]
-    rgb = corrected_color(filled[0], both[0][0], both[1][0], valid)
+    rgb = corrected_color(filled[0], both[0][0], both[1][0], valid=valid)
     rgb = rgb.clamp(0, 1).permute(0, 2, 3, 1)
-    depth = corrected_depth(filled[1][:, None], both[0][1], both[1][1], valid)[:, 0]
+    depth = corrected_depth(filled[1][:, None], both[0][1], both[1][1], valid=valid)[:, 0]
     use = (filled[1] > 0) & rgb.isfinite().all(-1) & depth.isfinite()
     known = use.numpy()
     scales = depth_ratios(guidance, both[0][1][:, 0].numpy())
@@ -205,7 +207,7 @@ def averaged(guidance: Guidance) -> Filled:
 
 
 def _plucker(
-    ray: Tensor, world_from_first: NDArray[np.float64], unit: float, full: tuple[int, int]
+    ray: Tensor, world_from_first: NDArray[np.float64], unit: float, *, full: tuple[int, int]
 ) -> NDArray[np.float32]:
     """Predicted (T, h, w, 6) rays of the first view's frame as (T, H, W, 6) world Plücker rays."""
     maps = resampled(ray.float().cpu().permute(0, 3, 1, 2), full).permute(0, 2, 3, 1).double()

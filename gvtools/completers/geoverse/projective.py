@@ -49,9 +49,9 @@ class Projective:
         cam_from_world: Tensor,
         K: Tensor,
         size: tuple[int, int],
+        *,
         grid: tuple[int, int],
         head_dim: int,
-        *,
         base: float = 100.0,
         position_scale: tuple[float, float] = (1.0, 1.0),
         invert_K: bool = True,
@@ -64,7 +64,7 @@ class Projective:
             cam_from_world.to(dtype), K, size=size, invert_K=invert_K
         )
         self.cos, self.sin = _angles(
-            grid, head_dim // 8, base, position_scale, self.matrix.new_empty(0)
+            grid, head_dim // 8, base, scale=position_scale, like=self.matrix.new_empty(0)
         )
         # As wide as half a head, so that whole rows are multiplied: rows of four are slow.
         self._query, self._key, self._output = (
@@ -143,6 +143,7 @@ def _angles(
     grid: tuple[int, int],
     frequencies: int,
     base: float,
+    *,
     scale: tuple[float, float],
     like: Tensor,
 ) -> tuple[Tensor, Tensor]:

@@ -51,7 +51,7 @@ class PoseEquations:
 
 
 def pose_equations(
-    sources: Cameras, reference: Cameras, inverse_depth: torch.Tensor, flow: ResidualFlow
+    sources: Cameras, reference: Cameras, inverse_depth: torch.Tensor, *, flow: ResidualFlow
 ) -> PoseEquations | None:
     """The equations of one reference view; None where too little motion could be measured.
 
@@ -73,14 +73,14 @@ def pose_equations(
     w = inverse_depth.reshape(-1).double().cpu().numpy()[rows]
     width = int(reference.width[0])
     xy = np.stack([rows % width, rows // width], axis=-1).astype(np.float64) + 0.5
-    jacobian, along = _derivatives(sources, reference, xy, w)
+    jacobian, along = _derivatives(sources, reference, xy, w=w)
     across = motion[..., 0] * along[..., 1] - motion[..., 1] * along[..., 0]
     across /= np.linalg.norm(along, axis=-1) + 1e-12
     off = np.full(count, np.nan)
     for s in range(count):
         if (weight[s] > 0).any():
             off[s] = np.median(np.abs(across[s, weight[s] > 0]))
-    system, right = _eliminated(jacobian, along, motion, weight)
+    system, right = _eliminated(jacobian, along, motion, weight=weight)
     return PoseEquations(system, right, off)
 
 
@@ -131,7 +131,7 @@ def _carried(pose: Float64) -> Float64:
 
 
 def _derivatives(
-    sources: Cameras, reference: Cameras, xy: Float64, w: Float64
+    sources: Cameras, reference: Cameras, xy: Float64, *, w: Float64
 ) -> tuple[Float64, Float64]:
     """How source pixels move with the source's pose (S, N, 2, 6) and the inverse depth (S, N, 2).
 
@@ -160,7 +160,7 @@ def _derivatives(
 
 
 def _eliminated(
-    jacobian: Float64, along: Float64, motion: Float64, weight: Float64
+    jacobian: Float64, along: Float64, motion: Float64, *, weight: Float64
 ) -> tuple[Float64, Float64]:
     """Normal equations of the sources' motions, with weights that set outliers aside.
 

@@ -41,7 +41,7 @@ def plane_hypotheses(
     """
     low, high = 1 / depths.far, 1 / depths.near
     if planes is None:
-        rate = disparity_rate(reference, sources, depths.near, depths.far)
+        rate = disparity_rate(reference, sources, depths.near, far=depths.far)
         planes = int(np.clip(np.ceil(rate.max() * (high - low)) + 1, FEWEST, MOST))
     inverse = np.linspace(low, high, planes, dtype=np.float32)
     return Hypotheses(torch.from_numpy(inverse), (high - low) / (planes - 1))

@@ -26,11 +26,13 @@ def enough_disparity(reference: Cameras, sources: Cameras, depths: DepthRange) -
         sources: S cameras.
         depths: of the reference.
     """
-    rate = disparity_rate(reference, sources, depths.near, np.inf)
+    rate = disparity_rate(reference, sources, depths.near, far=np.inf)
     return rate / depths.near >= LEAST_DISPARITY
 
 
-def only_turned(level: Level, cost: torch.Tensor, textured: torch.Tensor, matcher: Matcher) -> bool:
+def only_turned(
+    level: Level, cost: torch.Tensor, textured: torch.Tensor, *, matcher: Matcher
+) -> bool:
     """Whether a turn of the camera explains the pictures as well as any depth does.
 
     Infinite depth moves pixels by the turn alone. Where cameras moved next to nothing, it matches

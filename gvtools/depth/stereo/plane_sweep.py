@@ -116,7 +116,7 @@ class PlaneSweepStereo:
         depth = torch.where(inverse > 0, 1 / inverse, torch.zeros_like(inverse)).cpu().numpy()
         guide = self._pyramid(view, frame).images[0].numpy()
         trust = confidence.cpu().numpy()
-        known = self._outlined(depth, matched.cpu().numpy(), confirmed.cpu().numpy(), frame)
+        known = self._outlined(depth, matched.cpu().numpy(), confirmed.cpu().numpy(), frame=frame)
         known = cleanup.weighted_median(known, guide, trust, 2)
         height, width = frame.rgb.shape[:2]
         if known.shape != (height, width):
@@ -131,6 +131,7 @@ class PlaneSweepStereo:
         depth: NDArray[np.float32],
         matched: NDArray[np.bool_],
         confirmed: NDArray[np.bool_],
+        *,
         frame: Frame,
     ) -> NDArray[np.float32]:
         """(H, W) confirmed depth, cut back to outlines and continued where it matches."""
@@ -204,7 +205,7 @@ class PlaneSweepStereo:
             return None
         cameras = concatenate([source.cameras[-1] for source in sources])
         flow = residual_flow(coarse.level, coarse.inverse_depth, noise=self.options.noise)
-        found = pose_equations(cameras, reference.cameras[-1], coarse.inverse_depth, flow)
+        found = pose_equations(cameras, reference.cameras[-1], coarse.inverse_depth, flow=flow)
         return None if found is None else (row, [self.views.index(n) for n in names], found)
 
     def _coarse(
@@ -229,7 +230,7 @@ class PlaneSweepStereo:
         """Raise when a turn alone explains the pictures; sparse points vouch for positions."""
         options = self.options
         detailed = textured(coarse.level.reference, window=options.window, noise=options.noise)
-        if only_turned(coarse.level, coarse.cost, detailed, self._matcher):
+        if only_turned(coarse.level, coarse.cost, detailed, matcher=self._matcher):
             raise DegenerateError(
                 f"{self._scene.root}: the pictures beside {view.name} differ from it by a turn of "
                 "the camera alone, whatever their positions say; stereo needs two viewpoints; add "

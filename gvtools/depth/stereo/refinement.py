@@ -124,7 +124,7 @@ def refined(
         offer(fitted(planes[0], (1 - cost).clamp(min=0.01)))
         for change in (0.5, -0.5) if i % 2 == 0 else (0.25, -0.25):
             offer(torch.stack([planes[0] + change * step, planes[1], planes[2]]))
-    return _between(planes, cost, level, matcher, step=0.4 * step)
+    return _between(planes, cost, level, matcher=matcher, step=0.4 * step)
 
 
 def _shifted(planes: torch.Tensor, dy: int, dx: int) -> torch.Tensor:
@@ -141,7 +141,7 @@ def _shifted(planes: torch.Tensor, dy: int, dx: int) -> torch.Tensor:
 
 
 def _between(
-    planes: torch.Tensor, cost: torch.Tensor, level: Level, matcher: Matcher, *, step: float
+    planes: torch.Tensor, cost: torch.Tensor, level: Level, *, matcher: Matcher, step: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The inverse depths moved to the lowest point of a parabola through three costs."""
     sides = [

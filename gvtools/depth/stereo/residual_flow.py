@@ -57,7 +57,18 @@ def residual_flow(
         x, y, z = (A[i, 0] * u + A[i, 1] * v + A[i, 2] + inverse_depth * o[i] for i in range(3))
         x, y = x / z.clamp(min=1e-6), y / z.clamp(min=1e-6)
         inside = (z > 1e-6) & (x > 0) & (y > 0) & (x < size[0]) & (y < size[1])
-        flows.append(_motion(level.reference, source, size, x, y, inside, noise, iterations))
+        flows.append(
+            _motion(
+                level.reference,
+                source,
+                size,
+                x=x,
+                y=y,
+                inside=inside,
+                noise=noise,
+                iterations=iterations,
+            )
+        )
     return ResidualFlow(*(torch.stack(part) for part in zip(*flows, strict=True)))
 
 
@@ -65,6 +76,7 @@ def _motion(
     reference: torch.Tensor,
     source: torch.Tensor,
     size: list[int],
+    *,
     x: torch.Tensor,
     y: torch.Tensor,
     inside: torch.Tensor,

@@ -64,7 +64,7 @@ def choose_sources(
     score = weight.mean(1) * (turned > np.cos(np.deg2rad(60)))
     score *= shared.mean(1) >= LEAST_OVERLAP
     baseline = baselines(scene, name)[rows]
-    chosen = _spread_out(score * (baseline > 0), baseline, sources.centers, count)
+    chosen = _spread_out(score * (baseline > 0), baseline, sources.centers, count=count)
     return tuple(others[i] for i in chosen)
 
 
@@ -77,7 +77,7 @@ def parallax(center: Float64, others: Float64, points: Float64) -> Float64:
     return np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def _spread_out(score: Float64, baseline: Float64, centers: Float64, count: int) -> list[int]:
+def _spread_out(score: Float64, baseline: Float64, centers: Float64, *, count: int) -> list[int]:
     """Rows of the best scores, each lowered by how near it stands to those already taken.
 
     A score is 0 where the baseline is.

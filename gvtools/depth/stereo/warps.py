@@ -65,7 +65,7 @@ def pixel_grid(camera: Cameras, across: int) -> Float64:
 
 
 def disparity_rate(
-    reference: Cameras, sources: Cameras, near: float, far: float
+    reference: Cameras, sources: Cameras, near: float, *, far: float
 ) -> NDArray[np.float64]:
     """How far a pixel moves in each source from ``far`` to ``near``, over the inverse depths' gap.
 

@@ -92,7 +92,7 @@ def correspond(
         wanted = wanted & where
     rows, columns = np.nonzero(wanted)
     start = _centers(rows, columns)
-    xy, z = _carry(first.camera, second.camera, start, depth[rows, columns])
+    xy, z = _carry(first.camera, second.camera, start, depth=depth[rows, columns])
     size = np.array([second.camera.width[0], second.camera.height[0]])
     with np.errstate(invalid="ignore"):
         inside = (z > 0) & ((xy >= 0) & (xy < size)).all(-1)
@@ -103,7 +103,7 @@ def correspond(
     there[inside] = _sample(np.where(known, second_depth, 0), xy[inside], spread=occlusion)
     back = np.full_like(xy, np.nan)
     found = there > 0
-    back[found], ahead = _carry(second.camera, first.camera, xy[found], there[found])
+    back[found], ahead = _carry(second.camera, first.camera, xy[found], depth=there[found])
     back[found] = np.where(ahead[:, None] > 0, back[found], np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = z / there
@@ -135,7 +135,7 @@ def _centers(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Float64:
 
 
 def _carry(
-    source: Cameras, target: Cameras, xy: Float64, depth: NDArray[np.floating]
+    source: Cameras, target: Cameras, xy: Float64, *, depth: NDArray[np.floating]
 ) -> tuple[Float64, Float64]:
     """Lift (N, 2) places of one view by their (N,) depth: their places and depth in another.
 

@@ -140,7 +140,7 @@ def feature_consistency(
     rolled = np.roll(theirs, [n // 2 for n in theirs.shape[1:]], (1, 2))
     reference, _ = _dissimilarity(own, _sample(rolled, there))
     compared = len(here) - undefined
-    status = _status(first, second, network.name, score, reference)
+    status = _status(first, second, network.name, score=score, reference=reference)
     return FeatureConsistency(
         first=first.name,
         second=second.name,
@@ -158,6 +158,7 @@ def _status(
     first: PosedPicture,
     second: PosedPicture,
     network: str,
+    *,
     score: float | None,
     reference: float | None,
 ) -> str:

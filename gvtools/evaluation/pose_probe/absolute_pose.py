@@ -77,7 +77,7 @@ def absolute_pose(
         return None
     cam_from_world = np.eye(4)
     cam_from_world[:3] = found["cam_from_world"].matrix()
-    errors = _reprojection_errors(cam_from_world, xy, points - origin, K)
+    errors = _reprojection_errors(cam_from_world, xy, points - origin, K=K)
     inliers = errors <= max_error
     if inliers.sum() < LEAST:
         return None
@@ -117,7 +117,7 @@ def rival_pose(
     depth += pose.cam_from_world[2, 3]
     known, rest = pose, np.ones(len(xy), np.bool_)
     for _ in range(RIVALS):
-        rest &= _reprojection_errors(known.cam_from_world, xy, points, K) > NEAR * max_error
+        rest &= _reprojection_errors(known.cam_from_world, xy, points, K=K) > NEAR * max_error
         if rest.sum() < max(wanted, LEAST):
             return None
         # Half of the wanted share: matches are counted here, not the places they come from.
@@ -156,7 +156,7 @@ def _contradicts(first: Float64, second: Float64, depth: float) -> bool:
     return turned or center_distance(first, second) > DEPTH_SHARE * depth
 
 
-def _reprojection_errors(pose: Float64, xy: Float64, points: Float64, K: Float64) -> Float64:
+def _reprojection_errors(pose: Float64, xy: Float64, points: Float64, *, K: Float64) -> Float64:
     """(M,) pixels; infinite behind the camera."""
     local = points @ pose[:3, :3].T + pose[:3, 3]
     ahead = local[:, 2] > 0

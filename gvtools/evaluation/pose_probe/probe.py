@@ -138,7 +138,7 @@ class PoseProbe:
         features = features[_inside(features.xy, picture.mask)]
         views = self._promising(features, leave_out)
         keypoint, points = self._correspondences(features, views)
-        pose, counts = self._solved(features, keypoint, points, picture.camera.K[0])
+        pose, counts = self._solved(features, keypoint, points, K=picture.camera.K[0])
         reason = self._reason(counts)
         return self._located(
             picture,
@@ -195,7 +195,7 @@ class PoseProbe:
         return np.concatenate(keypoints), np.concatenate(points)
 
     def _solved(
-        self, features: Features, keypoint: NDArray[np.int64], points: Float64, K: Float64
+        self, features: Features, keypoint: NDArray[np.int64], points: Float64, *, K: Float64
     ) -> tuple[AbsolutePose | None, _Counts]:
         """The best pose, and what speaks for and against it."""
         xy = features.xy[keypoint]

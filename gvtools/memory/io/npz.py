@@ -92,7 +92,8 @@ def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]], kind: ty
         "next": np.full(len(view), -1),
     }
     memory.columns.replace(len(view), columns.__getitem__)
-    memory.segments.append(*(arrays[f"segment_{name}"] for name in _SEGMENT_ARRAYS))
+    start, length, view_rows, box = (arrays[f"segment_{name}"] for name in _SEGMENT_ARRAYS)
+    memory.segments.append(start, length, view_rows, box=box)
     start = arrays["agreement_start"]
     for i, round_ in enumerate(arrays["agreement_round"].tolist()):
         rows = slice(int(start[i]), int(start[i + 1]))

@@ -84,7 +84,9 @@ class TorchSplatter:
         u, v, z, size = self._project(target, rows)
         ahead = z > target.z_near
         rows, view, u, v, z, size = (column[ahead] for column in (rows, view, u, v, z, size))
-        for i, row, col in self._pairs(u, v, self.options.depth_reach * size, target.shape, sums):
+        for i, row, col in self._pairs(
+            u, v, self.options.depth_reach * size, shape=target.shape, table=sums
+        ):
             cell = row * width + col
             use = z[i] < limits[cell]
             zbuffer.scatter_reduce_(0, cell[use], z[i[use]], "amin")
@@ -94,13 +96,13 @@ class TorchSplatter:
             scale = scale.clamp(min=float(FAINTEST))
             self.total = torch.zeros((height * width, CHANNELS), device=self.device)
             reach = self.options.blend_reach * size
-            for i, row, col in self._pairs(u, v, reach, target.shape, sums):
+            for i, row, col in self._pairs(u, v, reach, shape=target.shape, table=sums):
                 cell = row * width + col
                 use = z[i] <= farthest[cell]
                 i, row, col, cell = i[use], row[use], col[use], cell[use]
                 squared = (col - u[i]) ** 2 + (row - v[i]) ** 2
                 kernel = (1 - squared / reach[i] ** 2).clamp(min=0) ** 2
-                self._add(cell, kernel, scale[i], rows[i], z=z[i] / float(target.unit))
+                self._add(cell, kernel, scale[i], rows=rows[i], z=z[i] / float(target.unit))
         return zbuffer.reshape(height, width).cpu().numpy()
 
     def resolve(self, target: FrameBuffers, open_: NDArray[np.bool_], *, generated: bool) -> None:
@@ -144,6 +146,7 @@ class TorchSplatter:
         u: torch.Tensor,
         v: torch.Tensor,
         half: torch.Tensor,
+        *,
         shape: tuple[int, int],
         table: torch.Tensor | None,
     ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
@@ -183,8 +186,8 @@ class TorchSplatter:
         cell: torch.Tensor,
         kernel: torch.Tensor,
         scale: torch.Tensor,
-        rows: torch.Tensor,
         *,
+        rows: torch.Tensor,
         z: torch.Tensor,
     ) -> None:
         """Add the pairs' contributions to the sums of their pixels."""

@@ -228,8 +228,8 @@ class Segments:
         start: NDArray[np.int64],
         length: NDArray[np.int32],
         view: NDArray[np.int32],
-        box: NDArray[np.float32],
         *,
+        box: NDArray[np.float32],
         changed: int | None = None,
     ) -> None:
         """Add rows of equal number; ``changed`` is the first earlier segment whose box grew."""

@@ -231,7 +231,7 @@ class Store:
         self.segments = Segments()
         self.segments.append(
             new_row[segments.start[:n][stays]], segments.length[:n][stays],
-            new_view[segments.view[:n][stays]], segments.box[:n][stays],
+            new_view[segments.view[:n][stays]], box=segments.box[:n][stays],
         )  # fmt: skip
         self.rebuild_index()
         return count - len(self)

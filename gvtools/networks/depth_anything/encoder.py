@@ -149,7 +149,7 @@ class Backbone(nn.Module):
         x = torch.cat((self.cls_token.expand(len(x), -1, -1), x), dim=1) + self._positions(grid)
         x = x.unflatten(0, (batch, views))
         taps = self.config.taps[:levels]
-        return self._run(x, grid, 0, taps, camera_token)
+        return self._run(x, grid, 0, taps=taps, camera_token=camera_token)
 
     def propagate(
         self, level: Tensor, grid: tuple[int, int], *, boundary: int | None = None
@@ -168,7 +168,9 @@ class Backbone(nn.Module):
         boundary = self.config.boundary if boundary is None else boundary
         state = level[..., self.config.width :]
         start = self.config.taps[boundary] + 1
-        return self._run(state, grid, start, self.config.taps[boundary + 1 :], None)
+        return self._run(
+            state, grid, start, taps=self.config.taps[boundary + 1 :], camera_token=None
+        )
 
     def normed(self, level: Tensor) -> Tensor:
         """What the heads receive of a raw (..., 2 width) level: [local, LayerNorm(current)]."""
@@ -180,6 +182,7 @@ class Backbone(nn.Module):
         x: Tensor,
         grid: tuple[int, int],
         start: int,
+        *,
         taps: tuple[int, ...],
         camera_token: Tensor | None,
     ) -> list[Tensor]:
@@ -258,7 +261,7 @@ def _ray_embedder(width: int) -> nn.Linear:
 
 
 def patch_rays(
-    cam_from_world: Tensor, K: Tensor, grid: tuple[int, int], size: tuple[int, int]
+    cam_from_world: Tensor, K: Tensor, grid: tuple[int, int], *, size: tuple[int, int]
 ) -> Tensor:
     """(B, V, N, 9): direction (z = 1 in the camera), origin and moment of the patches' middle rays.
 

@@ -164,7 +164,9 @@ class GeometryHead(nn.Module):
             grid: patches (rows, columns).
             views_at_once: views that are decoded together; bounds the memory.
         """
-        depth, ray = self._outputs(levels, grid, (self._depth, self._ray), views_at_once)
+        depth, ray = self._outputs(
+            levels, grid, (self._depth, self._ray), views_at_once=views_at_once
+        )
         return Geometry(
             depth=depth[:, :, 0].exp(),
             depth_confidence=depth[:, :, 1].exp() + 1,
@@ -176,7 +178,7 @@ class GeometryHead(nn.Module):
         self, levels: Sequence[Tensor], grid: tuple[int, int], *, views_at_once: int = 8
     ) -> tuple[Tensor, Tensor]:
         """Depth and its confidence, both (B, V, H, W), as ``forward`` gives them; no rays."""
-        (depth,) = self._outputs(levels, grid, (self._depth,), views_at_once)
+        (depth,) = self._outputs(levels, grid, (self._depth,), views_at_once=views_at_once)
         return depth[:, :, 0].exp(), depth[:, :, 1].exp() + 1
 
     def ray_chain(self) -> Iterator[nn.Module]:
@@ -196,6 +198,7 @@ class GeometryHead(nn.Module):
         levels: Sequence[Tensor],
         grid: tuple[int, int],
         chains: Sequence[Callable[[list[Tensor], tuple[int, int]], Tensor]],
+        *,
         views_at_once: int,
     ) -> list[Tensor]:
         """(B, V, ...) of each chain."""

@@ -94,7 +94,7 @@ class DepthAnything3(nn.Module):
             size = (images.shape[-2], images.shape[-1])
             token = self.cam_enc(cam_from_world, K, size)
             if self.config.encoder.rays:
-                rays = patch_rays(cam_from_world, K, self.encoder.grid(*size), size)
+                rays = patch_rays(cam_from_world, K, self.encoder.grid(*size), size=size)
         normalised = imagenet_normalised(images).to(self.encoder.cls_token.dtype)
         return self.encoder.encode(normalised, levels=levels, camera_token=token, rays=rays)
 

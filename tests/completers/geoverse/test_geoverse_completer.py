@@ -259,7 +259,7 @@ def test_predicted_rays_come_back_to_the_world(weights, monkeypatch, world):
     context, known = micro.moved(micro.context_views(2), micro.guidance(2, share=-1.0), **world)
     # Without any known depth, the centres alone give the scale.
     context = [replace(view, depth=None) for view in context]
-    order = chosen_views(context, known.cameras, known.depth, 2, selection="nearest")
+    order = chosen_views(context, known.cameras, known.depth, count=2, selection="nearest")
 
     def perfect(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
         made = generate(self, batch, **options)

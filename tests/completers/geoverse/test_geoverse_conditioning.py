@@ -36,7 +36,7 @@ def model() -> Any:
 
 def hints(model: Any, batch: ViewBatch, config: HintConfig = PAPER) -> Hints:
     level0, level1 = model.statistics
-    return encode_hints(model.geometry, level0, level1, batch, config)
+    return encode_hints(model.geometry, level0, level1, batch=batch, config=config)
 
 
 def with_valid(batch: ViewBatch, valid: Tensor) -> ViewBatch:
@@ -262,7 +262,7 @@ def test_clean_latents_are_hints_of_which_everything_is_known(model):
     config = HintConfig(cascade_context="jointly")
     found = hints(model, batch, config)
     first, second = model.statistics
-    level0, level1 = encode_latents(model.geometry, first, second, batch, HintConfig())
+    level0, level1 = encode_latents(model.geometry, first, second, batch=batch, config=HintConfig())
     close(found.level1, level1)
     close(found.level0[:, :2], level0[:, :2])
 

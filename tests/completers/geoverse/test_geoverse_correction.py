@@ -52,22 +52,26 @@ def stripes(offset: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
 def test_a_model_that_changes_nothing_leaves_the_filled_projection():
     filled, valid = stripes()
     made = torch.rand(2, 3, 16, 24)
-    assert torch.equal(corrected_color(filled, made, made, valid), filled)
+    assert torch.equal(corrected_color(filled, made, made, valid=valid), filled)
     depth = filled[:, :1] + 1
-    assert torch.allclose(corrected_depth(depth, made[:, :1] + 1, made[:, :1] + 1, valid), depth)
+    assert torch.allclose(
+        corrected_depth(depth, made[:, :1] + 1, made[:, :1] + 1, valid=valid), depth
+    )
 
 
 def test_a_change_of_everything_is_none_and_one_of_the_hole_is_whole():
     filled, valid = stripes()
     hint = torch.rand(2, 3, 16, 24)
-    assert torch.allclose(corrected_color(filled, hint + 0.2, hint, valid), filled, atol=1e-5)
+    assert torch.allclose(corrected_color(filled, hint + 0.2, hint, valid=valid), filled, atol=1e-5)
     change = torch.where(valid, 0.0, 0.3)
-    found = corrected_color(filled, hint + change, hint, valid)
+    found = corrected_color(filled, hint + change, hint, valid=valid)
     assert torch.allclose(found, filled + change, atol=1e-5)
     depth = filled[:, :1] + 1
-    grown = corrected_depth(depth, torch.where(valid, 1.0, 9.0), torch.ones_like(depth), valid)
+    grown = corrected_depth(
+        depth, torch.where(valid, 1.0, 9.0), torch.ones_like(depth), valid=valid
+    )
     assert torch.allclose(grown, torch.where(valid, depth, MOST * depth), rtol=1e-4)
-    assert (corrected_depth(torch.zeros_like(depth), depth, depth + 1, valid) == 0).all()
+    assert (corrected_depth(torch.zeros_like(depth), depth, depth + 1, valid=valid) == 0).all()
 
 
 def test_a_depth_correction_counts_by_what_exceeds_the_least():
@@ -83,14 +87,14 @@ def test_a_depth_correction_counts_by_what_exceeds_the_least():
         (-3 * CERTAIN, -2 * CERTAIN),
     ):
         made = torch.where(valid, hint, hint * torch.tensor(change).exp())
-        found = corrected_depth(depth, made, hint, valid)
+        found = corrected_depth(depth, made, hint, valid=valid)
         expected = torch.where(valid, depth, depth * torch.tensor(wanted).exp())
         assert torch.allclose(found, expected, rtol=1e-5)
-        whole = corrected_depth(depth, made, hint, valid, certain=0)
+        whole = corrected_depth(depth, made, hint, valid=valid, certain=0)
         assert torch.allclose(whole, torch.where(valid, depth, depth * made), rtol=1e-5)
     broken = hint.clone()
     broken[..., 3, 3] = torch.nan
-    assert int(corrected_depth(depth, broken, hint, valid).isnan().sum()) == 1
+    assert int(corrected_depth(depth, broken, hint, valid=valid).isnan().sum()) == 1
 
 
 def test_every_depth_correction_has_a_gradient_while_training():

@@ -51,7 +51,7 @@ def extensions(net: Denoiser, x: Tensor, t: Tensor, known: Conditions) -> dict[s
     branch = control_branch(net)
     adapted = branch.adapted(features, micro.GRID)
     coarse = Projective(
-        known.camera.cam_from_world, known.camera.K, known.camera.size, (2, 3), 16,
+        known.camera.cam_from_world, known.camera.K, known.camera.size, grid=(2, 3), head_dim=16,
         position_scale=(1.5, 4 / 3),
     )  # fmt: skip
     return {

@@ -36,7 +36,7 @@ def scaled(batch: ViewBatch, factor: float, *, depth: bool = True) -> ViewBatch:
 
 def test_patch_rays_pass_through_their_patches(batch):
     grid, size = (3, 4), (24, 32)
-    rays = patch_rays(batch.cam_from_world, batch.K, grid, size)
+    rays = patch_rays(batch.cam_from_world, batch.K, grid, size=size)
     direction, origin, moment = rays.split(3, dim=-1)
     assert rays.shape == (*batch.K.shape[:2], 12, 9)
     point = origin + 2.5 * direction
@@ -52,10 +52,10 @@ def test_patch_rays_pass_through_their_patches(batch):
 def test_features_depend_on_rays_and_not_on_the_worlds_unit(batch):
     plain, told = network(rays=False), network(rays=True)
     with torch.no_grad():
-        first = encode_views(told, batch, slice(None), TOLD)[1]
-        again = encode_views(told, scaled(batch, 40.0), slice(None), TOLD)[1]
-        nearer = encode_views(told, scaled(batch, 0.3, depth=False), slice(None), TOLD)[1]
-        silent = encode_views(told, batch, slice(None), HintConfig(cameras=False))[1]
+        first = encode_views(told, batch, slice(None), config=TOLD)[1]
+        again = encode_views(told, scaled(batch, 40.0), slice(None), config=TOLD)[1]
+        nearer = encode_views(told, scaled(batch, 0.3, depth=False), slice(None), config=TOLD)[1]
+        silent = encode_views(told, batch, slice(None), config=HintConfig(cameras=False))[1]
     assert torch.allclose(first, again, rtol=1e-3, atol=1e-4)
     assert not torch.allclose(first, nearer, rtol=1e-2, atol=1e-3)
     assert not torch.allclose(first, silent, rtol=1e-2, atol=1e-3)
@@ -67,7 +67,7 @@ def test_without_any_depth_the_unit_is_that_of_the_centres(batch):
     told = network(rays=True)
     blind = replace(batch, depth=torch.zeros_like(batch.depth))
     with torch.no_grad():
-        first = encode_views(told, blind, slice(None), TOLD)[1]
-        median = encode_views(told, blind, slice(None), HintConfig(cameras=True))[1]
+        first = encode_views(told, blind, slice(None), config=TOLD)[1]
+        median = encode_views(told, blind, slice(None), config=HintConfig(cameras=True))[1]
     assert torch.isfinite(first).all()
     assert torch.equal(first, median)

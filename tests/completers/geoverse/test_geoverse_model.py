@@ -216,7 +216,9 @@ def test_decoded_clean_latents_are_what_the_frozen_model_sees():
     batch = replace(
         batch, images=torch.rand(batch.images.shape), valid=torch.ones_like(batch.valid)
     )
-    level0, level1 = encode_latents(model.geometry, *levels(model), batch, model.config.hints)
+    level0, level1 = encode_latents(
+        model.geometry, *levels(model), batch=batch, config=model.config.hints
+    )
     prepared = model.prepare(batch)
     decoded = model.decode(prepared, level0, level1)
     whole = model.geometry(batch.images)

@@ -48,7 +48,7 @@ def dense(matrix: np.ndarray, y: int, x: int, head_dim: int, *, base: float = 10
 @pytest.mark.parametrize("head_dim", [8, 24])
 def test_every_token_is_transformed_as_the_definition_says(head_dim):
     pose, K = cameras()
-    encoding = Projective(pose, K, SIZE, GRID, head_dim)
+    encoding = Projective(pose, K, SIZE, grid=GRID, head_dim=head_dim)
     P = (lifted(pose, K) @ pose).numpy()
     x = tokens(head_dim)
     found = [f(x).numpy() for f in (encoding.query, encoding.key, encoding.value, encoding.output)]
@@ -83,7 +83,7 @@ def test_the_world_frame_does_not_matter_and_a_moved_camera_does(invert_K):
     other[:, 1, 0, 3] += 0.5
     results = []
     for poses in (pose, pose @ rigid(1, seed=9, reach=3.0)[0], other):
-        e = Projective(poses, K, SIZE, GRID, 24, invert_K=invert_K)
+        e = Projective(poses, K, SIZE, grid=GRID, head_dim=24, invert_K=invert_K)
         results.append(e.output(attend(e.query(q), e.key(k), e.value(v))))
     torch.testing.assert_close(results[0], results[1], rtol=1e-9, atol=1e-9)
     assert (results[0] - results[2]).abs().max() > 1e-2
@@ -91,14 +91,14 @@ def test_the_world_frame_does_not_matter_and_a_moved_camera_does(invert_K):
 
 def test_a_value_that_comes_back_to_its_token_is_unchanged():
     pose, K = cameras()
-    encoding = Projective(pose, K, SIZE, GRID, 16)
+    encoding = Projective(pose, K, SIZE, grid=GRID, head_dim=16)
     x = tokens(16)
     torch.testing.assert_close(encoding.output(encoding.value(x)), x)
 
 
 def test_within_a_view_scores_depend_on_the_distance_alone():
     pose, K = cameras(1, 1)
-    encoding = Projective(pose, K, SIZE, GRID, 16)
+    encoding = Projective(pose, K, SIZE, grid=GRID, head_dim=16)
     same = tokens(16, batch=1, views=1)[:, :, :1].expand(-1, -1, 12, -1)
     scores = (encoding.query(same) @ encoding.key(same).mT)[0, 0]
     scores = scores.unflatten(0, GRID).unflatten(2, GRID)
@@ -109,18 +109,18 @@ def test_within_a_view_scores_depend_on_the_distance_alone():
 
 def test_keys_of_a_coarser_grid_lie_at_the_centres_of_their_tokens():
     pose, K = cameras(1, 1)
-    coarse = Projective(pose, K, SIZE, (1, 2), 8, position_scale=(3.0, 2.0))
+    coarse = Projective(pose, K, SIZE, grid=(1, 2), head_dim=8, position_scale=(3.0, 2.0))
     # Columns 0, 1 have their middle at 0.5, columns 2, 3 at 2.5; rows 0 to 2 at 1.
     x, y = torch.tensor([0.5, 2.5]).double(), torch.ones(2).double()
     torch.testing.assert_close(coarse.cos[:, :, 0], torch.stack((x, y), -1).cos())
     torch.testing.assert_close(coarse.sin[:, :, 0], torch.stack((x, y), -1).sin())
-    fine = Projective(pose, K, SIZE, GRID, 8)
+    fine = Projective(pose, K, SIZE, grid=GRID, head_dim=8)
     torch.testing.assert_close(coarse.key_matrix, fine.key_matrix)
 
 
 def test_half_precision_rounds_the_result_only():
     pose, K = cameras(dtype=torch.float32)
-    encoding = Projective(pose, K, SIZE, GRID, 24)
+    encoding = Projective(pose, K, SIZE, grid=GRID, head_dim=24)
     assert encoding.matrix.dtype == encoding.cos.dtype == torch.float32
     x = tokens(24, dtype=torch.bfloat16)
     for method in (encoding.query, encoding.key, encoding.value, encoding.output):
@@ -134,7 +134,7 @@ def test_half_precision_rounds_the_result_only():
 
 def test_cameras_of_half_precision_are_raised_to_single():
     pose, K = cameras(dtype=torch.bfloat16)
-    assert Projective(pose, K, SIZE, GRID, 8).matrix.dtype == torch.float32
+    assert Projective(pose, K, SIZE, grid=GRID, head_dim=8).matrix.dtype == torch.float32
 
 
 def test_gradients():
@@ -142,7 +142,7 @@ def test_gradients():
     x = tokens(8, batch=1, views=2, heads=1).requires_grad_()
 
     def through(x, pose, K):
-        e = Projective(pose, K, SIZE, GRID, 8)
+        e = Projective(pose, K, SIZE, grid=GRID, head_dim=8)
         return e.output(e.value(x) * e.query(x)) + e.key(x)
 
     inputs = (x, pose.requires_grad_(), K.requires_grad_())
@@ -152,7 +152,7 @@ def test_gradients():
 @pytest.mark.slow
 def test_it_compiles_to_one_graph():
     pose, K = cameras(dtype=torch.float32)
-    encoding = Projective(pose, K, SIZE, GRID, 24)
+    encoding = Projective(pose, K, SIZE, grid=GRID, head_dim=24)
     x = tokens(24, dtype=torch.float32)
 
     def layer(x, encoding):
@@ -167,8 +167,8 @@ def test_it_compiles_to_one_graph():
 def test_cuda_agrees(dtype):
     pose, K = cameras(dtype=torch.float32)
     x = tokens(24, dtype=dtype)
-    here = Projective(pose, K, SIZE, GRID, 24)
-    there = Projective(pose.cuda(), K.cuda(), SIZE, GRID, 24)
+    here = Projective(pose, K, SIZE, grid=GRID, head_dim=24)
+    there = Projective(pose.cuda(), K.cuda(), SIZE, grid=GRID, head_dim=24)
     tolerance = 1e-5 if dtype == torch.float32 else 1e-2
     for name in ("query", "key", "value", "output"):
         torch.testing.assert_close(

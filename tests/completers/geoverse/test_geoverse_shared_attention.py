@@ -42,7 +42,7 @@ class Case:
         self.features = features.to(dtype=torch.float64).tensors
         camera = self.known.camera
         self.video_positions = Projective(
-            camera.cam_from_world, camera.K, camera.size, grid, HEAD_DIM,
+            camera.cam_from_world, camera.K, camera.size, grid=grid, head_dim=HEAD_DIM,
             position_scale=(micro.GRID[0] / grid[0], micro.GRID[1] / grid[1]),
         )  # fmt: skip
 

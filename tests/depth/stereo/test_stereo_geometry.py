@@ -165,7 +165,7 @@ def test_disturbed_poses_are_found_again():
         )
         inverse = torch.from_numpy(1 / made.depths[i]).float()
         flow = residual_flow(level, inverse, noise=0.006)
-        found = pose_equations(disturbed[others], disturbed[i], inverse, flow)
+        found = pose_equations(disturbed[others], disturbed[i], inverse, flow=flow)
         assert found is not None
         equations.append((i, others, found))
     cameras = adjusted(disturbed, equations, rotation=0.01, translation=0.01)

@@ -60,7 +60,7 @@ def test_disparity_rate_of_a_sidestep_is_focal_times_baseline():
     pose = cameras.cam_from_world.copy()
     pose[1] = pose[0]
     pose[1, 0, 3] -= 0.1
-    rate = disparity_rate(cameras[0], replace(cameras, cam_from_world=pose)[1], 1.0, 10.0)
+    rate = disparity_rate(cameras[0], replace(cameras, cam_from_world=pose)[1], 1.0, far=10.0)
     assert rate[0] == pytest.approx(0.1 * cameras.K[0, 0, 0])
 
 
@@ -68,7 +68,7 @@ def test_planes_are_one_pixel_apart_in_the_widest_source():
     cameras = plane_scene(turns=False).scene.cameras
     depths = DepthRange(1.0, 5.0, 1.5, 2.5, "points")
     planes = plane_hypotheses(cameras[2], cameras[[0, 1]], depths, planes=None)
-    rate = disparity_rate(cameras[2], cameras[[0, 1]], 1.0, 5.0).max()
+    rate = disparity_rate(cameras[2], cameras[[0, 1]], 1.0, far=5.0).max()
     assert 0.9 < planes.step * rate <= 1.0
     assert float(planes.inverse_depths[0]) == pytest.approx(0.2)
     assert float(planes.inverse_depths[-1]) == pytest.approx(1.0)
@@ -156,7 +156,7 @@ def test_sweep_and_parabola_find_the_plane(slanted):
 
 def test_refinement_reaches_sub_percent_depth_from_a_rough_start(slanted):
     made, level, planes = slanted
-    rate = disparity_rate(made.scene.cameras[2], made.scene.cameras[[0, 4]], 1.0, 5.0).max()
+    rate = disparity_rate(made.scene.cameras[2], made.scene.cameras[[0, 4]], 1.0, far=5.0).max()
     start = planes.clone()
     start[0] += 0.4 / rate * torch.sign(torch.sin(torch.arange(start.shape[2]) * 0.3))
     start[1:] = 0

@@ -86,7 +86,9 @@ def test_a_layer_of_the_denoiser_costs_its_closed_form():
     tokens, head_dim = views * 8, width // heads
     with torch.device("meta"):
         layer = CameraAttention(width, heads)
-        positions = Projective(meta(1, views, 4, 4), meta(1, views, 3, 3), (8, 8), grid, head_dim)
+        positions = Projective(
+            meta(1, views, 4, 4), meta(1, views, 3, 3), (8, 8), grid=grid, head_dim=head_dim
+        )
     products = 2 * tokens * width * (3 * width + width)
     scores = 4 * tokens**2 * width
     # Each of q, k, v and the output: two products of half a head with a square of that size.

@@ -139,7 +139,7 @@ def objective(
         OptionError: nothing was predicted, or a prediction has no reference.
     """
     weights = weights or LossWeights()
-    parts, counts = _parts(prediction, reference, context, context_weight)
+    parts, counts = _parts(prediction, reference, context, context_weight=context_weight)
     if not parts:
         raise OptionError("objective: nothing was predicted; give at least one term")
     terms, total = {}, None
@@ -155,7 +155,7 @@ def objective(
 
 
 def _parts(
-    prediction: Prediction, reference: Reference, context: int, context_weight: float
+    prediction: Prediction, reference: Reference, context: int, *, context_weight: float
 ) -> tuple[dict[str, Callable[[], Tensor]], dict[str, Tensor]]:
     """The terms, not yet computed, and what they stand on."""
     parts: dict[str, Callable[[], Tensor]] = {}

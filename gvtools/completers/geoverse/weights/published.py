@@ -215,14 +215,14 @@ def read_part(
         else:
             found[name] = tensor
     if part.name.startswith("statistics"):
-        _check_statistics(content, found, path, part)
+        _check_statistics(content, found, path, part=part)
         found = {name: tensor.reshape(-1) for name, tensor in found.items()}
     share_tied(found, part.tied, where=path)
     return found, tuple(ignored)
 
 
 def _check_statistics(
-    content: Mapping[str, Any], found: Mapping[str, Tensor], path: Path, part: Part
+    content: Mapping[str, Any], found: Mapping[str, Tensor], path: Path, *, part: Part
 ) -> None:
     """Refuse the statistics of another level, where the file names one, and no variances."""
     expected = int(part.name.removeprefix("statistics"))
