@@ -100,7 +100,7 @@ def pass_flops(
             model.decode(prepared, level0, level1, clock=clock)
     counts = counter.get_flop_counts()
     within = {
-        said: float(sum(counts[kind].values())) for kind, said in WITHIN.items() if kind in counts
+        place: float(sum(counts[kind].values())) for kind, place in WITHIN.items() if kind in counts
     }
     steps = {LEVEL1: len(bounds) - 1, LEVEL0: len(cascade_bounds) - 1}
     return PassFlops(clock.rows(steps), within, parameters(model), absent)

@@ -41,24 +41,24 @@ class RoundTargets:
     def of(self, number: int) -> list[CachedProjection]:
         """The targets of round ``number``, from 1, in order."""
         if self._next is None or self._next[0] != number:
-            return self._followed(number)
+            return self._projections(number)
         _, targets, looks = self._next
         self._next = None
         for look in looks:
             look.result()
         return targets
 
-    def look_ahead(self, number: int) -> None:
+    def prefetch_round(self, number: int) -> None:
         """Begin to project what observed views show of round ``number``, if there is one."""
         if number > len(self.plan.schedule) or not run_beside_each_other():
             return
-        targets = self._followed(number)
+        targets = self._projections(number)
         snapshot = self.memory.snapshot()
         # One by one, so that a run that is stopped need not wait for all.
         looks = [self._pool.submit(target.prefetch, snapshot) for target in targets]
         self._next = (number, targets, looks)
 
-    def _followed(self, number: int) -> list[CachedProjection]:
+    def _projections(self, number: int) -> list[CachedProjection]:
         config = self.plan.config
         return [
             CachedProjection(self.memory, camera, options=config.splat, reuse=config.savings.reuse)

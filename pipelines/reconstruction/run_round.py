@@ -113,7 +113,7 @@ def _lift_context(
 
 def _complete(
     plan: Plan,
-    followed: RoundTargets,
+    round_targets: RoundTargets,
     number: int,
     *,
     context: Sequence[ContextView],
@@ -121,14 +121,14 @@ def _complete(
     clock: rounds.Clock,
     console: Console,
 ) -> tuple[FuseReport, dict[str, Any]]:
-    config, memory, rows = plan.config, followed.memory, plan.schedule[number - 1]
+    config, memory, rows = plan.config, round_targets.memory, plan.schedule[number - 1]
     cameras = plan.targets.cameras[list(rows)]
     all_stems = target_stems(plan.targets.cameras.names)
     stems = [all_stems[row] for row in rows]
     with clock.stage("project"):
-        targets = followed.of(number)
+        targets = round_targets.of(number)
         before = [target.guidance() for target in targets]
-    followed.look_ahead(number + 1)
+    round_targets.prefetch_round(number + 1)
     # Files are compressed beside the work on the next targets.
     with ThreadPoolExecutor(WRITERS) as pool:
         writing: list[Future[None]] = []

@@ -81,7 +81,7 @@ def collect(
         facts=_facts(run),
         rounds=reports,
         changed=_changed(dotted(record["settings"])),
-        settings={key: _said(value) for key, value in settings.items()},
+        settings={key: _as_text(value) for key, value in settings.items()},
         warnings=[
             *_warnings(record, reports),
             *([] if sources.problem is None else [f"no photographs: {sources.problem}"]),
@@ -186,13 +186,13 @@ def _few(names: Sequence[str], most: int = 4) -> str:
 
 def _changed(settings: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Settings that differ from the defaults, with both."""
-    usual = dotted(RunSettings().to_dict())
+    defaults = dotted(RunSettings().to_dict())
     return [
-        (key, _said(value), _said(usual[key]) if key in usual else "none")
+        (key, _as_text(value), _as_text(defaults[key]) if key in defaults else "none")
         for key, value in settings.items()
-        if key not in usual or value != usual[key]
+        if key not in defaults or value != defaults[key]
     ]
 
 
-def _said(value: object) -> str:
+def _as_text(value: object) -> str:
     return "not set" if value is None else str(value)

@@ -37,9 +37,9 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, caption: 
         cells = "".join(f"<td>{text(value)}</td>" for value in values)
         body.append(f'<tr><th scope="row">{text(name)}</th>{cells}</tr>')
     # A caption of the table itself would scroll with it.
-    said = paragraph(caption, "quiet") if caption else ""
+    content = paragraph(caption, "quiet") if caption else ""
     return (
-        f'{said}<div class="wide" tabindex="0"><table><thead><tr>{head}</tr></thead>'
+        f'{content}<div class="wide" tabindex="0"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>"
     )
 
@@ -57,9 +57,9 @@ def tile(shown: Tile) -> str:
     )
 
 
-def paragraph(said: str, kind: str = "") -> str:
+def paragraph(content: str, kind: str = "") -> str:
     """A paragraph, of a CSS class or of none."""
-    return f'<p class="{kind}">{text(said)}</p>' if kind else f"<p>{text(said)}</p>"
+    return f'<p class="{kind}">{text(content)}</p>' if kind else f"<p>{text(content)}</p>"
 
 
 def folded(summary: str, content: str) -> str:

@@ -46,8 +46,8 @@ def report_html(report: RunReport) -> str:
 
 
 def _facts(report: RunReport) -> str:
-    said = "; ".join(f"{name} {value}" for name, value in report.facts)
-    return paragraph(said, "quiet")
+    content = "; ".join(f"{name} {value}" for name, value in report.facts)
+    return paragraph(content, "quiet")
 
 
 def _warnings(report: RunReport) -> str:

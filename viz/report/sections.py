@@ -61,10 +61,10 @@ def _round_table(report: RunReport) -> str:
             *(_fixed(_mean(mine, f"psnr{region}"), 2) for region in regions),
             _fixed(entry["seconds"].get("total"), 2), f"{entry['bytes'] / 2**20:.1f}",
         ])  # fmt: skip
-    said = (
+    content = (
         "Per round: what is stored after it, what became of its points, and means over its targets."
     )
-    return table(columns, rows, caption=said)
+    return table(columns, rows, caption=content)
 
 
 def figures(report: RunReport) -> str:
@@ -77,10 +77,10 @@ def figures(report: RunReport) -> str:
     rows = [row for row in rows if any(cell != NONE for cell in row[1:])]
     means = ""
     if rows:
-        said = f"Means over the targets, from {report.measures.source}"
-        said += ", below each the 95 % interval of the mean" if report.measures.intervals else ""
-        said += ". Depth errors are medians of a target's, relative to the true depth."
-        means = table(["", *REGIONS.values()], rows, caption=said)
+        content = f"Means over the targets, from {report.measures.source}"
+        content += ", below each the 95 % interval of the mean" if report.measures.intervals else ""
+        content += ". Depth errors are medians of a target's, relative to the true depth."
+        means = table(["", *REGIONS.values()], rows, caption=content)
     return means + notes + _figures_of_each(report)
 
 
@@ -88,10 +88,10 @@ def _cell(report: RunReport, key: str, scale: float) -> str:
     value, interval = report.measures.figures.get(key), report.measures.intervals.get(key)
     if value is None:
         return NONE
-    said = f"{value * scale:.4g}"
+    content = f"{value * scale:.4g}"
     if interval is not None:
-        said += f"\n{interval[0] * scale:.3g}–{interval[1] * scale:.3g}"
-    return said
+        content += f"\n{interval[0] * scale:.3g}–{interval[1] * scale:.3g}"
+    return content
 
 
 def _figures_of_each(report: RunReport) -> str:
@@ -139,9 +139,9 @@ def pictures(report: RunReport) -> str:
 
 def trajectories(report: RunReport) -> str:
     """Cameras from above and from the side, and the errors of estimated poses."""
-    said = paragraph(report.poses.note) if report.poses.note else ""
+    content = paragraph(report.poses.note) if report.poses.note else ""
     if report.poses.drawn is None:
-        return said
+        return content
     drawn = [
         _drawn(
             draw_trajectories(report.poses.drawn, panels=[name]),
@@ -153,7 +153,7 @@ def trajectories(report: RunReport) -> str:
     if report.poses.errors:
         errors = table(["estimated poses", "completed pictures", "true pictures"],
                        report.poses.errors)  # fmt: skip
-    return said + _plots(drawn) + errors
+    return content + _plots(drawn) + errors
 
 
 def time(report: RunReport) -> str:

@@ -128,6 +128,6 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
     first, second = (found.depth.flatten(0, 1)[:, None] for found in (made, hint))
     # The smallest corrections and the worst would have no gradient.
     length = corrected_depth(known, first, second, valid=valid, certain=0.0, most=FAR)
-    told = (known > 0).unflatten(0, shape)
+    mask = (known > 0).unflatten(0, shape)
     color, length = color.unflatten(0, shape), length.unflatten(0, shape)
-    return torch.where(told, color, rgb), torch.where(told[:, :, 0], length[:, :, 0], depth)
+    return torch.where(mask, color, rgb), torch.where(mask[:, :, 0], length[:, :, 0], depth)

@@ -47,10 +47,10 @@ def plan(*rounds: int) -> Plan:
 def test_rounds_are_the_plans_whether_looked_at_ahead_or_not(memory):
     with RoundTargets(plan(1, 2), memory) as targets:
         assert [t.camera.names for t in targets.of(1)] == [("t0",)]
-        targets.look_ahead(2)
+        targets.prefetch_round(2)
         ahead = targets.of(2)
         again = targets.of(2)
-        targets.look_ahead(3)
+        targets.prefetch_round(3)
     assert [t.camera.names for t in ahead] == [t.camera.names for t in again] == [("t1",), ("t2",)]
     for one, two in zip(ahead, again, strict=True):
         np.testing.assert_array_equal(one.guidance().rgb, two.guidance().rgb)
@@ -63,7 +63,7 @@ def test_an_error_comes_where_the_round_begins(memory, monkeypatch):
 
     monkeypatch.setattr(CachedProjection, "prefetch", broken)
     with RoundTargets(plan(1, 1), memory) as targets:
-        targets.look_ahead(2)
+        targets.prefetch_round(2)
         with pytest.raises(ZeroDivisionError):
             targets.of(2)
 
@@ -72,6 +72,6 @@ def test_a_run_that_is_stopped_waits_for_one_target_at_most(memory, monkeypatch)
     monkeypatch.setattr(CachedProjection, "prefetch", lambda self, snapshot: time.sleep(0.5))
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt), RoundTargets(plan(1, 20), memory) as targets:
-        targets.look_ahead(2)
+        targets.prefetch_round(2)
         raise KeyboardInterrupt
     assert time.monotonic() - start < 5

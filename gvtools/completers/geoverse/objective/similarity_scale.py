@@ -2,7 +2,8 @@
 
 (s*, Q*, b*) minimises sum_j |s Q o^_j + b - o_j|^2 over s > 0, Q in SO(3), b (appendix
 "Scale-aligned depth supervision"). The scale, unlike the rotation, is determined by two centres or
-by centres on a line, so these are solved; what leaves the scale open is said, its numbers are NaN.
+by centres on a line, so these are solved; where the scale stays open the status says so, and its
+numbers are NaN.
 """
 
 from __future__ import annotations

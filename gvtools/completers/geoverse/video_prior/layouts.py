@@ -31,11 +31,11 @@ class ViewLayout:
     @property
     def views_of_latent(self) -> tuple[tuple[int, ...], ...]:
         """The views that each latent holds, clip after clip."""
-        held = []
+        views = []
         for clip in self.clips:
             groups = [clip[:1]] + [clip[i : i + GROUP] for i in range(1, len(clip), GROUP)]
-            held += [tuple(sorted(set(group))) for group in groups]
-        return tuple(held)
+            views += [tuple(sorted(set(group))) for group in groups]
+        return tuple(views)
 
     @property
     def latent_of_view(self) -> tuple[int, ...]:
