@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.completers.base import Completer, Completion, ContextView, ScaleAlignment
+from gvtools.completers.base import (
+    Completer,
+    Completion,
+    ContextView,
+    ScaleAlignment,
+    run_completer,
+)
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.memory.projection_cache import CachedProjection
@@ -199,7 +205,7 @@ def complete_targets(
         with clock.stage("project"):
             guidance = target.guidance()
         with clock.stage("complete"):
-            completion = completer.complete(context, guidance, seed=seed)
+            completion = run_completer(completer, context, guidance, seed=seed)
         take(guidance, completion)
     return results, total
 
@@ -218,7 +224,7 @@ def _completed_together(
         sizes.setdefault(guidance.valid.shape[1:], []).append(index)
     for rows in sizes.values():
         of_one_size = concatenate([guidances[index] for index in rows])
-        completion = completer.complete(context, of_one_size, seed=seed)
+        completion = run_completer(completer, context, of_one_size, seed=seed)
         for place, index in enumerate(rows):
             completions[index] = _row(completion, place)
     return [completions[index] for index in range(len(guidances))]
