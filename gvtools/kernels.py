@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 
 from numba import get_num_threads, njit, threading_layer
 
-# Division by zero gives infinity, as in numpy; numba's default raises, and the branch that it
-# needs for that keeps loops from being vectorised (measured: ten times slower projection).
-# Other threads go on meanwhile: those that read and write files, and other memories' kernels.
+# error_model="numpy": division by zero gives infinity instead of raising; the check that raising
+# needs keeps loops from being vectorised (measured: projection ten times slower with it).
+# nogil=True: other Python threads (file I/O, kernels on other memories) run during a kernel.
 compiled = partial(njit, cache=True, error_model="numpy", nogil=True)
 
-# Relaxed rounding that still honours NaN and infinity.
+# LLVM's fast-math flags but "nnan" and "ninf": rounding may differ, NaN and infinity still hold.
 FAST = {"nsz", "arcp", "contract", "reassoc"}
 
 
@@ -41,7 +41,10 @@ def in_threads(kernel: Callable[..., Any], count: int, *args: Any) -> list[Any]:
 
 @cache
 def _pool(process: int) -> ThreadPoolExecutor:
-    """Of a process: a forked one has no threads of its parent's."""
+    """The thread pool of this process.
+
+    ``process`` is only the cache's key: after a fork the parent's pool has no live threads.
+    """
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="kernel")
 
 
@@ -50,8 +53,9 @@ class KernelSet(NamedTuple):
 
     Attributes:
         name: as users are told of it.
-        compile: calls them with a little data; a function of a module, without arguments.
-        last: the kernel that ``compile`` calls last.
+        compile: a module's function without arguments that calls each kernel once on small
+            arrays, since numba compiles at the first call; pickled for another process.
+        last: the last kernel that it calls; if this one is cached, so are the others.
     """
 
     name: str
@@ -90,10 +94,11 @@ def compile_side_by_side(sets: Sequence[KernelSet]) -> None:
         list(pool.map(compile_set, sets))
 
 
-def run_beside_each_other() -> bool:
-    """Whether kernels that use several threads may run in two threads at once.
+def parallel_kernels_may_overlap() -> bool:
+    """Whether two Python threads may each run a ``parallel=True`` kernel at the same time.
 
-    With numba's own pool, the last resort where neither OpenMP nor TBB is, they must not.
+    True for numba's OpenMP and TBB layers; its own "workqueue" layer is not thread-safe. False
+    also before the first such kernel has run, when the layer is not chosen yet.
     """
     try:
         return str(threading_layer()) in ("omp", "tbb")

@@ -73,16 +73,24 @@ class ContextView:
 
 
 class ScaleStatus(str, Enum):
-    """What the scale of a view's generated depth rests on, or why there is none."""
+    """How a view's generated depth was brought into scene units, or why it was refused."""
 
     MEMORY_DEPTH = "memory_depth"
+    """One factor, fitted to the memory's depth on the pixels that both know."""
     MEMORY_FIELD = "memory_field"
+    """A smooth field of factors, fitted to the memory's depth."""
     MEMORY_SURFACES = "memory_surfaces"
+    """No factor needed: the memory's surfaces, in scene units, were continued into the holes."""
     CONTEXT_DEPTH = "context_depth"
+    """One factor, fitted to the depth of the context views."""
     CAMERA_CENTRES = "camera_centres"
+    """One factor, fitted between predicted and given camera centres."""
     NOTHING_TO_COMPLETE = "nothing_to_complete"
+    """The view has no hole."""
     UNSUPPORTED = "unsupported"
+    """Refused: too few pixels or camera centres to fit a factor."""
     CONTRADICTED = "contradicted"
+    """Refused: the depth differs from known depth by more than a factor."""
 
     @property
     def accepted(self) -> bool:
@@ -108,13 +116,13 @@ class ScaleAlignment:
 
     Attributes:
         status: see ``ScaleStatus``.
-        scale: factor that takes the completion's depth to scene units; 1 where the completer has
-            applied its own, NaN where refused.
-        residual: median relative deviation from the memory's depth (0.01 = 1 %); NaN unknown.
-        overlap_px: pixels on which both depths are known, as far as they were counted.
-        inlier_share: share of these that agree with the scale, by weight; NaN unknown.
-        centres: camera centres that the scale was looked for in; 0 where none were.
-        correlation: of predicted and given camera centres; NaN unknown.
+        scale: multiply the completion's depth by this to get scene units; 1 if the completer's
+            depth is in scene units already, NaN if refused.
+        residual: median relative deviation from the memory's depth (0.01 = 1 %); NaN if unknown.
+        overlap_px: pixels with both depths; 0 also where they were not counted.
+        inlier_share: weighted share of these within the fit's tolerance, 0 to 1; NaN if unknown.
+        centres: number of camera centres in the fit; 0 if none were used.
+        correlation: between predicted and given camera centres, -1 to 1; NaN if unknown.
     """
 
     status: ScaleStatus
@@ -173,8 +181,10 @@ class Completion:
         rgb: (V, H, W, 3) float32 in [0, 1].
         depth: (V, H, W) float32 z-depth, scene units, 0 = none.
         confidence: (V, H, W) float32 in [0, 1]; below 1 where generated, 0 where nothing is known.
-        rays: (V, H, W, 6) float32 Plücker rays, world frame, from completers that predict them.
-        spent: what the completion cost and met, such as ``seconds``, ``steps``, ``unfilled``.
+        rays: (V, H, W, 6) float32 Plücker rays in the world frame: unit direction d, then moment
+            c x d (scene units), c the camera centre; None if the completer predicts none.
+        spent: figures of the whole call: ``seconds``, ``passes`` (model calls), ``steps``
+            (denoiser steps), ``holes`` and ``unfilled`` (pixels), ``views_without_scale``.
         scale_alignment: for each view, how the completer brought its depth into scene units; the
             generated depth of a refused view is 0. None, of a view or of all, leaves the alignment
             to the run, which compares depth with the memory's.
@@ -208,11 +218,11 @@ class Completer(ABC):
 
     Attributes:
         name: under which it is registered.
-        settings_type: its options as a ``gvtools.settings.Settings`` model; None has none. A type
-            of any kind here, so that the contract needs no more than numpy.
-        batches_targets: True takes all targets of a round of one picture size in a call; False
-            takes one, which then shows what the completions before it added to the memory.
-        costly: whether views with small holes are better left to ``inpaint``, see ``EffortPolicy``.
+        settings_type: its options, a subclass of ``gvtools.settings.Settings``; None if it has no
+            options. Annotated ``type[Any]``, so that this module does not import pydantic.
+        batches_targets: True: ``complete`` gets all targets of a round with equal image size at
+            once. False: one target at a time, projected after the previous one was fused.
+        costly: True leaves views with small holes to ``inpaint``, see ``EffortPolicy``.
         kernels: compiled kernels of its own, which a run compiles before its first round.
         settings: the options of this one.
     """
@@ -230,12 +240,12 @@ class Completer(ABC):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files that decide the result, such as weights: a run is not resumed with others."""
+        """Files that the result depends on, such as weights; resuming requires the same."""
         return ()
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should be told before a run."""
+        """Warnings for the user, shown before a run starts."""
         return ()
 
     @abstractmethod
@@ -252,7 +262,7 @@ class Completer(ABC):
 
 
 def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
-    """Refuse views whose numbers would spread from a pixel over all that is generated.
+    """Refuse colours or known depth with NaN or infinity: a network spreads one bad pixel to all.
 
     Args:
         context: their colours have to be finite; depth that is not finite counts as none.
@@ -286,7 +296,10 @@ def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
 def run_completer(
     completer: Completer, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
 ) -> Completion:
-    """What a completer makes of views, held to the contract.
+    """Call ``completer.complete`` and check what it returns.
+
+    That is its type, shapes, finite values, and that pixels which are valid in ``guidance`` kept
+    their colour and depth.
 
     Raises:
         ShapeError: it returned something else, of another size, or with NaN or infinity; or the

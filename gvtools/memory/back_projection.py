@@ -27,8 +27,10 @@ class BackProjectionOptions(Settings):
     section = "back_projection"
 
     edge: float = Field(0.05, gt=0)
-    """Drop a pixel whose 3x3 neighbours spread over more than this share of its depth, beyond what
-    a plane's slope explains; such pixels mix foreground and background ("flying pixels")."""
+    """Limit for depth edges, in relative change of inverse depth per pixel. Along each image axis,
+    a pixel is dropped if its two one-sided changes differ by more than this, if both exceed it, if
+    the only one exceeds it, or if neither neighbour has depth. Such pixels mix foreground and
+    background ("flying pixels")."""
     depth_max: float | None = Field(None, gt=0)
     """Drop what is farther, scene units; None keeps all."""
     grazing: float = Field(0.05, ge=0, lt=1)
@@ -62,8 +64,9 @@ def back_project(
         mask: (H, W) bool, True = use.
         options: see BackProjectionOptions.
         levels: the voxels that the points are for (``memory.levels``); for ``pixel_binning``.
-        pixel_binning: where 2 x 2 pixels together are at most so many voxel edges wide, they become
-            one point, their mean, unless the surface is steep; 0, or no ``levels``, keeps all.
+        pixel_binning: merge 2 x 2 pixels into one point, their mean, if together they are at most
+            this many voxel edges wide (of the voxel that they fall into) and the surface is not
+            steep; 0, or no ``levels``, keeps every pixel.
 
     Raises:
         ShapeError: the images and the camera disagree in size, or the camera is unusable.
@@ -132,6 +135,13 @@ def _usable(z):
 @compiled()
 def _lift(rgb, depth, trust, mask, K, local_from_cam, edge, depth_max, grazing,
           positions, colors, weight, spacing, pixels):  # fmt: skip
+    """Back-project all usable pixels; pixel (row, col) has its centre at (col + 0.5, row + 0.5).
+
+    In: depth (H, W); trust and mask (H, W), or empty where unused; K (3, 3); local_from_cam (4, 4).
+    Out, H*W rows filled from row 0: positions, colors, weight, spacing, pixels (row * W + col).
+    Returns the numbers of points, of pixels without usable depth or confidence, of edges and
+    grazing surfaces, and of masked pixels.
+    """
     height, width = depth.shape
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     skew = K[0, 1]
@@ -178,10 +188,11 @@ def _lift(rgb, depth, trust, mask, K, local_from_cam, edge, depth_max, grazing,
 
 @compiled()
 def _surface_cosine(depth, row, col, edge, fx, fy, cx, cy):
-    """Cosine between the pixel's ray and the surface there; -1 on a depth edge.
+    """|cos| of the angle between ray and surface normal, 0 to 1; -1 at a depth edge.
 
-    On a plane, inverse depth is linear in the image, so a neighbour's inverse depth may differ
-    by a slope; a jump shows as a spread of the two one-sided slopes beyond ``edge``.
+    On a plane, inverse depth is linear in image coordinates, so its relative changes from the
+    neighbour before and to the one after, z (1/z - 1/z_before) and z (1/z_after - 1/z), are equal;
+    ``edge`` bounds their difference.
     """
     height, width = depth.shape
     z = depth[row, col]
@@ -230,9 +241,9 @@ def _surface_cosine(depth, row, col, edge, fx, fy, cx, cy):
 
 @compiled()
 def _free_depth(depth, trust, mask, depth_max):
-    """(ceil(H/4), ceil(W/4)): the nearest depth of each cell, 0 unless every pixel has one.
+    """(ceil(H/4), ceil(W/4)): nearest depth in each cell of 4 x 4 pixels, at most ``depth_max``.
 
-    A depth that is not trusted says nothing of the space before it.
+    0 if a pixel has no depth, is masked, or has no confidence: the space before it is unknown.
     """
     height, width = depth.shape
     rows = (height + FREE_CELL - 1) // FREE_CELL

@@ -1,4 +1,4 @@
-"""The persistent memory: coloured observations in voxels, fused view by view, undone by round."""
+"""The persistent memory: coloured points in voxels, fused view by view, removable by round."""
 
 from __future__ import annotations
 
@@ -28,13 +28,15 @@ if TYPE_CHECKING:
     from gvtools.memory.splat.api import SplatOptions
 
 # Nearest neighbours are looked up for this many points when a cloud gives no spacing.
-SAMPLED = 20_000
+NEIGHBOUR_SAMPLES = 20_000
 # How far float colours may leave 0 to 1.
 COLOR_SLACK = 0.01
 
 
 class SpatialMemory(Store):
-    """A coloured point cloud that grows view by view; ``cloud`` is the store itself.
+    """A coloured point cloud that grows view by view.
+
+    ``cloud`` is its store: an Open3D point cloud that shares the arrays which kernels write.
 
     Space is divided into voxels, wider ones (``MemoryOptions.voxels_per_footprint``) where it was
     seen coarsely; a voxel keeps several observations, each of which remembers the view it came
@@ -79,7 +81,7 @@ class SpatialMemory(Store):
                 f"{camera.names[0]}: no depth; expected (H, W) z-depth; a project without recorded "
                 "depth gets it by gvtools.reconstruct"
             )
-        rgb = as_bytes(rgb, camera.names[0])
+        rgb = to_uint8(rgb, camera.names[0])
         points = back_project(
             rgb, depth, camera, frame=self.frame, confidence=confidence, mask=mask,
             options=options, levels=self.levels, pixel_binning=pixel_binning,
@@ -199,7 +201,7 @@ class SpatialMemory(Store):
         """Fuse a cloud's points, round by round and view by view."""
         count = len(columns["positions"])
         column = {key: values.reshape(count, -1)[:, 0] for key, values in columns.items()}
-        colors = as_bytes(columns["colors"], name)
+        colors = to_uint8(columns["colors"], name)
         generated = column.get("generated", np.zeros(count)) != 0
         round_ = column.get("round", generated).astype(np.int64)
         view = column.get("view", np.zeros(count)).astype(np.int64)
@@ -221,7 +223,7 @@ class SpatialMemory(Store):
             self.fuse(points, round=number, generated=bool(made))
 
 
-def as_bytes(colors: NDArray[Any], name: str) -> NDArray[np.uint8]:
+def to_uint8(colors: NDArray[Any], name: str) -> NDArray[np.uint8]:
     """Colours (..., 3) as uint8: those of a photograph as they are, float ones from 0 to 1 scaled.
 
     Raises:
@@ -248,7 +250,7 @@ def _neighbour_distance(positions: NDArray[np.float64]) -> float:
     near = positions - positions.mean(axis=0)
     search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(near))
     search.knn_index()
-    sample = near[:: max(1, len(near) // SAMPLED)]
+    sample = near[:: max(1, len(near) // NEIGHBOUR_SAMPLES)]
     _, squared = search.knn_search(o3d.core.Tensor(np.ascontiguousarray(sample)), 2)
     apart = np.sqrt(squared.numpy()[:, 1])
     apart = apart[apart > 0]

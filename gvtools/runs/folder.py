@@ -1,7 +1,7 @@
 """A run's folder while it is written: its rounds, when a round is complete, and how to resume.
 
 A round is written under a temporary name and renamed when it is complete, its memory included, so a
-kill at any moment leaves complete rounds only. The next round drops the previous one's memory file.
+kill at any moment leaves complete rounds only. Only the last complete round keeps its memory file.
 The context depth that an unfinished round had computed is kept; the next attempt reads it if it is
 the same run.
 """
@@ -23,9 +23,9 @@ from gvtools.runs.folder_lock import folder_lock
 from gvtools.runs.identity import versions
 from gvtools.runs.layout import MEMORY, METRICS, RECORD, REPORT, ROUNDS, round_folder
 
-# Names of files and folders that are not complete yet.
+# Files and folders that are still being written.
 PARTIAL = ".*.part"
-# Complete files of an unfinished round that the next attempt reads.
+# Files of an unfinished round that are complete; the next attempt reuses them.
 KEPT = "context_depth_*"
 
 
@@ -82,7 +82,7 @@ class RunDirectory:
             raise ProjectError(f"{record}: no readable JSON; give another --out")
         ours = isinstance(before, dict) and before.keys() >= {*identity, "versions"}
         if ours and not self._results():
-            # Nothing came of the first attempt; its options bind nobody.
+            # A run was begun here but completed no round: start anew, whatever its options were.
             return False
         if not isinstance(before, dict):
             before = {}
@@ -104,7 +104,7 @@ class RunDirectory:
     def _start(self, identity: dict[str, Any], *, resume: bool) -> int:
         resumes = self.check(identity, resume=resume)
         record = {**identity, "versions": versions()}
-        # A first attempt at the very same run, by the same versions, was begun here.
+        # Options and versions of an unfinished attempt are the same: reuse its context depth.
         same = self._record() == json.loads(json.dumps(record))
         self._drop_partial(but=self._part(0) if same else None)
         if not resumes:
@@ -112,12 +112,13 @@ class RunDirectory:
                 write_json(self.path / RECORD, record)
             return 0
         done = len(self.reports())
-        # Rounds after a removed one were built on it; they are repeated.
-        for later in sorted(self.path.glob("round_[0-9]*")):
-            if later.name > self.round_path(done - 1).name:
-                shutil.rmtree(later)
+        # Rounds after a removed one were built on it and have to be repeated.
+        for folder in sorted(self.path.glob("round_[0-9]*")):
+            number = folder.name.removeprefix("round_")
+            if number.isdigit() and int(number) >= done:
+                shutil.rmtree(folder)
         if done:
-            self._settle(done - 1)
+            self._finish_round(done - 1)
         return done
 
     def _record(self) -> Any:
@@ -195,7 +196,7 @@ class RunDirectory:
         write_json(self.path / METRICS, metrics)
         last = self.round_memory(number)
         if last.exists():
-            # Copied, not moved: whoever reads meanwhile finds one of the two.
+            # Copy, then delete: a concurrent reader always finds at least one of the two.
             with replaced_when_written(self.path / MEMORY) as temporary:
                 shutil.copyfile(last, temporary)
             last.unlink()
@@ -227,10 +228,10 @@ class RunDirectory:
                 f"{self.path}: round {number} cannot be written ({cause.strerror or cause}); free "
                 "some space and add --resume; earlier rounds are intact"
             ) from cause
-        self._settle(number)
+        self._finish_round(number)
 
-    def _settle(self, number: int) -> None:
-        """What follows from round ``number`` being complete; safe to repeat after a kill."""
+    def _finish_round(self, number: int) -> None:
+        """Remove the previous round's memory file and rewrite rounds.jsonl; safe to repeat."""
         if number:
             self.round_memory(number - 1).unlink(missing_ok=True)
         lines = [json.dumps(report) for report in self.reports()]

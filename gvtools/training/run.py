@@ -35,31 +35,32 @@ from gvtools.training.stage import Stage
 from gvtools.training.state import FILE
 
 WEIGHTS = "weights"
-# The whole training's settings, as the stage was last run with them.
+# Settings of all stages, written into the folder of each stage when it is started or resumed.
 SETTINGS = "training.json"
 SHEET_SAMPLES = 3
-# Endings of what terms stood on: in the log, not on the screen.
-COUNTS = ("_pixels", "_empty", "_without_scale")
-# Stages whose weights complete views, and those of them that need others' to learn from.
+# Log keys with these endings count the pixels or samples behind a loss term: logged, not printed.
+COUNT_SUFFIXES = ("_pixels", "_empty", "_without_scale")
+# Stages after which the model can complete views.
 GENERATIVE = ("denoiser", "reflow", "heads")
+# Those of them that learn from the output of a trained denoiser.
 AFTER_DENOISER = ("reflow", "heads")
 STAGE_OF: dict[str, type[Stage]] = {
     kind.name: kind for kind in (EncoderStage, DenoiserStage, ReflowStage, HeadsStage)
 }
-# Bytes at each end of a weights file that tell it from another.
-READ = 2**22
+# A weights file is fingerprinted by its name, its size and this many bytes at either end.
+FINGERPRINT_BYTES = 2**22
 
 
 class StageRun:
     """A stage in its folder ``OUT/STAGE``.
 
     Args:
-        config: of the training.
-        stage: its name.
-        out: of the training; each stage has a folder in it.
-        processes: this process and the others.
-        model_folder: where a relative path of the model's configuration is looked up.
-        init: weights to start from, instead of the stage before.
+        config: settings of the whole training.
+        stage: name of the stage, one of ``STAGES``.
+        out: folder of the whole training; the stage writes into ``out / stage``.
+        processes: rank, number and device of the training processes.
+        model_folder: folder that relative paths in the model's configuration refer to.
+        init: weights folder to start from, instead of the previous stage's.
     """
 
     def __init__(
@@ -118,9 +119,10 @@ class StageRun:
         )
         if resume and trainer.resume():
             if trainer.finished and (self.folder / WEIGHTS / WHOLE_FILE).is_file():
-                # Written again, they might differ in a digit; the next stage's state would not fit.
+                # Keep them: rewritten weights could differ by rounding, and a later stage that
+                # started from these would refuse to resume.
                 say(f"{self.stage}: finished before, weights in {self.folder / WEIGHTS}")
-                return _last(self.folder)
+                return _last_record(self.folder)
             say(f"{self.stage}: goes on after step {trainer.progress.step}")
         if self.processes.first:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -136,7 +138,7 @@ class StageRun:
         if trainer.finished:
             self._write_weights(model, trainer, samples)
             say(f"{self.stage}: weights in {self.folder / WEIGHTS}")
-        return _last(self.folder)
+        return _last_record(self.folder)
 
     def _recorder(self, step: int, say: Callable[[str], None]) -> Record | None:
         """Writes and says a record; None in all processes but the first."""
@@ -146,7 +148,9 @@ class StageRun:
 
         def record(step: int, values: dict[str, float]) -> None:
             log.write(step, values)
-            shown = ", ".join(f"{k} {v:.4g}" for k, v in values.items() if not k.endswith(COUNTS))
+            shown = ", ".join(
+                f"{k} {v:.4g}" for k, v in values.items() if not k.endswith(COUNT_SUFFIXES)
+            )
             say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
 
         return record
@@ -154,14 +158,17 @@ class StageRun:
     def _sheet_writer(
         self, model: GeoVerse, distributed: Replicated, samples: TrainingSamples
     ) -> Callable[[int], None] | None:
-        """Draws held-out samples; None in a process that has no part in that."""
+        """A function (step) that writes a PNG grid of completed held-out samples.
+
+        None in processes that neither write it nor hold parameters needed to compute it.
+        """
         if not (distributed.collective or self.processes.first):
             return None
         held_out = samples.held_out(SHEET_SAMPLES).to(self.processes.device)
         draw = encoder_sheet if self.stage == "encoder" else completion_sheet
 
         def sheet(step: int) -> None:
-            # What processes hold parts of, all of them have to run.
+            # Sharded parameters: the forward pass needs every process, though only one writes.
             with distributed.usable():
                 drawn = draw(model, held_out)
             if self.processes.first:
@@ -170,7 +177,11 @@ class StageRun:
         return sheet
 
     def _start(self, say: Callable[[str], None]) -> GeoVerse:
-        """The model that the stage begins with; every process makes the same."""
+        """Build the model from ``init``, else the last earlier stage with weights, else at random.
+
+        Sets ``_source`` (the weights' folder, None for random weights); for stage "heads" it also
+        takes the sampling of the start weights into ``model_config``. ``_identity`` needs both.
+        """
         before = STAGES[: STAGES.index(self.stage)]
         source = self.init
         if source is None:
@@ -195,7 +206,7 @@ class StageRun:
                     "from what they make; run --stage denoiser to its end first"
                 )
             if self.stage == "heads":
-                self.model_config = _sampled_as(self.model_config, found.flow)
+                self.model_config = _with_sampling_of(self.model_config, found.flow)
         return from_pretrained(source, config=self.model_config)
 
     def _refuse_unfinished(self, before: Sequence[str]) -> None:
@@ -215,10 +226,10 @@ class StageRun:
                 )
 
     def _distributed(self, module: Stage, video: VideoPrior | None) -> Replicated:
-        """What this process holds of the stage."""
+        """Wrap the stage for data-parallel or sharded training."""
         if video is not None:
             for model in models_of(module):
-                # A teacher does without its copy: it is large, and never trained.
+                # Student and teacher share one video prior; it is large and never trained.
                 model.attach_video(video)
         if self.config.parallel == "sharded" and self.processes.count > 1:
             from gvtools.training.sharded import Sharded
@@ -227,12 +238,12 @@ class StageRun:
         return Replicated(module, self.processes)
 
     def _identity(self) -> dict[str, Any]:
-        """What may not change between the parts of a stage."""
+        """The settings that must be unchanged when a stage is resumed; kept with its state."""
         data = self.config.data.to_dict()
         for name in ("workers", "cache"):
             data.pop(name)
         model = to_json(self.model_config)
-        # Of completions alone.
+        # Used when views are completed, not in training.
         for name in ("alignment", "color_alignment"):
             model.pop(name)
         model["flow"].pop("temperature")
@@ -240,7 +251,7 @@ class StageRun:
             "stage": self.stage,
             "seed": self.config.seed,
             "model": model,
-            # Those that are installed decide the samples.
+            # The samples depend on which photographs are installed.
             "photographs": list(photograph_names("train")),
             "options": self.options.to_dict(),
             "start": None if self._source is None else _fingerprint(self._source),
@@ -248,7 +259,7 @@ class StageRun:
         }
 
     def _write_weights(self, model: GeoVerse, trainer: Trainer, samples: TrainingSamples) -> None:
-        """The averaged weights; after stage 0 with the latents' statistics."""
+        """Write the averaged weights; after stage ``encoder`` with the latents' statistics."""
         with trainer.ema.swapped_in():
             whole = trainer.distributed.whole_model(model)
             if whole is not None:
@@ -259,18 +270,18 @@ class StageRun:
                         for index in range(self.options.statistics)
                     ]
                     measure_statistics(whole.to(device), batches)
-                # An encoder alone completes nothing.
+                # ``trained`` says whether these weights can complete views; an encoder's cannot.
                 config = self.model_config
                 if self.stage == "reflow":
-                    config = _distilled(config, self.options)
+                    config = _student_config(config, self.options)
                 whole.config = replace(config, trained=self.stage in GENERATIVE)
                 save_pretrained(whole, self.folder / WEIGHTS)
                 self._link_video()
-        # The next stage starts from them, in every process.
+        # No process may read the weights before the first one has written them.
         self.processes.wait()
 
     def _link_video(self) -> None:
-        """The video prior, which is not trained, lies where the stage's start has it."""
+        """Link to the start weights' video prior; it is not trained, so it is not copied."""
         link = self.folder / WEIGHTS / VIDEO_FOLDER
         if self.model_config.video is None or self._source is None:
             return
@@ -280,28 +291,34 @@ class StageRun:
             link.symlink_to((self._source / VIDEO_FOLDER).resolve(), target_is_directory=True)
 
 
-def _sampled_as(config: GeoVerseConfig, flow: FlowConfig) -> GeoVerseConfig:
-    """The configuration with the bounds and the guidance that its weights were distilled for."""
-    known = replace(config.flow, level1=flow.level1, cfg_scale=flow.cfg_scale)
-    return replace(config, flow=known)
+def _with_sampling_of(config: GeoVerseConfig, flow: FlowConfig) -> GeoVerseConfig:
+    """``config`` with the level-1 interval bounds and cfg_scale that the weights were made for."""
+    sampling = replace(config.flow, level1=flow.level1, cfg_scale=flow.cfg_scale)
+    return replace(config, flow=sampling)
 
 
-def _distilled(config: GeoVerseConfig, options: ReflowStageOptions) -> GeoVerseConfig:
-    """The student's configuration: it takes one step an interval, and its guidance is inside it."""
+def _student_config(config: GeoVerseConfig, options: ReflowStageOptions) -> GeoVerseConfig:
+    """``config`` with the distilled interval bounds, one Euler step each.
+
+    cfg_scale becomes 1 if the teacher was sampled with another one: the student has learnt it.
+    """
     flow = replace(config.flow, level1=options.bounds or config.flow.level1)
     if options.cfg_scale != 1:
         flow = replace(flow, cfg_scale=1.0)
     return replace(config, flow=flow)
 
 
-def _last(folder: Path) -> dict[str, float]:
+def _last_record(folder: Path) -> dict[str, float]:
     """The stage's last record."""
     records = read_log(folder)
     return records[-1] if records else {}
 
 
 def _fingerprint(folder: Path) -> str:
-    """Of the weights that a stage starts from, the video prior's left out; ends of large files."""
+    """16 hex digits of SHA-256 over each file's relative path, size and both ends.
+
+    The video prior is left out: no stage trains it.
+    """
     digest = hashlib.sha256()
     video = folder / VIDEO_FOLDER
     for path in sorted(folder.rglob("*")):
@@ -310,7 +327,7 @@ def _fingerprint(folder: Path) -> str:
         size = path.stat().st_size
         digest.update(f"{path.relative_to(folder).as_posix()} {size} ".encode())
         with path.open("rb") as file:
-            digest.update(file.read(READ))
-            file.seek(max(0, size - READ))
-            digest.update(file.read(READ))
+            digest.update(file.read(FINGERPRINT_BYTES))
+            file.seek(max(0, size - FINGERPRINT_BYTES))
+            digest.update(file.read(FINGERPRINT_BYTES))
     return digest.hexdigest()[:16]

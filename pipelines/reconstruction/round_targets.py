@@ -5,7 +5,7 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
-from gvtools.kernels import run_beside_each_other
+from gvtools.kernels import parallel_kernels_may_overlap
 from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.reconstruction.plan import Plan
@@ -50,7 +50,7 @@ class RoundTargets:
 
     def prefetch_round(self, number: int) -> None:
         """Begin to project what observed views show of round ``number``, if there is one."""
-        if number > len(self.plan.schedule) or not run_beside_each_other():
+        if number > len(self.plan.schedule) or not parallel_kernels_may_overlap():
             return
         targets = self._projections(number)
         snapshot = self.memory.snapshot()

@@ -167,24 +167,24 @@ def complete_targets(
     agree with each other.
 
     Args:
-        targets: the round's cameras, following ``memory``.
-        number: of the round.
-        memory: is added to.
+        targets: projections of ``memory`` into the round's cameras; each updates when it changes.
+        number: number of the round, from 1.
+        memory: generated points are fused into it.
         completer: see ``Completer``.
-        context: the given views.
-        config: of the run.
+        context: the observed views that the completer may use.
+        config: settings of the run.
         clock: receives the stages' times.
-        progress: (items, label) to the items.
-        done: is told of each target as soon as it is completed: its place and what became of it.
+        progress: ``progress(items, label)`` iterates over ``items`` and shows a progress bar.
+        done: called as ``done(row, result)`` after each target was completed and fused.
 
     Returns:
-        What became of each target, in the order given, and the sum of what was fused.
+        One result per target, in the order given, and the sum of what was fused.
     """
     seed = config.seed + number
     results: list[TargetResult] = []
     total = FuseReport()
 
-    def take(guidance: Guidance, completion: Completion) -> None:
+    def fuse_and_record(guidance: Guidance, completion: Completion) -> None:
         nonlocal total
         result, report = _align_and_fuse(
             guidance, completion, number, memory=memory, config=config, clock=clock
@@ -199,14 +199,14 @@ def complete_targets(
         with clock.stage("complete"):
             completions = _completed_together(completer, context, guidances, seed=seed)
         for pair in progress(list(zip(guidances, completions, strict=True)), f"round {number}"):
-            take(*pair)
+            fuse_and_record(*pair)
         return results, total
     for target in progress(list(targets), f"round {number}"):
         with clock.stage("project"):
             guidance = target.guidance()
         with clock.stage("complete"):
             completion = run_completer(completer, context, guidance, seed=seed)
-        take(guidance, completion)
+        fuse_and_record(guidance, completion)
     return results, total
 
 
@@ -217,7 +217,11 @@ def _completed_together(
     *,
     seed: int,
 ) -> list[Completion]:
-    """A batch of one for each target, of batches of all targets of one size."""
+    """Complete the targets in one call per image size.
+
+    Returns:
+        One Completion (V = 1) per target, in the order of ``guidances``.
+    """
     completions: dict[int, Completion] = {}
     sizes: dict[tuple[int, ...], list[int]] = {}
     for index, guidance in enumerate(guidances):
@@ -269,12 +273,13 @@ def _align_and_fuse(
                 guidance.cameras,
                 round=number,
                 generated=True,
-                # Unused outside the mask, where it must still be positive.
+                # Confidence has to be positive everywhere; outside the mask it is not used.
                 confidence=np.where(fused, confidence, np.float32(1)),
                 mask=fused,
                 options=config.back_projection,
                 pixel_binning=config.savings.pixel_binning,
             )
+    # "observed" and "completed" are shares of the target's pixels, 0 to 1.
     figures = {
         "name": guidance.cameras.names[0],
         "observed": float((valid & ~guidance.generated[0]).mean()),
@@ -291,8 +296,8 @@ def _scale_alignment(
 ) -> ScaleAlignment:
     """How the depth of a completion, a batch of one, gets into scene units.
 
-    Where the completer aligned it itself, its known pixels are the memory's own, so that comparing
-    them would tell nothing: its outcome stands, a refusal as well.
+    If the completer aligned its depth itself, its status is used, refusals included: its known
+    pixels are copies of the memory's, so comparing them would prove nothing.
     """
     by_completer = completion.scale_alignment and completion.scale_alignment[0]
     if by_completer:

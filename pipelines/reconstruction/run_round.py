@@ -36,19 +36,25 @@ def run_round(
     folder: Path,
     console: Console,
 ) -> dict[str, Any]:
-    """Run round ``number`` (0 is the context's), write its files, and report it, JSON-ready."""
+    """Run round ``number``, write its files into ``folder``, and return its report, JSON-ready.
+
+    Round 0 fuses the context views; later rounds complete and fuse their targets. In the report,
+    ``points``, ``observed`` and ``generated`` count observations in the memory after the round;
+    ``added``, ``merged`` and ``rejected`` are those of FuseReport; ``coverage_*`` are mean shares
+    of target pixels (0 to 1) that the memory projects to, None in round 0; ``bytes`` is its size.
+    """
     memory, clock = targets.memory, rounds.Clock()
     start = time.perf_counter()
     voxels = memory.voxels
-    about: dict[str, Any] = {"dropped": {}, "depth": [], "views": []}
-    about |= {"coverage_before": None, "coverage_after": None}
+    report: dict[str, Any] = {"dropped": {}, "depth": [], "views": []}
+    report |= {"coverage_before": None, "coverage_after": None}
     if number == 0:
         total, entries = _lift_context(plan, memory, folder, clock=clock, console=console)
     else:
         total, entries = _complete(
             plan, targets, number, context=context, folder=folder, clock=clock, console=console
         )
-    about |= entries
+    report |= entries
     generated = int(memory.generated.sum())
     return {
         "round": number,
@@ -61,13 +67,13 @@ def run_round(
         "merged": total.merged,
         "rejected": total.rejected,
         "fuse": asdict(total),
-        "dropped": about["dropped"],
-        "depth": about["depth"],
-        "coverage_before": about["coverage_before"],
-        "coverage_after": about["coverage_after"],
+        "dropped": report["dropped"],
+        "depth": report["depth"],
+        "coverage_before": report["coverage_before"],
+        "coverage_after": report["coverage_after"],
         "seconds": {**clock.seconds, "total": time.perf_counter() - start},
         "bytes": memory.nbytes,
-        "views": about["views"],
+        "views": report["views"],
     }
 
 
@@ -79,6 +85,11 @@ def _lift_context(
     clock: rounds.Clock,
     console: Console,
 ) -> tuple[FuseReport, dict[str, Any]]:
+    """Round 0: fuse the context views, with recorded, projected or computed depth.
+
+    A view whose depth would have to be computed takes the memory's projected depth if that matches
+    its photograph on a share ``savings.depth_from_memory`` of its pixels.
+    """
     least = plan.config.savings.depth_from_memory
 
     def from_memory(view: View, frame: Frame) -> DepthMap | None:
@@ -86,7 +97,7 @@ def _lift_context(
             return None
         splat = plan.config.splat
         depth_map = depth_from_memory(memory, view.camera, frame.rgb, least=least, options=splat)
-        # What a view before it got wrong must not spread.
+        # Reject projected depth that contradicts the sparse points: errors would accumulate.
         fit = depth_map and scale_to_points(plan.scene, view.name, depth_map.depth)
         return None if fit and disagrees(fit) else depth_map
 
@@ -106,7 +117,8 @@ def _lift_context(
     skipped = sum(report["source"] == MEMORY for report in depth)
     if skipped:
         console.line(
-            f"memory explains {skipped} of {len(depth)} context views: their depth was not computed"
+            f"{skipped} of {len(depth)} context views took their depth from the memory, which "
+            "matches their photographs"
         )
     return total, {"dropped": dropped, "depth": depth}
 
@@ -129,7 +141,7 @@ def _complete(
         targets = round_targets.of(number)
         before = [target.guidance() for target in targets]
     round_targets.prefetch_round(number + 1)
-    # Files are compressed beside the work on the next targets.
+    # Compress and write files in the background while the next targets are completed.
     with ThreadPoolExecutor(WRITERS) as pool:
         writing: list[Future[None]] = []
         results, total = rounds.complete_targets(

@@ -150,4 +150,4 @@ def test_no_round_is_looked_at_ahead_where_kernels_must_not_overlap(monkeypatch,
         return str(layer)
 
     monkeypatch.setattr(compiled, "threading_layer", said)
-    assert not compiled.run_beside_each_other()
+    assert not compiled.parallel_kernels_may_overlap()

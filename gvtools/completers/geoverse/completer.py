@@ -45,12 +45,13 @@ SHIPPED = Path(__file__).parent / "pretrained" / "tiny"
 
 
 @dataclass(frozen=True)
-class _Effort:
-    """What a pass is given.
+class _Sampling:
+    """Sampling schedule and image size of a pass.
 
     Attributes:
-        bounds: of the level-1 steps.
-        size: (H, W) of its pictures.
+        bounds: times 1 = tau_0 > ... > tau_K = 0 of the K Euler steps that denoise the level-1
+            features (see ``model.py``); empty if nothing is denoised.
+        size: (H, W) of the model's images, pixels.
     """
 
     bounds: tuple[float, ...]
@@ -87,7 +88,7 @@ class GeoVerseCompleter(Completer):
 
     @property
     def folder(self) -> Path:
-        """Of the weights."""
+        """The weights folder."""
         return SHIPPED if self.settings.weights is None else Path(self.settings.weights)
 
     @cached_property
@@ -97,7 +98,7 @@ class GeoVerseCompleter(Completer):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Whether the weights are untrained."""
+        """A warning if the weights are untrained."""
         if self.config.trained:
             return ()
         return (f"the weights in {self.folder} are untrained: what they complete is noise",)
@@ -116,25 +117,27 @@ class GeoVerseCompleter(Completer):
             raise OptionError("completer geoverse needs at least one context view, and got none")
         check_views(context, guidance)
         canvas = _Canvas(guidance)
-        holes = [index for index in range(len(guidance)) if not guidance.valid[index].all()]
+        # A pass is one run of the model over at most ``views`` views: first the context views,
+        # then as many targets as still fit.
+        incomplete = [index for index in range(len(guidance)) if not guidance.valid[index].all()]
         views = self.settings.views or self.config.views
-        photographs = min(self.settings.context_views or self.config.context, views - 1)
-        room = views - min(photographs, len(context))
+        context_count = min(self.settings.context_views or self.config.context, views - 1)
+        targets_per_pass = views - min(context_count, len(context))
         passes = steps = 0
-        filled = self._filled(context, guidance.select(holes)) if holes else None
-        for first in range(0, len(holes), room):
-            rows = holes[first : first + room]
+        filled = self._filled(context, guidance.select(incomplete)) if incomplete else None
+        for first in range(0, len(incomplete), targets_per_pass):
+            rows = incomplete[first : first + targets_per_pass]
             part = guidance.select(rows)
             fill = None if filled is None else filled.rows(range(first, first + len(rows)))
             depth = part.depth if fill is None else fill.depth
             selection = self.settings.context_selection
             chosen = chosen_views(
-                context, part.cameras, depth, count=photographs, selection=selection
+                context, part.cameras, depth, count=context_count, selection=selection
             )
-            effort = self._effort(part)
-            canvas.put(rows, self._pass(chosen, part, fill, effort=effort, seed=seed), part)
+            sampling = self._sampling(part)
+            canvas.put(rows, self._pass(chosen, part, fill, sampling=sampling, seed=seed), part)
             passes += 1
-            steps += max(len(effort.bounds) - 1, 0)
+            steps += max(len(sampling.bounds) - 1, 0)
         spent = {
             "seconds": time.perf_counter() - start,
             "passes": float(passes),
@@ -143,7 +146,7 @@ class GeoVerseCompleter(Completer):
         return canvas.completion(spent)
 
     def _filled(self, context: Sequence[ContextView], guidance: Guidance) -> Filled | None:
-        """What the model sees in holes; None where it fills them itself."""
+        """Fill of the holes that the model gets as hint; None if the model fills them itself."""
         if self.config.hints.fill != "surfaces":
             return None
         # It needs more than torch and numpy.
@@ -151,14 +154,14 @@ class GeoVerseCompleter(Completer):
 
         return surface_fill(context, guidance, shared=self.settings.shared_fill)
 
-    def _effort(self, part: Guidance) -> _Effort:
+    def _sampling(self, part: Guidance) -> _Sampling:
         """The model's own steps and picture size, or those of the settings."""
         bounds = self.config.flow.level1
         if self.settings.steps is not None:
             bounds = interval_bounds(self.settings.steps) if self.settings.steps else ()
         longest = min(self.settings.image_size or math.inf, self.config.image_size)
         size = model_size(*part.depth.shape[1:], longest=int(longest), patch=self.config.patch)
-        return _Effort(bounds, size)
+        return _Sampling(bounds, size)
 
     def _pass(
         self,
@@ -166,34 +169,37 @@ class GeoVerseCompleter(Completer):
         part: Guidance,
         fill: Filled | None,
         *,
-        effort: _Effort,
+        sampling: _Sampling,
         seed: int,
     ) -> Completed:
         """One pass of the model over context views and a few targets."""
-        options, size = self.settings, effort.size
+        options, size = self.settings, sampling.size
         batch, cameras = view_batch(context, part, size, fill=fill)
         # A photograph and a target of one name must not start from the same noise.
         names = [f"context {view.name}" for view in context]
         names += [f"target {name}" for name in part.cameras.names]
-        filled = None
+        # "correction": the model's change is added to ``base``, the projection with its holes
+        # filled. "decoded": the decoded pictures themselves are the result, and base is None.
+        base = None
         if self.config.composition == "correction" and options.composition != "decoded":
-            filled = averaged(part) if fill is None else fill
-        # Where the fill has depth everywhere, the model's own scale is of no use.
-        complete_fill = filled is not None and bool((filled.depth > 0).all())
+            base = averaged(part) if fill is None else fill
+        # Depth of ``base`` is in scene units. Only its pixels without depth take decoded depth,
+        # which has to be brought to the memory's scale first.
+        base_is_complete = base is not None and bool((base.depth > 0).all())
         cascade = options.cascade_steps
         with self._precision():
             generated = self.model.generate(
                 batch.to(self._device),
                 seed=seed,
                 names=[names],
-                bounds=effort.bounds,
+                bounds=sampling.bounds,
                 cascade_bounds=interval_bounds(cascade) if cascade else self.config.flow.cascade,
                 cfg_scale=options.cfg_scale,
                 temperature=options.temperature,
-                targets_alone=complete_fill,
+                targets_alone=base_is_complete,
             )
 
-        def scaled(color_alignment: str) -> Completed:
+        def decoded_in_scene_units(color_alignment: str) -> Completed:
             known = context_depth(context, part, size)
             alignment = options.alignment or self.config.alignment
             return to_scene_scale(
@@ -205,10 +211,12 @@ class GeoVerseCompleter(Completer):
                 color_alignment=color_alignment,
             )
 
-        if filled is None:
-            return scaled(options.color_alignment or self.config.color_alignment)
+        if base is None:
+            return decoded_in_scene_units(options.color_alignment or self.config.color_alignment)
         generated = seamless(generated, self.config.patch)
-        return corrected(generated, part, filled, back=None if complete_fill else scaled("none"))
+        return corrected(
+            generated, part, base, back=None if base_is_complete else decoded_in_scene_units("none")
+        )
 
     @property
     def _device(self) -> torch.device:
@@ -217,10 +225,10 @@ class GeoVerseCompleter(Completer):
         return torch.device(self.settings.device)
 
     def _precision(self) -> AbstractContextManager[Any]:
-        """Computes in bfloat16 where that is asked for."""
+        """Autocast to bfloat16 if the settings ask for it, or by default on CUDA."""
         kind, precision = self._device.type, self.settings.precision
-        half = precision == "bfloat16" or (precision == "auto" and kind == "cuda")
-        return torch.autocast(kind, dtype=torch.bfloat16) if half else nullcontext()
+        use_bfloat16 = precision == "bfloat16" or (precision == "auto" and kind == "cuda")
+        return torch.autocast(kind, dtype=torch.bfloat16) if use_bfloat16 else nullcontext()
 
 
 class _Canvas:
@@ -251,10 +259,10 @@ class _Canvas:
                 self.rays[row][hole] = completed.rays[position][hole]
             self.alignment[row] = completed.alignment[position]
             self.spent["unfilled"] += float((completed.depth[position][hole] <= 0).sum())
-            placed = np.isfinite(completed.scales[position]) or bool(
+            has_scale_or_depth = np.isfinite(completed.scales[position]) or bool(
                 (completed.depth[position] > 0).any()
             )
-            self.spent["views_without_scale"] += float(not placed)
+            self.spent["views_without_scale"] += float(not has_scale_or_depth)
 
     def completion(self, spent: dict[str, float]) -> Completion:
         """The result."""

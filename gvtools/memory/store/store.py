@@ -36,26 +36,27 @@ class MemoryOptions(Settings):
     section = "memory"
 
     merge_angle_deg: float = Field(2.0, ge=0, le=180)
-    """Observations of one voxel seen from directions closer than this merge when the new one is no
-    finer, degrees."""
+    """Two observations of a voxel merge if their viewing directions differ by at most this angle,
+    degrees, and ``min_detail_ratio`` allows it."""
     min_detail_ratio: float = Field(0.7, ge=0, le=1)
-    """A new observation whose spacing is below this share of the old one's stands on its own, so
-    that a close-up is not averaged into a distant view."""
+    """Smallest ratio of new to stored spacing at which they still merge. A finer observation, such
+    as a close-up, is stored separately instead of being averaged into a distant view."""
     observations_per_voxel: int = Field(12, ge=1)
-    """Longest chain; beyond it the most similar observation takes the new one in."""
+    """Most observations that a voxel keeps. In a full voxel a new one merges with the most similar,
+    whatever its direction and spacing."""
     weight_cap: float = Field(100.0, ge=1e-20, le=1e20)
-    """Confidence saturates here; so it does where what a view adds is below 2⁻²⁴ of what is
-    there."""
+    """Upper limit of an observation's confidence. Confidence is float32, so a contribution below
+    2⁻²⁴ of the present value has no effect either."""
     voxels_per_footprint: float = Field(1.0, ge=0)
-    """An observation goes into a voxel at most so many times as wide as its spacing where that is
-    wider than the memory's edge: twice, four times, ... to 128 times that edge. 0 has one edge
-    throughout."""
+    """Widest voxel that a point may go into, in multiples of its spacing. Voxel edges are 1, 2, 4,
+    ... 128 times ``voxel``; a point goes into the widest one within this limit, never into one
+    finer than ``voxel``. 0: all voxels have the edge ``voxel``."""
     free_space_tolerance: float = Field(0.03, ge=0, lt=1)
     """Share of depth that a generated point may stand in front of an observed surface."""
 
 
 class Store:
-    """Observations in voxels, the views that they come from, and what rounds added to others.
+    """Observations in voxels, the views they come from, and the confidence that rounds added.
 
     It grows, forgets and rebuilds its index; it knows nothing of fusion, projection or files.
 
@@ -72,11 +73,11 @@ class Store:
 
     Attributes:
         columns: the observations.
-        segments: contiguous observations of one block and view.
-        views: from where they were seen.
+        segments: runs of consecutive observations of one view in one block (16 x 16 x 16 voxels).
+        views: the fused views: camera, round, whether generated, free-space grid.
         index: which voxel holds which.
-        agreements: per round and fusion, (rows, confidence that it added to these observations of
-            earlier rounds, their confidence before).
+        agreements: by round, one entry for each fused view that saw what was there already: (rows
+            (A,) of observations of earlier rounds, confidence added (A,), confidence before (A,)).
         changes: how often something was fused or forgotten.
         observed_changes: how often that touched observed content.
     """
@@ -111,7 +112,7 @@ class Store:
 
     @property
     def reach(self) -> float:
-        """How far from the origin, along each axis, the finest voxels go, scene units."""
+        """Half the side of the cube around the origin that voxels cover, scene units."""
         return MAX_VOXEL * self.voxel
 
     @property
@@ -130,9 +131,9 @@ class Store:
 
         ``positions`` (N, 3) float32 in the memory's frame (``frame.to_world`` gives the world's),
         ``colors`` (N, 3) uint8 and, (N, 1) each, ``confidence`` and ``spacing`` float32, ``round``
-        uint16, ``view`` int32, ``generated`` and ``level`` uint8. It is the slice in use at the
-        time; after a fusion take it anew. What changes it in place changes the memory, whose voxel
-        index does not follow: ``clone`` it before moving points.
+        uint16, ``view`` int32, ``generated`` and ``level`` uint8. It has the memory's present
+        length: ask again after a fusion. Writing into it changes the memory, but not its voxel
+        index, so ``clone()`` it before moving points.
         """
         return self.columns.cloud()
 
@@ -148,7 +149,7 @@ class Store:
 
     @property
     def generated(self) -> NDArray[np.bool_]:
-        """(N,) bool."""
+        """(N,) bool: True if a completer made the observation, False if a camera observed it."""
         return self.columns.generated.view(np.bool_)
 
     @property
@@ -172,7 +173,7 @@ class Store:
         )
 
     def observed_grids(self, rows: Iterable[int]) -> list[FreeGrid]:
-        """K, cam_from_local and free-space grid of the observed views among ``rows``."""
+        """(K, cam_from_local, free_depth) of those views in ``rows`` that are not generated."""
         views = self.views
         return [
             (views[i].camera.K[0], views.cam_from_local[i], views[i].free_depth)
@@ -217,6 +218,8 @@ class Store:
         new_view = (np.cumsum(keep_view) - 1).astype(np.int32)
         keep = keep_view[columns.view]
         new_row = (np.cumsum(keep) - 1).astype(np.int32)
+        # Reset confidence to what each observation had in its own round, remove the round's rows
+        # and renumber the rest, then repeat what the other rounds added.
         columns.arrays.confidence[:count] = self.own_confidence()
         logs, self.agreements = self.agreements, {}
         columns.replace(int(keep.sum()), lambda name: getattr(columns, name)[keep])
@@ -251,10 +254,11 @@ class Store:
         self.index.voxels = int(self.index.block_count[: self.index.blocks].sum())
 
     def snapshot(self: S) -> S:
-        """This memory as it is now, for looking at what was observed beside later fusions.
+        """A read-only view of this memory, for projecting observed content in another thread.
 
-        The arrays are shared, so generated observations may still change in it. Neither of the two
-        must be fused into or forgotten from but for generated content in the original.
+        The arrays are shared, not copied. While it is in use, fuse only generated points into the
+        original and forget no round; never fuse into the snapshot. Its generated observations may
+        change meanwhile, its observed ones do not.
         """
         other = copy(self)
         other.columns, other.segments = copy(self.columns), copy(self.segments)

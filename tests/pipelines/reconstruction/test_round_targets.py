@@ -12,7 +12,7 @@ import pytest
 from memory_scenes import camera, random_memory
 
 from gvtools.cameras import concatenate
-from gvtools.kernels import run_beside_each_other
+from gvtools.kernels import parallel_kernels_may_overlap
 from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.reconstruction.plan import Plan
@@ -25,7 +25,7 @@ def memory() -> SpatialMemory:
     memory = random_memory(5)
     # With it, numba chooses how kernels run.
     memory.project(camera())
-    if not run_beside_each_other():
+    if not parallel_kernels_may_overlap():
         pytest.skip("no OpenMP and no TBB: rounds are not looked at ahead")
     return memory
 
