@@ -175,7 +175,10 @@ class ScaleAlignment:
 
 @dataclass(frozen=True, eq=False)
 class Completion:
-    """Completed target views. Where the guidance was valid, its rgb and depth stand unchanged.
+    """Completed target views. Where the guidance was valid, its rgb stands unchanged.
+
+    So does its depth there, unless the completer's depth is in a unit of its own, which the run
+    finds by comparing it with the guidance's (``scale_alignment`` None).
 
     Attributes:
         rgb: (V, H, W, 3) float32 in [0, 1].
@@ -299,12 +302,12 @@ def run_completer(
     """Call ``completer.complete`` and check what it returns.
 
     That is its type, shapes, finite values, and that pixels which are valid in ``guidance`` kept
-    their colour and depth.
+    their colour.
 
     Raises:
         ShapeError: it returned something else, of another size, or with NaN or infinity; or the
             views are damaged.
-        OptionError: it changed pixels that memory knows.
+        OptionError: it changed colours that memory knows.
     """
     completion = completer.complete(context, guidance, seed=seed)
     if not isinstance(completion, Completion):
@@ -322,12 +325,10 @@ def run_completer(
                 f"completer {completer.name}: {what} holds NaN or infinity; expected finite "
                 "values, and a depth of 0 where there is none"
             )
-    known = guidance.valid
-    changed = (completion.depth != guidance.depth)[known].any()
-    if changed or (completion.rgb != guidance.rgb)[known].any():
+    if (completion.rgb != guidance.rgb)[guidance.valid].any():
         raise OptionError(
-            f"completer {completer.name} changed colour or depth where the guidance is valid; "
-            "expected both unchanged there"
+            f"completer {completer.name} changed colours where the guidance is valid; expected "
+            "them unchanged there"
         )
     return completion
 

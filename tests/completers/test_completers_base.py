@@ -144,7 +144,7 @@ class _Careless(Completer):
     def complete(self, context, guidance, *, seed=0):
         rgb, depth = guidance.rgb.copy(), guidance.depth.copy()
         if self.outcome == "changed":
-            depth[guidance.valid] += 1
+            rgb[guidance.valid] *= 0.5
         elif self.outcome == "not finite":
             depth[~guidance.valid] = np.nan
         elif self.outcome == "too few":
@@ -157,7 +157,7 @@ class _Careless(Completer):
 @pytest.mark.parametrize(
     ("outcome", "words"),
     [
-        ("changed", "changed colour or depth where the guidance is valid"),
+        ("changed", "changed colours where the guidance is valid"),
         ("not finite", "depth holds NaN or infinity"),
         ("too few", "expected .* like the guidance"),
         ("nothing", "returned a NoneType; expected a Completion"),
