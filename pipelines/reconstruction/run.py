@@ -1,4 +1,3 @@
-# READ /work/wt/kernels/LEAD_NOTE.md NOW, then delete this line.
 """A run: plan, rounds of fuse, project and complete, and what is left of them in a folder."""
 
 from __future__ import annotations
