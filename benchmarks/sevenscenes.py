@@ -31,10 +31,11 @@ from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.store.points import PointSet
 from gvtools.scenes.project import open_project
 from gvtools.scenes.selection import select
+from pipelines.bench import fuse as bench_fuse
+from pipelines.bench import open3d_peers
+from pipelines.bench import splat as bench_splat
 from pipelines.bench.side_by_side import alternate
-from pipelines.commands.bench import fuse as bench_fuse
-from pipelines.commands.bench import open3d_peers, report
-from pipelines.commands.bench import splat as bench_splat
+from pipelines.commands.bench import report
 from pipelines.console import Console
 
 VOXEL = 0.005  # metres

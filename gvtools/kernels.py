@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from numba import get_num_threads, njit, threading_layer
+from numba import config, get_num_threads, njit, threading_layer
 
 # error_model="numpy": division by zero gives infinity instead of raising; the check that raising
 # needs keeps loops from being vectorised (measured: projection ten times slower with it).
@@ -65,6 +65,8 @@ class KernelSet(NamedTuple):
     @property
     def cached(self) -> bool:
         """Whether numba's cache holds the last of them, compiled since its file was written."""
+        if config.DISABLE_JIT:
+            return True
         function = self.last.py_func
         source = Path(function.__code__.co_filename)
         name = f"{source.stem}.{function.__qualname__}-{function.__code__.co_firstlineno}"

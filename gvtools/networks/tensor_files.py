@@ -141,8 +141,7 @@ def _read_header(path: Path) -> dict[str, _Entry]:
                 raise ValueError("no header")
             stored = json.loads(file.read(length))
         stored.pop("__metadata__", None)
-        ends = [0]
-        header = {}
+        header, parts = {}, []
         for name, value in stored.items():
             start, end = value["data_offsets"]
             if value["dtype"] not in STORED_TYPES:
@@ -152,10 +151,15 @@ def _read_header(path: Path) -> dict[str, _Entry]:
             if start < 0 or end - start != empty.nbytes:
                 raise ValueError(f"{name} has {end - start} bytes for {value['shape']}")
             header[name] = _Entry(8 + length + start, empty)
-            ends.append(end)
+            parts.append((start, end))
+        last = 0
+        for start, end in sorted(parts):
+            if start != last:
+                raise ValueError(f"a tensor begins at byte {start}, the one before ends at {last}")
+            last = end
         size = path.stat().st_size - 8 - length
-        if max(ends) != size:
-            raise ValueError(f"{size} bytes of tensors, {max(ends)} by its header")
+        if last != size:
+            raise ValueError(f"{size} bytes of tensors, {last} by its header")
     except Exception as error:
         # What a damaged header holds in place of numbers fails in many ways.
         raise CheckpointError(

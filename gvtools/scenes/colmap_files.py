@@ -78,6 +78,8 @@ def model_files(folder: Path) -> ModelFiles:
                 raise _damaged(path, f"{count} records that its head names cannot be in it")
         for stem in ("images", "points3D"):
             _check_records(folder / f"{stem}.bin")
+    else:
+        _check_points(folder / "points3D.txt")
     return ModelFiles(folder, suffix, _siblings(folder))
 
 
@@ -108,6 +110,17 @@ def _check_records(path: Path) -> None:
         offset = -1
     if offset != len(data):
         raise _damaged(path, "its records take another number")
+
+
+def _check_points(path: Path) -> None:
+    """Refuse a line of points3D.txt that lacks a number: pycolmap would read the rest shifted."""
+    for at, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        words = 0 if line.startswith("#") else len(line.split())
+        if words and (words < 8 or words % 2):
+            raise ProjectError(
+                f"{path}, line {at}: {words} values; expected id, x, y, z, r, g, b, error and pairs "
+                "of image and feature; export the model again"
+            )
 
 
 def _damaged(path: Path, reason: str) -> ProjectError:
@@ -163,6 +176,12 @@ def text_names(folder: Path) -> dict[int, str]:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise ProjectError(f"{path}: no text in UTF-8 ({error.reason})") from None
-    # An image has two lines, the second of which may be empty.
-    images = [line.split(maxsplit=9) for line in lines if not line.startswith("#")][::2]
-    return {int(row[0]): row[9].strip() for row in images if len(row) == 10 and row[0].isdecimal()}
+    # An image has two lines, the second of which may be empty; empty ones before it do not count.
+    names, rest = {}, iter(lines)
+    for line in rest:
+        if line.strip() and not line.startswith("#"):
+            row = line.split(maxsplit=9)
+            if len(row) == 10 and row[0].isdecimal():
+                names[int(row[0])] = row[9].strip()
+            next(rest, None)
+    return names

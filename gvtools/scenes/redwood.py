@@ -92,12 +92,20 @@ def read_log(path: Path) -> tuple[list[int], list[Float64]]:
         ProjectError: unreadable, or not of that form.
     """
     try:
-        values = np.array(path.read_text(encoding="utf-8").split(), np.float64).reshape(-1, 19)
+        rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+        rows = [row for row in rows if row]
+        for at, row in enumerate(rows):
+            if len(row) != (3 if at % 5 == 0 else 4):
+                raise ValueError(f"line {at + 1} that is not empty has {len(row)} numbers")
+        if len(rows) % 5:
+            raise ValueError("the last block is not whole")
+        numbers = [int(row[0]) for row in rows[::5]]
+        matrices = np.array([row for at, row in enumerate(rows) if at % 5], np.float64)
     except (OSError, ValueError) as error:
         raise ProjectError(
             f"{path}: {error}; expected blocks of three integers and four lines of four numbers"
         ) from None
-    return [int(number) for number in values[:, 0]], list(values[:, 3:].reshape(-1, 4, 4))
+    return numbers, list(matrices.reshape(-1, 4, 4))
 
 
 def pair_by_name(colors: list[Path], depths: list[Path]) -> dict[Path, Path]:

@@ -20,6 +20,9 @@ from gvtools.scenes.images import read_header
 PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
+# Keys that each frame has for itself.
+OF_A_FRAME = ("transform_matrix", "mask_path", "depth_file_path")
+
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]
 Pixels = Annotated[Number, Field(ge=1, le=1_000_000, multiple_of=1)]
@@ -116,16 +119,20 @@ class FrameKeys(BaseModel):
         return x, x
 
 
-def frame_keys(values: Mapping[str, Any], *, what: str) -> FrameKeys:
+def frame_keys(frame: Mapping[str, Any], shared: Mapping[str, Any], *, what: str) -> FrameKeys:
     """A frame's keys, checked.
 
     Args:
-        values: the frame's own over the file's.
+        frame: its own.
+        shared: the file's, of which those of the camera stand in for absent ones of the frame.
         what: where they were read, for the message.
 
     Raises:
         ProjectError: a key with a wrong value.
     """
+    values = {key: shared[key] for key in shared if key not in OF_A_FRAME} | dict(frame)
+    if "fl_x" in values or "fl_y" in values:
+        values.pop("camera_angle_x", None)  # not looked at
     try:
         return FrameKeys.model_validate(values)
     except ValidationError as error:

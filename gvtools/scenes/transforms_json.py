@@ -109,7 +109,7 @@ def _photographs(
         if not os.path.isfile(file):
             absent.append(name)
             continue
-        keys = frame_keys({**data, **frame}, what=what)
+        keys = frame_keys(frame, data, what=what)
         pose, defect = rigid_transform(_matrix(keys.transform_matrix, what), what=what)
         defects.append(defect)
         params = keys.lens(file, what=what)
@@ -224,7 +224,7 @@ def _matrix(value: Any, what: str) -> np.ndarray:
         raise ProjectError(f"{what}: no transform_matrix; expected a 4x4 pose")
     try:
         return np.array(value, np.float64)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers") from None
 
 

@@ -119,8 +119,8 @@ def config_from(args: argparse.Namespace) -> RunSettings:
     config, profile = RunSettings(), args.profile
     texts = []
     for text in args.set:
-        key, _, value = text.partition("=")
-        if key.strip() == "profile":
+        key, equals, value = text.partition("=")
+        if key.strip() == "profile" and equals:
             profile = value.strip()
         else:
             texts.append(text)
