@@ -38,6 +38,7 @@ def draw_pareto(
     Returns:
         A figure with its own Agg canvas.
     """
+    from matplotlib.ticker import LogLocator
 
     def panel(axes: Axes, key: str) -> None:
         label, unit = AXES[key]
@@ -69,6 +70,9 @@ def draw_pareto(
             axes.axvline(values[-1], color=RED, linestyle="--", label=f"budget {values[-1]:g}")
         if max(values) > LOGARITHMIC * min(values) > 0:
             axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            axes.minorticks_off()
         axes.grid(alpha=0.3)
         axes.set_xlabel(label)
         axes.set_ylabel("PSNR, dB, whole pictures")
