@@ -124,8 +124,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 
 def _views(written: Written) -> str:
-    renamed = f", {written.renamed} of them renamed as other cameras have their names"
-    return f"{written.views} views ({written.generated} generated{renamed * bool(written.renamed)})"
+    return f"{written.views} views ({written.generated} generated)"
 
 
 def _ply(memory: SpatialMemory, path: Path, limit: int | None, *, console: Console) -> None:

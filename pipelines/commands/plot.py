@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from pipelines.console import Console
 
-SUMMARY = "draw one figure of a run, a sweep or a training"
+SUMMARY = "draw one figure of a run or a training"
 EXAMPLES = (
     "gvtools plot trajectories runs/kitchen --out kitchen.svg",
     "gvtools plot losses training/tiny --out losses.png",
@@ -23,7 +23,6 @@ KINDS = {
     "coverage": "of a run: coverage against round",
     "timing": "of a run: time by stage and by round",
     "trajectories": "of a run: given, requested and estimated cameras",
-    "pareto": "of a sweep, or of a run in one: accuracy against time and memory",
     "losses": "of a training, or of one stage's folder: loss curves",
 }
 FORMATS = ("png", "svg", "pdf")
@@ -36,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "what", choices=tuple(KINDS), help="; ".join(f"{k}: {said}" for k, said in KINDS.items())
     )
-    parser.add_argument("folder", type=Path, metavar="DIR", help="of the run, sweep or training")
+    parser.add_argument("folder", type=Path, metavar="DIR", help="of the run or training")
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help=f"ends with {ENDINGS}"
     )
@@ -65,17 +64,6 @@ def _figure(what: str, folder: Path) -> Figure:
         from viz.plots.losses import draw_losses
 
         return draw_losses(read_training(folder), title=title)
-    if what == "pareto":
-        from pipelines.report.data import read_sweep
-        from viz.plots.pareto import draw_pareto
-
-        sweep = read_sweep(folder)
-        if sweep is None:
-            raise ProjectError(
-                f"{folder}: holds no tradeoff.json, nor do the folders above; expected the folder "
-                "of a sweep; gvtools tradeoff makes one"
-            )
-        return draw_pareto(sweep, title=title)
     from gvtools.runs.run import load_run
 
     run = load_run(folder)

@@ -20,6 +20,7 @@ EXAMPLES = (
     "gvtools tradeoff scan/ --out runs/tradeoff --budget 60",
     "gvtools tradeoff colmap/ --out runs/small --budget 200MB --targets every:8+4",
 )
+SPLIT = {"context": "every:2", "targets": "every:2+1"}
 UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 BYTES = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2.0**10, "mib": 2.0**20, "gib": 2.0**30}
 
@@ -36,13 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of a run: seconds (60, 5m, 2h) or bytes of memory (200MB, 1GiB); default: none",
     )
     parser.add_argument(
-        "--context", default="every:2", metavar="SPEC", help="views that are given (%(default)s)"
+        "--context", metavar="SPEC", help=f"views that are given ({SPLIT['context']})"
     )
     parser.add_argument(
         "--targets",
-        default="every:2+1",
         metavar="SPEC",
-        help="views that are held out and completed (%(default)s)",
+        help=f"views that are held out and completed ({SPLIT['targets']})",
     )
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings to start from")
     parser.add_argument(
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
     if args.out.exists() and not args.out.is_dir():
         raise OptionError(f"--out {args.out}: is a file; give a folder")
-    kind, budget = parse_budget(args.budget)
+    budget = parse_budget(args.budget)
     limit_kind, limit = parse_budget(args.limit)
     if limit_kind != "seconds" or limit is None:
         raise OptionError(f"--limit {args.limit}; expected a time, such as 900 or 15m")
@@ -89,16 +89,13 @@ def run(args: argparse.Namespace, console: Console) -> None:
         folder = args.out / "trials"
         folder.mkdir(exist_ok=True)
         trials = Trials(scene, config, names, folder=folder, identity=identity)
-        sweep = Sweep(
-            search_axes(plan), trials.outcome, longest_side(plan), limit, console.line, trials.kept
-        )
+        sweep = Sweep(search_axes(plan), trials, longest_side(plan), limit=limit, say=console.line)
         sweep.run({name: changes(config, asked_for(args, name)) for name in config.profiles})
         chosen = write_results(
             sweep,
             args.out,
             title=f"{scene.root.name}: {len(names)} held-out views",
-            identity=identity,
-            budget=(kind, budget),
+            budget=budget,
             console=console,
         )
         file = args.out / "profile.json"
@@ -106,7 +103,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             file.unlink(missing_ok=True)
             return
         # Everything but which views are given and which are completed.
-        changed = changes(RunSettings(), applied(config, chosen.outcome.settings))
+        changed = changes(RunSettings(), applied(config, chosen.settings))
         write_json(file, {k: changed[k] for k in changed if k not in ("context", "targets")})
         console.line(f"gvtools reconstruct ... --config {file}; more results in {args.out}")
 
@@ -125,8 +122,8 @@ def _planned(args: argparse.Namespace, config: RunSettings, console: Console) ->
     plan = make_plan(scene, config, say=console.line)
     if any(view is None for view in plan.targets.truth) or plan.targets.project is not None:
         raise OptionError(
-            f"--targets {args.targets}: no views of the project; expected a selection of them, "
-            "since a trial is measured against their pictures"
+            f"targets {config.targets}: no views of the project; expected a selection of them, "
+            "since a trial is measured against their photographs"
         )
     return scene, plan
 
@@ -136,7 +133,7 @@ def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunSettin
 
     A profile finds its own voxel edge, unless one is given.
     """
-    from gvtools.settings import with_file, with_profile, with_texts
+    from gvtools.settings import changes, with_file, with_profile, with_texts
     from pipelines.reconstruction.settings import RunSettings
 
     config = RunSettings()
@@ -147,7 +144,10 @@ def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunSettin
     named = [text for text in args.set if text.partition("=")[0].strip() == "profile"]
     texts = args.set if profile is None else [text for text in args.set if text not in named]
     config = with_texts(config, texts)
-    return config.replaced(context=args.context, targets=args.targets)
+    split = {**SPLIT, **changes(RunSettings(), config)}
+    return config.replaced(
+        context=args.context or split["context"], targets=args.targets or split["targets"]
+    )
 
 
 def parse_budget(text: str | None) -> tuple[str, float | None]:

@@ -1,7 +1,8 @@
 """The cameras of a memory, with points or without, for COLMAP's and nerfstudio's readers.
 
-Pictures stay where they are. Which of the views a completer made stands in ``generated.txt`` beside
-a model's files, one name a line and, where a run has it, the path of the picture; in a
+Pictures stay where they are. Views that a completer made are named ``generated/NAME``, and stand in
+``generated.txt`` beside a model's files, one a line and, where a run has it, the path of the
+picture; in a
 ``transforms.json`` their frames have the key ``generated``. By the list, or by the key
 ``exported_by``, an export is known, so that nothing else is ever written over.
 """
@@ -39,7 +40,6 @@ class Written:
     Attributes:
         views: cameras.
         generated: how many of them a completer made.
-        renamed: how many of those have a new name, since another camera has theirs.
         points: 3D points.
         elements: track elements: which view saw which point, and where.
         edge: voxel edge that the points were thinned to, scene units; 0 without points.
@@ -47,7 +47,6 @@ class Written:
 
     views: int
     generated: int
-    renamed: int = 0
     points: int = 0
     elements: int = 0
     edge: float = 0.0
@@ -62,13 +61,11 @@ class DistinctCameras:
         row_of_view: (views of the memory,) int64, which of the cameras each view has.
         generated: names of those that a completer alone saw through, in order, with the pictures
             that the run kept.
-        renamed: how many do not have the name that the memory knows them by.
     """
 
     cameras: Cameras
     row_of_view: NDArray[np.int64]
     generated: dict[str, Path | None]
-    renamed: int
 
 
 def write_colmap_export(
@@ -112,7 +109,6 @@ def write_colmap_export(
     return Written(
         views=len(distinct.cameras),
         generated=len(distinct.generated),
-        renamed=distinct.renamed,
         points=len(kept.rows),
         elements=len(point),
         edge=kept.edge,
@@ -141,7 +137,7 @@ def write_transforms_export(
         made = distinct.generated.get(name)
         paths.append(Path(images) / name if made is None else made)
     write_transforms(file, distinct.cameras, image_paths=paths, generated=distinct.generated.keys())
-    return Written(len(distinct.cameras), len(distinct.generated), distinct.renamed)
+    return Written(len(distinct.cameras), len(distinct.generated))
 
 
 def transforms_file(path: Path) -> Path:
@@ -177,8 +173,8 @@ def foreign_transforms(path: Path) -> Path | None:
 def distinct_cameras(memory: SpatialMemory, run: Path) -> DistinctCameras:
     """Each camera once, as formats of other tools need it, each with a unique name.
 
-    A view may be fused twice. Observed cameras keep their names. A generated one whose name another
-    camera has, also in other case, becomes ``generated/NAME``, ``generated_2/NAME`` and so on.
+    A view may be fused twice. Observed cameras keep their names; generated ones are named
+    ``generated/NAME``, or ``generated_2/NAME`` and so on where another has that in any case.
 
     Args:
         memory: with at least one view.
@@ -190,7 +186,6 @@ def distinct_cameras(memory: SpatialMemory, run: Path) -> DistinctCameras:
     cameras, made = memory.views.cameras, memory.views.generated
     if cameras is None:
         raise ProjectError("the memory has no views; nothing to export")
-    reserved = {name.lower() for name in cameras.names}  # no new name takes one of these
     first: list[int] = []  # for each camera kept the first view that has it
     names: list[str] = []
     rows_of_name: dict[str, list[int]] = {}
@@ -209,25 +204,23 @@ def distinct_cameras(memory: SpatialMemory, run: Path) -> DistinctCameras:
                 f"two different observed cameras of the memory are named {name!r}; formats of "
                 "other tools need unique names; rename one in the project and run again"
             )
-        if made[i] and name.lower() in used:
-            name = next(new for new in _new_names(name) if new.lower() not in reserved)
-            reserved.add(name.lower())
+        if made[i]:
+            name = next(new for new in _generated_names(name) if new.lower() not in used)
         alike.append(row)
         first.append(i)
         names.append(name)
         used.add(name.lower())
     kept = cameras[first]
-    renamed = sum(new != old for new, old in zip(names, kept.names, strict=True))
     kept = Cameras(kept.K, kept.cam_from_world, kept.width, kept.height, tuple(names))
     pictures: dict[str, Path | None] = {}
     for i, row in enumerate(row_of_view.tolist()):
         if made[first[row]]:
             # Of several rounds' pictures the last.
             pictures[names[row]] = _picture(memory, i, run) or pictures.get(names[row])
-    return DistinctCameras(kept, row_of_view, pictures, renamed)
+    return DistinctCameras(kept, row_of_view, pictures)
 
 
-def _new_names(name: str) -> Iterator[str]:
+def _generated_names(name: str) -> Iterator[str]:
     yield f"generated/{name}"
     yield from (f"generated_{number}/{name}" for number in count(2))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,11 +18,8 @@ from viz.report.content import RunReport
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene, View
-    from viz.plots.pareto import TradeOff
 
 PICTURES = 12
-# A sweep keeps its trials two folders below itself.
-ABOVE = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +70,6 @@ def collect(
     psnr = {view["name"]: view.get("psnr") for view in measures.views}
     scene, truths = sources.scene, sources.truths
     sheets = contact_sheets(run, psnr=psnr, most=most, scene=scene, truths=truths)
-    trade_off, unread = _trade_off(path, record)
     settings = dotted(run.settings)
     return RunReport(
         title=f"{path.resolve().name}: a run of gvtools",
@@ -87,53 +82,11 @@ def collect(
             *([] if sources.problem is None else [f"no photographs: {sources.problem}"]),
             *measures.warnings,
             *sheets.warnings,
-            *unread,
         ],
         measures=measures,
         sheets=sheets,
         poses=report_poses(reports, scene, record["context"], found=measures.poses),
-        trade_off=trade_off,
     )
-
-
-def read_sweep(path: Path, *, of: Mapping[str, Any] | None = None) -> TradeOff | None:
-    """The trade-off in a folder or one above it, such as that of a trial's run; None without one.
-
-    For a run it may stand beside the run's folder as well, of several there the last written, and
-    has to be of the run's project.
-
-    Args:
-        path: the folder.
-        of: the run's record; None takes any project's.
-
-    Raises:
-        ProjectError: one in the folder or above cannot be read.
-    """
-    from pipelines.tradeoff.results import FILE, read_trade_off
-
-    folder = path.resolve()
-    for candidate in (folder, *folder.parents)[:ABOVE]:
-        if (candidate / FILE).is_file():
-            found = read_trade_off(candidate / FILE, of=of)
-            if found is not None:
-                return found
-    if of is None:
-        return None
-    beside = sorted(folder.parent.glob(f"*/{FILE}"), key=lambda file: file.stat().st_mtime_ns)
-    for file in reversed(beside):
-        # What cannot be read there is no more this run's than anybody's.
-        with suppress(ProjectError):
-            found = read_trade_off(file, of=of)
-            if found is not None:
-                return found
-    return None
-
-
-def _trade_off(path: Path, record: Mapping[str, Any]) -> tuple[TradeOff | None, list[str]]:
-    try:
-        return read_sweep(path, of=record), []
-    except ProjectError as error:
-        return None, [str(error)]
 
 
 def _facts(run: Run) -> list[tuple[str, str]]:

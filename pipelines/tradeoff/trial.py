@@ -7,13 +7,14 @@ import json
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+import gvtools
 from gvtools.errors import GvError
 from gvtools.evaluation.view_figures import view_figures
 from gvtools.files import write_json
@@ -28,32 +29,32 @@ from pipelines.reconstruction.settings import RunSettings
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class Trial:
     """What a run with some settings takes and gives.
 
     Attributes:
+        label: "start", "profile NAME", or the setting that it changes.
         settings: by which it differs from the start.
         seconds: of the run.
         bytes: of the memory at the end.
         observations: stored at the end.
         psnr: mean over the targets, dB, whole pictures at their full size.
+        ssim: likewise.
         psnr_valid: of pixels that observations support, dB.
         psnr_generated: of generated pixels, dB.
-        ssim: mean over the targets, whole pictures at their full size.
         depth_rel: median relative depth error where the depth is known.
-        coverage: share of the pictures that observations support.
     """
 
+    label: str
     settings: dict[str, Any]
     seconds: float
     bytes: float
     observations: int
     psnr: float
-    psnr_valid: float | None
-    psnr_generated: float | None
-    ssim: float | None
-    depth_rel: float | None
-    coverage: float | None
+    ssim: float | None = None
+    psnr_valid: float | None = None
+    psnr_generated: float | None = None
+    depth_rel: float | None = None
 
 
 def applied(config: RunSettings, settings: Mapping[str, Any]) -> RunSettings:
@@ -80,7 +81,7 @@ class Trials:
         scene: the project.
         config: of the start; its voxel edge is set.
         names: of the target views, held out.
-        folder: where outcomes are kept, one JSON file each.
+        folder: where trials are kept, one JSON file each.
         identity: of the start, see ``run_identity``: other pictures, masks, weights or units are
             other trials.
     """
@@ -98,38 +99,34 @@ class Trials:
         self.identity = identity
         self._warm = False
 
-    def outcome(self, settings: Mapping[str, Any]) -> Outcome:
-        """The run with these settings.
+    def make(self, label: str, settings: Mapping[str, Any]) -> Trial:
+        """Run with these settings.
 
         Raises:
             GvError: the run is refused.
         """
-        kept = self.kept(settings)
-        if kept is not None:
-            return kept
         if not self._warm:
             # Kernels are compiled and files are cached once.
             self._warm = True
-            self._run({}, self.names[:1])
-        outcome = self._run(settings, self.names)
-        write_json(self._file(settings), asdict(outcome))
-        return outcome
+            self._run(label, {}, self.names[:1])
+        trial = self._run(label, settings, self.names)
+        write_json(self._file(settings), asdict(trial))
+        return trial
 
-    def kept(self, settings: Mapping[str, Any]) -> Outcome | None:
+    def kept(self, label: str, settings: Mapping[str, Any]) -> Trial | None:
         """What this trial gave before; None if it was not made, or its file is damaged."""
         try:
-            return Outcome(**json.loads(self._file(settings).read_text(encoding="utf-8")))
+            trial = Trial(**json.loads(self._file(settings).read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
             return None
+        return replace(trial, label=label)
 
     def _file(self, settings: Mapping[str, Any]) -> Path:
-        import gvtools
-
         parts = [self.identity, dict(settings), self.names, gvtools.__version__]
         text = json.dumps(parts, sort_keys=True, default=str)
         return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
 
-    def _run(self, settings: Mapping[str, Any], names: Sequence[str]) -> Outcome:
+    def _run(self, label: str, settings: Mapping[str, Any], names: Sequence[str]) -> Trial:
         config = applied(self.config, settings).replaced(targets=",".join(names))
         out = self.folder / "running"
         shutil.rmtree(out, ignore_errors=True)
@@ -149,17 +146,17 @@ class Trials:
         psnr = mean_of(figures, "psnr")
         if psnr is None:
             raise GvError("no target has a true picture to compare with; hold views out")
-        return Outcome(
+        return Trial(
+            label=label,
             settings=dict(settings),
             seconds=seconds,
             bytes=float(reports[-1]["bytes"]),
             observations=int(reports[-1]["points"]),
             psnr=psnr,
+            ssim=mean_of(figures, "ssim"),
             psnr_valid=mean_of(figures, "psnr_valid"),
             psnr_generated=mean_of(figures, "psnr_generated"),
-            ssim=mean_of(figures, "ssim"),
             depth_rel=mean_of(figures, "depth_rel_valid"),
-            coverage=mean_of(figures, "coverage"),
         )
 
 
@@ -176,7 +173,4 @@ def _figures(target: TargetFiles, scene: Scene) -> dict[str, Any]:
             np.asarray(Image.fromarray(values).resize(size, Image.Resampling.NEAREST))
             for values in (depth, observed, generated)
         )
-    figures: dict[str, Any] = view_figures(
-        picture, truth, observed=observed, generated=generated, depth=depth
-    )
-    return {**figures, "coverage": float(observed.mean())}
+    return view_figures(picture, truth, observed=observed, generated=generated, depth=depth)

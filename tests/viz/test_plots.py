@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from pipelines.cli import main
 from viz.plots.canvas import png
 from viz.plots.growth import draw_growth
 from viz.plots.losses import draw_losses, loss_names, running_median
-from viz.plots.pareto import TradeOff, draw_pareto
+from viz.plots.pareto import draw_pareto
 from viz.plots.quality import draw_quality
 from viz.plots.timing import draw_timing, stage_seconds
 from viz.plots.trajectories import Trajectories, draw_trajectories, principal_axes
@@ -170,18 +171,19 @@ def test_quality_draws_each_target_and_the_means():
 
 
 def test_a_front_over_time_and_memory():
-    trials = [{"label": "start", "kind": "start", "seconds": 2.0, "bytes": 2.0**20, "psnr": 20.0}]
-    seconds: Any
-    seconds, size = draw_pareto(TradeOff("", trials, trials, None, 5.0)).axes
-    np.testing.assert_allclose(points(seconds, "start"), [[2, 20]])
-    np.testing.assert_allclose(points(size, "start"), [[1, 20]])
+    def trial(label: str, seconds: float) -> SimpleNamespace:
+        return SimpleNamespace(label=label, seconds=seconds, bytes=2.0**20, psnr=20.0)
+
+    trials = [trial("start", 2.0), trial("profile fast", 7.0)]
+    figure: Any = draw_pareto(trials, front=trials[:1], chosen=trials[0], budget=("bytes", 2.0**21))
+    seconds, size = figure.axes
+    xy = {line.get_label(): line.get_xydata().tolist() for line in seconds.lines}
+    assert xy == {"trial": [[2, 20]], "profile": [[7, 20]], "front": [[2, 20]],
+                  "recommended": [[2, 20]]}  # fmt: skip
+    assert size.lines[0].get_xydata().tolist() == [[1, 20]]
+    assert size.lines[-1].get_label() == "budget 2"
     assert [size.get_xlabel(), size.get_ylabel()] == ["memory, MiB", "PSNR, dB, whole pictures"]
-    assert [seconds.get_xscale(), size.get_xscale()] == ["linear", "linear"]
-    trials.append({**trials[0], "seconds": 7.0, "kind": "trial"})
-    found = TradeOff("", trials, trials[:1], trials[0], None)
-    assert [axes.get_xscale() for axes in draw_pareto(found).axes] == ["log", "linear"]
-    with pytest.raises(OptionError, match="without trials"):
-        draw_pareto(TradeOff("", [], [], None, None))
+    assert [seconds.get_xscale(), size.get_xscale()] == ["log", "linear"]
 
 
 def test_a_panel_that_is_not_there():
@@ -211,7 +213,6 @@ def test_losses_of_a_training_and_of_one_stage(tmp_path):
 def test_what_cannot_be_drawn_is_refused(small_run, tmp_path, capsys):
     out = tmp_path / "f.png"
     assert "log.jsonl" in refused(capsys, "plot", "losses", tmp_path, "--out", out)
-    assert "tradeoff.json" in refused(capsys, "plot", "pareto", small_run, "--out", out)
     assert "run.json" in refused(capsys, "plot", "growth", tmp_path, "--out", out)
     assert ".svg" in refused(capsys, "plot", "growth", small_run, "--out", tmp_path / "f.bmp")
     assert not list(tmp_path.iterdir())

@@ -17,7 +17,7 @@ from gvtools.scenes.project import open_project
 from pipelines.cli import main
 from pipelines.reconstruction.plan import make_plan
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.report.data import collect, read_sweep
+from pipelines.report.data import collect
 from pipelines.report.sheets import chosen_targets
 from pipelines.report.write import write_report
 from viz.report.contact_sheet import TargetPictures, contact_row
@@ -239,37 +239,6 @@ def test_what_is_no_run_is_refused(own, tmp_path, capsys):
     shutil.rmtree(own / "round_000")
     assert "no round is done" in refused(capsys, "report", own, "--out", tmp_path / "a.html")
     assert not (tmp_path / "a.html").exists()
-
-
-def test_a_sweep_beside_the_run_is_drawn(own):
-    outcome = {
-        "label": "start", "settings": {}, "seconds": 3.0, "bytes": 1e6, "observations": 10,
-        "psnr": 20.0,
-    }  # fmt: skip
-    better = {**outcome, "label": "profile fast", "psnr": 25.0, "seconds": 9.0}
-    worse = {**outcome, "label": "voxel 2", "psnr": 19.0, "seconds": 13.0}
-    record = json.loads((own / "run.json").read_text())
-    sweep = {"project": record["project"], "reading": record["reading"],
-             "budget": 60, "budget_of": "seconds", "trials": [outcome, better, worse],
-             "front": [outcome, better], "recommended": better}  # fmt: skip
-    # Beside the run, as README has it, and above it, as a trial has it.
-    beside = own.parent / "sweep"
-    beside.mkdir()
-    (beside / "tradeoff.json").write_text(json.dumps(sweep))
-    assert read_sweep(own, of=record) is not None
-    for key, other in (("project", "/elsewhere"), ("reading", {"depth_unit": 2})):
-        (beside / "tradeoff.json").write_text(json.dumps({**sweep, key: other}))
-        (own.parent / "tradeoff.json").write_text(json.dumps({**sweep, key: other}))
-        assert read_sweep(own, of=record) is None
-    (own.parent / "tradeoff.json").write_text(json.dumps(sweep))
-    found = collect(own).trade_off
-    assert found is not None
-    assert [point["kind"] for point in found.trials] == ["start", "profile", "trial"]
-    assert [point["seconds"] for point in found.front] == [3.0, 9.0]
-    assert found.budget == 60
-    assert "Trade-off" in written(own).said
-    (own.parent / "tradeoff.json").write_text("[]")
-    assert any("no trade-off of this version" in warning for warning in collect(own).warnings)
 
 
 def test_no_text_of_a_users_files_becomes_markup(own, tmp_path):

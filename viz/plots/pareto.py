@@ -2,142 +2,84 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from gvtools.errors import OptionError
-from viz.plots.canvas import chosen, figure_of
-from viz.plots.palette import BLACK, BLUE, GREY, ORANGE, RED
+from viz.plots.canvas import figure_of
+from viz.plots.palette import BLUE, GREY, ORANGE, RED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Trial = Mapping[str, Any]
-
-# Marks differ, not colours alone.
-STYLES: dict[str, Any] = {
-    "trial": {"color": GREY, "marker": "o"},
-    "profile": {"color": ORANGE, "marker": "^"},
-    "start": {"color": BLACK, "marker": "D"},
-}
 # The horizontal axis is logarithmic where the largest is more than so many times the smallest.
 LOGARITHMIC = 3
-SCALES = {"seconds": 1.0, "bytes": 2.0**20}
-LABELS = {"seconds": "seconds of a whole run", "bytes": "memory, MiB"}
-
-
-@dataclass(frozen=True)
-class TradeOff:
-    """What a sweep of settings came to.
-
-    Attributes:
-        source: the file that it was read from.
-        trials: on all targets, each with ``seconds``, ``bytes``, ``psnr``, ``label`` and ``kind``
-            (of STYLES).
-        front: those that no other beats in both time and PSNR, fastest first.
-        recommended: the chosen one; None where none is within the budget.
-        budget: seconds; None without one.
-    """
-
-    source: str
-    trials: Sequence[Trial]
-    front: Sequence[Trial]
-    recommended: Trial | None
-    budget: float | None
+AXES = {"seconds": ("seconds of a whole run", 1.0), "bytes": ("memory, MiB", 2.0**20)}
 
 
 def draw_pareto(
-    found: TradeOff, *, title: str | None = None, panels: Sequence[str] | None = None
+    trials: Sequence[Any],
+    *,
+    front: Sequence[Any],
+    chosen: Any | None,
+    budget: tuple[str, float | None],
+    title: str | None = None,
 ) -> Figure:
     """PSNR over seconds of a run and over the memory's size, logarithmic where they spread.
 
     Args:
-        found: what a sweep came to.
+        trials: at least one, each with ``label``, ``seconds``, ``bytes`` and ``psnr``.
+        front: those that no other beats in both time and PSNR, fastest first.
+        chosen: the recommended one; None where none is within the budget.
+        budget: "seconds" or "bytes", and how many; None for no limit.
         title: of the scene.
-        panels: of "seconds" and "bytes"; None is both.
 
     Returns:
         A figure with its own Agg canvas.
-
-    Raises:
-        OptionError: no trials, or no such panel.
     """
-    if not found.trials:
-        raise OptionError("a trade-off without trials; expected one at least")
+    from matplotlib.ticker import LogLocator
 
     def panel(axes: Axes, key: str) -> None:
-        _points(axes, key, found.trials, recommended=found.recommended)
-        limit: list[float] = []
-        if key == "seconds":
-            _front(axes, found)
-            limit = [] if found.budget is None else [found.budget]
-        _spread(axes, [*(trial[key] for trial in found.trials), *limit])
-        axes.legend(fontsize="small", loc="lower right")
+        label, unit = AXES[key]
 
-    known = {key: partial(panel, key=key) for key in SCALES}
-    return figure_of(chosen(known, panels), title=title)
+        def mark(some: Sequence[Any], name: str, style: dict[str, Any]) -> None:
+            x, y = [getattr(trial, key) / unit for trial in some], [trial.psnr for trial in some]
+            axes.plot(x, y, label=name, **style)
 
-
-def _points(axes: Axes, key: str, trials: Sequence[Trial], *, recommended: Trial | None) -> None:
-    scale = SCALES[key]
-    for kind, style in STYLES.items():
-        of_kind = [trial for trial in trials if trial["kind"] == kind]
-        if of_kind:
-            axes.scatter(
-                [trial[key] / scale for trial in of_kind],
-                [trial["psnr"] for trial in of_kind],
-                label=kind,
-                s=36,
-                zorder=3,
-                **style,
-            )
-    for trial in trials:
-        if trial["kind"] == "profile" and key == "seconds":
+        profiles = [trial for trial in trials if trial.label.startswith("profile ")]
+        # Marks differ, not colours alone.
+        mark([t for t in trials if t not in profiles], "trial", _marks("o", GREY))
+        mark(profiles, "profile", _marks("^", ORANGE))
+        for trial in profiles if key == "seconds" else ():
             axes.annotate(
-                str(trial["label"]).removeprefix("profile "),
-                (trial[key] / scale, trial["psnr"]),
+                trial.label.removeprefix("profile "),
+                (trial.seconds, trial.psnr),
                 xytext=(6, -3),
                 textcoords="offset points",
                 fontsize="small",
                 parse_math=False,
             )
-    if recommended is not None:
-        axes.scatter(
-            [recommended[key] / scale],
-            [recommended["psnr"]],
-            s=180,
-            facecolors="none",
-            edgecolors=RED,
-            linewidths=2,
-            zorder=4,
-            label="recommended",
-        )
-    axes.grid(alpha=0.3)
-    axes.set_xlabel(LABELS[key])
-    axes.set_ylabel("PSNR, dB, whole pictures")
+        if key == "seconds":
+            mark(front, "front", {"color": BLUE, "drawstyle": "steps-post", "zorder": 1.5})
+        if chosen is not None:
+            mark([chosen], "recommended", _marks("o", RED, fillstyle="none", markersize=13))
+        values = [getattr(trial, key) / unit for trial in trials]
+        if budget[0] == key and budget[1] is not None:
+            values.append(budget[1] / unit)
+            axes.axvline(values[-1], color=RED, linestyle="--", label=f"budget {values[-1]:g}")
+        if max(values) > LOGARITHMIC * min(values) > 0:
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            axes.minorticks_off()
+        axes.grid(alpha=0.3)
+        axes.set_xlabel(label)
+        axes.set_ylabel("PSNR, dB, whole pictures")
+        axes.legend(fontsize="small", loc="lower right")
+
+    return figure_of([partial(panel, key=key) for key in AXES], title=title)
 
 
-def _spread(axes: Axes, values: Sequence[float]) -> None:
-    from matplotlib.ticker import LogLocator
-
-    if max(values) > LOGARITHMIC * min(values) > 0:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.minorticks_off()
-
-
-def _front(axes: Axes, found: TradeOff) -> None:
-    axes.step(
-        [trial["seconds"] for trial in found.front],
-        [trial["psnr"] for trial in found.front],
-        where="post",
-        color=BLUE,
-        zorder=2,
-        label="front",
-    )
-    if found.budget is not None:
-        axes.axvline(found.budget, color=RED, linestyle="--", label=f"budget {found.budget:g} s")
+def _marks(marker: str, color: str, **more: Any) -> dict[str, Any]:
+    return {"linestyle": "none", "marker": marker, "color": color, **more}

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from viz.plots.canvas import Rounds
-from viz.plots.pareto import TradeOff
 from viz.plots.trajectories import Trajectories
 from viz.report.contact_sheet import Tile
 
@@ -87,7 +86,6 @@ class RunReport:
         measures: figures of the targets.
         sheets: pictures of the targets.
         poses: cameras, and errors of estimated ones.
-        trade_off: where a sweep was made.
     """
 
     title: str
@@ -99,4 +97,3 @@ class RunReport:
     measures: Measures
     sheets: Sheets
     poses: Poses
-    trade_off: TradeOff | None = None

@@ -27,7 +27,6 @@ def report_html(report: RunReport) -> str:
         "pictures": ("Pictures", sections.pictures(report)),
         "trajectories": ("Trajectories", sections.trajectories(report)),
         "time": ("Time", sections.time(report)),
-        "trade-off": ("Trade-off", sections.trade_off(report)),
         "settings": ("Settings", sections.settings(report)),
     }
     shown = {name: part for name, part in parts.items() if part[1]}

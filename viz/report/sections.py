@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from viz.plots.canvas import png
 from viz.plots.growth import draw_growth
-from viz.plots.pareto import draw_pareto
 from viz.plots.quality import draw_quality, is_measured
 from viz.plots.timing import draw_timing
 from viz.plots.trajectories import draw_trajectories
@@ -163,21 +162,6 @@ def time(report: RunReport) -> str:
         for name, over in (("stages", "whole run"), ("rounds", "each round"))
     ]
     return _plots(drawn)
-
-
-def trade_off(report: RunReport) -> str:
-    """Accuracy against time and memory; nothing without a sweep."""
-    found = report.trade_off
-    if found is None:
-        return ""
-    drawn = [
-        _drawn(
-            draw_pareto(found, panels=[name]),
-            f"PSNR over {name}, trial by trial",
-        )
-        for name in ("seconds", "bytes")
-    ]
-    return paragraph(f"From {found.source}.") + _plots(drawn)
 
 
 def settings(report: RunReport) -> str:

@@ -113,7 +113,6 @@ class GeoVerse(GeoVerseNetworks):
         cfg_scale: float | None = None,
         temperature: float | None = None,
         video: VideoFeatures | None = None,
-        prior: bool = True,
         targets_alone: bool = False,
         clock: Clock = no_clock,
     ) -> Generated:
@@ -130,7 +129,6 @@ class GeoVerse(GeoVerseNetworks):
             cfg_scale: of classifier-free guidance; the configuration's by default.
             temperature: of level 1; the configuration's by default.
             video: features computed before, for the same views.
-            prior: see ``prepare``.
             targets_alone: without all views' geometry; the same pictures and depth, sooner.
             clock: receives the stages' names.
         """
@@ -139,7 +137,7 @@ class GeoVerse(GeoVerseNetworks):
         def seeds(draw: str) -> list[list[int]]:
             return [[view_seed(seed, draw, name) for name in row] for row in rows]
 
-        prepared = self.prepare(batch, seed=seeds("video"), video=video, prior=prior, clock=clock)
+        prepared = self.prepare(batch, seed=seeds("video"), video=video, clock=clock)
         like = prepared.hints.level1
 
         def noise(level: str) -> Tensor:

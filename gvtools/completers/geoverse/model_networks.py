@@ -97,7 +97,6 @@ class GeoVerseNetworks(nn.Module):
         *,
         seed: int | Sequence[Sequence[int]] = 0,
         video: VideoFeatures | None = None,
-        prior: bool = True,
         clock: Clock = no_clock,
     ) -> Prepared:
         """Everything that the denoising steps share, computed once.
@@ -107,7 +106,6 @@ class GeoVerseNetworks(nn.Module):
             seed: of the video prior's noise; one number, or B rows of V.
             video: features computed before, for the same views; taken from the attached prior
                 when None.
-            prior: False does without the video prior, as a model without one does.
             clock: receives the stages' names.
 
         Raises:
@@ -136,7 +134,7 @@ class GeoVerseNetworks(nn.Module):
             grid = (hints.level1.shape[-2], hints.level1.shape[-1])
             positions = Positions(config.level1, camera, grid)
             prepared = Prepared(batch, hints, conditions, positions)
-        if config.injection == "none" or not prior:
+        if config.injection == "none":
             return prepared
         with clock(stages.VIDEO):
             features = self._video_features(source, seed) if video is None else video

@@ -76,7 +76,7 @@ def test_generated_views_give_way_to_names_that_are_taken(scene, tmp_path):
     for number, row, name in (
         (2, 1, "view_0.png"),  # another camera than the observed one
         (2, 3, "VIEW_2.png"),  # the same file where case is ignored
-        (2, 4, "generated/view_0.png"),  # the name that the first one would get
+        (2, 4, "other/view_0.png"),
         (2, 5, "own.png"),
         (3, 1, "view_0.png"),  # the first one's camera again
         (3, 4, "view_0.png"),
@@ -91,11 +91,11 @@ def test_generated_views_give_way_to_names_that_are_taken(scene, tmp_path):
     expected = {
         "view_0.png": 0,
         "view_2.png": 2,
-        "generated_2/view_0.png": 1,
+        "generated/view_0.png": 1,
         "generated/VIEW_2.png": 3,
-        "generated/view_0.png": 4,
-        "own.png": 5,
-        "generated_3/view_0.png": 4,
+        "generated/other/view_0.png": 4,
+        "generated/own.png": 5,
+        "generated_2/view_0.png": 4,
     }
     run(run_folder, "--format", "colmap", "--out", tmp_path / "out")
     poses, generated = exported(tmp_path / "out")
@@ -105,11 +105,11 @@ def test_generated_views_give_way_to_names_that_are_taken(scene, tmp_path):
     assert set(generated) == set(expected) - {"view_0.png", "view_2.png"}
     pictures = {name: path.removeprefix(f"{run_folder}/") for name, path in generated.items()}
     assert pictures == {
-        "generated_2/view_0.png": "round_003/generated_view_0.png",
+        "generated/view_0.png": "round_003/generated_view_0.png",
         "generated/VIEW_2.png": "",
-        "generated/view_0.png": "",
-        "own.png": "round_002/generated_own.png",
-        "generated_3/view_0.png": "round_003/generated_view_0.png",
+        "generated/other/view_0.png": "",
+        "generated/own.png": "round_002/generated_own.png",
+        "generated_2/view_0.png": "round_003/generated_view_0.png",
     }
 
 
@@ -125,17 +125,6 @@ def test_new_names_stand_in_transforms_too(scene, tmp_path):
         "images/view_2.png": False,
         "images/generated/view_0.png": True,
     }
-
-
-def test_renamed_views_are_counted(scene, tmp_path, capsys):
-    memory = fused(scene, [0, 2])
-    add_view(memory, scene.views[3].camera, "view_0.png", number=2, generated=True)
-    add_view(memory, scene.views[4].camera, "own.png", number=2, generated=True)
-    memory.save(tmp_path / "memory.npz")
-    for kind in ("colmap", "transforms"):
-        words = (tmp_path / "memory.npz", "--format", kind, "--out", tmp_path / kind)
-        export.run(parsed(*words), Console())
-        assert "4 views (2 generated, 1 of them renamed" in capsys.readouterr().out
 
 
 def test_track_elements_follow_the_renamed_views(scene, tmp_path):
@@ -202,7 +191,7 @@ def test_pictures_are_named_from_anywhere(saved, tmp_path, monkeypatch):
     Image.new("RGB", (96, 72)).save(picture)
     monkeypatch.chdir(tmp_path)
     run(saved.relative_to(tmp_path), "--format", "colmap", "--out", "out")
-    assert exported(tmp_path / "out")[1] == {"view_4.png": str(picture.resolve())}
+    assert exported(tmp_path / "out")[1] == {"generated/view_4.png": str(picture.resolve())}
 
 
 @pytest.mark.parametrize("stem", ["x/../../../secret", "link"])

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from gvtools.completers.base import create
 from gvtools.errors import GvError, OptionError, ProjectError
 from gvtools.settings import with_texts, with_values
 from pipelines.commands.tradeoff import parse_budget
@@ -16,7 +16,7 @@ from pipelines.reconstruction.plan import Plan
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.tradeoff.search_axes import SearchAxis, search_axes
 from pipelines.tradeoff.sweep import Sweep, pareto_front
-from pipelines.tradeoff.trial import Outcome, applied
+from pipelines.tradeoff.trial import Trial, applied
 
 SIDE = 100
 AXES = [
@@ -30,11 +30,14 @@ AXES = [
 class Runs:
     """Seconds multiply, decibels add; waste takes time and gives nothing."""
 
-    def __init__(self, refuse: object = None) -> None:
+    def __init__(self, *, refuse: object = None, earlier: Sequence[Trial] = ()) -> None:
         self.now = 0.0
-        self.refuse = refuse
+        self.refuse, self.earlier = refuse, earlier
 
-    def __call__(self, settings):
+    def kept(self, label, settings):
+        return next((trial for trial in self.earlier if trial.settings == settings), None)
+
+    def make(self, label, settings):
         edge, steps = settings.get("edge", 2), settings.get("steps", 1)
         if edge == self.refuse:
             raise OptionError("edge is refused")
@@ -42,16 +45,20 @@ class Runs:
         seconds = 8.0 / edge * (1.5 if steps == 3 else 1) * (1 + settings.get("waste", 5) / 5)
         seconds /= 1 + 3 * half
         self.now += seconds
-        return Outcome(
-            settings=dict(settings), seconds=seconds, bytes=1e6 / edge, observations=1000 // edge,
-            psnr=20 - np.log2(edge) + 0.7 * (steps == 3) + half, psnr_valid=None,
-            psnr_generated=None, ssim=0.5, depth_rel=None, coverage=None,
+        return Trial(
+            label=label, settings=dict(settings), seconds=seconds, bytes=1e6 / edge,
+            observations=1000 // edge, psnr=20 - np.log2(edge) + 0.7 * (steps == 3) + half,
+            ssim=0.5,
         )  # fmt: skip
 
 
-def swept(*, limit: float = 1e6, refuse: object = None) -> tuple[Sweep, Runs]:
-    runs = Runs(refuse)
-    sweep = Sweep(AXES, runs, SIDE, limit, say=lambda _: None, clock=lambda: runs.now)
+def sweep_of(runs: Any, *, limit: float = 1e6, clock: Any = lambda: 0.0) -> Sweep:
+    return Sweep(AXES, runs, SIDE, limit, say=lambda _: None, clock=clock)
+
+
+def swept(*, limit: float = 1e6, **options: Any) -> tuple[Sweep, Runs]:
+    runs = Runs(**options)
+    sweep = sweep_of(runs, limit=limit, clock=lambda: runs.now)
     sweep.run({"odd": {"edge": 3}, "balanced": {}})
     return sweep, runs
 
@@ -73,19 +80,15 @@ def test_the_most_accurate_trial_within_the_budget_is_recommended(kind, budget, 
     sweep, _ = swept()
     if budget == 3e5:
         sweep.trials = [t for t in sweep.trials if t.label != "profile odd"]
-    chosen = sweep.recommended(lambda outcome: getattr(outcome, kind) <= budget)
+    chosen = sweep.recommended((kind, budget))
     assert (chosen and chosen.label) == best
 
 
 def test_marginal_values_are_those_of_one_step_of_one_setting():
-    rows = {(row["setting"], row["from"]): row for row in swept()[0].marginal_values()}
-    halved = rows["edge", "2"]
-    assert halved["psnr"] == pytest.approx(1.0) and halved["time"] == pytest.approx(2.0)
-    assert halved["bytes"] == pytest.approx(2.0)
-    assert rows["steps", "1"]["psnr"] == pytest.approx(0.7)
-    assert rows["steps", "1"]["time"] == pytest.approx(1.5)
-    wasted = rows["waste", "0"]
-    assert wasted["psnr"] == pytest.approx(0.0) and wasted["time"] == pytest.approx(2.0)
+    rows = {(row.setting, row.before): row[3:] for row in swept()[0].steps()}
+    assert rows["edge", "2"] == pytest.approx((1, 0, 2, 2, 2))
+    assert rows["steps", "1"] == pytest.approx((0.7, 0, 1.5, 1, 1))
+    assert rows["waste", "0"] == pytest.approx((0, 0, 2, 1, 1))
 
 
 def test_the_limit_holds_and_what_was_left_out_is_named():
@@ -108,39 +111,34 @@ def test_the_front_holds_what_no_other_beats():
     front = pareto_front(trials)
     for trial in trials:
         beaten = any(
-            other.outcome.seconds <= trial.outcome.seconds
-            and other.outcome.psnr >= trial.outcome.psnr
+            other.seconds <= trial.seconds and other.psnr >= trial.psnr
             for other in trials
             if other is not trial
         )
         assert (trial in front) != beaten
-    assert sorted(front, key=lambda trial: trial.outcome.seconds) == front
+    assert sorted(front, key=lambda trial: trial.seconds) == front
 
 
 def test_an_earlier_sweeps_trials_take_no_time():
     whole, _ = swept()
-    given = {str(trial.outcome.settings): trial.outcome for trial in whole.trials}
-
-    def kept(settings):
-        return given.get(str(dict(settings)))
-
-    again = Sweep(AXES, kept, SIDE, 1e-9, say=lambda _: None, kept=kept, clock=lambda: 0.0)
-    again.run({"odd": {"edge": 3}})
-    assert again.trials == whole.trials and not again.left_out
+    again, runs = swept(limit=1e-9, earlier=whole.trials)
+    assert again.trials == whole.trials and not again.left_out and not runs.now
 
 
 def test_no_time_for_a_single_trial_is_said():
-    now = iter([0.0, 1.0])
     with pytest.raises(GvError, match="leaves no time"):
-        Sweep(AXES, Runs(), SIDE, 0.5, clock=lambda: next(now)).run({})
+        sweep_of(Runs(), limit=0.5, clock=iter([0.0, 1.0]).__next__).run({})
 
 
 def test_a_full_disk_is_no_fault_of_the_settings():
-    def run(settings):
+    runs = Runs()
+
+    def make(label, settings):
         raise ProjectError("cannot be written") from OSError("no space")
 
+    runs.make = make  # type: ignore[method-assign]
     with pytest.raises(ProjectError, match="cannot be written"):
-        Sweep(AXES, run, SIDE, 1e6).run({})
+        sweep_of(runs).run({})
 
 
 @pytest.mark.parametrize(
@@ -158,11 +156,11 @@ def test_a_budget_that_is_none_is_refused(text):
         parse_budget(text)
 
 
-def axes_of(source: str, config: RunSettings) -> dict[str, dict]:
+def axes_of(source: str, config: RunSettings, *, voxel: float = 0.01) -> dict[str, dict]:
     """The axes of a run whose depth comes from ``source``: values by name, by axis."""
     cameras = SimpleNamespace(width=np.array([640]), height=np.array([480]))
     plan = SimpleNamespace(
-        config=config.replaced(voxel=0.01),
+        config=config.replaced(voxel=voxel),
         targets=SimpleNamespace(cameras=cameras),
         source=SimpleNamespace(name=source),
     )
@@ -182,9 +180,7 @@ def test_every_axis_holds_the_start_and_values_that_a_run_takes(completer, sourc
     for name, values in axes.items():
         assert len(values) > 1 and [settings for settings in values.values() if not settings], name
         for settings in values.values():
-            changed = applied(config, settings)
-            assert (changed != config) == bool(settings), (name, settings)
-            create(changed.completer, **changed.completer_options)
+            assert (applied(config, settings) != config) == bool(settings), (name, settings)
 
 
 def test_a_value_of_ones_own_takes_its_place_among_the_others():
@@ -193,7 +189,12 @@ def test_a_value_of_ones_own_takes_its_place_among_the_others():
     assert list(values) == ["4", "12", "30", "48"] and values["30"] == {}
     config = with_values(RunSettings(), {"savings.depth_from_memory": 0.95})
     values = axes_of("da3", config)["views explained, share of pixels"]
-    assert list(values) == ["0.8", "0.9", "0.95", "as found"] and values["0.95"] == {}
+    assert list(values) == ["0.8", "0.9", "0.95", "default"] and values["0.95"] == {}
+    assert list(axes_of("recorded", RunSettings(), voxel=0.00922743)["voxel edge"]) == [
+        "0.01845",
+        "0.009227",
+        "0.004614",
+    ]
     config = with_values(RunSettings(), {"memory.voxels_per_footprint": 0.0})
     assert list(axes_of("recorded", config)["far voxels, footprints"]) == ["1", "0"]
 
