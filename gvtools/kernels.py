@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from numba import config, get_num_threads, njit, threading_layer
+from numba import get_num_threads, njit, threading_layer
 
 # error_model="numpy": division by zero gives infinity instead of raising; the check that raising
 # needs keeps loops from being vectorised (measured: projection ten times slower with it).
@@ -65,7 +65,7 @@ class KernelSet(NamedTuple):
     @property
     def cached(self) -> bool:
         """Whether numba's cache holds the last of them, compiled since its file was written."""
-        if config.DISABLE_JIT:
+        if not hasattr(self.last, "py_func"):  # numba's compiler is switched off
             return True
         function = self.last.py_func
         source = Path(function.__code__.co_filename)

@@ -118,7 +118,7 @@ def _check_points(path: Path) -> None:
         words = 0 if line.startswith("#") else len(line.split())
         if words and (words < 8 or words % 2):
             raise ProjectError(
-                f"{path}, line {at}: {words} values; expected id, x, y, z, r, g, b, error and pairs "
+                f"{path}, line {at}: {words} values; expected id, x, y, z, r, g, b, error, pairs "
                 "of image and feature; export the model again"
             )
 

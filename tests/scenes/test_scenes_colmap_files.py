@@ -59,7 +59,9 @@ def test_absurd_inner_count_is_refused(tmp_path):
         ("cameras", r"^1 SIMPLE_RADIAL 96 72", "1 SIMPLE_RADIAL 96", "as many parameters"),
         ("cameras", r"SIMPLE_RADIAL", "SIMPEL_RADIAL", "Camera model does not exist"),
         ("cameras", r" -0\.1\S+", "", "as many parameters"),
-        ("points3D", r"^1 \S+ \S+ \S+ .*$", "1 2 3", "points3D.txt is malformed"),
+        ("points3D", r"^1 \S+ \S+ \S+ .*$", "1 2 3", "3 values; expected id"),
+        # One number less: pycolmap would read the others shifted.
+        ("points3D", r"^1 \S+ ", "1 ", "values; expected id"),
     ],
 )
 def test_malformed_text_model_names_the_file(tmp_path, name, pattern, replacement, told):

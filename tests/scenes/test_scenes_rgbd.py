@@ -269,6 +269,10 @@ def test_redwood_trajectory_that_does_not_fit(tmp_path):
     (root / "trajectory.log").write_text("\n".join(text.splitlines()[:13]))
     with pytest.raises(ProjectError, match=r"trajectory\.log: .*expected blocks of three"):
         read_redwood(root)
+    for wrong in (text.replace("1 1 2", "nan 1 2"), text.replace("1 1 2", "1 2")):
+        (root / "trajectory.log").write_text(wrong)
+        with pytest.raises(ProjectError, match=r"trajectory\.log: .*expected blocks of three"):
+            read_redwood(root)
     (root / "trajectory.log").write_text(text.split("1 1 2")[0].replace("0 0 1", "7 7 8"))
     with pytest.raises(ProjectError, match="1 poses numbered 7 for 3 pictures"):
         read_redwood(root)

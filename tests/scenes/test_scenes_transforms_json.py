@@ -186,7 +186,6 @@ WRONG: dict[str, tuple[Any, ...]] = {
     "fl_y": (0, -1.5, [91]),
     "w": (0, -96, 96.5, "96", None, 10**30),
     "h": (0, 71.9, math.inf),
-    "camera_angle_x": (0, -0.6, math.pi, 4, math.nan, "0.6", None),
     "cx": ("48", {}),
     "k2": (math.nan, 10**400),
     "depth_unit_scale_factor": (0, -1e-3, "1", math.inf),
@@ -219,6 +218,17 @@ def test_wrong_values_name_the_frame_the_key_and_the_value(tmp_path, capsys, key
     assert f"transforms.json, {first}: {key} is {reprlib.repr(value)}; expected " in told
     assert told.count("\n") == 1
     assert "unexpected" not in told
+
+
+def test_a_pose_and_depth_of_the_whole_file_are_no_frames_own(tmp_path):
+    save(tmp_path / "images/a.png", ramp())
+    one = frame(camera_angle_x=None)  # beside fl_x it is not looked at
+    shared = {**PINHOLE, "depth_file_path": "images/a.png", "mask_path": "images/a.png"}
+    scene = read_transforms(transforms(tmp_path, [one], **shared))
+    assert not scene.views[0].has_depth and scene.views[0].load().mask is None
+    pose = one.pop("transform_matrix")
+    with pytest.raises(ProjectError, match="no transform_matrix"):
+        read_transforms(transforms(tmp_path, [one], **shared, transform_matrix=pose))
 
 
 def test_whole_numbers_may_be_written_as_floats(tmp_path):
