@@ -120,7 +120,7 @@ def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
 def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
     """Over many steps on the same few samples."""
     shutil.copytree(trained / "reflow", tmp_path / "reflow")
-    more = ["--set", "heads.ray=0", *steps("heads", 30)]
+    more = ["--set", "heads.ray=0", "--set", "data.pool=8", *steps("heads", 30)]
     more += ["--set", "heads.optimizer.batch=8"]
     assert train(tmp_path, "heads", *more) == 0
     records = read_log(tmp_path / "heads")
