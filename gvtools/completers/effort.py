@@ -10,8 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gvtools.completers.base import Completer, Completion, ContextView, ScaleAlignment, create
+from gvtools.completers.base import (
+    Completer,
+    Completion,
+    ContextView,
+    create,
+)
 from gvtools.completers.holes import hole_radius
+from gvtools.completers.scale_alignment import ScaleAlignment
 from gvtools.guidance import Guidance
 from gvtools.settings import Settings
 

@@ -15,9 +15,9 @@ from gvtools.completers.base import (
     Completer,
     Completion,
     ContextView,
-    ScaleAlignment,
     run_completer,
 )
+from gvtools.completers.scale_alignment import ScaleAlignment
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.memory.projection_cache import CachedProjection

@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
-from gvtools.completers.base import Completer, Completion, ScaleAlignment, ScaleStatus, create
+from gvtools.completers.base import (
+    Completer,
+    Completion,
+    create,
+)
 from gvtools.completers.effort import EffortPolicy, SmallHolesInpainted
 from gvtools.completers.holes import hole_radius
 from gvtools.completers.inpaint import InpaintCompleter
+from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 from gvtools.settings import with_profile, with_values

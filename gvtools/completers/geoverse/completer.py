@@ -18,8 +18,6 @@ from gvtools.completers.base import (
     Completer,
     Completion,
     ContextView,
-    ScaleAlignment,
-    ScaleStatus,
     check_views,
 )
 from gvtools.completers.geoverse.completer_settings import GeoVerseSettings
@@ -37,6 +35,7 @@ from gvtools.completers.geoverse.postprocess import (
 from gvtools.completers.geoverse.resampling import model_size
 from gvtools.completers.geoverse.weights.folder import check_headers, from_pretrained
 from gvtools.completers.push_pull import Filled
+from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 

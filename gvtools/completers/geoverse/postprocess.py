@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gvtools.cameras import Cameras
-from gvtools.completers.base import ScaleAlignment, ScaleStatus
 from gvtools.completers.geoverse.correction import corrected_color, corrected_depth
 from gvtools.completers.geoverse.depth_scale import MAX_FACTOR, both_known, pass_scale, scaled_depth
 from gvtools.completers.geoverse.passes import Generated
 from gvtools.completers.geoverse.resampling import resampled, resampled_depth
 from gvtools.completers.push_pull import Filled, push_pull, push_pull_depth
+from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.guidance import Guidance
 
 # Confidence of a generated pixel at most: below what was observed.

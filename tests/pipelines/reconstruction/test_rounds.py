@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
-from gvtools.completers.base import Completer, Completion, ScaleAlignment, ScaleStatus
+from gvtools.completers.base import (
+    Completer,
+    Completion,
+)
+from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.memory.projection_cache import CachedProjection
