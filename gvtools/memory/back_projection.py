@@ -51,9 +51,8 @@ def back_project(
 ) -> PointSet:
     """Lift the pixels of one view to points.
 
-    The confidence of a point is the source's, times the cosine between ray and surface (oblique
-    surfaces are measured badly); depth edges are dropped. The spacing is the pixel's footprint on
-    the fronto-parallel plane, z / f.
+    Confidence is the source's, times the cosine between ray and surface (oblique surfaces are
+    measured badly); depth edges are dropped. The spacing is the pixel's footprint, z / f.
 
     Args:
         rgb: (H, W, 3) uint8.
@@ -85,8 +84,7 @@ def back_project(
     count, invalid, edges, masked = _lift(
         np.ascontiguousarray(rgb, np.uint8), z, trust, use, np.ascontiguousarray(camera.K[0]),
         np.ascontiguousarray(frame.local_from_cam(camera.world_from_cam[0])),
-        options.edge, far, options.grazing,
-        positions, colors, weight, spacing, pixels,
+        options.edge, far, options.grazing, positions, colors, weight, spacing, pixels,
     )  # fmt: skip
     if levels and pixel_binning > 0:
         count = bin_pixels(

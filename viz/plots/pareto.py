@@ -42,15 +42,11 @@ def draw_pareto(
 
     def panel(axes: Axes, key: str) -> None:
         label, unit = AXES[key]
-
-        def mark(some: Sequence[Any], name: str, style: dict[str, Any]) -> None:
-            x, y = [getattr(trial, key) / unit for trial in some], [trial.psnr for trial in some]
-            axes.plot(x, y, label=name, **style)
-
+        mark = partial(_mark, axes, key)
         profiles = [trial for trial in trials if trial.label.startswith("profile ")]
         # Marks differ, not colours alone.
-        mark([t for t in trials if t not in profiles], "trial", _marks("o", GREY))
-        mark(profiles, "profile", _marks("^", ORANGE))
+        mark([t for t in trials if t not in profiles], name="trial", style=_marks("o", GREY))
+        mark(profiles, name="profile", style=_marks("^", ORANGE))
         for trial in profiles if key == "seconds" else ():
             axes.annotate(
                 trial.label.removeprefix("profile "),
@@ -61,9 +57,15 @@ def draw_pareto(
                 parse_math=False,
             )
         if key == "seconds":
-            mark(front, "front", {"color": BLUE, "drawstyle": "steps-post", "zorder": 1.5})
+            mark(
+                front, name="front", style={"color": BLUE, "drawstyle": "steps-post", "zorder": 1.5}
+            )
         if chosen is not None:
-            mark([chosen], "recommended", _marks("o", RED, fillstyle="none", markersize=13))
+            mark(
+                [chosen],
+                name="recommended",
+                style=_marks("o", RED, fillstyle="none", markersize=13),
+            )
         values = [getattr(trial, key) / unit for trial in trials]
         if budget[0] == key and budget[1] is not None:
             values.append(budget[1] / unit)
@@ -83,3 +85,9 @@ def draw_pareto(
 
 def _marks(marker: str, color: str, **more: Any) -> dict[str, Any]:
     return {"linestyle": "none", "marker": marker, "color": color, **more}
+
+
+def _mark(axes: Axes, key: str, trials: Sequence[Any], *, name: str, style: dict[str, Any]) -> None:
+    """Plot trials by their seconds or bytes."""
+    x = [getattr(trial, key) / AXES[key][1] for trial in trials]
+    axes.plot(x, [trial.psnr for trial in trials], label=name, **style)
