@@ -48,14 +48,7 @@ def draw_pareto(
         mark([t for t in trials if t not in profiles], name="trial", style=_marks("o", GREY))
         mark(profiles, name="profile", style=_marks("^", ORANGE))
         for trial in profiles if key == "seconds" else ():
-            axes.annotate(
-                trial.label.removeprefix("profile "),
-                (trial.seconds, trial.psnr),
-                xytext=(6, -3),
-                textcoords="offset points",
-                fontsize="small",
-                parse_math=False,
-            )
+            _name(axes, trial)
         if key == "seconds":
             mark(
                 front, name="front", style={"color": BLUE, "drawstyle": "steps-post", "zorder": 1.5}
@@ -91,3 +84,11 @@ def _mark(axes: Axes, key: str, trials: Sequence[Any], *, name: str, style: dict
     """Plot trials by their seconds or bytes."""
     x = [getattr(trial, key) / AXES[key][1] for trial in trials]
     axes.plot(x, [trial.psnr for trial in trials], label=name, **style)
+
+
+def _name(axes: Axes, profile: Any) -> None:
+    """Write a profile's name beside its mark."""
+    axes.annotate(
+        profile.label.removeprefix("profile "), (profile.seconds, profile.psnr), xytext=(6, -3),
+        textcoords="offset points", fontsize="small", parse_math=False,
+    )  # fmt: skip
