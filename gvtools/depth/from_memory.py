@@ -1,4 +1,4 @@
-"""What memory already explains of a photograph that is about to be lifted."""
+"""Depth of a photograph taken from the memory, where the memory's projection matches it."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ def depth_from_memory(
     least: float,
     options: SplatOptions | None = None,
 ) -> DepthMap | None:
-    """The depth of a photograph by memory, where memory explains enough of it.
+    """The memory's projected depth of a photograph, if the projection matches enough of it.
 
-    Memory explains a pixel where its observed content shows the photograph's colour, but for a
+    A pixel matches where the memory's observed content shows the photograph's colour, but for a
     gain per channel that all pixels share; the darker the photograph, the less may be off.
 
     Args:
         memory: is projected.
         camera: of the photograph, a batch of one.
         rgb: (H, W, 3) uint8, the photograph.
-        least: the share of the pixels that have to be explained.
+        least: the share of the pixels that have to match.
         options: of the projection.
 
     Returns:
-        Depth and confidence of the explained pixels, source MEMORY; None where they are too few.
+        Depth and confidence of the matching pixels, source MEMORY; None where they are too few.
     """
     if not len(memory):
         return None
@@ -59,9 +59,9 @@ def depth_from_memory(
     off = np.abs(shown * gain.astype(np.float32) - seen).mean(-1) * valid
     size = (WINDOW, WINDOW)
     mean = cv2.blur(off, size) / np.maximum(cv2.blur(valid.astype(np.float32), size), 1e-6)
-    explained = valid & (mean < tolerance)
-    if explained.mean() < least:
+    matching = valid & (mean < tolerance)
+    if matching.mean() < least:
         return None
-    depth = np.where(explained, known.depth[0], np.float32(0))
-    confidence = np.where(explained, np.minimum(known.confidence[0], 1), np.float32(1))
+    depth = np.where(matching, known.depth[0], np.float32(0))
+    confidence = np.where(matching, np.minimum(known.confidence[0], 1), np.float32(1))
     return DepthMap(depth, confidence.astype(np.float32), MEMORY)

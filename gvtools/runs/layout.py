@@ -44,7 +44,7 @@ def context_depth(folder: Path, stem: str) -> Path:
 
 
 def inside(folder: Path, path: Path) -> Path:
-    """``path``, if it lies in ``folder`` once every link and ".." is followed.
+    """``path``, if it lies in ``folder`` once every link and ".." is resolved.
 
     Raises:
         ProjectError: it does not.

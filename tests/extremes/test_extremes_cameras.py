@@ -17,9 +17,11 @@ from gvtools.cameras import Cameras, check_usable, invert_rigid, rigid_transform
 from gvtools.errors import ShapeError
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.splat.api import BACKENDS, SplatOptions
+from gvtools.memory.splat.api import SplatOptions
 
 LENSES = (1e-2, 1.0, 60.0, 170.0, 179.9)
+
+BACKENDS = ("cpu", "torch", "nearest", "open3d")
 
 
 @settings(max_examples=60, deadline=None)

@@ -71,8 +71,8 @@ def correspond(
     differ by no more than ``occlusion``. Elsewhere it is that of the nearest pixel.
 
     Args:
-        first: the view whose pixels are followed, those with depth inside its mask.
-        second: the view they are followed into; its size may differ.
+        first: the view whose pixels are reprojected, those with depth inside its mask.
+        second: the view they are reprojected into; its size may differ.
         occlusion: largest relative depth difference |z / depth - 1| on one surface.
         where: (H, W) bool, the only pixels of first to follow; None means all.
 

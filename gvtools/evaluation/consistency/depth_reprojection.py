@@ -74,8 +74,8 @@ class DepthReprojection(_Figures):
     """Agreement of the depth of two views.
 
     Attributes:
-        first: name of the view whose pixels were followed.
-        second: name of the view they were followed into.
+        first: name of the view whose pixels were reprojected.
+        second: name of the view they were reprojected into.
         known: first's pixels with depth, inside its mask.
         inside: those that fall inside the second picture.
     """
@@ -107,8 +107,8 @@ def depth_reprojection(
     """Follow first's pixels by their depth into second, and back by second's depth.
 
     Args:
-        first: the view whose pixels are followed.
-        second: the view they are followed into; its size may differ.
+        first: the view whose pixels are reprojected.
+        second: the view they are reprojected into; its size may differ.
         occlusion: largest relative depth difference at which both see one surface.
 
     Raises:

@@ -15,10 +15,8 @@ from pydantic import Field
 from gvtools.cameras import Cameras
 from gvtools.settings import Settings
 
-BACKENDS = ("cpu", "torch", "nearest", "open3d")
 # Back ends without blending.
 ONE_PIXEL = ("nearest", "open3d")
-DEVICES = ("auto", "cpu", "cuda")
 
 
 class SplatOptions(Settings):
