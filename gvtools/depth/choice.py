@@ -18,8 +18,6 @@ CHOICES = ("auto", "sensor", "colmap", "plane-sweep", "da3")
 # The voxel edge from eight views is then within 10 % of that from sparse points or from full depth,
 # measured on four scenes.
 ROUGH_SIDE, ROUGH_LEVELS = 160, 2
-PAIR = "rectified-pair"  # the name of that source
-PAIRED = "two views side by side: OpenCV's semi-global matching, which is made for them"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +48,7 @@ def choose_source(
 
     "auto" takes recorded depth where there is some and computes the rest: by Depth Anything 3 where
     its weights are given, by COLMAP's PatchMatch where pycolmap has CUDA, otherwise by plane-sweep
-    stereo. Two views side by side go to rectified
-    stereo instead of the plane sweep. Nothing but ``views`` is looked at.
+    stereo. Nothing but ``views`` is looked at.
 
     Args:
         scene: the project.
@@ -112,9 +109,7 @@ def _chosen(
     if choice in ("sensor", "colmap"):
         return _asked_recorded(scene, views, choice, recorded=recorded)
     if choice == "plane-sweep":
-        source = _stereo(scene, views, stereo)
-        paired = f"asked for plane-sweep; {PAIRED}"
-        return ChosenSource(source, paired if source.name == PAIR else "asked for")
+        return ChosenSource(_stereo(scene, views, stereo), "asked for")
     if recorded == len(views):
         return ChosenSource(RecordedDepth(), "every context view has recorded depth")
     if recorded and len(views) < 2 and foundation.weights is None:
@@ -126,7 +121,7 @@ def _chosen(
         source, how = ColmapPatchMatch(scene, views), "COLMAP's PatchMatch, as there is CUDA"
     else:
         source = _stereo(scene, views, stereo)
-        how = PAIRED if source.name == PAIR else "plane-sweep stereo of the photographs"
+        how = "plane-sweep stereo of the photographs"
     if not recorded:
         return ChosenSource(source, f"no context view has recorded depth; {how}")
     return ChosenSource(
@@ -162,10 +157,6 @@ def _stereo(scene: Scene, views: Sequence[str], options: StereoOptions | None) -
             f"{scene.root}: {len(views)} context view(s) without depth; expected depth, or at "
             "least 2 views to compute it from"
         )
-    from gvtools.depth.rectified_pair import RectifiedPair, is_rectifiable
-
-    if len(views) == 2 and is_rectifiable(scene.subset(views).cameras):
-        return RectifiedPair(scene, views)
     from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 
     return PlaneSweepStereo(scene, options=options or StereoOptions(), views=tuple(views))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.appearance.fitted_depth import FittedDepth
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap, DepthSource, RecordedDepth, is_recorded
 from gvtools.errors import DegenerateError, ProjectError
@@ -69,7 +70,9 @@ class DepthCache:
             ProjectError: a kept file is damaged, or cannot be written.
         """
         path = self._file[view.name]
-        if path.exists():
+        # An interrupted attempt fitted other Gaussians.
+        stale = self._unfinished and self.source.name == FittedDepth.name
+        if path.exists() and not stale:
             try:
                 depth_map, failed = read_context_depth(path, frame.rgb.shape[:2])
             except UNREADABLE as error:

@@ -13,7 +13,6 @@ from tiny_scan import write_scan
 from gvtools.depth import choice, colmap_patch_match
 from gvtools.depth.choice import choose_source, rough_source
 from gvtools.depth.colmap_patch_match import ColmapPatchMatch
-from gvtools.depth.rectified_pair import RectifiedPair
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded
 from gvtools.depth.stereo.options import StereoOptions
@@ -89,27 +88,28 @@ def test_auto_computes_where_there_is_none(scan, monkeypatch):
     assert "plane-sweep" in chosen.reason
 
 
-def test_a_pair_side_by_side_says_so_and_which_settings_it_ignores(scan, tmp_path, capsys):
+def test_settings_that_a_source_ignores_are_said(scan, tmp_path, capsys):
     bare = without_depth(scan, *range(6))
     given = StereoOptions(window=5, planes=64)
-    for asked in ("plane-sweep", "auto"):
-        pair = choose_source(bare, bare.names[:2], asked, stereo=given)
-        assert isinstance(pair.source, RectifiedPair)
-        assert "two views side by side" in pair.reason
-        assert set(pair.ignored) == {"stereo.window=5", "stereo.planes=64"}
-        assert not choose_source(bare, bare.names[:2], asked).ignored
-        assert not choose_source(bare, bare.names[:2], asked, stereo=StereoOptions()).ignored
-        # Three views go to the plane sweep, which takes them.
-        assert not choose_source(bare, bare.names[:3], asked, stereo=given).ignored
-    assert choose_source(scan, scan.names, "auto", stereo=given).ignored
-    words = ["reconstruct", str(scan.root), "--out", str(tmp_path / "run"), "--dry-run"]
-    words += ["--context", "first:2", "--targets", "range:3-4", "--depth", "plane-sweep"]
+    assert set(choose_source(scan, scan.names, "auto", stereo=given).ignored) == {
+        "stereo.window=5",
+        "stereo.planes=64",
+    }
+    assert not choose_source(scan, scan.names, "auto", stereo=StereoOptions()).ignored
+    assert not choose_source(bare, bare.names[:2], "auto", stereo=given).ignored
+    words = [
+        "reconstruct",
+        str(scan.root),
+        "--refine",
+        "0",
+        "--out",
+        str(tmp_path / "run"),
+        "--dry-run",
+    ]
+    words += ["--context", "first:2", "--targets", "range:3-4"]
     assert main([*words, "--set", "stereo.window=5"]) == 0
-    told = capsys.readouterr()
-    assert "depth rectified-pair (asked for plane-sweep; two views side by side" in told.out
-    assert told.err.splitlines() == [
-        "warning: stereo.window=5 changes nothing: no plane sweep computes depth here, but "
-        "rectified-pair"
+    assert capsys.readouterr().err.splitlines() == [
+        "warning: stereo.window=5 changes nothing: no plane sweep computes depth here, but recorded"
     ]
     assert main(words) == 0
     assert not capsys.readouterr().err
@@ -136,8 +136,8 @@ def test_a_rough_source_is_a_small_sweep_without_posing(scan, tmp_path):
     patch_match = rough_source(bare, ColmapPatchMatch(_with_points(bare), bare.names))
     assert isinstance(patch_match, PlaneSweepStereo)
     assert patch_match.views == bare.names
-    pair = choose_source(bare, bare.names[1:3], "auto").source
-    assert rough_source(bare, pair) is pair
+    recorded = RecordedDepth()
+    assert rough_source(scan, recorded) is recorded
 
 
 def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):
