@@ -43,8 +43,6 @@ class CompleteOptions(Settings):
     """Run the video prior; none: where the configuration has one, but not on a CPU."""
     repeat: Count = 9
     """Timed passes."""
-    flops_only: bool = False
-    """Run nothing."""
     compile: bool = False
     """Compile the denoisers and the RGB head first."""
 
@@ -89,9 +87,9 @@ class CompleteOptions(Settings):
         return self.precision == "bfloat16"
 
     def runs_video(self, config: GeoVerseConfig) -> bool:
-        """The video prior is part of the pass; counting alone needs no memory for it."""
+        """The video prior is part of the pass."""
         if self.video is None:
-            return config.video is not None and (self.flops_only or self.place.type == "cuda")
+            return config.video is not None and self.place.type == "cuda"
         return self.video
 
 

@@ -1,7 +1,6 @@
 """``gvtools bench``: our times beside those of what a user would otherwise call, as ratios.
 
-``bench complete`` times the generative core by stage; its only peer is its own step with attention
-spelt out.
+``bench complete`` times the generative core by stage, which has no peer.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ SUMMARY = (
 )
 EXAMPLES = (
     "gvtools bench splat --repeat 15 --json splat.json",
-    "gvtools bench complete --config base --flops-only",
+    "gvtools bench complete --config base",
 )
 
 FEWEST_POINTS = 1000
@@ -39,7 +38,6 @@ COMPLETE = (
     "precision",
     "video",
     "compile",
-    "flops_only",
 )
 
 
@@ -90,12 +88,6 @@ def _add_complete(group: argparse._ArgumentGroup) -> None:
         action="store_true",
         default=None,
         help="torch.compile first: needs a C++ compiler and most of a minute, pays in long runs",
-    )
-    group.add_argument(
-        "--flops-only",
-        action="store_true",
-        default=None,
-        help="count FLOPs and parameters; run nothing, which needs no memory",
     )
 
 
