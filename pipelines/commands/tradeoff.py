@@ -15,14 +15,13 @@ if TYPE_CHECKING:
     from pipelines.reconstruction.plan import Plan
     from pipelines.reconstruction.settings import RunSettings
 
-SUMMARY = "try a run's settings on held-out views: what each gives and takes, and what to choose"
+SUMMARY = "try profiles and single settings on held-out views, and say what to choose"
 EXAMPLES = (
     "gvtools tradeoff scan/ --out runs/tradeoff --budget 60",
-    "gvtools tradeoff colmap/ --out runs/small --budget 200MB --targets every:8+4",
+    "gvtools tradeoff colmap/ --out runs/quick --budget 5m --targets every:8+4",
 )
 SPLIT = {"context": "every:2", "targets": "every:2+1"}
 UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
-BYTES = {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2.0**10, "mib": 2.0**20, "gib": 2.0**30}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the results")
     parser.add_argument(
         "--budget",
-        metavar="AMOUNT",
-        help="of a run: seconds (60, 5m, 2h) or bytes of memory (200MB, 1GiB); default: none",
+        metavar="TIME",
+        help="of a run: 60, 5m, 2h; default: none",
     )
     parser.add_argument(
         "--context", metavar="SPEC", help=f"views that are given ({SPLIT['context']})"
@@ -58,10 +57,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Sweep, and write table, front, marginal values and the recommended profile.
+    """Sweep, and write table, front and the recommended profile.
 
     Raises:
-        GvError: a project or settings that cannot be run, or a budget that is none.
+        GvError: a project or settings that cannot be run, or a time that is none.
     """
     from gvtools.files import write_json
     from gvtools.runs.folder_lock import folder_lock
@@ -69,32 +68,31 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from pipelines.commands.scene_arguments import reading_of
     from pipelines.reconstruction.plan import run_identity
     from pipelines.reconstruction.settings import RunSettings
+    from pipelines.tradeoff.planned import planned_trials
     from pipelines.tradeoff.results import write_results
-    from pipelines.tradeoff.search_axes import longest_side, search_axes
-    from pipelines.tradeoff.sweep import Sweep
+    from pipelines.tradeoff.sweep import sweep
     from pipelines.tradeoff.trial import Trials, applied
 
     if args.out.exists() and not args.out.is_dir():
         raise OptionError(f"--out {args.out}: is a file; give a folder")
-    budget = parse_budget(args.budget)
-    limit_kind, limit = parse_budget(args.limit)
-    if limit_kind != "seconds" or limit is None:
-        raise OptionError(f"--limit {args.limit}; expected a time, such as 900 or 15m")
+    budget = None if args.budget is None else parse_seconds("--budget", args.budget)
+    limit = parse_seconds("--limit", args.limit)
     config = asked_for(args)
     scene, plan = _planned(args, config, console)
     config = config.replaced(voxel=plan.config.voxel, memory=plan.config.memory)
-    names = plan.targets.cameras.names
+    planned = planned_trials(
+        plan, {name: changes(config, asked_for(args, name)) for name in config.profiles}
+    )
     with folder_lock(args.out):
         identity = run_identity(plan, reading_of(args))
         folder = args.out / "trials"
         folder.mkdir(exist_ok=True)
-        trials = Trials(scene, config, names, folder=folder, identity=identity)
-        sweep = Sweep(search_axes(plan), trials, longest_side(plan), limit=limit, say=console.line)
-        sweep.run({name: changes(config, asked_for(args, name)) for name in config.profiles})
+        runs = Trials(scene, config, folder=folder, identity=identity)
+        trials = sweep(planned, runs, limit=limit, console=console)
         chosen = write_results(
-            sweep,
+            trials,
             args.out,
-            title=f"{scene.root.name}: {len(names)} held-out views",
+            title=f"{scene.root.name}: {len(plan.targets.cameras.names)} held-out views",
             budget=budget,
             console=console,
         )
@@ -150,18 +148,13 @@ def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunSettin
     )
 
 
-def parse_budget(text: str | None) -> tuple[str, float | None]:
-    """("seconds" or "bytes", amount) of ``60``, ``5m``, ``200MB``; None without a text.
+def parse_seconds(option: str, text: str) -> float:
+    """Of ``60``, ``5m`` or ``2h``.
 
     Raises:
         OptionError: another unit, or nothing above 0.
     """
-    if text is None:
-        return "seconds", None
     found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", text)
-    unit = found[2].lower() if found else "?"
-    if not found or (unit not in UNITS and unit not in BYTES) or not float(found[1]) > 0:
-        raise OptionError(f"{text!r}; expected seconds (60, 5m, 2h) or bytes (200MB, 1GiB)")
-    if unit in BYTES:
-        return "bytes", float(found[1]) * BYTES[unit]
-    return "seconds", float(found[1]) * UNITS[unit]
+    if not found or found[2].lower() not in UNITS or not float(found[1]) > 0:
+        raise OptionError(f"{option} {text!r}; expected seconds (60), 5m or 2h")
+    return float(found[1]) * UNITS[found[2].lower()]

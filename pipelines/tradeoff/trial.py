@@ -1,4 +1,4 @@
-"""One trial: a reconstruction with other settings, measured at the truth's full size."""
+"""One trial: a reconstruction with other settings, measured on held-out views."""
 
 from __future__ import annotations
 
@@ -6,24 +6,19 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
 import gvtools
 from gvtools.errors import GvError
-from gvtools.evaluation.view_figures import view_figures
 from gvtools.files import write_json
 from gvtools.runs.folder import RunDirectory
-from gvtools.runs.target_files import TargetFiles, read_target
-from gvtools.scenes.scene import Scene, View
+from gvtools.runs.layout import METRICS
+from gvtools.scenes.scene import Scene
 from gvtools.settings import with_values
 from pipelines.console import Console
-from pipelines.reconstruction.measure import mean_of
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
@@ -38,11 +33,11 @@ class Trial:
         seconds: of the run.
         bytes: of the memory at the end.
         observations: stored at the end.
-        psnr: mean over the targets, dB, whole pictures at their full size.
+        psnr: mean over the targets, dB, whole pictures.
         ssim: likewise.
         psnr_valid: of pixels that observations support, dB.
         psnr_generated: of generated pixels, dB.
-        depth_rel: median relative depth error where the depth is known.
+        depth_rel_valid: median relative depth error where the depth is known.
     """
 
     label: str
@@ -54,12 +49,12 @@ class Trial:
     ssim: float | None = None
     psnr_valid: float | None = None
     psnr_generated: float | None = None
-    depth_rel: float | None = None
+    depth_rel_valid: float | None = None
 
 
 def applied(config: RunSettings, settings: Mapping[str, Any]) -> RunSettings:
-    """A run's settings with a trial's; one that names a completer says all of its options."""
-    if "completer" in settings:
+    """A run's settings with a trial's; one that names another completer says all of its options."""
+    if settings.get("completer", config.completer) != config.completer:
         config = config.replaced(completer_options={})
     return with_values(config, settings)
 
@@ -79,24 +74,16 @@ class Trials:
 
     Args:
         scene: the project.
-        config: of the start; its voxel edge is set.
-        names: of the target views, held out.
+        config: of the start; its voxel edge is set and its targets are held out.
         folder: where trials are kept, one JSON file each.
         identity: of the start, see ``run_identity``: other pictures, masks, weights or units are
             other trials.
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        config: RunSettings,
-        names: Sequence[str],
-        *,
-        folder: Path,
-        identity: Mapping[str, Any],
+        self, scene: Scene, config: RunSettings, *, folder: Path, identity: Mapping[str, Any]
     ) -> None:
-        self.scene, self.config, self.names, self.folder = scene, config, list(names), folder
-        self.identity = identity
+        self.scene, self.config, self.folder, self.identity = scene, config, folder, identity
         self._warm = False
 
     def make(self, label: str, settings: Mapping[str, Any]) -> Trial:
@@ -108,69 +95,42 @@ class Trials:
         if not self._warm:
             # Kernels are compiled and files are cached once.
             self._warm = True
-            self._run(label, {}, self.names[:1])
-        trial = self._run(label, settings, self.names)
+            self._run(label, {"rounds": 1})
+        trial = self._run(label, settings)
         write_json(self._file(settings), asdict(trial))
         return trial
 
     def kept(self, label: str, settings: Mapping[str, Any]) -> Trial | None:
         """What this trial gave before; None if it was not made, or its file is damaged."""
         try:
-            trial = Trial(**json.loads(self._file(settings).read_text(encoding="utf-8")))
+            data = json.loads(self._file(settings).read_text(encoding="utf-8"))
+            return Trial(**data | {"label": label})
         except (OSError, ValueError, TypeError):
             return None
-        return replace(trial, label=label)
 
     def _file(self, settings: Mapping[str, Any]) -> Path:
-        parts = [self.identity, dict(settings), self.names, gvtools.__version__]
+        parts = [self.identity, dict(settings), gvtools.__version__]
         text = json.dumps(parts, sort_keys=True, default=str)
         return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
 
-    def _run(self, label: str, settings: Mapping[str, Any], names: Sequence[str]) -> Trial:
-        config = applied(self.config, settings).replaced(targets=",".join(names))
+    def _run(self, label: str, settings: Mapping[str, Any]) -> Trial:
         out = self.folder / "running"
         shutil.rmtree(out, ignore_errors=True)
         start = time.perf_counter()
         try:
-            reconstruct(self.scene, config, out, console=_Silent())
+            reconstruct(self.scene, applied(self.config, settings), out, console=_Silent())
             seconds = time.perf_counter() - start
-            directory = RunDirectory(out)
-            reports = directory.reports()
-            figures = [
-                _figures(read_target(directory.round_path(number), entry), self.scene)
-                for number, report in enumerate(reports)
-                for entry in report["views"]
-            ]
+            report = RunDirectory(out).reports()[-1]
+            figures = json.loads((out / METRICS).read_text(encoding="utf-8"))
         finally:
             shutil.rmtree(out, ignore_errors=True)
-        psnr = mean_of(figures, "psnr")
-        if psnr is None:
+        if figures["psnr"] is None:
             raise GvError("no target has a true picture to compare with; hold views out")
+        names = ("observations", "psnr", "ssim", "psnr_valid", "psnr_generated", "depth_rel_valid")
         return Trial(
             label=label,
             settings=dict(settings),
             seconds=seconds,
-            bytes=float(reports[-1]["bytes"]),
-            observations=int(reports[-1]["points"]),
-            psnr=psnr,
-            ssim=mean_of(figures, "ssim"),
-            psnr_valid=mean_of(figures, "psnr_valid"),
-            psnr_generated=mean_of(figures, "psnr_generated"),
-            depth_rel=mean_of(figures, "depth_rel_valid"),
+            bytes=float(report["bytes"]),
+            **{name: figures[name] for name in names},
         )
-
-
-def _figures(target: TargetFiles, scene: Scene) -> dict[str, Any]:
-    """Figures of one target, its picture enlarged to the truth's size where the run reduced it."""
-    view: View = scene[target.name]
-    truth = view.load()
-    size = (truth.rgb.shape[1], truth.rgb.shape[0])
-    picture, depth = target.picture, target.depth
-    observed, generated = target.observed, target.generated
-    if picture.shape != truth.rgb.shape:
-        picture = np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BILINEAR))
-        depth, observed, generated = (
-            np.asarray(Image.fromarray(values).resize(size, Image.Resampling.NEAREST))
-            for values in (depth, observed, generated)
-        )
-    return view_figures(picture, truth, observed=observed, generated=generated, depth=depth)

@@ -13,6 +13,7 @@ import pytest
 from browser import Browser, open_browser
 from command_line import refused
 
+from gvtools.appearance.fit import FitOptions
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
 from pipelines.reconstruction.plan import make_plan
@@ -121,7 +122,7 @@ def test_settings_that_differ_come_first_and_all_are_there(page):
     heads = [index for index, row in enumerate(rows) if row[:2] == ["setting", "value"]]
     changed = [row[0] for row in rows[heads[0] + 1 : heads[1]]]
     everything = [row[0] for row in rows[heads[1] + 1 :]]
-    assert set(changed) == {"context", "targets", "views_per_round"}
+    assert set(changed) == {"context", "targets", "views_per_round", "refine.seconds"}
     assert len(everything) > 40
     assert "splat.depth_band" in everything
 
@@ -178,7 +179,8 @@ def test_a_project_that_is_gone(own, small_scan, capsys):
 
 
 def test_a_run_that_has_its_project_open_writes_the_same_page(own, small_scan, page):
-    config = RunSettings(context="first:3", targets="range:4-7", views_per_round=2)
+    refine = FitOptions(seconds=0)
+    config = RunSettings(context="first:3", targets="range:4-7", views_per_round=2, refine=refine)
     before = (own / "report.html").read_bytes()
     (own / "report.html").unlink()
     write_report(make_plan(open_project(small_scan), config), own)

@@ -19,7 +19,7 @@ from pipelines.tradeoff.sweep import EQUAL
 from pipelines.tradeoff.trial import applied
 
 # Another edge than the first guess, as if it had been measured.
-WIDER = ("--set", "fusion.voxel_scale=1.25")
+WIDER = ("--set", "fusion.voxel_scale=1.25", "--set", "refine.seconds=0")
 
 
 def rows(folder: Path, name: str) -> list[dict[str, str]]:
@@ -40,34 +40,37 @@ def swept(scan, tmp_path_factory) -> Path:
 
 
 def test_a_sweep_leaves_table_front_plot_and_profile(swept):
-    trials, front, marginal = (rows(swept, name) for name in ("trials", "front", "marginal"))
+    trials, front = (rows(swept, name) for name in ("trials", "front"))
     assert len(trials) == len(list((swept / "trials").iterdir())) > 12
     assert (swept / "front.png").read_bytes()[:4] == b"\x89PNG"
     psnr = [float(row["PSNR (dB)"]) for row in front]
     assert psnr and psnr == sorted(psnr)
-    assert {"voxel edge", "completer", "projection"} <= {row["setting"] for row in marginal}
-    for row in marginal:
-        assert row["from"] != row["to"] and float(row["time (x)"]) > 0
-    coarse = next(row for row in marginal if row["setting"] == "voxel edge")
-    assert float(coarse["observations (x)"]) > 1.2 and float(coarse["memory (x)"]) > 1
-    # Runs leave nothing behind but their outcomes.
-    assert all(path.suffix == ".json" for path in (swept / "trials").iterdir())
+    stored = {row["trial"]: float(row["observations"]) for row in trials}
+    coarse = next(name for name in stored if name.startswith("voxel "))
+    assert 1.2 * stored[coarse] < stored["start"]
 
 
 @pytest.mark.parametrize("label", ["recommended", "profile accurate"])
 def test_reconstruct_gives_the_figures_of_a_trial(scan, swept, tmp_path, label):
     tried = {row["trial"]: row for row in rows(swept, "trials")}
     if label == "recommended":
-        # Smaller pictures are another product.
-        whole = [row for name, row in tried.items() if not name.startswith("picture size")]
-        best = max(float(row["PSNR (dB)"]) for row in whole)
-        equal = [row for row in whole if float(row["PSNR (dB)"]) >= best - EQUAL]
+        best = max(float(row["PSNR (dB)"]) for row in tried.values())
+        equal = [row for row in tried.values() if float(row["PSNR (dB)"]) >= best - EQUAL]
         trial = min(equal, key=lambda row: float(row["a run (s)"]))
         chosen = ["--config", str(swept / "profile.json")]
     else:
         trial = tried[label]
         chosen = ["--profile", "accurate", *WIDER]
-    arguments = ["reconstruct", str(scan), "--context", "every:2", "--targets", "every:2+1"]
+    arguments = [
+        "reconstruct",
+        str(scan),
+        "--refine",
+        "0",
+        "--context",
+        "every:2",
+        "--targets",
+        "every:2+1",
+    ]
     assert main([*arguments, "--out", str(tmp_path / "run"), "--quiet", *chosen]) == 0
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert found["observations"] == float(trial["observations"])
@@ -95,9 +98,9 @@ def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
 
 def test_a_second_sweep_takes_over_what_is_there(scan, swept, capsys):
     before = {path: path.stat().st_mtime_ns for path in (swept / "trials").iterdir()}
-    assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "1B"]) == 2
+    assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "200MB"]) == 2
     assert "expected seconds" in capsys.readouterr().err
-    assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "1kB", *WIDER]) == 0
+    assert main(["tradeoff", str(scan), "--out", str(swept), "--budget", "0.01", *WIDER]) == 0
     captured = capsys.readouterr()
     assert "no trial is within the budget" in captured.err
     after = {path: path.stat().st_mtime_ns for path in (swept / "trials").iterdir()}
@@ -118,7 +121,7 @@ def test_a_project_that_is_read_otherwise_is_tried_anew(scan, swept, capsys):
     [
         (["--targets", "orbit:3"], "no views of the project"),
         (["--set", "targets=orbit:3"], "targets orbit:3: no views of the project"),
-        (["--limit", "100MB"], "expected a time"),
+        (["--limit", "100MB"], "expected seconds"),
         (["--set", "splat.bandd=1"], "did you mean"),
         (["--set", "rounds=1"], "give fewer --targets"),
     ],
