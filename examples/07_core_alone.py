@@ -37,8 +37,6 @@ guidance = Guidance(second.camera, rgb, depth, known, known.astype(np.float32), 
 
 completion = GeoVerseCompleter().complete([context], guidance, seed=0)
 print(f"known {guidance.coverage:.1%}, depth afterwards {(completion.depth > 0).mean():.1%}")
-for name, value in completion.spent.items():
-    print(f"  {name}: {value:.3g}")
 picture = np.concatenate([rgb[0], completion.rgb[0], second.load().rgb / 255], axis=1)
 path = output_folder() / "core.png"
 Image.fromarray(np.rint(picture * 255).astype(np.uint8)).save(path)

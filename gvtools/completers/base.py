@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import difflib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -84,8 +84,6 @@ class Completion:
         confidence: (V, H, W) float32 in [0, 1]; below 1 where generated, 0 where nothing is known.
         rays: (V, H, W, 6) float32 Plücker rays in the world frame: unit direction d, then moment
             c x d (scene units), c the camera centre; None if the completer predicts none.
-        spent: figures of the whole call: ``seconds``, ``passes`` (model calls), ``steps``
-            (denoiser steps), ``holes`` and ``unfilled`` (pixels), ``views_without_scale``.
         scale_alignment: for each view, how the completer brought its depth into scene units; the
             generated depth of a refused view is 0. None, of a view or of all, leaves the alignment
             to the run, which compares depth with the memory's.
@@ -95,7 +93,6 @@ class Completion:
     depth: Float32
     confidence: Float32
     rays: Float32 | None = None
-    spent: Mapping[str, float] = field(default_factory=dict)
     scale_alignment: tuple[ScaleAlignment | None, ...] | None = None
 
     def __post_init__(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,10 +66,7 @@ class SmallHolesInpainted(Completer):
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:
-        """Complete all views, each by one of the two; see ``Completer.complete``.
-
-        ``spent["inpainted_views"]`` counts the cheap one's.
-        """
+        """Complete all views, each by one of the two; see ``Completer.complete``."""
         small = [hole_radius(valid) <= self.below for valid in guidance.valid]
         parts = []
         for completer, cheap in ((self.cheap_one, True), (self.costly_one, False)):
@@ -78,12 +74,10 @@ class SmallHolesInpainted(Completer):
             if rows:
                 completion = completer.complete(context, guidance.select(rows), seed=seed)
                 parts.append((rows, completion))
-        return _merged(guidance, parts, sum(small))
+        return _merged(guidance, parts)
 
 
-def _merged(
-    guidance: Guidance, parts: Sequence[tuple[Sequence[int], Completion]], inpainted: int
-) -> Completion:
+def _merged(guidance: Guidance, parts: Sequence[tuple[Sequence[int], Completion]]) -> Completion:
     """The completions of some rows each, as one of all rows."""
     shape = guidance.valid.shape
     rgb, depth = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
@@ -93,7 +87,6 @@ def _merged(
         every = [guidance.cameras.plucker(row) for row in range(len(guidance))]
         rays = np.stack(every).astype(np.float32)
     alignments: list[ScaleAlignment | None] = [None] * len(guidance)
-    spent: dict[str, Any] = {"inpainted_views": float(inpainted)}
     for rows, part in parts:
         at = list(rows)
         rgb[at], depth[at], confidence[at] = part.rgb, part.depth, part.confidence
@@ -101,7 +94,5 @@ def _merged(
             rays[at] = part.rays
         for row, alignment in zip(at, part.scale_alignment or [None] * len(at), strict=True):
             alignments[row] = alignment
-        for key, value in part.spent.items():
-            spent[key] = spent.get(key, 0.0) + value
     unaligned = all(alignment is None for alignment in alignments)
-    return Completion(rgb, depth, confidence, rays, spent, None if unaligned else tuple(alignments))
+    return Completion(rgb, depth, confidence, rays, None if unaligned else tuple(alignments))

@@ -42,6 +42,8 @@ FAR_QUANTILE = 0.45
 CONTINUED = 0.15
 # A continued plane stays within these multiples of the extreme inverse depths of the view.
 FARTHEST, NEAREST = 0.5, 2.0
+# Trust in a plane of a generated rim pixel, beside one of an observed.
+GENERATED = 0.3
 # Known pixels that tell the extremes.
 ENOUGH = 20_000
 
@@ -60,7 +62,6 @@ class HoleDepth:
         plane_of: (H, W) int32, row of ``planes``, -1 elsewhere.
         spread: (H, W) float64, relative disagreement of the directions about a filled pixel.
         distance: (H, W) float64, to the nearest known pixel, pixels; infinite without any.
-        clipped: how many filled pixels met the limits ``FARTHEST`` and ``NEAREST``.
     """
 
     inverse: Float64
@@ -69,7 +70,6 @@ class HoleDepth:
     plane_of: NDArray[np.int32]
     spread: Float64
     distance: Float64
-    clipped: int
 
 
 def fill_depth(
@@ -79,6 +79,7 @@ def fill_depth(
     focal: float,
     steepest_deg: float = 80.0,
     smoothing: bool = True,
+    generated: NDArray[np.bool_] | None = None,
 ) -> HoleDepth:
     """Continue the surfaces around the holes of a depth map through them.
 
@@ -87,6 +88,7 @@ def fill_depth(
         valid: (H, W) bool, where ``depth`` (> 0) is known.
         focal: focal length, pixels.
         steepest_deg: a surface seen at a more grazing angle counts as a step.
+        generated: (H, W) bool, known pixels that a completer made; None where all were observed.
         smoothing: whether medians, wider the farther from the rim, settle the fill.
     """
     known = valid & (depth > 0) & np.isfinite(depth)
@@ -102,22 +104,24 @@ def fill_depth(
     plane_of.reshape(-1)[rim] = np.arange(len(rim), dtype=np.int32)
     spread, distance = np.zeros(depth.shape), rim_distance(known)
     if not len(rim):
-        return HoleDepth(inverse, hits, np.zeros((0, 5)), plane_of, spread, distance, 0)
+        return HoleDepth(inverse, hits, np.zeros((0, 5)), plane_of, spread, distance)
     slope = math.tan(math.radians(steepest_deg)) / focal
     planes = np.zeros((len(rim), 5))
     in_threads(_fit_rim, len(rim), inverse, rim, slope, planes)
+    if generated is not None:
+        planes[generated.reshape(-1)[rim], 3] *= GENERATED
     some = inverse[known]
     low, high = np.percentile(some[:: max(1, some.size // ENOUGH)], (1, 99))
     limits = np.array((FARTHEST * low, NEAREST * high))
     values, weights = np.zeros((len(depth), 8)), np.zeros((len(depth), 8))
-    clipped = in_threads(
+    in_threads(
         _combine, len(depth), inverse, known, hits, planes, plane_of.ravel(), slope, limits, spread,
         values, weights,
     )  # fmt: skip
     if smoothing:
         for step in (8, 4, 2, 1, 1):
             inverse = median_of_fill(inverse, known, distance, step=step)
-    return HoleDepth(inverse, hits, planes, plane_of, spread, distance, sum(clipped))
+    return HoleDepth(inverse, hits, planes, plane_of, spread, distance)
 
 
 @compiled()
@@ -293,12 +297,11 @@ def _unhidden(planes, flat, hits, h, x, y, width, slope):
 def _combine(
     first, last, inverse, known, hits, planes, flat, slope, limits, spread, row_values, row_weights
 ):  # fmt: skip
-    """Write the answer of the eight pairs into each hole pixel; the number of clipped pixels.
+    """Write the answer of the eight pairs into each hole pixel.
 
     ``row_values`` and ``row_weights`` (H, 8) are scratch.
     """
     width = known.shape[1]
-    clipped = 0
     for y in range(first, last):
         values, weights = row_values[y], row_weights[y]
         for x in range(width):
@@ -327,13 +330,11 @@ def _combine(
                 continue
             value, weight = _weighted_quantile(values, weights, count, FAR_QUANTILE)
             bounded = min(max(value, limits[0]), limits[1])
-            clipped += bounded != value
             inverse[y, x] = bounded
             apart = 0.0
             for i in range(count):
                 apart += abs(values[i] - value) * weights[i]
             spread[y, x] = apart / (weight * bounded)
-    return clipped
 
 
 @compiled()

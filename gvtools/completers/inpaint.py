@@ -7,9 +7,7 @@ same surface (``hole_color``) and, where a context photograph sees the filled po
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,28 +70,20 @@ class InpaintCompleter(Completer):
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:
         """Fill the holes of all views; see ``Completer.complete``. Nothing here is random."""
-        start = time.perf_counter()
         check_views(context, guidance)
         valid = guidance.valid
         rgb = np.where(valid[..., None], guidance.rgb, np.float32(0))
         depth = np.where(valid, guidance.depth, np.float32(0))
         confidence = np.where(valid, np.minimum(guidance.confidence, 1), 0).astype(np.float32)
-        spent = dict.fromkeys(
-            ("holes", "filled", "from_context", "depth_clipped", "views_without_support"), 0.0
-        )
         for index in range(len(guidance)):
-            spent["holes"] += float((~valid[index]).sum())
-            if valid[index].all():
-                continue
-            if valid[index].sum() < self.settings.min_support:
-                spent["views_without_support"] += 1
+            if valid[index].all() or valid[index].sum() < self.settings.min_support:
                 continue
             view = (rgb[index], depth[index], confidence[index])
-            counts = self._fill(view, valid[index], guidance.cameras[index], context=context)
-            for key, count in counts.items():
-                spent[key] += float(count)
-        spent["seconds"] = time.perf_counter() - start
-        return Completion(rgb, depth, confidence, spent=spent)
+            self._fill(
+                view, valid[index], guidance.cameras[index],
+                generated=guidance.generated[index], context=context,
+            )  # fmt: skip
+        return Completion(rgb, depth, confidence)
 
     def _fill(
         self,
@@ -101,20 +91,24 @@ class InpaintCompleter(Completer):
         valid: NDArray[np.bool_],
         camera: Cameras,
         *,
+        generated: NDArray[np.bool_],
         context: Sequence[ContextView],
-    ) -> dict[str, Any]:
-        """Write depth, then colour, then confidence into a view's holes; counts of pixels.
+    ) -> None:
+        """Write depth, then colour, then confidence into a view's holes.
 
         Args:
             view: colour (H, W, 3), depth (H, W) and confidence (H, W) of one view.
             valid: (H, W) where the memory knows them.
             camera: a batch of one.
+            generated: (H, W) which of these a completer made.
             context: photographs to look points up in.
         """
         rgb, depth, confidence = view
         options = self.settings
         focal = float(np.sqrt(camera.K[0, 0, 0] * camera.K[0, 1, 1]))
-        surface = fill_depth(depth, valid, focal=focal, steepest_deg=options.steepest_deg)
+        surface = fill_depth(
+            depth, valid, focal=focal, steepest_deg=options.steepest_deg, generated=generated
+        )
         holes = ~valid & (surface.inverse > 0)
         if options.reach is not None:
             holes &= surface.distance <= options.reach * float(np.hypot(*valid.shape))
@@ -128,11 +122,6 @@ class InpaintCompleter(Completer):
         color = fill_color(rgb, valid, surface, evidence=evidence, sweeps=options.sweeps)
         rgb[holes], depth[holes] = color[holes], fill[holes]
         confidence[holes] = _confidence(valid, surface, options)[holes]
-        return {
-            "filled": holes.sum(),
-            "from_context": (weight > 0.5).sum(),
-            "depth_clipped": surface.clipped,
-        }
 
 
 def _confidence(

@@ -25,5 +25,4 @@ class NoneCompleter(Completer):
             np.where(valid[..., None], guidance.rgb, np.float32(0)),
             np.where(valid, guidance.depth, np.float32(0)),
             np.where(valid, np.minimum(guidance.confidence, 1), 0).astype(np.float32),
-            spent={"seconds": 0.0, "holes": float((~valid).sum()), "filled": 0.0},
         )

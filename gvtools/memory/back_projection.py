@@ -19,6 +19,8 @@ from gvtools.settings import Settings
 
 # Side of a cell of the free-space grid, pixels.
 FREE_CELL = 4
+# Cosine that generated pixels at depth edges and on grazing surfaces are weighted by.
+LEAST_COSINE = 0.05
 
 
 class BackProjectionOptions(Settings):
@@ -48,6 +50,7 @@ def back_project(
     options: BackProjectionOptions | None = None,
     levels: VoxelLevels | None = None,
     pixel_binning: float = 0.0,
+    generated: bool = False,
 ) -> PointSet:
     """Lift the pixels of one view to points.
 
@@ -66,6 +69,8 @@ def back_project(
         pixel_binning: merge 2 x 2 pixels into one point, their mean, if together they are at most
             this many voxel edges wide (of the voxel that they fall into) and the surface is not
             steep; 0, or no ``levels``, keeps every pixel.
+        generated: a completer made the depth: it has no measured pixel that mixes foreground and
+            background, so depth edges and grazing surfaces are kept, with a small confidence.
 
     Raises:
         ShapeError: the images and the camera disagree in size, or the camera is unusable.
@@ -84,7 +89,8 @@ def back_project(
     count, invalid, edges, masked = _lift(
         np.ascontiguousarray(rgb, np.uint8), z, trust, use, np.ascontiguousarray(camera.K[0]),
         np.ascontiguousarray(frame.local_from_cam(camera.world_from_cam[0])),
-        options.edge, far, options.grazing, positions, colors, weight, spacing, pixels,
+        options.edge, far, options.grazing, LEAST_COSINE if generated else 0.0,
+        positions, colors, weight, spacing, pixels,
     )  # fmt: skip
     if levels and pixel_binning > 0:
         count = bin_pixels(
@@ -131,11 +137,12 @@ def _usable(z):
 
 
 @compiled()
-def _lift(rgb, depth, trust, mask, K, local_from_cam, edge, depth_max, grazing,
+def _lift(rgb, depth, trust, mask, K, local_from_cam, edge, depth_max, grazing, least_cosine,
           positions, colors, weight, spacing, pixels):  # fmt: skip
     """Back-project all usable pixels; pixel (row, col) has its centre at (col + 0.5, row + 0.5).
 
     In: depth (H, W); trust and mask (H, W), or empty where unused; K (3, 3); local_from_cam (4, 4).
+    Edges and grazing surfaces are dropped where ``least_cosine`` is 0, else they have this cosine.
     Out, H*W rows filled from row 0: positions, colors, weight, spacing, pixels (row * W + col).
     Returns the numbers of points, of pixels without usable depth or confidence, of edges and
     grazing surfaces, and of masked pixels.
@@ -160,8 +167,10 @@ def _lift(rgb, depth, trust, mask, K, local_from_cam, edge, depth_max, grazing,
                 continue
             cosine = _surface_cosine(depth, row, col, edge, fx, fy, cx, cy)
             if cosine < grazing:
-                edges += 1
-                continue
+                if least_cosine == 0:
+                    edges += 1
+                    continue
+                cosine = least_cosine
             w = np.float32(cosine)
             if trust.size:
                 w *= trust[row, col]

@@ -42,6 +42,8 @@ def seen_through(x, y, z, K, cam_from_world, free_depth, tolerance):
     return depth < free_depth[np.int64(row), np.int64(column)] * (1 - tolerance)
 
 
+# How far a point may be moved out of free space, and in what steps, as shares of its depth.
+FARTHEST, STEP = 2.0, 1.02
 # Views that are looked at in one call: a call costs as much as some thousand points.
 VIEWS_PER_CALL = 32
 
@@ -78,6 +80,41 @@ def in_free_space(
     for first in range(0, len(views), VIEWS_PER_CALL):
         grids = stacked(views[first : first + VIEWS_PER_CALL])
         in_threads(_mark, len(positions), positions, *grids, tolerance, out)
+    return out
+
+
+def behind_free_space(
+    origin: NDArray[np.float64],
+    rays: NDArray[np.float64],
+    depth: NDArray[np.float64],
+    *,
+    views: Sequence[FreeGrid],
+    tolerance: float,
+) -> NDArray[np.float64]:
+    """Move points along their rays until no view saw past them.
+
+    Args:
+        origin: (3,) the rays' common start.
+        rays: (N, 3) from ``origin`` to the point at depth 1.
+        depth: (N,) of the points, > 0, scene units.
+        views: see ``in_free_space``.
+        tolerance: see ``in_free_space``.
+
+    Returns:
+        (N,) the depth, at most ``FARTHEST`` times as large; 0 where all of that is free.
+    """
+    out = depth.copy()
+    left = np.arange(len(depth))
+    factor = 1.0
+    while len(left):
+        points = origin + rays[left] * (depth[left] * factor)[:, None]
+        hit = in_free_space(points.astype(np.float32), views, tolerance=tolerance)
+        out[left] = depth[left] * factor
+        left = left[hit]
+        factor *= STEP
+        if factor > FARTHEST:
+            out[left] = 0
+            break
     return out
 
 

@@ -45,11 +45,23 @@ def view_distance(store: Store, camera: Cameras, scale: float) -> NDArray[np.flo
     return angle / 15 + distance / (0.15 * scale)
 
 
-def project(store: Store, cameras: Cameras, *, options: SplatOptions | None = None) -> Guidance:
+def project(
+    store: Store,
+    cameras: Cameras,
+    *,
+    options: SplatOptions | None = None,
+    without: str | None = None,
+) -> Guidance:
     """Project the memory into cameras of one image size.
 
     What is nearer to the camera's plane than a voxel and than 1e-4 of the typical depth is not
     drawn.
+
+    Args:
+        store: is projected.
+        cameras: of one image size.
+        options: None takes the defaults.
+        without: name of a view whose observations are left out, by a back end that blends.
 
     Raises:
         ShapeError: the cameras have images of several sizes, or there is none, or one is unusable.
@@ -69,7 +81,7 @@ def project(store: Store, cameras: Cameras, *, options: SplatOptions | None = No
     splatter = _splatter(store, options)
     views = []
     for camera in cameras:
-        projection = _Projection(store, camera, options, splatter=splatter)
+        projection = _Projection(store, camera, options, splatter=splatter, without=without)
         projection.observe()
         views.append(projection.guidance())
     return concatenate(views)
@@ -142,8 +154,16 @@ class _Projection:
     """The steps that write one target camera's images: what was observed, then the rest."""
 
     def __init__(
-        self, store: Store, camera: Cameras, options: SplatOptions, *, splatter: Splatter
+        self,
+        store: Store,
+        camera: Cameras,
+        options: SplatOptions,
+        *,
+        splatter: Splatter,
+        without: str | None = None,
     ) -> None:
+        names = [view.camera.names[0] for view in store.views]
+        self.shown = np.array([name != without for name in names], np.bool_)
         self.store, self.camera, self.options = store, camera, options
         self.splatter = splatter
         shape = (int(camera.height[0]), int(camera.width[0]))
@@ -220,6 +240,7 @@ class _Projection:
         rows = rows.ravel()
         rows = rows[rows < segments.count]
         rows = rows[store.views.generated[segments.view[rows]] == generated]
+        rows = rows[self.shown[segments.view[rows]]]
         self._cull_boxes(segments.box, rows, target.rect, z_range=self.z_range)
         self.seen = rows[target.rect[rows, 1] >= 0]
         if not len(self.seen):

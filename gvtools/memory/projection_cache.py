@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from gvtools.appearance.appearance import Appearance, Picture, applied
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
 from gvtools.memory.projection import Observed, observed_of, project_again
@@ -21,6 +22,7 @@ class CachedProjection:
         camera: a batch of one.
         options: of the projection.
         reuse: False splats everything each time that the memory has changed.
+        appearance: gives colours of what was observed; None leaves them the memory's.
     """
 
     def __init__(
@@ -30,6 +32,7 @@ class CachedProjection:
         *,
         options: SplatOptions | None = None,
         reuse: bool = True,
+        appearance: Appearance | None = None,
     ) -> None:
         self.memory, self.camera = memory, camera
         self.options = options or SplatOptions()
@@ -37,6 +40,8 @@ class CachedProjection:
         self._at = (-1, -1)
         self._observed: Observed | None = None
         self._guidance: Guidance | None = None
+        self.appearance = appearance
+        self._picture: Picture | None = None
 
     def prefetch(self, snapshot: SpatialMemory) -> None:
         """Project what observed views show ahead of ``guidance``, where that is reused.
@@ -60,5 +65,9 @@ class CachedProjection:
                 self._guidance, self._observed = project_again(
                     memory, self.camera, observed, options=self.options
                 )
+            if self.appearance is not None:
+                if self._picture is None:
+                    self._picture = self.appearance.picture(self.camera)
+                self._guidance = applied(self._picture, self._guidance, blend=self.appearance.blend)
             self._at = at
         return self._guidance

@@ -14,6 +14,7 @@ from gvtools.errors import DegenerateError, GvError, MemoryFileError, ShapeError
 from gvtools.memory import fusion
 from gvtools.memory.back_projection import BackProjectionOptions, back_project
 from gvtools.memory.fusion import FuseReport
+from gvtools.memory.occlusion import behind_free_space
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.points import PointSet
 from gvtools.memory.store.store import MemoryOptions, Store
@@ -84,10 +85,36 @@ class SpatialMemory(Store):
         rgb = to_uint8(rgb, camera.names[0])
         points = back_project(
             rgb, depth, camera, frame=self.frame, confidence=confidence, mask=mask,
-            options=options, levels=self.levels, pixel_binning=pixel_binning,
+            options=options, levels=self.levels, pixel_binning=pixel_binning, generated=generated,
         )  # fmt: skip
         report = self.fuse(points, round=round, generated=generated)
         return replace(report, dropped=dict(points.dropped))
+
+    def behind_free_space(
+        self, depth: NDArray[np.float32], camera: Cameras, *, where: NDArray[np.bool_]
+    ) -> NDArray[np.float32]:
+        """Generated depth, moved back where an observed ray saw its place to be free.
+
+        Args:
+            depth: (H, W) float32 z-depth, scene units.
+            camera: a batch of one.
+            where: (H, W) bool, the generated pixels; the others stay as they are.
+
+        Returns:
+            (H, W) float32; 0 where all places along the ray are free.
+        """
+        where = where & (depth > 0)
+        rows, columns = np.nonzero(where)
+        pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1)
+        pose = self.frame.local_from_cam(camera.world_from_cam[0])
+        rays = pixels @ np.linalg.inv(camera.K[0]).T @ pose[:3, :3].T
+        out = depth.copy()
+        out[where] = behind_free_space(
+            pose[:3, 3], rays, depth[where].astype(np.float64),
+            views=self.observed_grids(range(len(self.views))),
+            tolerance=self.options.free_space_tolerance,
+        )  # fmt: skip
+        return out
 
     def fuse(self, points: PointSet, *, round: int, generated: bool = False) -> FuseReport:
         """Take one view's points in.

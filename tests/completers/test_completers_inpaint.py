@@ -56,7 +56,7 @@ def test_a_hidden_wall_gets_the_walls_depth_and_colour():
     assert np.abs(result.rgb[0] - rgb)[36:84, 80].max() < 0.1
 
 
-def test_nothing_known_is_left_empty_and_counted():
+def test_nothing_known_is_left_empty():
     rgb, depth = wall_view()
     empty = np.zeros((HEIGHT, WIDTH), bool)
     few = empty.copy()
@@ -66,15 +66,12 @@ def test_nothing_known_is_left_empty_and_counted():
         assert not result.depth[0][~valid].any()
         assert not result.confidence[0][~valid].any()
         assert not result.rgb[0][~valid].any()
-        assert result.spent["views_without_support"] == 1
-        assert result.spent["filled"] == 0
 
 
 def test_a_view_without_holes_comes_back():
     rgb, depth = wall_view()
     result = create("inpaint").complete([], guidance(rgb, depth, _hole(), camera()))
     assert np.array_equal(result.rgb[0], rgb)
-    assert result.spent["holes"] == 0
 
 
 def test_the_same_seed_gives_the_same_bytes():
@@ -130,7 +127,6 @@ def test_a_photograph_of_another_surface_is_not_used():
     without = create("inpaint").complete([], given)
     blocked = create("inpaint").complete(context, given)
     assert np.array_equal(blocked.rgb, without.rgb)
-    assert blocked.spent["from_context"] == 0
 
 
 def test_a_photograph_that_disagrees_with_two_others_is_outvoted():

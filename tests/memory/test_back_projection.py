@@ -50,6 +50,22 @@ def test_projection_undoes_back_projection(seed, far):
     assert lifted.camera is source
 
 
+def test_generated_depth_keeps_its_edges_with_little_confidence():
+    source = camera(width=40, height=30, focal=35)
+    depth = np.full((30, 40), 4, np.float32)
+    depth[10:20, 10:30] = 2
+    rgb = _numbered(depth.shape)
+    measured = back_project(rgb, depth, source)
+    made = back_project(rgb, depth, source, generated=True)
+    assert measured.dropped["depth edge"] > 0
+    assert (len(made), made.dropped["depth edge"]) == (depth.size, 0)
+    kept = np.zeros(depth.shape, bool)
+    kept[measured.colors[:, 0], measured.colors[:, 1]] = True
+    at_edge = ~kept[made.colors[:, 0], made.colors[:, 1]]
+    assert made.confidence[at_edge].max() < made.confidence[~at_edge].min() / 5
+    np.testing.assert_array_equal(made.confidence[~at_edge], measured.confidence)
+
+
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0.5, 0, 1), (0.3, -0.6, 1), (0.9, 0.4, 1)])
 def test_a_slanted_plane_is_kept_whole_with_its_cosine_and_spacing(normal):
     source = camera(width=120, height=90, focal=100)

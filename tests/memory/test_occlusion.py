@@ -5,7 +5,8 @@ import pytest
 from memory_scenes import camera, plane_view, random_camera
 
 from gvtools.memory.back_projection import FREE_CELL
-from gvtools.memory.occlusion import in_free_space
+from gvtools.memory.occlusion import FARTHEST, STEP, behind_free_space, in_free_space
+from gvtools.memory.spatial_memory import SpatialMemory
 
 
 def _view(source, grid):
@@ -57,3 +58,32 @@ def test_no_view_and_no_grid_free_nothing():
     assert not in_free_space(where, [], tolerance=0.0).any()
     nothing = np.zeros((0, 0), np.float32)
     assert not in_free_space(where, [_view(camera(), nothing)], tolerance=0.0).any()
+
+
+def test_points_move_back_along_their_rays_until_nothing_saw_past_them():
+    source = camera(width=64, height=48, focal=60)
+    views = [_view(source, plane_view(source, 4.0).free_depth)]
+    rays = np.array([(0, 0, 1), (0.1, 0.1, 1), (0, 0, 1), (0, 0, 1), (5, 0, 1)], float)
+    depth = np.array([2.0, 3.0, 4.1, 4 * 0.96 / FARTHEST / STEP, 2.0])
+    moved = behind_free_space(np.zeros(3), rays, depth, views=views, tolerance=0.03)
+    limit = 4 * 0.97
+    assert ((moved[:2] >= limit) & (moved[:2] < limit * STEP)).all()
+    # Behind the wall already; free for as far as is tried; out of the view.
+    assert moved[2:].tolist() == [4.1, 0.0, 2.0]
+
+
+def test_what_moves_back_is_taken_by_fusion():
+    source = camera(width=64, height=48, focal=60)
+    beside = camera(width=64, height=48, focal=60, center=(0.5, 0, 0))
+    memory = SpatialMemory(0.05)
+    grey, wall = np.full((48, 64, 3), 128, np.uint8), np.full((48, 64), 4, np.float32)
+    memory.observe(grey, wall, source, round=0)
+    made = np.full((48, 64), 3, np.float32)
+    where = np.ones(made.shape, bool)
+    moved = memory.behind_free_space(made, beside, where=where)
+    assert moved.min() >= 3
+    rejected = memory.observe(grey, moved, beside, round=1, generated=True).rejected_free
+    assert rejected == 0
+    assert memory.observe(grey, made, beside, round=1, generated=True).rejected_free > 1000
+    untouched = memory.behind_free_space(made, beside, where=~where)
+    np.testing.assert_array_equal(untouched, made)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -111,7 +110,6 @@ class GeoVerseCompleter(Completer):
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:
         """Complete all target views, several in a pass; see ``Completer.complete``."""
-        start = time.perf_counter()
         if not context:
             raise OptionError("completer geoverse needs at least one context view, and got none")
         check_views(context, guidance)
@@ -122,7 +120,6 @@ class GeoVerseCompleter(Completer):
         views = self.settings.views or self.config.views
         context_count = min(self.settings.context_views or self.config.context, views - 1)
         targets_per_pass = views - min(context_count, len(context))
-        passes = steps = 0
         filled = self._filled(context, guidance.select(incomplete)) if incomplete else None
         for first in range(0, len(incomplete), targets_per_pass):
             rows = incomplete[first : first + targets_per_pass]
@@ -134,15 +131,8 @@ class GeoVerseCompleter(Completer):
                 context, part.cameras, depth, count=context_count, selection=selection
             )
             sampling = self._sampling(part)
-            canvas.put(rows, self._pass(chosen, part, fill, sampling=sampling, seed=seed), part)
-            passes += 1
-            steps += max(len(sampling.bounds) - 1, 0)
-        spent = {
-            "seconds": time.perf_counter() - start,
-            "passes": float(passes),
-            "steps": float(steps),
-        }
-        return canvas.completion(spent)
+            canvas.put(rows, self._pass(chosen, part, fill, sampling=sampling, seed=seed))
+        return canvas.completion()
 
     def _filled(self, context: Sequence[ContextView], guidance: Guidance) -> Filled | None:
         """Fill of the holes that the model gets as hint; None if the model fills them itself."""
@@ -243,11 +233,10 @@ class _Canvas:
         self.rays = np.zeros((*valid.shape, 6), np.float32)
         for index in range(len(guidance)):
             self.rays[index] = guidance.cameras.plucker(index)
-        self.spent = {"holes": float((~valid).sum()), "unfilled": 0.0, "views_without_scale": 0.0}
         nothing = ScaleAlignment(ScaleStatus.NOTHING_TO_COMPLETE)
         self.alignment = [nothing] * len(guidance)
 
-    def put(self, rows: Sequence[int], completed: Completed, part: Guidance) -> None:
+    def put(self, rows: Sequence[int], completed: Completed) -> None:
         """Fill the holes of some views."""
         for position, row in enumerate(rows):
             hole = ~self.valid[row]
@@ -257,19 +246,13 @@ class _Canvas:
             if completed.rays is not None and np.isfinite(completed.scales[position]):
                 self.rays[row][hole] = completed.rays[position][hole]
             self.alignment[row] = completed.alignment[position]
-            self.spent["unfilled"] += float((completed.depth[position][hole] <= 0).sum())
-            has_scale_or_depth = np.isfinite(completed.scales[position]) or bool(
-                (completed.depth[position] > 0).any()
-            )
-            self.spent["views_without_scale"] += float(not has_scale_or_depth)
 
-    def completion(self, spent: dict[str, float]) -> Completion:
+    def completion(self) -> Completion:
         """The result."""
         return Completion(
             self.rgb,
             self.depth,
             self.confidence,
             self.rays,
-            spent={**self.spent, **spent},
             scale_alignment=tuple(self.alignment),
         )

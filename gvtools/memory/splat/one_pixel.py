@@ -45,8 +45,14 @@ class NearestImage:
     colors: NDArray[Any] | None = None
 
 
+# Nearest depth that is drawn of a memory, in voxel edges.
+NEAREST = 1e-3
+
+
 @compiled(fastmath=FAST)
-def _fill(positions, first, last, M, fx, skew, fy, cx, cy, depth_max, width, height, buffer):
+def _fill(
+    positions, first, last, M, fx, skew, fy, cx, cy, depth_min, depth_max, width, height, buffer
+):
     """Depth bits in the high half and the point's index in the low half: one comparison."""
     pixel = np.empty(CHUNK, np.uint32)
     depth = np.empty(CHUNK, np.float32)
@@ -74,7 +80,9 @@ def _fill(positions, first, last, M, fx, skew, fy, cx, cy, depth_max, width, hei
             inverse = np.float32(1) / pz
             u = (fx * px + skew * py) * inverse + cx + half
             v = fy * py * inverse + cy + half
-            inside = (u >= 0) & (u < wide) & (v >= 0) & (v < tall) & (pz > 0) & (pz <= depth_max)
+            inside = (
+                (u >= 0) & (u < wide) & (v >= 0) & (v < tall) & (pz > depth_min) & (pz <= depth_max)
+            )
             # Out of view goes to a spare cell behind the image, so the loop has no branch.
             pixel[k] = np.uint32(np.int32(v) * columns + np.int32(u)) if inside else spare
             depth[k] = pz
@@ -86,13 +94,15 @@ def _fill(positions, first, last, M, fx, skew, fy, cx, cy, depth_max, width, hei
 
 
 @compiled(parallel=True)
-def _fill_parallel(positions, parts, M, fx, skew, fy, cx, cy, depth_max, width, height, buffers):
+def _fill_parallel(
+    positions, parts, M, fx, skew, fy, cx, cy, depth_min, depth_max, width, height, buffers
+):
     count = len(positions)
     for t in prange(parts):
         buffers[t] = np.iinfo(np.int64).max
         _fill(
             positions, t * count // parts, (t + 1) * count // parts, M, fx, skew, fy, cx, cy,
-            depth_max, width, height, buffers[t],
+            depth_min, depth_max, width, height, buffers[t],
         )  # fmt: skip
 
 
@@ -124,6 +134,7 @@ def project_nearest(
     *,
     colors: NDArray[Any] | None = None,
     origin: ArrayLike = (0.0, 0.0, 0.0),
+    depth_min: float = 0.0,
     depth_max: float = np.inf,
 ) -> NearestImage:
     """Project points into one camera, one pixel each, nearest depth wins.
@@ -133,6 +144,7 @@ def project_nearest(
         camera: a batch of one.
         colors: (N, 3) of any type, to be looked up for the winners.
         origin: (3,) world frame.
+        depth_min: points at this depth and before it are left out, scene units.
         depth_max: points beyond are left out, scene units.
     """
     height, width = int(camera.height[0]), int(camera.width[0])
@@ -146,7 +158,7 @@ def project_nearest(
     _fill_parallel(
         np.ascontiguousarray(positions), parts, M.astype(np.float32),
         single(K[0, 0]), single(K[0, 1]), single(K[1, 1]), single(K[0, 2] - 0.5),
-        single(K[1, 2] - 0.5), single(depth_max), width, height, buffers,
+        single(K[1, 2] - 0.5), single(depth_min), single(depth_max), width, height, buffers,
     )  # fmt: skip
     depth = np.empty(height * width, np.float32)
     index = np.empty(height * width, np.int32)
@@ -235,7 +247,10 @@ def project_one_pixel(store: Store, cameras: Cameras, *, open3d: bool = False) -
 
 
 def _nearest(store: Store, camera: Cameras) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    image = project_nearest(store.columns.positions, store.frame.seen_from(camera))
+    # A point within the rounding of the camera's plane is neither before nor behind it.
+    image = project_nearest(
+        store.columns.positions, store.frame.seen_from(camera), depth_min=NEAREST * store.voxel
+    )
     return image.depth, image.index
 
 

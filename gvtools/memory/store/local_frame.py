@@ -76,6 +76,13 @@ class LocalFrame:
         local[:, :3, :3] = cam_from_world[:, :3, :3] @ self.axes
         return local
 
+    def cam_from_world(self, cam_from_local: Float64) -> Float64:
+        """(V, 4, 4) poses in the world of cameras given in this frame: of ``cam_from_local``."""
+        world = cam_from_local.copy()
+        world[:, :3, :3] = cam_from_local[:, :3, :3] @ self.axes.T
+        world[:, :3, 3] = cam_from_local[:, :3, 3] - world[:, :3, :3] @ self.origin
+        return world
+
     def local_from_cam(self, world_from_cam: Float64) -> Float64:
         """(4, 4) from one camera to this frame."""
         local = world_from_cam.copy()

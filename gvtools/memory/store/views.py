@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,6 +50,9 @@ class ViewTable:
 
     def __getitem__(self, index: int) -> SourceView:
         return self._views[index]
+
+    def __iter__(self) -> Iterator[SourceView]:
+        return iter(self._views)
 
     @property
     def cameras(self) -> Cameras | None:

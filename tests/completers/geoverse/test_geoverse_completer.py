@@ -77,15 +77,13 @@ def test_observed_pixels_are_kept_bit_for_bit_and_holes_are_filled(weights, size
         assert found.dtype == np.float32
         assert found[known.valid].tobytes() == given[known.valid].tobytes(), name
     hole = ~known.valid
-    assert result.spent["holes"] == hole.sum()
     assert result.rgb[hole].std() > 0.01 and result.rgb.min() >= 0 and result.rgb.max() <= 1
     assert np.isfinite(result.rgb).all() and np.isfinite(result.depth).all()
-    assert result.spent["unfilled"] == (result.depth[hole] <= 0).sum()
     confident = result.confidence[hole]
     assert (confident >= 0).all() and (confident <= GENERATED).all()
     assert ((result.depth[hole] > 0) == (confident > 0)).all()
     if min(size) >= 20:
-        assert result.spent["unfilled"] == 0
+        assert (result.depth[hole] > 0).all()
         assert 1 < np.median(result.depth[hole]) < 9
     assert result.rays is not None
     direction, moment = result.rays[..., :3], result.rays[..., 3:]
@@ -108,7 +106,6 @@ def test_more_targets_than_a_pass_takes_go_through_several(weights, monkeypatch)
     result = complete(weights, context, known, context_views=2, views=4)
     assert [batch.images.shape[1] for batch, _, _ in seen] == [4, 4, 3]
     assert [batch.context for batch, _, _ in seen] == [2, 2, 2]
-    assert result.spent["passes"] == 3
     names = [name for _, names, _ in seen for name in names[2:]]
     assert names == [f"target {name}" for name in known.cameras.names]
     for index in range(5):
@@ -139,8 +136,8 @@ def test_views_without_holes_come_back_and_are_not_computed(weights, monkeypatch
     expected = np.float32(mixed.cameras.plucker(1))
     assert result.rays is not None and result.rays[1].tobytes() == expected.tobytes()
     seen.clear()
-    whole = complete(weights, context, full)
-    assert not seen and whole.spent["passes"] == whole.spent["holes"] == 0
+    complete(weights, context, full)
+    assert not seen
     nothing = Guidance(full.cameras[:0], *(getattr(full, name)[:0] for name in FIELDS))
     assert complete(weights, context, nothing).rgb.shape == (0, 30, 40, 3)
 
@@ -180,7 +177,7 @@ def test_neither_the_worlds_unit_nor_its_frame_matter(weights, alignment, world)
     expected = complete(weights, context, known, alignment=alignment)
     found = complete(weights, *micro.moved(context, known, **WORLDS[world]), alignment=alignment)
     scale = WORLDS[world].get("scale", 1.0)
-    assert expected.spent["views_without_scale"] == 0
+    assert (expected.depth > 0).all()
     np.testing.assert_allclose(found.rgb, expected.rgb, atol=2e-4)
     np.testing.assert_allclose(found.depth, expected.depth * scale, rtol=5e-4)
     np.testing.assert_allclose(found.confidence, expected.confidence, atol=2e-4)
@@ -222,7 +219,6 @@ def test_a_pass_that_went_wrong_leaves_holes_and_says_so(weights, monkeypatch):
     hole = ~known.valid
     assert not result.depth[0, :6, :6][hole[0, :6, :6]].any()
     assert not result.confidence[1][hole[1]].any() and not result.depth[1][hole[1]].any()
-    assert result.spent["unfilled"] == (result.depth[hole] <= 0).sum() > hole[1].sum()
 
 
 @pytest.mark.filterwarnings("error")
@@ -235,9 +231,7 @@ def test_without_any_support_for_a_scale_there_is_no_depth(weights, monkeypatch)
     known = micro.guidance(2, share=-1.0)
     result = complete(weights, micro.context_views(2), known)
     assert not result.depth.any() and not result.confidence.any() and result.rgb.any()
-    assert result.spent["views_without_scale"] == 2
     assert statuses(result) == [ScaleStatus.UNSUPPORTED] * 2
-    assert result.spent["unfilled"] == result.spent["holes"] == known.valid.size
     assert result.rays is not None
     np.testing.assert_array_equal(result.rays[1], np.float32(known.cameras.plucker(1)))
 
@@ -293,9 +287,8 @@ def test_steps_and_the_scale_of_guidance_are_the_options(weights, monkeypatch):
         ({"steps": 2, "cfg_scale": 1.5}, [1, 1, 0.5, 0.5]),
     ):
         calls.clear()
-        result = complete(weights, context, known, **options)
+        complete(weights, context, known, **options)
         assert sorted(calls, reverse=True) == pytest.approx(times)
-        assert result.spent["steps"] == len(set(times))
 
 
 def test_temperature_scales_the_noise_that_level_1_starts_from(weights, monkeypatch):

@@ -41,7 +41,9 @@ def whole(scan, weights, tmp_path_factory) -> Path:
 def reconstruct(scan: Path, weights: Path, out: Path, *words: str) -> int:
     """Exit status of the command."""
     given = ("--completer", "geoverse", "--set", f"completer.weights={weights}", "--quiet")
-    return main(["reconstruct", str(scan), "--out", str(out), *OPTIONS, *given, *words])
+    return main(
+        ["reconstruct", str(scan), "--refine", "0", "--out", str(out), *OPTIONS, *given, *words]
+    )
 
 
 def test_a_dry_run_says_what_it_would_do_and_computes_nothing(
@@ -52,7 +54,21 @@ def test_a_dry_run_says_what_it_would_do_and_computes_nothing(
 
     monkeypatch.setattr(GeoVerseCompleter, "complete", called)
     given = ("--completer", "geoverse", "--set", f"completer.weights={weights}", "--dry-run")
-    assert main(["reconstruct", str(scan), "--out", str(tmp_path / "run"), *OPTIONS, *given]) == 0
+    assert (
+        main(
+            [
+                "reconstruct",
+                str(scan),
+                "--refine",
+                "0",
+                "--out",
+                str(tmp_path / "run"),
+                *OPTIONS,
+                *given,
+            ]
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert "geoverse" in said and "dry run" in said
     assert not (tmp_path / "run").exists()
