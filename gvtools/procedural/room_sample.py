@@ -78,27 +78,47 @@ def write_room(
         OptionError: a negative seed, fewer than 4 views, or images below 16 x 16 pixels.
         ProjectError: the folder holds something else or cannot be written.
     """
-    if seed < 0 or views < 4 or width < 16 or height < 16:
-        raise OptionError(
-            f"room: seed {seed}, {views} views of {width}x{height}; expected a seed of 0 or more, "
-            "at least 4 views and images of at least 16x16"
-        )
     folder = Path(folder)
-    count = max(2, round(views * CONTEXT_SHARE))
-    context = tuple(f"context_{i:02d}.png" for i in range(count))
-    targets = tuple(f"target_{i:02d}.png" for i in range(views - count))
+    check_options(seed, views, width=width, height=height)
+    context, targets = _names(views)
     sample = RoomSample(folder, context, targets, context + targets, seed)
     record: dict[str, Any] = {"sample": "room", "version": 2, "width": width, "height": height}
     record |= {key: value for key, value in asdict(sample).items() if key != "folder"}
     if is_written(folder, record):
         return sample
-    room = furnished_room(seed)
-    rng = np.random.default_rng([seed, 21])
-    cameras = _path(
-        room.geometry.rooms[0, 1], context, targets, width=width, height=height, rng=rng
-    )
+    room, cameras, rng = room_views(seed, views, width=width, height=height)
     write_sample(folder, _photographed(room, cameras, rng), record=record)
     return sample
+
+
+def check_options(seed: int, views: int, *, width: int, height: int) -> None:
+    """Refuse what no sample can be drawn with.
+
+    Raises:
+        OptionError: a negative seed, fewer than 4 views, or images below 16 x 16 pixels.
+    """
+    if seed < 0 or views < 4 or width < 16 or height < 16:
+        raise OptionError(
+            f"room: seed {seed}, {views} views of {width}x{height}; expected a seed of 0 or more, "
+            "at least 4 views and images of at least 16x16"
+        )
+
+
+def room_views(
+    seed: int, views: int, *, width: int, height: int
+) -> tuple[ProceduralScene, Cameras, np.random.Generator]:
+    """The room, its cameras (context before targets), and the generator for what follows."""
+    room = furnished_room(seed)
+    rng = np.random.default_rng([seed, 21])
+    size = room.geometry.rooms[0, 1]
+    return room, _path(size, *_names(views), width=width, height=height, rng=rng), rng
+
+
+def _names(views: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of context and targets."""
+    count = max(2, round(views * CONTEXT_SHARE))
+    context = tuple(f"context_{i:02d}.png" for i in range(count))
+    return context, tuple(f"target_{i:02d}.png" for i in range(views - count))
 
 
 def compile_kernels() -> None:

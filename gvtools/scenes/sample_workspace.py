@@ -1,4 +1,4 @@
-"""A sample written as a COLMAP dense workspace, whole or not at all."""
+"""A sample written to a folder, whole or not at all; most are COLMAP dense workspaces."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -72,10 +73,7 @@ def write_sample(folder: Path, content: SampleContent, *, record: dict[str, Any]
     """
     from PIL import Image
 
-    partial: Path | None = None
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    with written_whole(folder, record) as partial:
         (partial / "images").mkdir()
         for name, image, depth in zip(
             content.cameras.names, content.images, content.depths, strict=True
@@ -93,6 +91,20 @@ def write_sample(folder: Path, content: SampleContent, *, record: dict[str, Any]
             view_index=view_index,
             xy=xy,
         )
+
+
+@contextmanager
+def written_whole(folder: Path, record: dict[str, Any]) -> Iterator[Path]:
+    """A folder to write a sample into, which becomes ``folder`` with its record at the end.
+
+    Raises:
+        ProjectError: the folder cannot be written.
+    """
+    partial: Path | None = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        yield partial
         (partial / RECORD).write_text(json.dumps(record, indent=1) + "\n")
         # mkdtemp makes folders private; a sample is as readable as any other folder.
         partial.chmod(0o755)

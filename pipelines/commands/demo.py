@@ -13,8 +13,9 @@ SUMMARY = "run the main job on a sample that needs no download"
 EXAMPLES = (
     "gvtools demo",
     "gvtools demo --sample motorcycle --out runs/motorcycle",
+    "gvtools demo --sample noisy-room",
 )
-SAMPLES = ("room", "motorcycle")
+SAMPLES = ("room", "noisy-room", "motorcycle")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +23,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     The sample is written beside the run also with ``--dry-run``, which opens it.
     """
-    parser.add_argument("--sample", choices=SAMPLES, default="room", help="default room")
+    parser.add_argument(
+        "--sample",
+        choices=SAMPLES,
+        default="room",
+        help="default room; noisy-room is the same as a cheap RGB-D camera records it",
+    )
     add_run_arguments(parser, out_required=False)
 
 
@@ -40,7 +46,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from pipelines.reconstruction.run import reconstruct
     from pipelines.report.write import draw_run
 
-    compile_kernels(config, console, more=(KERNELS,) if args.sample == "room" else ())
+    compile_kernels(config, console, more=(KERNELS,) if args.sample != "motorcycle" else ())
     console.line(f"sample {args.sample}, seed {config.seed}: writing {sample}")
     context, targets = _write(args.sample, sample, config.seed)
     if args.context is None:
@@ -89,6 +95,11 @@ def _write(name: str, folder: Path, seed: int) -> tuple[tuple[str, ...], tuple[s
 
         room = write_room(folder, seed=seed)
         return room.context, room.targets
+    if name == "noisy-room":
+        from gvtools.procedural.noisy_room import write_noisy_room
+
+        noisy = write_noisy_room(folder, seed=seed)
+        return noisy.context, noisy.targets
     from gvtools.scenes.stereo_sample import write_motorcycle
 
     pair = write_motorcycle(folder)

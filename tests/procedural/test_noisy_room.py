@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import maximum_filter, minimum_filter
+
+from gvtools.cameras import Cameras
+from gvtools.errors import OptionError, ProjectError
+from gvtools.procedural.depth_sensor import Surfaces, measured_depth, range_noise
+from gvtools.procedural.noisy_room import jittered, write_noisy_room
+from gvtools.procedural.room_sample import RoomSample, write_room
+from gvtools.scenes.inspection import inspect
+from gvtools.scenes.project import open_project
+from gvtools.scenes.scene import Scene
+from pipelines.cli import main
+
+SIZE = {"views": 10, "width": 240, "height": 180}
+CONTEXT = 4
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> RoomSample:
+    return write_noisy_room(tmp_path_factory.mktemp("noisy") / "seed0", seed=0, **SIZE)
+
+
+@pytest.fixture(scope="module")
+def scene(sample: RoomSample) -> Scene:
+    return open_project(sample.folder)
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """The same room without noise."""
+    return open_project(write_room(tmp_path_factory.mktemp("room") / "room", seed=0, **SIZE).folder)
+
+
+def wall(z: float, *, albedo: float = 0.8, glossy: bool = False, size: int = 240) -> Surfaces:
+    """A wall across the view, at one depth."""
+    shape = (size, size)
+    camera = Cameras.pinhole(size, size, focal=400.0)
+    return Surfaces(
+        np.full(shape, z, np.float32),
+        np.full(shape, albedo, np.float32),
+        np.full(shape, glossy),
+        camera.rays(),
+    )
+
+
+@pytest.mark.parametrize("z", [0.8, 1.5, 2.5, 4.0])
+def test_range_noise_grows_with_the_square_of_range(z: float) -> None:
+    depth = measured_depth(wall(z), np.random.default_rng(0))
+    known = depth[depth > 0]
+    step = z * z / (580 * 0.075 * 8)  # of z where disparity moves by an eighth of a pixel
+    expected = np.hypot(0.0015 + 0.0025 * (z - 0.4) ** 2, step / np.sqrt(12))
+    assert known.std() == pytest.approx(expected, rel=0.08)
+    assert known.mean() == pytest.approx(z, abs=0.2 * expected + 0.05 * step)
+
+
+def test_noise_is_common_to_neighbours_but_not_to_distant_pixels() -> None:
+    depth = measured_depth(wall(2.5), np.random.default_rng(0))[:, :220]
+    error = depth - 2.5
+    near = np.corrcoef(error[:, 1:].ravel(), error[:, :-1].ravel())[0, 1]
+    far = np.corrcoef(error[:, 20:].ravel(), error[:, :-20].ravel())[0, 1]
+    assert 0.35 < near < 0.55
+    assert abs(far) < 0.05
+
+
+def test_disparity_comes_in_eighths_of_a_pixel() -> None:
+    depth = measured_depth(wall(3.0), np.random.default_rng(0))
+    eighths = 580 * 0.075 * 8 / depth[depth > 0]
+    np.testing.assert_allclose(eighths, np.rint(eighths), atol=1e-3)
+
+
+def test_dark_far_and_glossy_surfaces_have_holes() -> None:
+    rng = np.random.default_rng(0)
+
+    def share(**options: float) -> float:
+        return float((measured_depth(wall(**options), rng)[:, :200] == 0).mean())  # type: ignore[arg-type]
+
+    assert share(z=2.0) == 0
+    assert share(z=2.0, albedo=0.005) > 0.9
+    assert share(z=2.0, albedo=0.02) < 0.5 < share(z=4.0, albedo=0.02)
+    assert 0.1 < share(z=2.0, glossy=True) < 1
+    assert share(z=7.0) > 0.9
+
+
+def test_edges_have_a_shadow_on_the_left_and_depth_between_front_and_back() -> None:
+    surfaces = wall(3.0)
+    surfaces.depth[:, 120:160] = 1.5
+    depth = measured_depth(surfaces, np.random.default_rng(0))
+    # Disparity of the front less that of the back, at this focal length.
+    shadow = 400 * 0.075 * (1 / 1.5 - 1 / 3.0)
+    lost = (depth == 0).mean(0)
+    assert lost[:100].max() == 0
+    assert lost[121 - int(shadow) : 119].min() == 1
+    assert lost[165:220].max() == 0
+    right = depth[:, 159:161]
+    between = (right > 1.65) & (right < 2.7)
+    assert 0.2 < between.mean() < 0.4
+
+
+def test_a_strip_on_the_right_has_no_depth(scene: Scene) -> None:
+    for view in scene.views[:CONTEXT]:
+        depth = view.load().depth
+        assert depth is not None
+        assert not depth[:, -round(0.04 * SIZE["width"]) :].any()
+
+
+def test_context_is_noisy_by_the_stated_amounts(scene: Scene, twin: Scene) -> None:
+    holes, scaled = [], []
+    for view, true in zip(scene.views[:CONTEXT], twin.views[:CONTEXT], strict=True):
+        depth, truth = view.load().depth, true.load().depth
+        assert depth is not None and truth is not None
+        holes.append((depth == 0).mean())
+        flat = maximum_filter(truth, 3) - minimum_filter(truth, 3) < 0.04 * truth
+        use = flat & (depth > 0)
+        scaled.append((depth - truth)[use] / range_noise(truth[use]))
+    assert 0.1 < np.mean(holes) < 0.35
+    spread = 1.4826 * np.median(np.abs(np.concatenate(scaled)))
+    assert 1.0 < spread < 1.3  # rounding of disparity adds to the noise
+
+
+def test_exposure_varies_by_a_few_percent(scene: Scene, twin: Scene) -> None:
+    ratio = [
+        view.load().rgb.mean() / true.load().rgb.mean()
+        for view, true in zip(scene.views[:CONTEXT], twin.views[:CONTEXT], strict=True)
+    ]
+    assert 0.001 < np.std(ratio) < 0.04
+    assert np.abs(np.array(ratio) - 1).max() < 0.1
+
+
+def test_targets_are_the_truth_at_the_true_poses(
+    scene: Scene, twin: Scene, sample: RoomSample
+) -> None:
+    assert scene.names == sample.context + sample.targets
+    np.testing.assert_allclose(scene.cameras.K, twin.cameras.K, rtol=1e-8)
+    poses, true = scene.cameras.cam_from_world, twin.cameras.cam_from_world
+    np.testing.assert_allclose(poses[CONTEXT:], true[CONTEXT:], atol=1e-9)
+    assert np.abs(poses[:CONTEXT] - true[:CONTEXT]).max((1, 2)).min() > 1e-3
+    for view, other in zip(scene.views[CONTEXT:], twin.views[CONTEXT:], strict=True):
+        frame, exact = view.load(), other.load()
+        assert frame.depth is not None and exact.depth is not None
+        np.testing.assert_allclose(frame.depth, exact.depth, atol=6e-4)
+        # Kernels that were just compiled and kernels from the cache round a few pixels otherwise.
+        assert np.abs(frame.rgb.astype(int) - exact.rgb).max() <= 1
+
+
+def test_pose_errors_have_the_stated_size_and_drift() -> None:
+    poses = np.tile(np.eye(4), (4000, 1, 1))
+    moved = jittered(poses, np.random.default_rng(0))
+    centers = -np.einsum("vji,vj->vi", moved[:, :3, :3], moved[:, :3, 3])
+    assert np.sqrt((centers**2).sum(1).mean()) == pytest.approx(0.01, rel=0.05)
+    cosine = (np.trace(moved[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    degrees = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    assert np.sqrt((degrees**2).mean()) == pytest.approx(0.5, rel=0.05)
+    neighbours = np.corrcoef(centers[1:, 0], centers[:-1, 0])[0, 1]
+    assert 0.3 < neighbours < 0.6
+    assert abs(np.corrcoef(centers[30:, 0], centers[:-30, 0])[0, 1]) < 0.1
+
+
+def test_reader_has_nothing_to_complain(scene: Scene) -> None:
+    report = inspect(scene)
+    assert report.ok and report.metric and report.kind == "rgbd"
+    assert [finding.message for finding in report.findings if finding.level != "info"] == []
+
+
+def test_same_seed_same_bytes_and_another_is_refused(sample: RoomSample, tmp_path: Path) -> None:
+    again = write_noisy_room(tmp_path / "again", seed=0, **SIZE)
+    files = sorted(path.name for path in sample.folder.iterdir())
+    assert len(files) == 3 * SIZE["views"] + 2
+    assert files == sorted(path.name for path in again.folder.iterdir())
+    for name in files:
+        assert (sample.folder / name).read_bytes() == (again.folder / name).read_bytes(), name
+    assert write_noisy_room(sample.folder, seed=0, **SIZE) == sample
+    with pytest.raises(ProjectError, match="another sample"):
+        write_noisy_room(sample.folder, seed=1, **SIZE)
+    with pytest.raises(OptionError, match="expected a seed of 0 or more"):
+        write_noisy_room(tmp_path / "bad", seed=-1)
+
+
+def test_demo_takes_the_sample_by_name(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert main(["demo", "--sample", "noisy-room", "--out", str(out), "--dry-run", "--quiet"]) == 0
+    assert open_project(tmp_path / "run-sample").kind == "rgbd"
