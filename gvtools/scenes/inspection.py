@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gvtools.errors import GvError
+from gvtools.scenes.pose_contradictions import Thumbnail, contradiction_findings, thumbnail
 from gvtools.scenes.scene import Finding, Scene
 
 # Focal lengths of usual lenses, over the image's sides.
@@ -82,8 +83,10 @@ class SceneReport:
 
 
 class _Opened(NamedTuple):
-    """One view that was decoded: its masked share, and of its depth, if any, what is valid."""
+    """One view that was decoded: its number, its masked share, and of its depth what is valid."""
 
+    view: int
+    thumbnail: Thumbnail
     masked: float
     pixels: int = 0
     valid: int = 0
@@ -110,6 +113,11 @@ def inspect(scene: Scene) -> SceneReport:
     errors = reprojection_errors(scene)
     findings += _views_without_depth(scene)
     findings += _doubtful_cameras(scene, errors)
+    findings += contradiction_findings(
+        scene,
+        {item.view: item.thumbnail for item in opened},
+        {item.view: item.range[1] for item in opened if item.valid},
+    )
     return SceneReport(
         root=str(scene.root),
         kind=scene.kind,
@@ -150,7 +158,7 @@ def reprojection_errors(scene: Scene) -> np.ndarray:
 def _open(scene: Scene, findings: list[Finding]) -> list[_Opened]:
     known = {finding.message for finding in findings}
     opened, empty = [], []
-    for view in scene.views:
+    for number, view in enumerate(scene.views):
         try:
             frame = view.load()
         except GvError as error:
@@ -158,15 +166,16 @@ def _open(scene: Scene, findings: list[Finding]) -> list[_Opened]:
                 findings.append(Finding("error", str(error)))
             continue
         masked = 0.0 if frame.mask is None else 1.0 - float(frame.mask.mean())
+        seen = number, thumbnail(frame), masked
         if frame.depth is None:
-            opened.append(_Opened(masked))
+            opened.append(_Opened(*seen))
             continue
         valid = frame.depth[frame.depth > 0]
         if valid.size:
             spread = float(valid.min()), float(np.median(valid)), float(valid.max())
-            opened.append(_Opened(masked, frame.depth.size, valid.size, spread))
+            opened.append(_Opened(*seen, frame.depth.size, valid.size, spread))
         else:
-            opened.append(_Opened(masked, frame.depth.size))
+            opened.append(_Opened(*seen, frame.depth.size))
             empty.append(view.name)
     if empty:
         message = f"{len(empty)} depth maps hold no valid pixel, first {empty[0]}"

@@ -5,6 +5,8 @@ import json
 
 import numpy as np
 import pytest
+import skimage.data
+from PIL import Image
 from scenes_workspace import HEIGHT, WIDTH, sevenscenes, workspace
 
 from gvtools.errors import ProjectError
@@ -74,3 +76,16 @@ def test_the_kitchen(shared, capsys):
     out = capsys.readouterr().out
     assert "ok: true" in out
     assert np.char.count(out, "info: ") >= 1
+
+
+def test_poses_that_contradict_each_other_are_a_warning(tmp_path, capsys):
+    sevenscenes(tmp_path, frames=4)
+    pose = (tmp_path / "frame-000000.pose.txt").read_text()
+    for i, name in enumerate(("astronaut", "astronaut", "coffee", "coffee")):
+        picture = Image.fromarray(getattr(skimage.data, name)()).resize((WIDTH, HEIGHT))
+        picture.save(tmp_path / f"frame-{i:06d}.color.png")
+        (tmp_path / f"frame-{i:06d}.pose.txt").write_text(pose)
+    run(tmp_path)
+    out = capsys.readouterr().out
+    assert "warning: 4 pairs of views have nearly equal cameras but show different things" in out
+    assert "ok: true" in out

@@ -1,0 +1,262 @@
+"""Pairs of views whose cameras are nearly equal but whose pictures show different things.
+
+Structure from motion that meets an object which repeats (a label on two sides, equal facades) can
+give pictures of one side the poses of the other. Reprojection errors stay small then, since every
+point fits. What gives such poses away is a pair of cameras at nearly the same place, with nearly
+the same orientation, that see different surroundings.
+
+The parallax between such cameras is small, so that the homography of their rotation,
+``K_b R K_a⁻¹``, carries one picture onto the other up to a few pixels of a small picture. Windows
+are compared by zero-normalised cross-correlation, which no change of brightness or contrast alters,
+at the best of a few shifts, which take up what parallax is left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# Cameras count as nearly equal below this distance, in scene depths, and this angle.
+NEAR = 0.06
+NEAR_DEGREES = 10.0
+# How many of its nearest cameras a view is compared with.
+NEIGHBORS = 6
+# Pictures are compared at this length of the longer side, in square windows, at shifts, in pixels.
+SIDE, WINDOW, SHIFT = 48, 9, 3
+# A window has contrast from this standard deviation, grey levels, and agrees from this correlation.
+CONTRAST, AGREE = 4.0, 0.5
+# Pictures can be compared when this share of them has contrast, and contradict each other when more
+# than the second share of that disagrees. On six real scenes it is at most 0.03.
+COMPARABLE, DISAGREEING = 0.3, 0.15
+# Sparse points contradict when each view has at least this many that lie in the other's picture,
+# and less than this share of them is of both. On three real scenes it is at least 0.5.
+POINTS, SHARED = 30, 0.05
+LISTED = 3  # pairs that the finding names
+
+
+class Thumbnail(NamedTuple):
+    """A picture reduced for comparison: (h, w) float32 grey levels, and where they may be used."""
+
+    grey: Float32
+    valid: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """Two views whose poses cannot both be right.
+
+    Attributes:
+        names: of the two.
+        distance: between the camera centres, scene units.
+        degrees: between their orientations.
+        disagreement: share of the comparable area in which the pictures differ; None where the
+            pictures could not be compared.
+        shared_points: sparse points of both views; None without enough points.
+        points: of those that could be shared, the smaller number of the two views.
+    """
+
+    names: tuple[str, str]
+    distance: float
+    degrees: float
+    disagreement: float | None
+    shared_points: int | None
+    points: int | None
+
+    def __str__(self) -> str:
+        if self.disagreement is not None and self.disagreement > DISAGREEING:
+            evidence = f"{self.disagreement:.0%} of the picture differs"
+        else:
+            evidence = f"{self.shared_points} of {self.points} sparse points shared"
+        return f"{self.names[0]} and {self.names[1]} ({evidence})"
+
+
+def thumbnail(frame: Frame) -> Thumbnail:
+    """The frame's picture reduced to ``SIDE`` pixels on its longer side."""
+    height, width = frame.rgb.shape[:2]
+    scale = SIDE / max(height, width)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    grey = cv2.resize(
+        cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA
+    )
+    valid = np.ones(grey.shape, np.bool_)
+    if frame.mask is not None:
+        share = cv2.resize(frame.mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        valid = share > 0.99
+    return Thumbnail(grey.astype(np.float32), valid)
+
+
+def contradiction_findings(
+    scene: Scene, thumbnails: Mapping[int, Thumbnail], depths: Mapping[int, float]
+) -> list[Finding]:
+    """One warning when nearly equal cameras see different things, else nothing.
+
+    Args:
+        scene: whose poses are doubted.
+        thumbnails: by the view's number; of the views whose pictures could be read.
+        depths: median z-depth of views that have any, scene units.
+    """
+    found = contradictions(scene, thumbnails, depths)
+    if not found:
+        return []
+    more = f" and {len(found) - LISTED} more" if len(found) > LISTED else ""
+    message = (
+        f"{len(found)} pairs of views have nearly equal cameras but show different things: "
+        f"{', '.join(str(pair) for pair in found[:LISTED])}{more}; expected at most "
+        f"{DISAGREEING:.0%} of the picture to differ and at least {SHARED:.0%} of the points to be "
+        "shared: their poses contradict each other (an object that looks alike from two sides, "
+        "swapped pictures, or something large that moved); look at these pairs, then solve the "
+        "poses again or leave the wrong views out (--context)"
+    )
+    return [Finding("warning", message)]
+
+
+def contradictions(
+    scene: Scene, thumbnails: Mapping[int, Thumbnail], depths: Mapping[int, float]
+) -> list[Contradiction]:
+    """The pairs of views whose poses contradict each other, worst first; arguments as above."""
+    if len(scene) < 2:
+        return []
+    cameras = scene.cameras
+    found = []
+    for a, b, distance, degrees in _near_pairs(cameras, _reach(scene, depths)):
+        points = None if scene.points is None else _shared_points(scene.points, cameras, (a, b))
+        differs = None
+        if a in thumbnails and b in thumbnails:
+            differs = disagreement(thumbnails[a], thumbnails[b], cameras[[a, b]])
+        unshared = points is not None and points[0] < SHARED * points[1]
+        if unshared or (differs is not None and differs > DISAGREEING):
+            names = scene.views[a].name, scene.views[b].name
+            shared, of = points or (None, None)
+            found.append(Contradiction(names, distance, degrees, differs, shared, of))
+    return sorted(found, key=lambda pair: -(pair.disagreement or 1.0))
+
+
+def disagreement(a: Thumbnail, b: Thumbnail, cameras: Cameras) -> float | None:
+    """Share of the area with contrast in which two pictures differ.
+
+    Args:
+        a: the first picture.
+        b: the second, which is carried onto the first by the homography of the rotation.
+        cameras: of the two, at any size.
+
+    Returns:
+        None where less than ``COMPARABLE`` of the picture lies in both and has contrast in both.
+    """
+    x = a.grey - a.grey.mean()
+    y, valid = _carried(b, cameras, a.grey.shape)
+    mask = (valid & a.valid).astype(np.float32)
+    weight = np.maximum(_window(mask), 1e-6)
+    mean_y = _window(mask * y) / weight
+    var_y = np.maximum(_window(mask * y * y) / weight - mean_y**2, 0)
+    best = np.full(x.shape, -1.0, np.float32)
+    contrast = np.zeros(x.shape, np.bool_)
+    padded = cv2.copyMakeBorder(x, *(SHIFT,) * 4, cv2.BORDER_REPLICATE)
+    for dy in range(2 * SHIFT + 1):
+        for dx in range(2 * SHIFT + 1):
+            moved = padded[dy : dy + x.shape[0], dx : dx + x.shape[1]]
+            sums = _window(cv2.merge([mask * moved, mask * moved * moved, mask * moved * y]))
+            mean_x, square, product = np.moveaxis(sums / weight[..., None], -1, 0)
+            var_x = np.maximum(square - mean_x**2, 0)
+            correlation = (product - mean_x * mean_y) / np.sqrt(var_x * var_y + 1e-3)
+            np.maximum(best, correlation, out=best)
+            if dx == dy == SHIFT:
+                contrast = (np.minimum(var_x, var_y) > CONTRAST**2) & (weight > 0.4)
+    if contrast.mean() < COMPARABLE:
+        return None
+    return float((best[contrast] < AGREE).mean())
+
+
+def _window(values: Float32) -> Float32:
+    """Means over windows; what lies outside the picture counts as zero."""
+    return np.asarray(cv2.blur(values, (WINDOW, WINDOW), borderType=cv2.BORDER_CONSTANT))
+
+
+def _carried(
+    b: Thumbnail, cameras: Cameras, shape: tuple[int, ...]
+) -> tuple[Float32, NDArray[np.bool_]]:
+    """The second picture seen from the first's orientation, and where it is known."""
+    first = cameras[0].resized(shape[1], shape[0])
+    second = cameras[1].resized(b.grey.shape[1], b.grey.shape[0])
+    rotation = second.cam_from_world[0, :3, :3] @ first.cam_from_world[0, :3, :3].T
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centres
+    H = np.linalg.inv(half) @ second.K[0] @ rotation @ np.linalg.inv(first.K[0]) @ half
+    size = shape[1], shape[0]
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    grey = cv2.warpPerspective(b.grey - b.grey.mean(), H, size, flags=flags)
+    valid = cv2.warpPerspective(b.valid.astype(np.float32), H, size, flags=flags)
+    return np.asarray(grey, np.float32), valid > 0.99
+
+
+def _reach(scene: Scene, depths: Mapping[int, float]) -> Float64:
+    """(V,) how far another camera may stand from each, scene units.
+
+    A share of the view's depth, from its sparse points or its depth map. A scene that has neither
+    is taken to be as deep as its cameras are spread, and half the mean step from view to view is
+    the most.
+    """
+    cameras = scene.cameras
+    centers = cameras.centers
+    known = dict(depths)
+    if scene.points is not None:
+        for view in range(len(scene)):
+            rows = scene.points.point_index[scene.points.view_index == view]
+            if len(rows):
+                axis = cameras.cam_from_world[view, 2]
+                known[view] = float(np.median(scene.points.positions[rows] @ axis[:3] + axis[3]))
+    if known:
+        middle = float(np.median(list(known.values())))
+        return NEAR * np.array([known.get(view, middle) for view in range(len(scene))])
+    step = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).mean())
+    return np.full(len(scene), min(NEAR * float(np.ptp(centers, axis=0).max()), step / 2))
+
+
+def _near_pairs(cameras: Cameras, reach: Float64) -> list[tuple[int, int, float, float]]:
+    """Pairs of nearly equal cameras: numbers, distance (scene units) and angle (degrees)."""
+    from scipy.spatial import KDTree
+
+    centers, rotations = cameras.centers, cameras.cam_from_world[:, :3, :3]
+    unit = float(np.median(reach))
+    if not unit > 0:
+        return []
+    # The Frobenius distance of two rotations that differ by the angle t is sqrt(8) sin(t / 2).
+    turn = np.sqrt(8) * np.sin(np.radians(NEAR_DEGREES) / 2)
+    places = np.concatenate([centers / unit, rotations.reshape(-1, 9) / turn], axis=1)
+    count = min(NEIGHBORS + 1, len(cameras))
+    _, nearest = KDTree(places).query(places, count)
+    pairs = {(min(a, int(b)), max(a, int(b))) for a, row in enumerate(nearest) for b in row}
+    near = []
+    for a, b in sorted(pairs):
+        distance = float(np.linalg.norm(centers[a] - centers[b]))
+        sine = np.linalg.norm(rotations[a] - rotations[b]) / np.sqrt(8)
+        degrees = float(np.degrees(2 * np.arcsin(min(sine, 1.0))))
+        if a != b and distance < min(reach[a], reach[b]) and degrees < NEAR_DEGREES:
+            near.append((a, b, distance, degrees))
+    return near
+
+
+def _shared_points(
+    points: SparsePoints, cameras: Cameras, views: tuple[int, int]
+) -> tuple[int, int] | None:
+    """How many points both views have, and of how many; None where there are too few to tell."""
+    own = [np.unique(points.point_index[points.view_index == view]) for view in views]
+    inside = []
+    for rows, other in zip(own, reversed(views), strict=True):
+        xy, z = cameras[other].project(points.positions[rows])
+        size = [cameras.width[other], cameras.height[other]]
+        with np.errstate(invalid="ignore"):
+            seen = (z[0] > 0) & (xy[0] >= 0).all(-1) & (xy[0] < size).all(-1)
+        inside.append(int(seen.sum()))
+    if min(inside) < POINTS:
+        return None
+    return len(np.intersect1d(own[0], own[1])), min(inside)

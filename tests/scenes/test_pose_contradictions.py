@@ -1,0 +1,181 @@
+"""Cameras in the middle of a box whose walls are photographs far away, so that truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import skimage.data
+
+from gvtools.cameras import Cameras
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.inspection import inspect
+from gvtools.scenes.pose_contradictions import contradictions, disagreement, thumbnail
+from gvtools.scenes.project import open_project
+from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
+
+WIDTH, HEIGHT, FOCAL = 96, 72, 80.0
+FAR = 4.0  # distance of the walls, scene units
+WALLS = ("astronaut", "coffee")  # seen along +z, and along -z
+
+
+def wall_picture(camera: Cameras, name: str) -> np.ndarray:
+    """(H, W, 3) uint8: the photograph on the plane z = FAR, 8 units wide, as the camera sees it."""
+    photograph = cv2.resize(getattr(skimage.data, name)(), (400, 400), interpolation=cv2.INTER_AREA)
+    from_pixel = np.array([[8 / 400, 0, -4], [0, 8 / 400, -4], [0, 0, 1]])
+    pose = camera.cam_from_world[0]
+    plane = np.stack([pose[:3, 0], pose[:3, 1], FAR * pose[:3, 2] + pose[:3, 3]], axis=1)
+    H = camera.K[0] @ plane @ from_pixel
+    return np.asarray(cv2.warpPerspective(photograph, H, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR))
+
+
+def turned(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
+    """(3, 3) rotation by degrees."""
+    vector = np.radians([pitch, yaw, roll])
+    return np.asarray(cv2.Rodrigues(vector)[0])
+
+
+def camera_at(center: np.ndarray, rotation: np.ndarray) -> Cameras:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
+    return Cameras.pinhole(WIDTH, HEIGHT, focal=FOCAL, cam_from_world=pose)
+
+
+def walk(views: int = 12, *, spread: float = 0.02, wrong: tuple[int, ...] = ()) -> Scene:
+    """Two views at each of places ``spread`` apart; those of ``wrong`` saw the other wall."""
+    rng = np.random.default_rng(3)
+    made = []
+    for i in range(views):
+        rotation = turned(*rng.uniform(-3, 3, 3))
+        camera = camera_at(np.array([spread * (i // 2), *rng.uniform(-0.02, 0.02, 2)]), rotation)
+        rgb = wall_picture(camera, WALLS[i in wrong])
+        exposure = rng.uniform(0.6, 1.1)
+        rgb = np.clip(255 * (rgb / 255.0) ** rng.uniform(0.8, 1.4) * exposure, 0, 255)
+        frame = Frame(rgb.astype(np.uint8), np.full((HEIGHT, WIDTH), FAR, np.float32))
+        made.append(
+            View(f"{i:02d}.png", camera, partial(Frame, frame.rgb, frame.depth), has_depth=True)
+        )
+    return Scene(Path("walls"), "rgbd", tuple(made), metric=True)
+
+
+def contradiction_messages(scene: Scene) -> list[str]:
+    findings = inspect(scene).findings
+    return [item.message for item in findings if "nearly equal cameras" in item.message]
+
+
+def without_depth(scene: Scene) -> Scene:
+    views = [replace(view, has_depth=False, load=partial(Frame, view.load().rgb)) for view in scene]
+    return replace(scene, views=tuple(views))
+
+
+def test_exposure_and_small_turns_are_no_contradiction() -> None:
+    scene = walk()
+    assert contradiction_messages(scene) == []
+    assert contradiction_messages(without_depth(scene)) == []
+
+
+def test_half_of_the_views_with_poses_of_the_other_side_are_told() -> None:
+    wrong = (1, 3, 5, 7, 9, 11)
+    scene = walk(wrong=wrong)
+    report = inspect(scene)
+    assert report.ok
+    (message,) = contradiction_messages(scene)
+    assert "show different things" in message and "solve the poses again" in message
+    thumbnails = {i: thumbnail(view.load()) for i, view in enumerate(scene)}
+    found = contradictions(scene, thumbnails, dict.fromkeys(thumbnails, FAR))
+    assert message.startswith(f"{len(found)} pairs of views")
+    for pair in found:
+        a, b = (int(name[:2]) for name in pair.names)
+        assert (a in wrong) != (b in wrong)
+    assert {int(name[:2]) for pair in found for name in pair.names} == set(range(12))
+
+
+def test_one_swapped_picture_is_told_without_depth_too() -> None:
+    scene = without_depth(walk(wrong=(4,), spread=0.5))
+    (message,) = contradiction_messages(scene)
+    assert "04.png" in message
+
+
+def test_cameras_that_are_not_near_each_other_say_nothing() -> None:
+    scene = walk(wrong=(2, 6, 10), spread=0.5)
+    apart = replace(scene, views=scene.views[::2])
+    assert contradiction_messages(apart) == []
+    assert contradiction_messages(without_depth(apart)) == []
+
+
+def test_pictures_without_contrast_cannot_be_compared() -> None:
+    scene = walk(views=2)
+    flat = thumbnail(Frame(np.full((HEIGHT, WIDTH, 3), 128, np.uint8)))
+    other = thumbnail(scene.views[0].load())
+    assert disagreement(flat, other, scene.cameras) is None
+    assert disagreement(other, other, scene.cameras[[0, 0]]) == 0
+
+
+def test_masked_pixels_are_not_compared() -> None:
+    scene = walk(views=2)
+    frames = [view.load() for view in scene]
+    spoilt = frames[1].rgb.copy()
+    spoilt[:, : WIDTH // 3] = frames[1].rgb[::-1, ::-1][:, : WIDTH // 3]
+    mask = np.ones((HEIGHT, WIDTH), np.bool_)
+    mask[:, : WIDTH // 3] = False
+    first = thumbnail(frames[0])
+    open_to_all = disagreement(first, thumbnail(Frame(spoilt)), scene.cameras)
+    masked = disagreement(first, thumbnail(Frame(spoilt, mask=mask)), scene.cameras)
+    assert open_to_all is not None and masked is not None
+    assert masked == 0 < open_to_all
+
+
+def points_of(scene: Scene, *, shared: bool) -> SparsePoints:
+    """Points on the wall; each view's own, or all of them in all views."""
+    rng = np.random.default_rng(0)
+    count = 40
+    sets = 1 if shared else len(scene)
+    positions = np.column_stack([rng.uniform(-1, 1, (sets * count, 2)), np.full(sets * count, FAR)])
+    view_index = np.repeat(np.arange(len(scene)), count)
+    point_index = np.tile(np.arange(count), len(scene)) if shared else np.arange(sets * count)
+    xy = np.array([scene.cameras[int(v)].project(positions[[p]])[0][0, 0]
+                   for v, p in zip(view_index, point_index, strict=True)])  # fmt: skip
+    zeros = np.zeros((len(positions), 3), np.uint8)
+    errors = np.zeros(len(positions), np.float32)
+    return SparsePoints(
+        positions, zeros, errors, point_index.astype(np.int32), view_index.astype(np.int32), xy
+    )
+
+
+def test_near_views_that_share_no_sparse_point_are_told() -> None:
+    scene = without_depth(walk(views=4))
+    assert contradiction_messages(replace(scene, points=points_of(scene, shared=True))) == []
+    (message,) = contradiction_messages(replace(scene, points=points_of(scene, shared=False)))
+    assert "0 of 40 sparse points shared" in message
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    "name",
+    [
+        "fox_colmap",
+        "fern_colmap",
+        "sceaux_colmap",
+        "sevenscenes_reg",
+        "sevenscenes_clip",
+    ],
+)
+def test_real_scenes_raise_no_false_alarm(shared: Path, name: str) -> None:
+    assert contradiction_messages(open_project(shared / "data" / name)) == []
+
+
+@pytest.mark.data
+def test_swapped_photographs_of_a_real_scene_are_told(shared: Path) -> None:
+    scene = read_colmap(shared / "data" / "fox_colmap")
+    views = list(scene.views)
+    a, b = 0, len(views) // 2
+    views[a], views[b] = (
+        replace(views[a], load=views[b].load),
+        replace(views[b], load=views[a].load),
+    )
+    (message,) = contradiction_messages(replace(scene, views=tuple(views)))
+    assert views[a].name in message or views[b].name in message
