@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -38,6 +39,63 @@ def replaced_when_written(path: Path) -> Iterator[Path]:
     except BaseException:
         _discard(temporary)
         raise
+
+
+@contextmanager
+def folder_replaced_when_written(path: Path) -> Iterator[Path]:
+    """Gives an empty folder of the same name; on success it takes the place of ``path``.
+
+    What only the earlier folder holds moves over into the new one. A kill leaves one of both
+    complete; ``recover_folder`` finds it.
+
+    Raises:
+        ProjectError: writing failed; ``path`` is as it was.
+    """
+    new, old = _work(path) / "new" / path.name, _work(path) / "old"
+    try:
+        _settle(path)
+        new.mkdir(parents=True)
+        yield new
+        os.rename(path, old)
+        os.rename(new, path)
+    except (OSError, ProjectError) as error:
+        cause = error.__cause__ if isinstance(error, ProjectError) else error
+        if not isinstance(cause, OSError):
+            raise
+        raise ProjectError(
+            f"{path}: cannot be replaced ({cause.strerror or cause}); free some space and try "
+            "again; it is as it was"
+        ) from cause
+    finally:
+        _settle(path)
+
+
+def recover_folder(path: Path) -> None:
+    """Put a folder back that a killed ``folder_replaced_when_written`` had moved aside."""
+    old = _work(path) / "old"
+    if old.is_dir() and not path.exists():
+        os.rename(old, path)
+
+
+def only_in(old: Path, new: Path) -> list[str]:
+    """Names of what one folder holds and another does not, without files that were half-written."""
+    names = {entry.name for entry in old.iterdir() if not entry.name.endswith(".part")}
+    return sorted(names - {entry.name for entry in new.iterdir()})
+
+
+def _work(path: Path) -> Path:
+    """Where the folder that is to replace ``path`` is written, on the same file system."""
+    return path.with_name(f".{path.name}.part")
+
+
+def _settle(path: Path) -> None:
+    """End a replacement wherever it stopped."""
+    recover_folder(path)
+    old = _work(path) / "old"
+    if old.is_dir():
+        for name in only_in(old, path):
+            os.rename(old / name, path / name)
+    shutil.rmtree(_work(path), ignore_errors=True)
 
 
 def _discard(path: Path) -> None:

@@ -86,10 +86,7 @@ class RunDirectory:
             return False
         if not isinstance(before, dict):
             before = {}
-        changed = [
-            key for key in identity if before.get(key) != json.loads(json.dumps(identity[key]))
-        ]
-        if changed:
+        if changed := changed_keys(identity, before):
             raise ProjectError(
                 f"{self.path}: belongs to another run ({', '.join(changed)} differ); give another "
                 "--out"
@@ -236,6 +233,11 @@ class RunDirectory:
             self.round_memory(number - 1).unlink(missing_ok=True)
         lines = [json.dumps(report) for report in self.reports()]
         write_text(self.path / ROUNDS, "".join(f"{line}\n" for line in lines))
+
+
+def changed_keys(identity: Mapping[str, Any], record: Mapping[str, Any]) -> list[str]:
+    """The keys of an identity that have another value in a run's record."""
+    return [key for key in identity if record.get(key) != json.loads(json.dumps(identity[key]))]
 
 
 def _clear(part: Path) -> None:

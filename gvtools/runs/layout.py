@@ -1,7 +1,7 @@
 """Where the files of a run lie, and how they are named.
 
     run.json  rounds.jsonl  memory.npz  metrics.json
-    round_000/report.json  round_000/context_depth_VIEW.npz
+    round_000/report.json  round_000/context_depth_VIEW.npz  round_000/appearance.npz
     round_001/report.json  round_001/{guidance,valid,generated,after,depth}_TARGET.*
 
 Other modules of this package read and write these files; nothing outside knows their names.
@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from gvtools.errors import OptionError, ProjectError
 
 RECORD, REPORT, ROUNDS, METRICS = "run.json", "report.json", "rounds.jsonl", "metrics.json"
-MEMORY = "memory.npz"
+MEMORY, APPEARANCE = "memory.npz", "appearance.npz"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 # Pictures that a round leaves of each target.
 GUIDANCE, VALID, COMPLETION, AFTER = "guidance", "valid", "generated", "after"

@@ -6,10 +6,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.runs.layout import MEMORY
+from gvtools.runs.layout import APPEARANCE, MEMORY, round_folder
 
 if TYPE_CHECKING:
+    from gvtools.appearance.appearance import Appearance
     from gvtools.memory.spatial_memory import SpatialMemory
+
+
+def load_appearance(path: Path) -> Appearance | None:
+    """The Gaussians that a run fitted; None for a file, and for a run without them.
+
+    Raises:
+        MemoryFileError: a damaged file.
+    """
+    from gvtools.appearance.appearance import Appearance
+
+    file = round_folder(path, 0) / APPEARANCE
+    return Appearance.load(file) if file.exists() else None
 
 
 def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:

@@ -1,0 +1,147 @@
+"""Corrections of cameras that are fitted along: small motions of poses, and exposure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from kornia.geometry.liegroup import Se3
+from numpy.typing import NDArray
+
+# A pose moves by at most this angle [rad], and this share of the typical depth.
+MOST_TURN, MOST_SHIFT = 0.035, 0.03
+# Views that a camera takes its correction from, and the distance (in shares of the depth) and angle
+# [rad] at which one counts 37 %.
+NEAR_VIEWS, NEAR_SHIFT, NEAR_TURN = 2, 0.03, 0.05
+# Step lengths: of turns [rad], of shifts in shares of the depth, of the logarithm of exposures.
+# Those of poses are at the end smaller by the last number, so that right poses come to rest.
+TURN_RATE, SHIFT_RATE, GAIN_RATE, RATE_END = 1e-3, 1e-3, 2e-3, 0.02
+
+
+class CameraCorrections:
+    """Pose and exposure of each view, as corrected so far.
+
+    The corrections of all views have mean zero, so that the scene as a whole stays where it is.
+
+    Attributes:
+        twists: (V, 6) shift (in shares of the depth) and turn [rad], applied on the camera's side.
+        log_gains: (V, 3) logarithms of the brightness of red, green and blue.
+        depth: typical depth, scene units.
+        spread: whether other cameras share the corrections of the views near them.
+    """
+
+    def __init__(
+        self, poses: NDArray[np.float64], *, depth: float, with_poses: bool, exposure: bool
+    ) -> None:
+        self.given, self.depth, self.spread = poses, depth, False
+        self.with_poses, self.exposure = with_poses, exposure
+        count = len(poses)
+        self.twists, self.log_gains = np.zeros((count, 6)), np.zeros((count, 3))
+        self._pose_moments = np.zeros((2, count, 6))
+        self._gain_moments = np.zeros((2, count, 3))
+        self._pose_steps, self._gain_steps = np.zeros(count, int), np.zeros(count, int)
+
+    def pose(self, number: int) -> NDArray[np.float64]:
+        """(4, 4) the corrected pose of a view."""
+        if not self.with_poses:
+            return self.given[number]
+        return moved(self.given[number], self._motion(number))
+
+    def _motion(self, number: int) -> NDArray[np.float64]:
+        twist = self.twists[number] - self.twists.mean(axis=0)
+        return twist * np.repeat([self.depth, 1.0], 3)
+
+    def poses(self) -> NDArray[np.float64]:
+        """(V, 4, 4) all corrected poses."""
+        return np.stack([self.pose(number) for number in range(len(self.given))])
+
+    def corrected(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(4, 4) another camera's pose, moved as the views near it were moved if ``spread``."""
+        return moved(pose, self._motion_near(pose)) if self.spread else pose
+
+    def like_neighbours(self, number: int, *, but: Sequence[int]) -> NDArray[np.float64]:
+        """(4, 4) a view's given pose, moved as the views near it; the views ``but`` do not count.
+
+        A tracker's error that changes slowly along its path moves cameras near each other alike.
+        """
+        return moved(self.given[number], self._motion_near(self.given[number], but=but))
+
+    def start_like_neighbours(self, numbers: Sequence[int]) -> None:
+        """Correct views that were not fitted so far as those near them, if ``spread``."""
+        if self.spread:
+            unit = np.repeat([self.depth, 1.0], 3)
+            near = [self._motion_near(self.given[row], but=numbers) / unit for row in numbers]
+            self.twists[list(numbers)] = np.array(near) + self.twists.mean(axis=0)
+
+    def _motion_near(
+        self, pose: NDArray[np.float64], *, but: Sequence[int] = ()
+    ) -> NDArray[np.float64]:
+        """(6,) mean motion of the views that stand and look most like a pose."""
+        centers = -np.einsum("vji,vj->vi", self.given[:, :3, :3], self.given[:, :3, 3])
+        center = -pose[:3, :3].T @ pose[:3, 3]
+        angle = np.arccos(np.clip(self.given[:, 2, :3] @ pose[2, :3], -1, 1))
+        apart = np.linalg.norm(centers - center, axis=1) / (NEAR_SHIFT * self.depth)
+        apart += angle / NEAR_TURN
+        apart[list(but)] = np.inf
+        near = np.argsort(apart, kind="stable")[:NEAR_VIEWS]
+        weight = np.exp(apart[near].min() - apart[near])
+        motions = np.stack([self._motion(row) for row in near])
+        return weight @ motions / weight.sum()
+
+    def give_back(self) -> None:
+        """Take the poses as they were given, from now on."""
+        self.twists[:] = 0
+        self.with_poses = self.spread = False
+
+    def summary(self) -> str:
+        """How far poses were moved, in words."""
+        motions = np.stack([self._motion(number) for number in range(len(self.given))])
+        shift = np.median(np.linalg.norm(motions[:, :3], axis=1))
+        turn = np.degrees(np.median(np.linalg.norm(motions[:, 3:], axis=1)))
+        return f"poses moved by {shift:.3g} scene units and {turn:.2f} degrees (medians)"
+
+    def gain(self, number: int) -> NDArray[np.float32]:
+        """(3,) what a view's red, green and blue are multiplied by."""
+        return np.exp(self.log_gains[number] - self.log_gains.mean(axis=0)).astype(np.float32)
+
+    def step(self, number: int, d_camera: NDArray[np.float32], *, share: float) -> None:
+        """Move a view's pose against the gradient (12,) by its rotation and translation."""
+        if not self.with_poses:
+            return
+        pose = self.pose(number)
+        d_rotation, d_translation = d_camera[:9].reshape(3, 3).astype(float), d_camera[9:]
+        # A turn w about the camera's axes changes R by w x R and t by w x t.
+        moments = d_rotation @ pose[:3, :3].T + np.outer(d_translation, pose[:3, 3])
+        turn = [moments[2, 1] - moments[1, 2], moments[0, 2] - moments[2, 0],
+                moments[1, 0] - moments[0, 1]]  # fmt: skip
+        gradient = np.concatenate([d_translation * self.depth, turn])
+        self._pose_steps[number] += 1
+        rate = np.repeat([SHIFT_RATE, TURN_RATE], 3) * RATE_END**share
+        self.twists[number] -= rate * _adam(
+            self._pose_moments[:, number], gradient, self._pose_steps[number]
+        )
+        limit = np.repeat([MOST_SHIFT, MOST_TURN], 3)
+        self.twists[number] = np.clip(self.twists[number], -limit, limit)
+
+    def step_gain(self, number: int, gradient: NDArray[np.float32]) -> None:
+        """Change a view's exposure against the gradient (3,) by its logarithm."""
+        if not self.exposure:
+            return
+        self._gain_steps[number] += 1
+        self.log_gains[number] -= GAIN_RATE * _adam(
+            self._gain_moments[:, number], gradient, self._gain_steps[number]
+        )
+
+
+def moved(pose: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A pose (4, 4) after a motion (6,), shift and turn, on the camera's side."""
+    return Se3.exp(torch.from_numpy(motion)[None]).matrix()[0].detach().numpy() @ pose
+
+
+def _adam(moments: NDArray, gradient: NDArray, step: int) -> NDArray[np.float64]:
+    """The direction of a step of Adam; ``moments`` (2, ...) are updated."""
+    moments[0] += 0.1 * (gradient - moments[0])
+    moments[1] += 0.001 * (np.square(gradient) - moments[1])
+    mean, square = moments[0] / (1 - 0.9**step), moments[1] / (1 - 0.999**step)
+    return mean / (np.sqrt(square) + 1e-15)

@@ -1,0 +1,43 @@
+"""The kernels of fitting, compiled by one small picture."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gvtools.kernels import KernelSet
+
+
+def compile_splatting() -> None:
+    """Call each kernel of splatting once."""
+    from gvtools.appearance.gaussians import Gaussians
+    from gvtools.appearance.splat.splat import Lens, Splat
+
+    some = Gaussians.at([[0.0, 0.0, 2.0]], [[255, 0, 0]], sizes=[0.5])
+    lens = Lens.of(np.eye(4), np.diag([16.0, 16.0, 1.0]), size=(16, 16), near=0.1)
+    picture = Splat(some.values, lens)
+    picture.backward(np.ones_like(picture.image))
+
+
+def compile_steps() -> None:
+    """Call each kernel of the loss and of the optimiser once."""
+    from gvtools.appearance import kernels
+    from gvtools.appearance.splat.project_kernels import VALUES
+
+    picture = np.zeros((3, 16, 16), np.float32)
+    weight, losses = np.ones((16, 16), np.float32), np.zeros(3)
+    kernels.picture_loss(0, 3, picture, picture, weight, 0.2, np.zeros_like(picture), losses)
+    rows, gradients = np.zeros(1, np.int64), np.zeros((1, VALUES + 2), np.float32)
+    values, moments = np.zeros((1, VALUES), np.float32), np.zeros((2, 1, VALUES), np.float32)
+    rates, widths = np.zeros(VALUES, np.float32), np.ones(1, np.float32)
+    kernels.adam_rows(0, 1, rows, gradients[:, :VALUES], values, moments, rates, widths, 1)
+
+
+def kernel_sets() -> tuple[KernelSet, ...]:
+    """What fitting needs."""
+    from gvtools.appearance import kernels
+    from gvtools.appearance.splat import project_kernels
+
+    return (
+        KernelSet("splatting", compile_splatting, project_kernels.backward_gaussians),
+        KernelSet("fitting", compile_steps, kernels.adam_rows),
+    )

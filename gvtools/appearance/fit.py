@@ -1,0 +1,383 @@
+"""Fitting of Gaussians to photographs: stochastic gradient descent, one photograph a step.
+
+After Kerbl et al. 2023, with step lengths for hundreds of steps instead of tens of thousands: a
+position moves by shares of a pixel where it lies, so no scale of the scene enters.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from gvtools.appearance import kernels
+from gvtools.appearance.camera_corrections import CameraCorrections
+from gvtools.appearance.fit_views import FitView, ReducedView, reduced
+from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.growth import Population
+from gvtools.appearance.picture import Picture
+from gvtools.appearance.pose_check import prediction_error
+from gvtools.appearance.sample import Sample
+from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH, VALUES
+from gvtools.appearance.splat.splat import Lens, Splat
+from gvtools.kernels import in_threads
+from gvtools.settings import Settings
+
+# Share of the fit from which pictures are taken at a quarter, half and all of their size.
+SIZES = ((0.0, 4), (0.2, 2), (0.6, 1))
+# Each degree of the spherical harmonics joins after so much of the fit.
+DEGREE_EVERY = 0.12
+# Gaussians are added in this part of the fit, each time after such a share of it, if these are not
+# too few steps to tell where, and not later than after so many
+# steps. The share is the first number below, the second with fewer than ``FEW`` photographs.
+GROWTH_END, FEWEST_BETWEEN, MOST_BETWEEN = 0.55, 25, 100
+GROWTH_SHARE, GROWTH_SHARE_FEW, FEW = 0.13, 0.25, 10
+# Positions move by at most about so many pixels a step, and by this share of it at the end.
+POSITION_RATE, POSITION_END = 0.32, 0.01
+# A fit that goes on with fitted Gaussians begins here: pictures have all of their size, and steps
+# are as short as at the end of the fit before.
+CONTINUED = 0.6
+# Step lengths of log scales, quaternions, logits, colours and the other harmonics.
+RATES = (0.02, 0.004, 0.05, 0.01, 5e-4)
+# Steps of a fit whose length is not given: for each photograph, at least and at most.
+STEPS_PER_VIEW, FEWEST_STEPS, MOST_STEPS = 15, 300, 1200
+# Of so many photographs one is left out until this part of the fit, as a judge; at most so many.
+JUDGE_OF, JUDGES_JOIN, MOST_JUDGES = 8, 0.75, 5
+# With few photographs, a random share of the Gaussians is left out of each step, growing to this
+# share divided by the number of photographs, so that none relies on others that hide it from the
+# few directions that there are. After "DropGaussian" (Park et al. 2025).
+LEFT_OUT, MOST_LEFT_OUT = 1.2, 0.5
+# Reduced photographs are kept for later steps where all of them together take less.
+KEPT_BYTES = 2**30
+# What the corrections of neighbours must gain for a camera to take them [dB].
+LEAST_GAIN = 0.1
+# Poses are checked at these parts of the fit, and at its end; they must then predict neighbouring
+# photographs by so much of the error better than those given.
+POSE_CHECKS, LEAST_BETTER = (0.3, 0.6), 0.01
+# From so many pixels on a Gaussian is split, below it gets a twin.
+WIDE = 2.0
+
+
+class FitOptions(Settings):
+    """How Gaussians are fitted to photographs.
+
+    >>> FitOptions().steps_for(40), FitOptions(steps=100).steps_for(40)
+    (600, 100)
+    >>> FitOptions(seconds=0.0).wanted
+    False
+    """
+
+    section = "refine"
+
+    seconds: float | None = Field(None, ge=0)
+    """How long they are fitted; none counts steps instead, which gives the same result every time;
+    0 leaves the memory's own colours. [s]"""
+    steps: int | None = Field(None, ge=0)
+    """How many steps, where no time is given; none makes as many as take about as long as the rest
+    of a run, by the number of photographs; 0 leaves the memory's own colours."""
+    most_gaussians: int = Field(200_000, ge=1)
+    """How many there may be."""
+    growth: float = Field(2e-4, gt=0)
+    """Gaussians are added where pictures pull at those that are there more than this; less gives
+    more of them."""
+    ssim: float = Field(0.2, ge=0, le=1)
+    """Share of structural similarity in the loss; the rest is absolute difference."""
+    depth: float = Field(0.1, ge=0)
+    """Weight of recorded depth in the loss, by relative difference; 0 ignores it."""
+    poses: bool = True
+    """Whether the poses of views with recorded depth, which come from a tracker, are refined."""
+    exposure: bool = True
+    """Whether each photograph's red, green and blue may be brighter than the others'."""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there is time or a step for it."""
+        return self.seconds != 0 if self.seconds is not None else self.steps != 0
+
+    def steps_for(self, views: int) -> int:
+        """How many steps a fit of so many photographs makes, where no time is given."""
+        if self.steps is not None:
+            return self.steps
+        return min(max(STEPS_PER_VIEW * views, FEWEST_STEPS), MOST_STEPS)
+
+
+@dataclass
+class Progress:
+    """How far a fit is.
+
+    Attributes:
+        share: of its time or its steps that is over, 0 to 1.
+        steps: made so far.
+        gaussians: how many there are.
+        psnr: of the last photographs, each before its own step [dB].
+    """
+
+    share: float
+    steps: int
+    gaussians: int
+    psnr: float
+
+
+class Fit:
+    """A fit in progress.
+
+    Attributes:
+        people: the Gaussians.
+        cameras: corrections of poses and exposures.
+        steps: made so far.
+        judged: pictures of the photographs that were left out, by their numbers, as they were
+            predicted before these joined the fit.
+    """
+
+    def __init__(
+        self,
+        start: Gaussians,
+        views: Sequence[FitView],
+        *,
+        options: FitOptions | None = None,
+        seed: int = 0,
+        begin: float = 0.0,
+        splatter: type[Splat] = Splat,
+    ) -> None:
+        """Prepare a fit.
+
+        Args:
+            start: Gaussians to begin with; left as they are.
+            views: at least one.
+            options: see FitOptions.
+            seed: of the order of photographs and of where Gaussians are added.
+            begin: share of a whole fit that is left out because ``start`` was fitted to the same
+                photographs before; all of them are then fitted from the first step.
+            splatter: draws the Gaussians.
+        """
+        self.splatter = splatter
+        self.views, self.options = list(views), options or FitOptions()
+        self.frame = start.frame
+        self.rng = np.random.default_rng(seed)
+        width = pixel_width(start.values[:, :LOG_SCALE], self.views)
+        self.population = Population(start.values.copy(), width)
+        recorded = all(view.depth is not None for view in self.views)
+        self.cameras = CameraCorrections(
+            np.array([view.cam_from_local for view in self.views]),
+            depth=float(np.median(width)) * float(np.median([v.K[0, 0] for v in self.views])),
+            with_poses=self.options.poses and recorded,
+            exposure=self.options.exposure,
+        )
+        self.near = 0.02 * self.cameras.depth
+        self.steps = 0
+        self.judged: dict[int, Picture] = {}
+        self.begin = begin
+        self._judges = () if begin else judges(len(self.views))
+        self._checks = tuple(share for share in POSE_CHECKS if share > begin)
+        # Recorded depth tells as much as other directions.
+        self._left_out = 0.0 if recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
+        self._grown = (0, begin)
+        self._growth_share = GROWTH_SHARE_FEW if len(self.views) < FEW else GROWTH_SHARE
+        self._order: list[int] = []
+        self._reduced: dict[int, ReducedView] = {}
+        self._factor = 0
+        self._errors: list[float] = []
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """As fitted so far."""
+        return Gaussians(self.population.values, frame=self.frame)
+
+    def run(
+        self,
+        *,
+        clock: Callable[[], float] = time.perf_counter,
+        report: Callable[[Progress], object] = lambda progress: None,
+    ) -> None:
+        """Fit for the time or the number of steps that the options give.
+
+        Args:
+            clock: tells seconds.
+            report: is called now and then, and at the end.
+        """
+        options, began = self.options, clock()
+        steps = options.steps_for(len(self.views))
+        while True:
+            if options.seconds is None:
+                over = self.steps / max(steps, 1)
+            else:
+                over = (clock() - began) / max(options.seconds, 1e-9)
+            if over >= 1:
+                break
+            self.step(self.begin + (1 - self.begin) * over)
+            if self.steps % 50 == 0:
+                report(self.progress(over))
+        self._check_poses()
+        report(self.progress(1.0))
+
+    def progress(self, share: float) -> Progress:
+        """Figures so far."""
+        error = float(np.mean(self._errors[-50:])) if self._errors else 1.0
+        return Progress(share, self.steps, len(self.population), -10 * np.log10(max(error, 1e-10)))
+
+    def step(self, share: float) -> None:
+        """One step, on one photograph; ``share`` of a whole fit is over."""
+        self.steps += 1
+        if self._checks and share >= self._checks[0]:
+            self._checks = self._checks[1:]
+            self._check_poses()
+        if share >= JUDGES_JOIN and self._judges:
+            self._let_judges_join()
+        if not self._order:
+            given = [row for row in range(len(self.views)) if row not in self._judges]
+            self._order = self.rng.permutation(given).tolist()
+        number = self._order.pop()
+        view = self._at_size(number, share)
+        degree = min(2, int(share / DEGREE_EVERY))
+        lens = Lens.of(self.cameras.pose(number), view.K, size=view.size, near=self.near)
+        some = Sample(self.population.values, self._left_out * share, rng=self.rng)
+        picture = self.splatter(some.values, lens, degree=degree)
+        gradient = self._loss_gradient(number, picture, view)
+        rows, d_camera = picture.backward(gradient)
+        seen = some.back(picture.seen, rows)
+        self.cameras.step(number, d_camera, share=share)
+        used = SH + 3 * (degree + 1) ** 2
+        in_threads(
+            kernels.adam_rows, len(seen), seen, rows[:, :used],
+            self.population.values, self.population.moments, _rates(share),
+            self.population.footprint, self.steps,
+        )  # fmt: skip
+        self._note_pulls(lens, seen, rows)
+        since = self.steps - self._grown[0]
+        due = since >= FEWEST_BETWEEN and share - self._grown[1] >= self._growth_share
+        if due or since >= MOST_BETWEEN:
+            self._grown = (self.steps, share)
+            if share < self.begin + (1 - self.begin) * GROWTH_END:
+                self.population.grow(
+                    self.options.growth, self.options.most_gaussians, wide=WIDE, rng=self.rng
+                )
+            self.population.remove_faint()
+
+    def _check_poses(self) -> None:
+        """Give poses back as they were unless they predict neighbouring photographs better now."""
+        if self.cameras.with_poses:
+            before = prediction_error(self.views, self.cameras.given)
+            after = prediction_error(self.views, self.cameras.poses())
+            if not after < before * (1 - LEAST_BETTER):
+                self.cameras.give_back()
+
+    def _let_judges_join(self) -> None:
+        """Predict the photographs that were left out, then fit them, too.
+
+        They also tell whether a camera's error in pose is that of its neighbours.
+        """
+        rows, cameras = self._judges, self.cameras
+        self.judged = {row: self._picture(row, cameras.given[row]) for row in rows}
+        if cameras.with_poses:
+            near = {row: self._picture(row, cameras.like_neighbours(row, but=rows)) for row in rows}
+            gain = [
+                self._error(row, self.judged[row]) - self._error(row, near[row]) for row in rows
+            ]
+            if np.mean(gain) > LEAST_GAIN:
+                cameras.spread, self.judged = True, near
+        cameras.start_like_neighbours(rows)
+        self._judges = ()
+
+    def _picture(self, number: int, pose: NDArray[np.float64]) -> Picture:
+        view = self.views[number]
+        height, width = view.rgb.shape[:2]
+        lens = Lens.of(pose, view.K, size=(width, height), near=self.near)
+        return Picture.of(self.splatter(self.population.values, lens))
+
+    def _error(self, number: int, picture: Picture) -> float:
+        """Negative PSNR of a picture of a photograph [dB]."""
+        view = self.views[number]
+        off = picture.rgb - view.rgb / np.float32(255)
+        off = off if view.mask is None else off[view.mask]
+        return 10 * float(np.log10(np.square(off).mean()))
+
+    def _at_size(self, number: int, share: float) -> ReducedView:
+        factor = next(size for start, size in reversed(SIZES) if share >= start)
+        if factor != self._factor:
+            self._factor, self._reduced = factor, {}
+        if number in self._reduced:
+            return self._reduced[number]
+        view = reduced(self.views[number], factor)
+        if len(self.views) * view.target.nbytes < KEPT_BYTES:
+            self._reduced[number] = view
+        return view
+
+    def _loss_gradient(self, number: int, picture: Splat, view: ReducedView) -> NDArray[np.float32]:
+        """(5, H, W) gradient of the loss, times the number of pixels: it then has useful digits."""
+        options, pixels = self.options, view.weight.size
+        gain = self.cameras.gain(number)
+        shown = picture.image[:3] * gain[:, None, None]
+        # SSIM compares windows: what is masked must look as it should, or it counts nearby.
+        masked = self.views[number].mask is not None
+        target = np.where(view.weight > 0, view.target, shown) if masked else view.target
+        gradient = np.zeros_like(picture.image)
+        losses = np.empty(3)
+        in_threads(
+            kernels.picture_loss, 3, shown, target, view.weight, options.ssim, gradient, losses
+        )
+        gradient *= pixels
+        self._errors.append(float(((shown - target) ** 2 * view.weight).mean()))
+        self.cameras.step_gain(number, (gradient[:3] * shown).sum(axis=(1, 2)) / pixels)
+        gradient[:3] *= gain[:, None, None]
+        if view.depth is not None and options.depth > 0:
+            gradient[3:] += options.depth * _depth_gradient(picture.image, view)
+        return gradient
+
+    def _note_pulls(self, lens: Lens, seen: NDArray[np.int64], rows: NDArray[np.float32]) -> None:
+        people = self.population
+        pull = np.hypot(rows[:, VALUES] * lens.width, rows[:, VALUES + 1] * lens.height)
+        people.pull[seen] += pull * (0.5 / (lens.width * lens.height))
+        people.pulls[seen] += 1
+
+
+def judges(views: int) -> tuple[int, ...]:
+    """Numbers of the photographs that are left out at first, of so many in all."""
+    count = min(views // JUDGE_OF, MOST_JUDGES)
+    return tuple((2 * k + 1) * views // (2 * count) for k in range(count))
+
+
+def _rates(share: float) -> NDArray[np.float32]:
+    scale, turn, opacity, color, harmonic = RATES
+    rates = np.empty(VALUES, np.float32)
+    rates[:LOG_SCALE] = POSITION_RATE * POSITION_END**share
+    rates[LOG_SCALE:QUATERNION] = scale
+    rates[QUATERNION:LOGIT] = turn
+    rates[LOGIT] = opacity
+    rates[SH : SH + 3] = color
+    rates[SH + 3 :] = harmonic
+    return rates
+
+
+def _depth_gradient(image: NDArray[np.float32], view: ReducedView) -> NDArray[np.float32]:
+    """(2, H, W) gradient of |D - A d| / d over the pixels with recorded depth d.
+
+    D is the image's depth times alpha and A its alpha, so opaque pixels should have D = d.
+    """
+    assert view.depth is not None
+    known = view.depth > 0
+    d = np.where(known, view.depth, np.float32(1))
+    sign = np.sign(image[3] - image[4] * d) * known * view.weight
+    return np.stack([sign / d, -sign])
+
+
+def pixel_width(positions: NDArray[np.float32], views: Sequence[FitView]) -> NDArray[np.float32]:
+    """(N,) width of a pixel at each position in the nearest view that sees it, scene units.
+
+    What no view sees gets the median of the others.
+    """
+    width = np.full(len(positions), np.inf)
+    for view in views:
+        points = positions @ view.cam_from_local[:3, :3].T + view.cam_from_local[:3, 3]
+        z, size = points[:, 2], np.array(view.rgb.shape[1::-1])
+        ahead = z > 0
+        focal = np.array([view.K[0, 0], view.K[1, 1]])
+        xy = points[:, :2] / np.where(ahead, z, 1)[:, None] * focal + view.K[:2, 2]
+        inside = ahead & (xy > -0.3 * size).all(axis=1) & (xy < 1.3 * size).all(axis=1)
+        width[inside] = np.minimum(width[inside], z[inside] / focal[0])
+    seen = np.isfinite(width)
+    width[~seen] = np.median(width[seen]) if seen.any() else 1.0
+    return width.astype(np.float32)

@@ -1,0 +1,82 @@
+"""The photographs that Gaussians are fitted to, at several sizes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+# Reduced pictures are no smaller than this [px].
+SMALLEST = 16
+
+
+@dataclass(frozen=True, eq=False)
+class FitView:
+    """One photograph.
+
+    Attributes:
+        rgb: (H, W, 3) uint8.
+        K: (3, 3) intrinsics [px].
+        cam_from_local: (4, 4) pose in the Gaussians' frame.
+        mask: (H, W) bool, True = use; None uses all.
+        depth: (H, W) float32 z-depth, scene units, 0 = none; None has none.
+    """
+
+    rgb: NDArray[np.uint8]
+    K: NDArray[np.float64]
+    cam_from_local: NDArray[np.float64]
+    mask: NDArray[np.bool_] | None = None
+    depth: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedView:
+    """A photograph at one size, as the loss needs it.
+
+    Attributes:
+        target: (3, H, W) float32 colours from 0 to 1.
+        weight: (H, W) float32, the share of each pixel that is used.
+        depth: (H, W) float32, 0 = none; None has none.
+        K: (3, 3) intrinsics of this size.
+    """
+
+    target: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    depth: NDArray[np.float32] | None
+    K: NDArray[np.float64]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.target.shape[2], self.target.shape[1]
+
+
+def reduced(view: FitView, factor: int) -> ReducedView:
+    """A view at one over ``factor`` of its size; colours are means, depth is picked.
+
+    Of colours only those that the mask lets through count.
+    """
+    height, width = view.rgb.shape[:2]
+    rows, columns = max(height // factor, SMALLEST), max(width // factor, SMALLEST)
+    if factor == 1:
+        rows, columns = height, width
+    target = torch.from_numpy(view.rgb).permute(2, 0, 1).float() / 255
+    mask = np.ones((height, width), np.float32) if view.mask is None else view.mask
+    weight = torch.from_numpy(np.asarray(mask, np.float32))[None]
+    both = torch.cat([target * weight, weight])
+    if (rows, columns) != (height, width):
+        both = torch.nn.functional.interpolate(both[None], (rows, columns), mode="area")[0]
+    depth = view.depth
+    if depth is not None and (rows, columns) != (height, width):
+        y = ((np.arange(rows) + 0.5) * height / rows).astype(int)
+        x = ((np.arange(columns) + 0.5) * width / columns).astype(int)
+        depth = np.ascontiguousarray(depth[y][:, x])
+    K = view.K.copy()
+    K[0] *= columns / width
+    K[1] *= rows / height
+    arrays = both.contiguous().numpy()
+    if view.mask is not None:
+        arrays[:3] /= np.maximum(arrays[3], np.float32(1e-6))
+    return ReducedView(arrays[:3], arrays[3], depth, K)

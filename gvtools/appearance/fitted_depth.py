@@ -1,0 +1,39 @@
+"""Depth of photographs as fitted Gaussians show it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gvtools.appearance.appearance import Appearance
+from gvtools.depth.source import DepthMap
+from gvtools.scenes.scene import Frame, Scene, View
+
+# A pixel has depth where the Gaussians stop this share of the light.
+OPAQUE = 0.8
+# Difference from the photograph, of colours 0 to 1, at which confidence is down to 37 %.
+TOLERANCE = 0.12
+LEAST_CONFIDENCE = 0.05
+
+
+class FittedDepth:
+    """Depth of views by Gaussians that were fitted to them.
+
+    Confidence falls where the Gaussians do not look like the photograph.
+    """
+
+    name = "fitted"
+
+    def __init__(self, appearance: Appearance) -> None:
+        self.appearance = appearance
+
+    def covers(self, view: View) -> bool:
+        """Every view."""
+        return True
+
+    def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
+        """The depth that the Gaussians show from the view's camera."""
+        shown = self.appearance.picture(view.camera)
+        off = np.abs(shown.rgb - frame.rgb / np.float32(255)).mean(axis=2)
+        confidence = np.exp(-np.square(off / TOLERANCE)).astype(np.float32)
+        known = np.where(shown.alpha > OPAQUE, shown.depth, 0).astype(np.float32)
+        return DepthMap(known, np.maximum(confidence, LEAST_CONFIDENCE), self.name)

@@ -1,0 +1,93 @@
+"""Where Gaussians are added and removed while they are fitted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, VALUES
+
+# A Gaussian fainter than this is removed.
+FAINTEST = 0.005
+# The two halves of a Gaussian are so much smaller than it was.
+SHRINK = 1.6
+
+
+class Population:
+    """Gaussians with what fitting remembers of each.
+
+    Attributes:
+        values: (N, VALUES) float32 parameters.
+        moments: (2, N, VALUES) float32, Adam's running means.
+        footprint: (N,) float32 width of a pixel where it lies, scene units.
+        pull: (N,) summed length of the gradient by its centre in pictures.
+        pulls: (N,) in how many pictures.
+    """
+
+    def __init__(self, values: NDArray[np.float32], footprint: NDArray[np.float32]) -> None:
+        self.values, self.footprint = values, footprint
+        self.moments = np.zeros((2, *values.shape), np.float32)
+        self._forget_pulls()
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def _forget_pulls(self) -> None:
+        self.pull, self.pulls = np.zeros(len(self)), np.zeros(len(self))
+
+    def keep(self, rows: NDArray[np.bool_]) -> None:
+        """Remove all other rows."""
+        self.values, self.footprint = self.values[rows], self.footprint[rows]
+        self.moments = np.ascontiguousarray(self.moments[:, rows])
+        self._forget_pulls()
+
+    def add(self, values: NDArray[np.float32], footprint: NDArray[np.float32]) -> None:
+        """Append Gaussians."""
+        self.values = np.concatenate([self.values, values])
+        self.footprint = np.concatenate([self.footprint, footprint])
+        fresh = np.zeros((2, len(values), VALUES), np.float32)
+        self.moments = np.concatenate([self.moments, fresh], axis=1)
+        self._forget_pulls()
+
+    def remove_faint(self) -> None:
+        """Remove Gaussians that hardly show."""
+        self.keep(self.values[:, LOGIT] >= np.log(FAINTEST / (1 - FAINTEST)))
+
+    def grow(self, threshold: float, most: int, *, wide: float, rng: np.random.Generator) -> None:
+        """Double the Gaussians that pictures pull about most: they cover more than they can show.
+
+        Args:
+            threshold: least mean pull.
+            most: Gaussians there may be afterwards.
+            wide: standard deviation in pixels from which one is split into two smaller ones; a
+                smaller one gets a twin, which the next steps move away.
+            rng: places the halves.
+        """
+        pull = self.pull / np.maximum(self.pulls, 1)
+        rows = np.flatnonzero(pull > threshold)
+        room = max(most - len(self), 0)
+        if len(rows) > room:
+            rows = np.sort(rows[np.argsort(-pull[rows], kind="stable")[:room]])
+        spread = np.exp(self.values[rows, LOG_SCALE:QUATERNION].max(axis=1))
+        split = rows[spread > wide * self.footprint[rows]]
+        twins = rows[spread <= wide * self.footprint[rows]]
+        halves = np.repeat(self.values[split], 2, axis=0)
+        offset = rng.standard_normal((len(halves), 3)) * np.exp(halves[:, LOG_SCALE:QUATERNION])
+        turn = rotations(halves[:, QUATERNION:LOGIT])
+        halves[:, :LOG_SCALE] += np.einsum("nij,nj->ni", turn, offset).astype(np.float32)
+        halves[:, LOG_SCALE:QUATERNION] -= np.float32(np.log(SHRINK))
+        kept = np.ones(len(self), bool)
+        kept[split] = False
+        footprint = self.footprint
+        new = np.concatenate([self.values[twins], halves])
+        self.keep(kept)
+        self.add(new, np.concatenate([footprint[twins], np.repeat(footprint[split], 2)]))
+
+
+def rotations(quaternions: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 3, 3) matrices of quaternions w, x, y, z of any length."""
+    import torch
+    from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
+    q = torch.from_numpy(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
+    return quaternion_to_rotation_matrix(q).numpy()

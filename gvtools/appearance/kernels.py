@@ -1,0 +1,150 @@
+"""Kernels of fitting: the loss between two pictures with its gradient, and Adam on some rows."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gvtools.kernels import FAST, compiled
+
+# SSIM (Wang et al. 2004): a Gaussian window of 11 pixels with standard deviation 1.5, zero outside
+# the picture, and its two constants for colours from 0 to 1.
+WINDOW = 11
+HALF = WINDOW // 2
+C1, C2 = 0.01**2, 0.03**2
+_WEIGHTS = np.exp(-0.5 * ((np.arange(WINDOW) - HALF) / 1.5) ** 2)
+WEIGHTS = (_WEIGHTS / _WEIGHTS.sum()).astype(np.float32)
+
+
+@compiled(fastmath=FAST)
+def blur(picture, out, work):
+    """Blur one channel (H, W) by the window; ``work`` has the same shape."""
+    height, width = picture.shape
+    for y in range(height):
+        line = work[y]
+        line[:] = np.float32(0)
+        for k in range(WINDOW):
+            at = y + k - HALF
+            if 0 <= at < height:
+                weight, source = WEIGHTS[k], picture[at]
+                for x in range(width):
+                    line[x] += weight * source[x]
+    for y in range(height):
+        line, result = work[y], out[y]
+        result[:] = np.float32(0)
+        for k in range(WINDOW):
+            shift = k - HALF
+            weight = WEIGHTS[k]
+            count = width - abs(shift)
+            to, source = result[max(0, -shift) :], line[max(0, shift) :]
+            for x in range(count):
+                to[x] += weight * source[x]
+
+
+@compiled(fastmath=FAST)
+def picture_loss(first, last, picture, target, weight, share, d_picture, losses):
+    """(1 - share) mean |picture - target| + share (1 - SSIM), and its gradient, by channels.
+
+    Args:
+        first: channels to do.
+        last: one past the last of them.
+        picture: (C, H, W) float32.
+        target: (C, H, W) float32, what it should be.
+        weight: (H, W) of the pixels, 0 to 1.
+        share: of SSIM.
+        d_picture: (C, H, W) gradient, written.
+        losses: (C,) the channels' shares of the loss, written.
+    """
+    one, two = np.float32(1), np.float32(2)
+    c1, c2 = np.float32(C1), np.float32(C2)
+    channels, height, width = picture.shape[0], picture.shape[1], picture.shape[2]
+    scale = np.float32(1 / (channels * height * width))
+    k1, k2 = np.float32(1 - share) * scale, -np.float32(share) * scale
+    work, product = np.empty_like(target[0]), np.empty_like(target[0])
+    m, xx, xy = np.empty_like(target[0]), np.empty_like(target[0]), np.empty_like(target[0])
+    mean, square = np.empty_like(target[0]), np.empty_like(target[0])
+    for c in range(first, last):
+        x, y = picture[c], target[c]
+        blur(x, m, work)
+        blur(y, mean, work)
+        for i in range(height):
+            for j in range(width):
+                product[i, j] = x[i, j] * x[i, j]
+        blur(product, xx, work)
+        for i in range(height):
+            for j in range(width):
+                product[i, j] = x[i, j] * y[i, j]
+        blur(product, xy, work)
+        for i in range(height):
+            for j in range(width):
+                product[i, j] = y[i, j] * y[i, j]
+        blur(product, square, work)
+        total = np.float64(0)
+        for i in range(height):
+            line = np.float32(0)
+            for j in range(width):
+                u, v = m[i, j], mean[i, j]
+                a1 = two * u * v + c1
+                a2 = two * (xy[i, j] - u * v) + c2
+                b1 = u * u + v * v + c1
+                b2 = xx[i, j] - u * u + square[i, j] - v * v + c2
+                inverse = one / (b1 * b2)
+                ssim = a1 * a2 * inverse
+                w = weight[i, j]
+                line += w * (one - ssim)
+                by_square, by_product = -w * ssim / b2, w * two * a1 * inverse
+                m[i, j] = (
+                    w * two * (v * a2 * inverse - u * ssim / b1)
+                    - two * u * by_square - v * by_product
+                )  # fmt: skip
+                xx[i, j], xy[i, j] = by_square, by_product
+            total += share * line
+        blur(m, product, work)
+        blur(xx, m, work)
+        blur(xy, xx, work)
+        for i in range(height):
+            line = np.float32(0)
+            for j in range(width):
+                difference = x[i, j] - y[i, j]
+                w = weight[i, j]
+                line += w * abs(difference)
+                sign = w if difference > 0 else (-w if difference < 0 else np.float32(0))
+                smooth = product[i, j] + two * x[i, j] * m[i, j] + y[i, j] * xx[i, j]
+                d_picture[c, i, j] = k1 * sign + k2 * smooth
+            total += (1 - share) * line
+        losses[c] = total * scale
+
+
+@compiled(fastmath=FAST)
+def adam_rows(first, last, rows, gradients, values, moments, rates, row_rates, step):
+    """One step of Adam (Kingma & Ba 2015) on some rows; the others stay as they are.
+
+    Args:
+        first: of ``rows``.
+        last: one past the last of them.
+        rows: (M,) numbers of the rows that have a gradient.
+        gradients: (M, C).
+        values: (N, at least C) float32, changed.
+        moments: (2, N, at least C) running means of gradient and squared gradient, changed.
+        rates: (C,) step length of each column.
+        row_rates: (N,) factor of the first three columns, the positions.
+        step: how many steps were made, this one included.
+    """
+    short, long, tiny = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
+    rest_short, rest_long = np.float32(0.1), np.float32(0.001)
+    c1 = np.float32(1 / (1 - 0.9**step))
+    c2 = np.float32(1 / (1 - 0.999**step))
+    columns = gradients.shape[1]
+    rate = np.empty(columns, np.float32)
+    for j in range(first, last):
+        i = rows[j]
+        g, p, m, v = gradients[j], values[i], moments[0, i], moments[1, i]
+        rate[:] = rates[:columns]
+        for k in range(3):
+            rate[k] *= row_rates[i]
+        for k in range(columns):
+            a = short * m[k] + rest_short * g[k]
+            b = long * v[k] + rest_long * g[k] * g[k]
+            m[k], v[k] = a, b
+            p[k] -= rate[k] * (a * c1) / (math.sqrt(b * c2) + tiny)

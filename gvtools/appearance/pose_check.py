@@ -1,0 +1,60 @@
+"""Whether poses fit recorded depth: each photograph is predicted from its neighbours'."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gvtools.appearance.fit_views import FitView, reduced
+
+# Photographs are compared at one over this of their size, each with so many neighbours.
+SMALLER, NEIGHBOURS = 2, 2
+
+
+def prediction_error(views: Sequence[FitView], poses: NDArray[np.float64]) -> float:
+    """Mean over pairs of neighbouring photographs of the median colour difference, 0 to 1.
+
+    Each pixel with depth is looked up in the neighbour; what is hidden there is a minority that the
+    median passes over. NaN where no pair overlaps.
+
+    Args:
+        views: at least two, with depth.
+        poses: (V, 4, 4) of the cameras, in the frame of the views.
+    """
+    small = [reduced(view, SMALLER) for view in views]
+    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    errors = []
+    for row, view in enumerate(small):
+        assert view.depth is not None
+        apart = (
+            np.linalg.norm(centers - centers[row], axis=1) + 1 - poses[:, 2, :3] @ poses[row, 2, :3]
+        )
+        for other in np.argsort(apart, kind="stable")[1 : NEIGHBOURS + 1]:
+            y, x = np.nonzero((view.depth > 0) & (view.weight > 0.5))
+            rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))]).T @ np.linalg.inv(view.K).T
+            points = rays * view.depth[y, x, None]
+            motion = poses[other] @ np.linalg.inv(poses[row])
+            points = points @ motion[:3, :3].T + motion[:3, 3]
+            found, inside = _looked_up(small[other].target, points, small[other].K)
+            if inside.sum() > 100:
+                errors.append(float(np.median(np.abs(found - view.target[:, y, x])[:, inside])))
+    return float(np.mean(errors)) if errors else float("nan")
+
+
+def _looked_up(
+    picture: NDArray[np.float32], points: NDArray[np.float64], K: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Colours (3, N) of a picture at points of its camera's frame, and which lie inside."""
+    height, width = picture.shape[1:]
+    ahead = points[:, 2] > 0
+    xy = points @ K.T
+    xy = xy[:, :2] / np.where(ahead, xy[:, 2], 1)[:, None]
+    inside = ahead & (xy > 0).all(axis=1) & (xy < [width, height]).all(axis=1)
+    grid = torch.from_numpy((xy / [width, height] * 2 - 1).astype(np.float32))[None, None]
+    colors = torch.nn.functional.grid_sample(
+        torch.from_numpy(picture)[None], grid, padding_mode="border", align_corners=False
+    )
+    return colors[0, :, 0].numpy(), inside

@@ -1,0 +1,94 @@
+"""The Gaussians that a fit begins with: few, at sparse points or at pixels with recorded depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.appearance.fit_views import FitView
+from gvtools.appearance.gaussians import Gaussians
+from gvtools.errors import DegenerateError
+from gvtools.memory.store.local_frame import LocalFrame
+
+# Few are fitted faster and end better: the fit adds more where pictures ask for them.
+STARTING_GAUSSIANS = 25_000
+# Least red, green and blue that a Gaussian begins with: one that has none of it feels no pull.
+DARKEST = 8
+# Nearest neighbours whose distance gives a Gaussian its size, and the largest size by quantile.
+NEIGHBOURS, LARGEST = 3, 0.99
+
+
+def from_points(
+    positions: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+    *,
+    frame: LocalFrame,
+    most: int | None = None,
+) -> Gaussians:
+    """Gaussians at coloured points, as wide as the points lie apart.
+
+    Args:
+        positions: (N, 3) in ``frame``, at least two different ones.
+        colors: (N, 3).
+        frame: is passed on.
+        most: how many there may be; None sets no limit beside the usual number.
+    """
+    every = max(1, len(positions) // STARTING_GAUSSIANS)
+    if most is not None:
+        every = max(every, -(-len(positions) // most))
+    rows = slice(None, None, every)
+    positions, colors = positions[rows], np.maximum(colors[rows], DARKEST)
+    return Gaussians.at(positions, colors, sizes=_sizes(positions), frame=frame)
+
+
+def from_depth(
+    views: Sequence[FitView], *, frame: LocalFrame, seed: int, most: int | None = None
+) -> Gaussians:
+    """Gaussians at randomly picked pixels with depth.
+
+    Args:
+        views: those without depth give none.
+        frame: is passed on.
+        seed: of which pixels.
+        most: as for ``from_points``.
+
+    Raises:
+        DegenerateError: next to no pixel has depth.
+    """
+    rng = np.random.default_rng(seed)
+    count = STARTING_GAUSSIANS if most is None else min(most, STARTING_GAUSSIANS)
+    share = max(count // max(sum(view.depth is not None for view in views), 1), 1)
+    positions, colors = [], []
+    for view in views:
+        if view.depth is None:
+            continue
+        usable = view.depth > 0 if view.mask is None else (view.depth > 0) & view.mask
+        row, column = np.nonzero(usable)
+        picked = rng.permutation(len(row))[:share]
+        row, column = row[picked], column[picked]
+        rays = np.stack([column + 0.5, row + 0.5, np.ones(len(row))]).T @ np.linalg.inv(view.K).T
+        points = rays * view.depth[row, column, None]
+        pose = view.cam_from_local
+        positions.append((points - pose[:3, 3]) @ pose[:3, :3])
+        colors.append(view.rgb[row, column])
+    if sum(map(len, positions)) <= NEIGHBOURS:
+        raise DegenerateError(
+            f"{sum(map(len, positions))} pixels with depth in {len(views)} views; expected more"
+        )
+    return from_points(np.concatenate(positions), np.concatenate(colors), frame=frame, most=most)
+
+
+def _sizes(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N,) root mean squared distance to the nearest neighbours, scene units."""
+    import open3d as o3d
+
+    points = o3d.core.Tensor(np.ascontiguousarray(positions - positions.mean(axis=0)))
+    search = o3d.core.nns.NearestNeighborSearch(points)
+    search.knn_index()
+    _, squared = search.knn_search(points, NEIGHBOURS + 1)
+    sizes = np.sqrt(squared.numpy()[:, 1:].mean(axis=1))
+    positive = sizes[sizes > 0]
+    least = float(positive.min()) if positive.size else 1.0
+    return np.clip(sizes, least, np.quantile(sizes, LARGEST))

@@ -1,0 +1,111 @@
+"""Pictures of Gaussians in the memory's guidance, and as depth of photographs."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from splat_scene import HEIGHT, WALL, WIDTH, K, pose, rough_gaussians
+
+from gvtools.appearance.appearance import Appearance, applied
+from gvtools.appearance.blending import Blend, blended
+from gvtools.appearance.fitted_depth import LEAST_CONFIDENCE, OPAQUE, FittedDepth
+from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.splat.project_kernels import LOGIT
+from gvtools.cameras import Cameras
+from gvtools.guidance import Guidance
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.scenes.scene import Frame
+
+SIZE = np.array([WIDTH]), np.array([HEIGHT])
+CAMERA = Cameras(K[None], pose(0.1)[None], *SIZE, ("one",))
+
+
+@pytest.fixture(scope="module")
+def solid() -> Gaussians:
+    """Nearly opaque Gaussians on the left of the picture."""
+    some = rough_gaussians()
+    some.values[:, LOGIT] = 4.0
+    return Gaussians(some.values[some.values[:, 0] < 0.2])
+
+
+@pytest.fixture(scope="module")
+def guidance() -> Guidance:
+    rng = np.random.default_rng(0)
+    shape = (1, HEIGHT, WIDTH)
+    valid = rng.uniform(size=shape) < 0.8
+    return Guidance(
+        CAMERA,
+        rng.uniform(0, 1, (*shape, 3)).astype(np.float32) * valid[..., None],
+        rng.uniform(1, 3, shape).astype(np.float32) * valid,
+        valid,
+        rng.uniform(0, 1, shape).astype(np.float32) * valid,
+        valid & (rng.uniform(size=shape) < 0.3),
+    )
+
+
+def test_only_colours_that_were_observed_change(solid, guidance):
+    picture = Appearance(solid, 0.05).picture(CAMERA)
+    where = guidance.valid[0] & ~guidance.generated[0] & (picture.alpha > 0.5)
+    assert 0 < where.sum() < (guidance.valid[0] & ~guidance.generated[0]).sum()
+    result = applied(picture, guidance, blend=Blend(0.3, 0.5))
+    for name in ("depth", "valid", "generated", "confidence"):
+        np.testing.assert_array_equal(getattr(result, name), getattr(guidance, name))
+    assert result.cameras is guidance.cameras
+    np.testing.assert_array_equal(result.rgb[0][~where], guidance.rgb[0][~where])
+    assert (result.rgb[0] != guidance.rgb[0]).any(axis=2)[where].mean() > 0.95
+    expected = blended(picture.rgb, guidance.rgb[0], where, blend=Blend(0.3, 0.5))
+    np.testing.assert_array_equal(result.rgb[0], expected)
+
+
+def test_a_picture_does_not_depend_on_the_gaussians_frame(solid):
+    plain = Appearance(solid, 0.05).picture(CAMERA)
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    frame = LocalFrame.at([40.0, -7.0, 2.0], turn * np.sign(np.linalg.det(turn)))
+    camera = Cameras(K[None], frame.cam_from_world(pose(0.1)[None]), *SIZE, ("one",))
+    moved = Appearance(Gaussians(solid.values, frame=frame), 0.05).picture(camera)
+    np.testing.assert_allclose(moved.rgb, plain.rgb, atol=1e-4)
+    np.testing.assert_allclose(moved.alpha, plain.alpha, atol=1e-4)
+
+
+def test_what_is_nearer_than_the_near_plane_is_not_drawn(solid):
+    picture = Appearance(solid, WALL + 1).picture(CAMERA)
+    assert not picture.alpha.any() and not picture.rgb.any() and not picture.depth.any()
+    assert not picture.solid.any()
+
+
+def test_colours_are_over_black_and_depth_is_the_surfaces():
+    veil = Gaussians.at([[0.0, 0, 2.0]], [[200, 100, 50]], sizes=[3.0])
+    picture = Appearance(veil, 0.05).picture(CAMERA)
+    assert picture.alpha.max() < 0.2
+    seen = picture.alpha > 0.05
+    assert seen.mean() > 0.9
+    expected = picture.alpha[..., None] * np.array([200, 100, 50]) / 255
+    np.testing.assert_allclose(picture.rgb[seen], expected[seen], atol=1e-4)
+    depth = (pose(0.1) @ [0, 0, 2, 1])[2]
+    np.testing.assert_allclose(picture.depth[seen], depth, rtol=1e-4)
+
+
+def test_fitted_depth_is_what_opaque_gaussians_show_trusted_by_the_look(solid):
+    appearance = Appearance(solid, 0.05)
+    shown = appearance.picture(CAMERA)
+    rgb = np.rint(shown.rgb * 255).astype(np.uint8)
+    rgb[:, :10] = 255 - rgb[:, :10] // 2
+    source = FittedDepth(appearance)
+
+    view: Any = SimpleNamespace(camera=CAMERA)
+    scene: Any = None
+    found = source.depth(scene, view, Frame(rgb, None, None))
+    assert found.depth.dtype == found.confidence.dtype == np.float32
+    opaque = shown.alpha > OPAQUE
+    assert 0.1 < opaque.mean() < 0.9
+    np.testing.assert_array_equal(found.depth[opaque], shown.depth[opaque])
+    assert not found.depth[~opaque].any()
+    assert source.covers(view) and found.source == source.name == "fitted"
+    assert found.confidence[:, 10:].min() > 0.99
+    off = np.abs(shown.rgb - rgb / np.float32(255)).mean(axis=2)[:, :10]
+    expected = np.maximum(np.exp(-np.square(off / 0.12)), LEAST_CONFIDENCE)
+    np.testing.assert_allclose(found.confidence[:, :10], expected, rtol=1e-5)
+    assert found.confidence[:, :10].min() == np.float32(LEAST_CONFIDENCE)

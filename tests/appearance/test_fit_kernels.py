@@ -1,0 +1,93 @@
+"""The loss between pictures against kornia and autograd, and Adam on rows against torch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from kornia.metrics import ssim
+
+from gvtools.appearance import kernels
+from gvtools.appearance.splat.project_kernels import VALUES
+
+HEIGHT, WIDTH, SHARE = 30, 37, 0.2
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """Picture, target, and weights that are 0 where a window leaves the picture."""
+    rng = np.random.default_rng(0)
+    target = rng.uniform(0, 1, (3, HEIGHT, WIDTH)).astype(np.float32)
+    picture = (0.6 * target + 0.4 * rng.uniform(0, 1, target.shape)).astype(np.float32)
+    weight = np.zeros((HEIGHT, WIDTH), np.float32)
+    inner = (slice(kernels.HALF, -kernels.HALF),) * 2
+    weight[inner] = rng.uniform(0, 1, weight[inner].shape)
+    return picture, target, weight
+
+
+def reference_loss(picture: torch.Tensor, target, weight) -> torch.Tensor:
+    """By kornia: the weighted mean over all pixels and channels."""
+    theirs = torch.from_numpy(target).double()[None]
+    similar = ssim(picture[None], theirs, kernels.WINDOW)[0]
+    each = (1 - SHARE) * (picture - theirs[0]).abs() + SHARE * (1 - similar)
+    return (each * torch.from_numpy(weight).double()).mean()
+
+
+def test_the_loss_is_that_of_kornia_and_its_gradient_that_of_autograd(pictures):
+    picture, target, weight = pictures
+    gradient, losses = np.zeros_like(picture), np.zeros(3)
+    kernels.picture_loss(0, 3, picture, target, weight, SHARE, gradient, losses)
+    theirs = torch.from_numpy(picture).double().requires_grad_()
+    expected = reference_loss(theirs, target, weight)
+    expected.backward()
+    assert losses.sum() == pytest.approx(expected.item(), rel=1e-5)
+    assert theirs.grad is not None
+    scale = float(theirs.grad.abs().max())
+    np.testing.assert_allclose(gradient, theirs.grad.numpy(), atol=1e-4 * scale, rtol=1e-3)
+
+
+def test_a_channel_by_itself_gives_its_share(pictures):
+    picture, target, weight = pictures
+    whole, part = np.zeros_like(picture), np.zeros_like(picture)
+    losses, loss = np.zeros(3), np.zeros(3)
+    kernels.picture_loss(0, 3, picture, target, weight, SHARE, whole, losses)
+    kernels.picture_loss(1, 2, picture, target, weight, SHARE, part, loss)
+    np.testing.assert_array_equal(part[1], whole[1])
+    np.testing.assert_array_equal(loss, [0, losses[1], 0])
+    assert not part[[0, 2]].any()
+
+
+def test_equal_pictures_have_no_loss_and_no_gradient(pictures):
+    _, target, weight = pictures
+    gradient, losses = np.zeros_like(target), np.zeros(3)
+    kernels.picture_loss(0, 3, target, target, weight, SHARE, gradient, losses)
+    assert abs(losses).max() < 1e-6
+    assert abs(gradient).max() < 1e-6
+
+
+@pytest.mark.parametrize("columns", [VALUES, 14])
+def test_rows_move_as_by_torchs_adam_and_the_others_stay(columns):
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=(9, VALUES)).astype(np.float32)
+    before, moments = values.copy(), np.zeros((2, 9, VALUES), np.float32)
+    rows, rates = np.array([1, 4, 5, 8]), rng.uniform(1e-3, 1e-2, VALUES).astype(np.float32)
+    widths = rng.uniform(0.1, 3, 9).astype(np.float32)
+    # Adam's steps do not depend on where the values are, so steps of length 1 tell all others.
+    unit = torch.zeros(4, columns, dtype=torch.float64, requires_grad=True)
+    adam = torch.optim.Adam([unit], lr=1.0, betas=(0.9, 0.999), eps=1e-15)
+    for step in range(1, 6):
+        gradients = rng.normal(size=(4, columns)).astype(np.float32)
+        unit.grad = torch.from_numpy(gradients).double()
+        adam.step()
+        for first, last in ((0, 1), (1, 4)):
+            kernels.adam_rows(
+                first, last, rows, gradients, values, moments, rates, widths, step
+            )  # fmt: skip
+    length = np.repeat(rates[None, :columns], 4, axis=0)
+    length[:, :3] *= widths[rows, None]
+    expected = before[rows, :columns] + length * unit.detach().numpy()
+    np.testing.assert_allclose(values[rows, :columns], expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(values[rows, columns:], before[rows, columns:])
+    others = np.setdiff1d(np.arange(9), rows)
+    np.testing.assert_array_equal(values[others], before[others])
+    assert not moments[:, others].any()

@@ -1,0 +1,150 @@
+"""Refinement of poses: back to the truth where they are off, untouched where they are right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from splat_scene import photographs, picture, pose, pose_errors, rough_gaussians, walk
+
+from gvtools.appearance.camera_corrections import CameraCorrections, moved
+from gvtools.appearance.fit import JUDGES_JOIN, Fit, FitOptions, judges
+from gvtools.appearance.pose_check import prediction_error
+from gvtools.appearance.start import from_depth
+from gvtools.memory.store.local_frame import LocalFrame
+
+COUNT = 8
+FRAME = LocalFrame.at()
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return walk(COUNT)
+
+
+@pytest.fixture(scope="module")
+def views(truth):
+    return photographs(truth, depth=True)
+
+
+@pytest.fixture(scope="module")
+def gaussians(views):
+    """Fitted from the true poses."""
+    fit = Fit(rough_gaussians(), views, options=FitOptions(steps=200, poses=False))
+    fit.run()
+    return fit.gaussians
+
+
+def given(views, motions):
+    """The views with poses that are off by some motions."""
+    return [
+        replace(view, cam_from_local=moved(view.cam_from_local, motion))
+        for view, motion in zip(views, motions, strict=True)
+    ]
+
+
+def test_poses_that_are_off_come_back_nearer_to_the_truth(views, truth):
+    rng = np.random.default_rng(1)
+    motions = rng.normal(0, [0.03] * 3 + [0.01] * 3, (COUNT, 6))
+    off = given(views, motions)
+    fit = Fit(from_depth(off, frame=FRAME, seed=0, most=1500), off, options=FitOptions(steps=300))
+    fit.run()
+    before = pose_errors(np.stack([view.cam_from_local for view in off]), truth)
+    after = pose_errors(fit.cameras.poses(), truth)
+    assert fit.cameras.with_poses
+    assert after[0] < 0.7 * before[0]
+    assert after[1] < 0.7 * before[1]
+    assert "scene units" in fit.cameras.summary()
+
+
+def test_exact_poses_are_given_back_to_the_bit(views, truth):
+    fit = Fit(from_depth(views, frame=FRAME, seed=0, most=1500), views,
+              options=FitOptions(steps=60))  # fmt: skip
+    fit.step(0.0)
+    assert fit.cameras.with_poses
+    assert (fit.cameras.poses() != truth).any()
+    fit.run()
+    assert not fit.cameras.with_poses
+    np.testing.assert_array_equal(fit.cameras.poses(), truth)
+    np.testing.assert_array_equal(fit.cameras.corrected(pose(0.3)), pose(0.3))
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_poses_are_refined_only_where_asked_for_and_depth_is_recorded(views, truth, depth):
+    some = views if depth else [replace(views[0], depth=None), *views[1:]]
+    fit = Fit(rough_gaussians(), some, options=FitOptions(steps=100, poses=not depth))
+    fit.step(0.0)
+    assert not fit.cameras.with_poses
+    np.testing.assert_array_equal(fit.cameras.poses(), truth)
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_neighbours_corrections_are_taken_only_if_judges_gain(views, truth, gaussians, alike):
+    (judge,) = judges(COUNT)
+    motions = np.zeros((COUNT, 6))
+    motions[:, 0] = 0.06
+    motions[[0, 1, 7], 0] = -0.1
+    if not alike:
+        motions[judge] = 0
+    off = given(views, motions)
+    fit = Fit(gaussians, off, options=FitOptions())
+    # As if the fit had found the errors of all but the judge, whose photograph it has not seen.
+    fit.cameras.twists[:, 0] = -motions[:, 0] / fit.cameras.depth
+    fit.cameras.twists[judge] = 0
+    before = fit.cameras.given[judge]
+    near = fit.cameras.like_neighbours(judge, but=[judge])
+    fit.step(JUDGES_JOIN)
+    assert fit.cameras.with_poses
+    assert fit.cameras.spread == alike
+    taken = near if alike else before
+    np.testing.assert_allclose(
+        fit.judged[judge].rgb, picture(gaussians, taken).rgb, atol=1e-3, rtol=0
+    )
+    other = off[judge].cam_from_local
+    error = np.linalg.norm(fit.cameras.corrected(other)[:3, 3] - truth[judge][:3, 3])
+    assert error < 0.02
+    assert alike or np.array_equal(fit.cameras.corrected(other), other)
+
+
+def test_true_poses_predict_neighbours_better_than_wrong_ones(views, truth):
+    rng = np.random.default_rng(0)
+    wrong = np.stack([moved(each, rng.normal(0, 0.02, 6)) for each in truth])
+    assert prediction_error(views, truth) < 0.7 * prediction_error(views, wrong)
+
+
+def test_views_that_do_not_overlap_predict_nothing(views):
+    away = np.stack([pose(0.0)] * 3)
+    away[1, :3, 3] = [-900, 0, 0]
+    away[2, :3, 3] = [900, 0, 0]
+    back_to_back = np.stack([pose(0.0), np.diag([-1.0, 1.0, -1.0, 1.0])])
+    assert np.isnan(prediction_error(views[:2], back_to_back))
+    assert np.isnan(prediction_error(views[:3], away))
+
+
+def test_corrections_have_mean_zero_and_a_limit(truth):
+    cameras = CameraCorrections(truth, depth=2.0, with_poses=True, exposure=True)
+    for _ in range(200):
+        cameras.step(0, np.ones(12, np.float32), share=0.0)
+        cameras.step_gain(1, np.array([1, -1, 0], np.float32))
+    assert np.abs(cameras.twists).max() <= 0.035
+    motions = cameras.poses() @ np.linalg.inv(truth)
+    shift = motions[:, :3, 3]
+    assert np.abs(shift[0]).max() > 0.02
+    np.testing.assert_allclose(shift.mean(axis=0), 0, atol=2e-3)
+    gains = np.log([cameras.gain(number) for number in range(COUNT)])
+    np.testing.assert_allclose(gains.mean(axis=0), 0, atol=1e-6)
+    assert gains[1, 0] < gains[2, 0] < 1 and gains[1, 1] > gains[2, 1] and gains[1, 2] == 0
+
+
+def test_the_gradient_of_a_pose_is_that_of_a_small_motion_on_the_cameras_side():
+    cameras = CameraCorrections(walk(2), depth=2.0, with_poses=True, exposure=False)
+    for axis in range(6):
+        # A loss that falls along one motion: its gradient by rotation and translation.
+        start, motion = cameras.given[0], np.zeros(6)
+        motion[axis] = 1e-5
+        slope = -(moved(start, motion) - start)[:3] / 1e-5
+        gradient = np.concatenate([slope[:, :3].ravel(), slope[:, 3]]).astype(np.float32)
+        fresh = CameraCorrections(walk(2), depth=2.0, with_poses=True, exposure=False)
+        fresh.step(0, gradient, share=0.0)
+        assert fresh.twists[0, axis] == pytest.approx(1e-3, rel=1e-3)
