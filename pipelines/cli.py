@@ -18,6 +18,7 @@ COMMANDS = {
     "demo": "pipelines.commands.demo",
     "check": "pipelines.commands.check",
     "reconstruct": "pipelines.commands.reconstruct",
+    "refine": "pipelines.commands.refine",
     "render": "pipelines.commands.render",
     "tradeoff": "pipelines.commands.tradeoff",
     "evaluate": "pipelines.commands.evaluate",
@@ -93,7 +94,7 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
         print(f"gvtools: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        goes_on = "reconstruct goes on with --resume, tradeoff by itself"
+        goes_on = "reconstruct goes on with --resume, tradeoff by itself; refine changed nothing"
         print(f"gvtools: interrupted; {goes_on}", file=sys.stderr)
         return 1
     except Exception as error:

@@ -78,7 +78,10 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("small")
     scan, run = write_scan(root / "scan", views=8), root / "run"
     options = ("--context", "first:3", "--targets", "range:4-7", "--views-per-round", "2")
-    assert main(["reconstruct", str(scan), "--out", str(run), *options, "--quiet"]) == 0
+    assert (
+        main(["reconstruct", str(scan), "--refine", "0", "--out", str(run), *options, "--quiet"])
+        == 0
+    )
     return run
 
 

@@ -19,6 +19,10 @@ ROOT = Path(gvtools.__file__).parent
 # Modules whose docstrings hold examples.
 DOCTESTED = (
     "gvtools",
+    "gvtools.appearance.blending",
+    "gvtools.appearance.fit",
+    "gvtools.appearance.gaussians",
+    "gvtools.appearance.splat.splat",
     "gvtools.cameras",
     "gvtools.completers.complete",
     "gvtools.evaluation.trajectories",

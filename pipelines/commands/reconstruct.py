@@ -50,6 +50,13 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
     )
     parser.add_argument("--completer", metavar="NAME", help="default inpaint")
     parser.add_argument("--profile", metavar="NAME", help="fast, balanced or accurate")
+    parser.add_argument(
+        "--refine",
+        type=float,
+        metavar="SECONDS",
+        help="fit Gaussians to the photographs so long; 0: not at all (default: about as long as "
+        "the rest takes)",
+    )
     parser.add_argument("--voxel", metavar="EDGE", help="auto, or scene units")
     parser.add_argument(
         "--device", metavar="NAME", help="cpu, cuda (the torch back end), or auto: cpu"
@@ -131,6 +138,8 @@ def config_from(args: argparse.Namespace) -> RunSettings:
     names = ("context", "targets", "views_per_round", "rounds", "max_side", "depth", "completer",
              "voxel", "device", "seed")  # fmt: skip
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    if args.refine is not None:
+        given["refine.seconds"] = args.refine
     if args.allow_overlap:
         given["allow_overlap"] = True
     return with_texts(with_values(config, given), texts)

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """
     from gvtools.files import write_json
     from gvtools.runs.layout import file_stems
-    from gvtools.runs.memory_file import load_memory
+    from gvtools.runs.memory_file import load_appearance, load_memory
     from gvtools.scenes.selection import select
     from pipelines.rendering.figures import measure, render_view, summary
     from pipelines.rendering.view_files import write_view
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     short = {"backend": args.backend, "device": args.device}
     given = [f"splat.{key}={value}" for key, value in short.items() if value is not None]
     options = splat_options([*given, *args.set])
-    memory = load_memory(args.memory)
+    memory, appearance = load_memory(args.memory), load_appearance(args.memory)
     if not len(memory.views):
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
     cameras, scene = _cameras(args, memory)
@@ -98,7 +98,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
     memory.project(cameras[row_of[names[0]]], options=options)
     views = []
     for name in console.track(names, "rendering"):
-        guidance, seconds = render_view(memory, cameras[row_of[name]], options)
+        guidance, seconds = render_view(
+            memory, cameras[row_of[name]], options, appearance=appearance
+        )
         frame = scene[name].load() if scene is not None and args.against_images else None
         if args.out is not None:
             write_view(args.out, stems[name], guidance)

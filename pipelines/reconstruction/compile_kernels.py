@@ -30,6 +30,10 @@ def compile_kernels(
     sets = [memory.KERNELS, *completer.kernels, *more]
     if completer.costly and config.effort.inpaint_below > 0:
         sets += completer_type("inpaint").kernels
+    if config.refine.wanted:
+        from gvtools.appearance.compile_kernels import kernel_sets
+
+        sets += kernel_sets()
     missing = [kernels for kernels in sets if not kernels.cached]
     began = perf_counter()
     if missing:

@@ -41,6 +41,7 @@ class Plan:
         completer: of the whole run, under its effort policy.
         ignored: settings of stereo that this source does not look at.
         weights: files of networks that decide the result.
+        evidence: the scene as it enters the memory, where that is smaller; None for ``scene``.
     """
 
     scene: Scene
@@ -54,6 +55,7 @@ class Plan:
     completer: Completer
     ignored: tuple[str, ...] = ()
     weights: tuple[Path, ...] = ()
+    evidence: Scene | None = None
 
     @property
     def derived(self) -> dict[str, Any]:
@@ -150,6 +152,7 @@ def _on_device(config: RunSettings) -> RunSettings:
 
     "auto" is CUDA where the torch back end was chosen, may choose, and finds such a device.
     """
+    from gvtools.appearance.splat.gsplat_splatter import gsplat_installed
     from gvtools.errors import OptionError
     from gvtools.settings import with_values
 
@@ -172,6 +175,11 @@ def _on_device(config: RunSettings) -> RunSettings:
         raise OptionError(
             f"device cuda: torch {torch.__version__} finds no CUDA device; expected one; use "
             "--device cpu, or install a CUDA build of torch"
+        )
+    if config.refine.wanted and not gsplat_installed():
+        raise OptionError(
+            "device cuda: gsplat, which fits Gaussians there, is not installed; expected it; pip "
+            "install gvtools[cuda], or use --refine 0 or --device cpu"
         )
     return with_values(config, {"splat.backend": "torch", "splat.device": "cuda"})
 

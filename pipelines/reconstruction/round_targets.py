@@ -5,6 +5,7 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
+from gvtools.appearance.appearance import Appearance
 from gvtools.kernels import parallel_kernels_may_overlap
 from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -20,10 +21,13 @@ class RoundTargets:
     Args:
         plan: of the run.
         memory: that the rounds add to.
+        appearance: shows what was observed; None leaves it to the memory.
     """
 
-    def __init__(self, plan: Plan, memory: SpatialMemory) -> None:
-        self.plan, self.memory = plan, memory
+    def __init__(
+        self, plan: Plan, memory: SpatialMemory, appearance: Appearance | None = None
+    ) -> None:
+        self.plan, self.memory, self.appearance = plan, memory, appearance
         self._pool = ThreadPoolExecutor(1)
         self._next: tuple[int, list[CachedProjection], list[Future[None]]] | None = None
 
@@ -61,6 +65,12 @@ class RoundTargets:
     def _projections(self, number: int) -> list[CachedProjection]:
         config = self.plan.config
         return [
-            CachedProjection(self.memory, camera, options=config.splat, reuse=config.savings.reuse)
+            CachedProjection(
+                self.memory,
+                camera,
+                options=config.splat,
+                reuse=config.savings.reuse,
+                appearance=self.appearance,
+            )
             for camera in self.plan.targets.cameras[list(self.plan.schedule[number - 1])]
         ]

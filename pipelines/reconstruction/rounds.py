@@ -242,7 +242,6 @@ def _row(completion: Completion, index: int) -> Completion:
         completion.depth[rows],
         completion.confidence[rows],
         rays,
-        completion.spent,
         None if completion.scale_alignment is None else completion.scale_alignment[rows],
     )
 
@@ -261,6 +260,11 @@ def _align_and_fuse(
     with clock.stage("align"):
         alignment = _scale_alignment(guidance, completion, config)
     filled = ~valid & (depth > 0)
+    if alignment.accepted:
+        with clock.stage("fuse"):
+            scale = np.float32(alignment.scale)
+            depth = memory.behind_free_space(depth * scale, guidance.cameras, where=filled) / scale
+        filled &= depth > 0
     fused = filled & (confidence >= config.fusion.min_confidence) & (confidence > 0)
     report = FuseReport()
     if not alignment.accepted:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from gvtools.files import write_json
 from gvtools.runs.folder import RunDirectory
-from gvtools.runs.layout import MEMORY, REPORT
+from gvtools.runs.layout import APPEARANCE, MEMORY, REPORT
 from pipelines.console import Console
 from pipelines.reconstruction.compile_kernels import compile_kernels
 from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gvtools.completers.base import ContextView
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.scenes.scene import Scene
+    from pipelines.reconstruction.fitting import Fitted
     from pipelines.reconstruction.settings import RunSettings
 
 # Draws what a finished run shows, given its plan and its folder; returns the names of the files.
@@ -64,12 +65,53 @@ def reconstruct(
         console.line(f"dry run: {out}: {state}")
         return out
     with directory.open_or_resume(identity, resume=resume) as done:
-        memory = (
-            _last_memory(plan, directory, done, console=console) if done else _empty_memory(plan)
-        )
-        _run_rounds(plan, memory, directory, done=done, console=console)
-        _finish(plan, memory, directory, console=console, draw=draw)
+        fitted = _fitted(plan, directory, done, console=console)
+        drawn = complete_run(plan, directory, done, fitted=fitted, console=console, draw=draw)
+        say_results(directory, drawn, console)
     return out
+
+
+def complete_run(
+    plan: Plan,
+    directory: RunDirectory,
+    done: int = 0,
+    *,
+    fitted: Fitted | None,
+    console: Console,
+    draw: Draw | None,
+) -> Sequence[str]:
+    """The rounds from number ``done`` on, and the end products.
+
+    Args:
+        plan: with its cameras as the project gives them.
+        directory: of the run, open.
+        done: how many rounds are complete.
+        fitted: Gaussians of the run; None leaves the memory's own colours.
+        console: where progress and figures go.
+        draw: see ``reconstruct``.
+
+    Returns:
+        The names of the files that ``draw`` wrote.
+
+    Raises:
+        GvError: see ``reconstruct``.
+    """
+    if fitted is not None:
+        plan = fitted.applied(plan)
+    memory = _last_memory(plan, directory, done, console=console) if done else _empty_memory(plan)
+    _run_rounds(plan, memory, directory, done=done, fitted=fitted, console=console)
+    return _finish(plan, memory, directory, console=console, draw=draw)
+
+
+def _fitted(plan: Plan, directory: RunDirectory, done: int, *, console: Console) -> Fitted | None:
+    """Gaussians fitted now or by the attempt that is resumed; None where there are none."""
+    from pipelines.reconstruction.fitting import Fitted, fit_appearance
+
+    if done:
+        # None are there where none were wanted or could be fitted; ``gvtools refine`` adds them.
+        saved = directory.round_path(0) / APPEARANCE
+        return Fitted.load(saved).on(plan.config.device) if saved.exists() else None
+    return fit_appearance(plan, console) if plan.config.refine.wanted else None
 
 
 def _empty_memory(plan: Plan) -> SpatialMemory:
@@ -98,7 +140,13 @@ def _last_memory(
 
 
 def _run_rounds(
-    plan: Plan, memory: SpatialMemory, directory: RunDirectory, *, done: int, console: Console
+    plan: Plan,
+    memory: SpatialMemory,
+    directory: RunDirectory,
+    *,
+    done: int,
+    fitted: Fitted | None,
+    console: Console,
 ) -> None:
     """The rounds from number ``done`` on."""
     from pipelines.reconstruction.depth_cache import DepthCache
@@ -107,18 +155,22 @@ def _run_rounds(
     from pipelines.reconstruction.run_round import run_round
 
     context: list[ContextView] | None = None
-    with RoundTargets(plan, memory) as targets:
+    with RoundTargets(plan, memory, None if fitted is None else fitted.appearance) as targets:
         for number in range(done, len(plan.schedule) + 1):
             if number and context is None:
-                cache = DepthCache(
-                    plan.scene, plan.context, plan.source, folder=directory.round_path(0)
-                )
-                context = load_context(plan.scene, plan.context, cache)
+                scene = plan.evidence or plan.scene
+                cache = DepthCache(scene, plan.context, plan.source, folder=directory.round_path(0))
+                context = load_context(scene, plan.context, cache)
             with directory.writing_round(number) as folder:
                 report = run_round(
                     plan, targets, number, context=context or [], folder=folder, console=console
                 )
                 memory.save(folder / MEMORY)
+                if fitted is not None and number == 0:
+                    fitted = fitted.with_best_blend(plan, memory)
+                    fitted.save(folder / APPEARANCE)
+                    targets.appearance = fitted.appearance
+                    console.line(f"colours: {fitted.appearance.blend}")
                 write_json(folder / REPORT, report)
             console.line(_round_line(report))
 
@@ -141,17 +193,22 @@ def _finish(
     *,
     console: Console,
     draw: Draw | None,
-) -> None:
-    """The run's end products, all derived from the last round's memory."""
+) -> Sequence[str]:
+    """The run's end products, all derived from the last round's memory; see ``complete_run``."""
     from gvtools.memory.io.ply import export_memory_ply
-    from gvtools.runs.context_depth import off_scale
     from pipelines.reconstruction.measure import measure_run
-    from viz.plots.growth import growth_text
 
     export_memory_ply(memory, directory.path / "memory.ply")
     metrics = measure_run(plan, memory, directory, console=console)
     directory.finish(len(plan.schedule), metrics)
-    drawn = draw(plan, directory) if draw else ()
+    return draw(plan, directory) if draw else ()
+
+
+def say_results(directory: RunDirectory, drawn: Sequence[str], console: Console) -> None:
+    """Say how the memory of a finished run grew, and where its files are."""
+    from gvtools.runs.context_depth import off_scale
+    from viz.plots.growth import growth_text
+
     reports = directory.reports()
     console.line(growth_text(reports))
     flagged = off_scale(reports[0].get("depth", ()))

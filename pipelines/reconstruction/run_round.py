@@ -92,17 +92,19 @@ def _lift_context(
     """
     least = plan.config.savings.depth_from_memory
 
+    scene = plan.evidence or plan.scene
+
     def from_memory(view: View, frame: Frame) -> DepthMap | None:
-        if least is None:
+        if least is None or plan.evidence is not None:
             return None
         splat = plan.config.splat
         depth_map = depth_from_memory(memory, view.camera, frame.rgb, least=least, options=splat)
         # Reject projected depth that contradicts the sparse points: errors would accumulate.
-        fit = depth_map and scale_to_points(plan.scene, view.name, depth_map.depth)
+        fit = depth_map and scale_to_points(scene, view.name, depth_map.depth)
         return None if fit and disagrees(fit) else depth_map
 
     source = DepthCache(
-        plan.scene, plan.context, plan.source, folder=folder, unfinished=True, fallback=from_memory
+        scene, plan.context, plan.source, folder=folder, unfinished=True, fallback=from_memory
     )
     if source.kept:
         console.line(
@@ -110,7 +112,7 @@ def _lift_context(
             "which an interrupted attempt at this run had computed"
         )
     total, dropped, depth = rounds.observe_context(
-        plan.scene, plan.context, source=source,
+        scene, plan.context, source=source,
         memory=memory, config=plan.config, clock=clock, progress=console.track,
     )  # fmt: skip
     warn_of_depth(depth, console)

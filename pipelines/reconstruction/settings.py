@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
+from gvtools.appearance.fit import FitOptions
 from gvtools.completers.effort import EffortPolicy
 from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.stereo.options import StereoOptions
@@ -22,8 +23,9 @@ class FusionOptions(Settings):
 
     section = "fusion"
 
-    min_confidence: float = Field(0.08, ge=0, le=1)
-    """Generated pixels below this are not fused."""
+    min_confidence: float = Field(0.0, ge=0, le=1)
+    """Generated pixels below this are not fused; 0 keeps all that nothing observed contradicts, so
+    that later views agree with them."""
     max_scale_residual: float = Field(0.1, gt=0)
     """A completion whose depth fits the memory's worse than this relative residual is refused."""
     voxel_percentile: float = Field(10.0, ge=0, le=100)
@@ -66,6 +68,7 @@ class RunSettings(Settings):
             "max_side": 480,
             "views_per_round": 12,
             "effort.inpaint_below": 0.05,
+            "refine.steps": 0,
         },
         # The defaults.
         "balanced": {},
@@ -75,6 +78,7 @@ class RunSettings(Settings):
             "savings.depth_from_memory": None,
             "memory.merge_angle_deg": 0.0,
             "memory.observations_per_voxel": 64,
+            "refine.seconds": 300.0,
         },
     }
     options_of: ClassVar[Mapping[str, str]] = {"completer": "completer_options"}
@@ -101,8 +105,8 @@ class RunSettings(Settings):
     seed: int = Field(0, ge=0)
     """Of everything random."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where memory is projected: "cuda" takes the torch back end there, "auto" leaves it to
-    ``splat.backend`` and ``splat.device``."""
+    """Where memory is projected and Gaussians are fitted: "cuda" takes torch and gsplat there,
+    "auto" leaves it to ``splat.backend`` and ``splat.device``."""
     allow_overlap: bool = False
     """Whether a view may be context and target."""
     completer_options: dict[str, Any] = Field(default_factory=dict)
@@ -115,3 +119,4 @@ class RunSettings(Settings):
     fusion: FusionOptions = FusionOptions()
     savings: SavingsOptions = SavingsOptions()
     effort: EffortPolicy = EffortPolicy()
+    refine: FitOptions = FitOptions()

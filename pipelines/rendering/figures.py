@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from gvtools.appearance.appearance import Appearance, applied
 from gvtools.cameras import Cameras
 from gvtools.evaluation.lpips_distance import Lpips
 from gvtools.evaluation.view_figures import FIGURES, view_figures
@@ -17,11 +18,17 @@ from gvtools.scenes.scene import Frame
 
 
 def render_view(
-    memory: SpatialMemory, camera: Cameras, options: SplatOptions
+    memory: SpatialMemory,
+    camera: Cameras,
+    options: SplatOptions,
+    *,
+    appearance: Appearance | None = None,
 ) -> tuple[Guidance, float]:
-    """One projection and its seconds."""
+    """One projection, with the colours of an appearance if there is one, and its seconds."""
     start = time.perf_counter()
     guidance = memory.project(camera, options=options)
+    if appearance is not None:
+        guidance = applied(appearance.picture(camera), guidance, blend=appearance.blend)
     return guidance, time.perf_counter() - start
 
 

@@ -102,7 +102,12 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         ("voxel", f"{config['voxel']:g} scene units"),
         ("seed", str(config["seed"])),
         ("gvtools", str(record["versions"].get("gvtools", "?"))),
+        *[("refined", _refined(call)) for call in record.get("refined", [])],
     ]
+
+
+def _refined(call: Mapping[str, Any]) -> str:
+    return ", ".join(f"{value:g} {unit}" for unit, value in call.items())
 
 
 def _warnings(record: Mapping[str, Any], reports: Sequence[Mapping[str, Any]]) -> Iterator[str]:

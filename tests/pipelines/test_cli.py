@@ -29,7 +29,7 @@ def scan(tmp_path):
 
 
 def reconstruct(*arguments: object) -> tuple[object, ...]:
-    return ("reconstruct", *arguments, *RUN)
+    return ("reconstruct", *arguments, "--refine", "0", *RUN)
 
 
 def test_version(capsys):

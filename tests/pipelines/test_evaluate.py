@@ -20,7 +20,10 @@ RUN = ("--context", "first:3", "--views-per-round", "2", "--quiet")
 
 
 def reconstruct(scan, out, *more: object) -> None:
-    assert main(["reconstruct", str(scan), "--out", str(out), *RUN, *map(str, more)]) == 0
+    assert (
+        main(["reconstruct", str(scan), "--refine", "0", "--out", str(out), *RUN, *map(str, more)])
+        == 0
+    )
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,9 @@ def scan(tmp_path):
 
 
 def reconstruct(scan, out, *options: object) -> int:
-    return main(["reconstruct", str(scan), "--out", str(out), *RUN, *map(str, options)])
+    return main(
+        ["reconstruct", str(scan), "--refine", "0", "--out", str(out), *RUN, *map(str, options)]
+    )
 
 
 @pytest.fixture(scope="module")

@@ -50,7 +50,18 @@ def scan(tmp_path, monkeypatch):
 
 
 def reconstruct(scan, out, *more: object) -> int:
-    words = ["reconstruct", scan, "--out", out, *RUN, "--depth", "plane-sweep", *more]
+    words = [
+        "reconstruct",
+        scan,
+        "--refine",
+        "0",
+        "--out",
+        out,
+        *RUN,
+        "--depth",
+        "plane-sweep",
+        *more,
+    ]
     return main([str(word) for word in words])
 
 
@@ -151,7 +162,17 @@ def test_views_off_the_sparse_points_scale_are_reported_and_named(
     options = ("--context", "not:first:1", "--targets", "first:1", "--completer", "none")
     # Every view's depth is asked for, whatever memory explains.
     every = ("--set", "savings.depth_from_memory=none")
-    words = ["reconstruct", str(scan), "--out", str(out), *options, *every, "--quiet"]
+    words = [
+        "reconstruct",
+        str(scan),
+        "--refine",
+        "0",
+        "--out",
+        str(out),
+        *options,
+        *every,
+        "--quiet",
+    ]
     assert main(words) == 0
     for entry in json.loads((out / "round_000" / "report.json").read_text())["depth"]:
         off, scale = int(entry["view"][5:-4]) in wrong, entry["scale"]

@@ -56,7 +56,7 @@ def whole(scan, tmp_path_factory):
 
 
 def words(scan: Path, out: Path, *more: str) -> list[str]:
-    return ["reconstruct", str(scan), "--out", str(out), *RUN, *more]
+    return ["reconstruct", str(scan), "--refine", "0", "--out", str(out), *RUN, *more]
 
 
 def reconstruct(scan: Path, out: Path, *more: str) -> int:

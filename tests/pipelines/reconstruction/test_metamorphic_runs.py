@@ -81,7 +81,7 @@ def plain(scene, tmp_path_factory) -> Run:
 
 def run(scene: Scene, out: Path, *more: str, targets: Sequence[str] = TARGETS) -> Run:
     texts = [f"context={','.join(CONTEXT)}", f"targets={','.join(targets)}", "views_per_round=2"]
-    config = with_texts(RunSettings(), [*texts, *more])
+    config = with_texts(RunSettings(), ["refine.steps=0", *texts, *more])
     reconstruct(scene, config, out, console=Console(quiet=True))
     pictures = {
         path.name: np.asarray(Image.open(path))

@@ -38,7 +38,7 @@ def whole(scan, tmp_path_factory):
 
 
 def run(scan: Path, out: Path, *settings: str, resume: bool = False, dry_run: bool = False) -> Path:
-    config = with_texts(RunSettings(), (*SETTINGS, *settings))
+    config = with_texts(RunSettings(), ("refine.steps=0", *SETTINGS, *settings))
     return reconstruct(
         open_project(scan), config, out, console=Console(quiet=True), resume=resume, dry_run=dry_run
     )
@@ -125,7 +125,17 @@ def test_resuming_after_a_stop_gives_the_bytes_of_an_uninterrupted_run(
 def test_resuming_after_a_kill_signal(whole, scan, tmp_path, delay):
     out = tmp_path / "run"
     options = [f"--set={text}" for text in SETTINGS]
-    command = [sys.executable, "-m", "pipelines.cli", "reconstruct", str(scan), "--out", str(out)]
+    command = [
+        sys.executable,
+        "-m",
+        "pipelines.cli",
+        "reconstruct",
+        str(scan),
+        "--refine",
+        "0",
+        "--out",
+        str(out),
+    ]
     process = subprocess.Popen([*command, *options, "--quiet"])
     time.sleep(delay)
     process.send_signal(signal.SIGKILL)

@@ -92,7 +92,15 @@ def test_where_some_views_tell_the_others_are_not_computed(tmp_path, photographs
 
 
 def test_photographs_with_points_sweep_nothing(photographs, swept, tmp_path, capsys):
-    words = ["reconstruct", str(photographs), "--out", str(tmp_path / "run"), "--dry-run"]
+    words = [
+        "reconstruct",
+        str(photographs),
+        "--refine",
+        "0",
+        "--out",
+        str(tmp_path / "run"),
+        "--dry-run",
+    ]
     assert main(words) == 0
     assert not swept
     assert "computed now" not in capsys.readouterr().out
@@ -116,7 +124,7 @@ def test_without_points_a_small_sweep_serves_and_is_said(photographs, swept):
 
 def test_a_dry_run_without_points_says_it_and_leaves_nothing(tmp_path, swept, capsys):
     folder = write_colmap_scan(tmp_path / "colmap", points=0)
-    words = ["reconstruct", str(folder), "--out", str(tmp_path / "run")]
+    words = ["reconstruct", str(folder), "--refine", "0", "--out", str(tmp_path / "run")]
     assert main([*words, "--dry-run"]) == 0
     out = capsys.readouterr().out.splitlines()
     assert out[0].startswith("no sparse points or recorded depth to go by")
@@ -127,16 +135,6 @@ def test_a_dry_run_without_points_says_it_and_leaves_nothing(tmp_path, swept, ca
     assert main([*words, "--dry-run", "--voxel", "0.05"]) == 0
     assert not swept
     assert "computed now" not in capsys.readouterr().out
-
-
-def test_a_pair_is_asked_itself_and_kept(photographs):
-    scene = replace(read_colmap(photographs), points=None)
-    names = scene.names[:2]
-    said: list[str] = []
-    source = choose_source(scene, names, "auto").source
-    edge = automatic_voxel(scene, names, source, percentile=50, say=said.append)
-    assert edge == pytest.approx(WALL / FOCAL, rel=0.1)
-    assert "depth (rectified-pair) of 2 of 2 context views, computed now, and kept" in said[0]
 
 
 def test_no_depth_at_all_is_an_error_that_names_the_way_out(photographs, tmp_path):

@@ -1,0 +1,310 @@
+"""Before the first round: Gaussians are fitted to the context's photographs.
+
+The fit comes before the memory, because it refines the poses of RGB-D views that the memory is
+then built with, and because it gives photographs their depth.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.appearance.appearance import Appearance
+from gvtools.appearance.blending import Blend, best_blend
+from gvtools.appearance.fit import CONTINUED, Fit, Progress, judges
+from gvtools.appearance.fit_views import FitView
+from gvtools.appearance.fitted_depth import FittedDepth
+from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.picture import Picture
+from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
+from gvtools.appearance.start import from_depth, from_points
+from gvtools.cameras import Cameras
+from gvtools.depth.choice import rough_source
+from gvtools.depth.source import MixedDepth, RecordedDepth
+from gvtools.errors import GvError, ShapeError
+from gvtools.memory.projection import project
+from gvtools.scenes.reduced import reduced
+from gvtools.scenes.scene import Frame
+from gvtools.view_selection import evenly_spread
+from pipelines.reconstruction.prefetch import prefetch
+from pipelines.reconstruction.voxel_edge import grid_frame
+
+if TYPE_CHECKING:
+    from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.memory.store.local_frame import LocalFrame
+    from gvtools.scenes.scene import Scene
+    from pipelines.console import Console
+    from pipelines.reconstruction.plan import Plan
+
+# Progress is told so often [s].
+SAY_EVERY = 5.0
+# With fewer sparse points, the depth of so many views tells where surfaces are.
+FEWEST_POINTS, ROUGH_VIEWS = 100, 12
+# Least tolerance of the blend with recorded depth. Gaussians smear where no view near the target
+# saw them, and judges stand too near to others to show it; recorded depth is right there, too.
+WITH_DEPTH = 0.4
+# Longer side at which photographs with fitted depth enter the memory [px]: it need only tell what
+# is known, as the Gaussians show it.
+EVIDENCE_SIDE = 320
+# What a fit may leave of the cameras; the names are those of ``Fitted`` and of its file.
+CAMERA_ARRAYS = ("context_poses", "target_poses", "log_gains")
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """What a fit leaves for the run.
+
+    Attributes:
+        appearance: the fitted Gaussians.
+        context_poses: (C, 4, 4) refined cam_from_world of the context; None where kept as given.
+        target_poses: (V, 4, 4) of the targets, corrected like the context near them; or None.
+        log_gains: (C, 3) logarithms of the context's exposures; None where none was fitted.
+        spread: whether the targets share the corrections of the context near them.
+        judged: pictures of context views as they were predicted without their photographs; not
+            kept in the file.
+    """
+
+    appearance: Appearance
+    context_poses: NDArray[np.float64] | None = None
+    target_poses: NDArray[np.float64] | None = None
+    log_gains: NDArray[np.float64] | None = None
+    spread: bool = False
+    judged: Mapping[str, Picture] = field(default_factory=dict)
+
+    def save(self, path: Path) -> None:
+        """Write all of it into one file."""
+        gaussians = self.appearance.gaussians
+        arrays: dict[str, Any] = {
+            "values": gaussians.values,
+            "origin": gaussians.frame.origin,
+            "axes": gaussians.frame.axes,
+            "near": self.appearance.near,
+            "blend": [self.appearance.blend.share, self.appearance.blend.tolerance],
+            "spread": self.spread,
+        }
+        for name in CAMERA_ARRAYS:
+            if (array := getattr(self, name)) is not None:
+                arrays[name] = array
+        with path.open("wb") as file:
+            np.savez(file, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Fitted:
+        """Read what ``save`` wrote.
+
+        Raises:
+            MemoryFileError: missing or damaged.
+        """
+        appearance = Appearance.load(path)
+        with np.load(path) as data:
+            cameras = {name: data[name] for name in CAMERA_ARRAYS if name in data}
+            return cls(appearance, **cameras, spread=bool(data.get("spread")))
+
+    def on(self, device: str) -> Fitted:
+        """The same with what draws Gaussians on a device, "cpu" or "cuda"."""
+        return replace(self, appearance=replace(self.appearance, splatter=splatter_on(device)))
+
+    def posed(self, plan: Plan) -> Plan:
+        """The plan with refined poses."""
+        if self.context_poses is None or self.target_poses is None:
+            return plan
+        scene = _with_poses(plan.scene, plan.context, self.context_poses)
+        cameras = _posed(plan.targets.cameras, self.target_poses)
+        return replace(plan, scene=scene, targets=replace(plan.targets, cameras=cameras))
+
+    def applied(self, plan: Plan) -> Plan:
+        """The plan with refined poses, and with the fitted depth for views that have no other."""
+        plan = self.posed(plan)
+        scene, source = plan.scene, plan.source
+        if isinstance(source, RecordedDepth):
+            return plan
+        fitted = FittedDepth(self.appearance)
+        some = any(scene[name].has_depth for name in plan.context)
+        evidence = scene if some else reduced(scene, EVIDENCE_SIDE)
+        factor = _size(scene, plan.context) / _size(evidence, plan.context)
+        assert plan.config.voxel is not None
+        return replace(
+            plan,
+            source=MixedDepth(RecordedDepth(), fitted) if some else fitted,
+            evidence=evidence,
+            config=plan.config.replaced(voxel=plan.config.voxel * factor),
+        )
+
+    def with_best_blend(self, plan: Plan, memory: SpatialMemory) -> Fitted:
+        """The same with the blend that predicts the left-out photographs best.
+
+        Args:
+            plan: after ``applied``.
+            memory: of the context.
+        """
+        if not self.judged:
+            return self
+        recorded = all(plan.scene[name].has_depth for name in plan.context)
+        least = WITH_DEPTH if recorded else 0.0
+        blend = best_blend(self._samples(plan, memory), least_tolerance=least)
+        return replace(self, appearance=replace(self.appearance, blend=blend))
+
+    def _samples(
+        self, plan: Plan, memory: SpatialMemory
+    ) -> Iterator[tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_], NDArray[Any]]]:
+        for name, picture in self.judged.items():
+            view = plan.scene[name]
+            frame = view.load()
+            options = plan.config.splat
+            guidance = project(memory, view.camera, options=options, without=name)
+            where = guidance.valid[0] & picture.solid
+            if frame.mask is not None:
+                where &= frame.mask
+            yield picture.rgb, guidance.rgb[0], where, frame.rgb / np.float32(255)
+
+
+def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = None) -> Fitted | None:
+    """Fit Gaussians to a run's context; None where that cannot be, and the console says why.
+
+    Args:
+        plan: of the run, with its cameras as the project gives them.
+        console: where progress goes.
+        earlier: a fit of this run to go on with.
+    """
+    fit = _new_fit(plan, console) if earlier is None else _continued_fit(plan, earlier)
+    if fit is None:
+        return None
+    if fit.splatter is GsplatSplat:
+        console.line("fitting: on the CUDA device, by gsplat")
+    _run(fit, console)
+    return _fitted(fit, plan if earlier is None else earlier.posed(plan), earlier)
+
+
+def _new_fit(plan: Plan, console: Console) -> Fit | None:
+    frame = grid_frame(plan.scene, plan.context)
+    views = _views(plan, frame)
+    if all(view.depth is not None for view in views) and not judges(len(views)):
+        # Recorded depth shows a few views as well, and no photograph can be left out to tell.
+        console.line(f"no Gaussians are fitted: {len(views)} views with recorded depth")
+        return None
+    try:
+        start = _start(plan, views, frame)
+    except GvError as error:
+        console.warn(f"no Gaussians are fitted: {error}")
+        return None
+    options, splatter = plan.config.refine, splatter_on(plan.config.device)
+    return Fit(start, views, options=options, seed=plan.config.seed, splatter=splatter)
+
+
+def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
+    start = earlier.appearance.gaussians
+    views = _views(earlier.posed(plan), start.frame)
+    fit = Fit(
+        start, views, options=plan.config.refine, seed=plan.config.seed, begin=CONTINUED,
+        splatter=splatter_on(plan.config.device),
+    )  # fmt: skip
+    fit.cameras.spread = earlier.spread
+    if earlier.log_gains is not None:
+        fit.cameras.log_gains[:] = earlier.log_gains
+    return fit
+
+
+def _run(fit: Fit, console: Console) -> None:
+    """Run a fit and say now and then how far it is."""
+    began, told = time.perf_counter(), 0.0
+
+    def say(progress: Progress) -> None:
+        nonlocal told
+        now = time.perf_counter() - began
+        if now - told >= SAY_EVERY or progress.share >= 1:
+            told = now
+            console.line(
+                f"fitting: {progress.share:.0%}, {now:.0f} s, step {progress.steps}, "
+                f"{progress.gaussians:,} Gaussians, {progress.psnr:.2f} dB"
+            )
+
+    fit.run(report=say)
+    if fit.cameras.with_poses:
+        console.line(f"fitting: {fit.cameras.summary()}")
+
+
+def _fitted(fit: Fit, plan: Plan, earlier: Fitted | None) -> Fitted:
+    """What a fit that has ended leaves; what it did not change is that of an earlier one."""
+    cameras, frame = fit.cameras, fit.frame
+    blend = Blend() if earlier is None else earlier.appearance.blend
+    judged = {plan.context[number]: picture for number, picture in fit.judged.items()}
+    found = Fitted(
+        Appearance(fit.gaussians, fit.near, blend, fit.splatter),
+        log_gains=cameras.log_gains,
+        judged=judged,
+    )
+    if cameras.with_poses:
+        given = frame.cam_from_local(plan.targets.cameras.cam_from_world)
+        targets = np.array([cameras.corrected(pose) for pose in given]).reshape(-1, 4, 4)
+        return replace(
+            found,
+            context_poses=frame.cam_from_world(cameras.poses()),
+            target_poses=frame.cam_from_world(targets),
+            spread=cameras.spread,
+        )
+    if earlier is None:
+        return found
+    return replace(
+        found,
+        context_poses=earlier.context_poses,
+        target_poses=earlier.target_poses,
+        spread=earlier.spread,
+    )
+
+
+def _views(plan: Plan, frame: LocalFrame) -> list[FitView]:
+    views = [plan.scene[name] for name in plan.context]
+    poses = frame.cam_from_local(plan.scene.subset(plan.context).cameras.cam_from_world)
+    frames = prefetch(lambda view: view.load(), views)
+    return [
+        FitView(loaded.rgb, view.camera.K[0], pose, loaded.mask, loaded.depth)
+        for view, pose, loaded in zip(views, poses, frames, strict=True)
+    ]
+
+
+def _start(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians:
+    """Gaussians at recorded depth, else at sparse points, else at a rough plane sweep's depth.
+
+    Raises:
+        GvError: a camera that cannot be splatted into, or nothing tells where surfaces are.
+    """
+    if any(view.K[0, 1] for view in views):
+        raise ShapeError("cameras with skew; expected none; undistort the photographs first")
+    seed, most = plan.config.seed, plan.config.refine.most_gaussians
+    if any(view.depth is not None for view in views):
+        return from_depth(views, frame=frame, seed=seed, most=most)
+    points = plan.scene.points
+    if points is not None and len(points.positions) >= FEWEST_POINTS:
+        positions = frame.from_world(points.positions)
+        return from_points(positions, points.colors, frame=frame, most=most)
+    source, rough = rough_source(plan.scene, plan.source), []
+    for name, view in evenly_spread(list(zip(plan.context, views, strict=True)), ROUGH_VIEWS):
+        found = source.depth(plan.scene, plan.scene[name], Frame(view.rgb, None, view.mask))
+        rough.append(replace(view, depth=found.depth))
+    return from_depth(rough, frame=frame, seed=seed, most=most)
+
+
+def _with_poses(scene: Scene, names: Sequence[str], poses: NDArray[np.float64]) -> Scene:
+    moved = dict(zip(names, poses, strict=True))
+    views = tuple(
+        replace(view, camera=_posed(view.camera, moved[view.name][None]))
+        if view.name in moved
+        else view
+        for view in scene.views
+    )
+    return replace(scene, views=views)
+
+
+def _posed(cameras: Cameras, cam_from_world: NDArray[np.float64]) -> Cameras:
+    return Cameras(cameras.K, cam_from_world, cameras.width, cameras.height, cameras.names)
+
+
+def _size(scene: Scene, names: Sequence[str]) -> float:
+    camera = scene[names[0]].camera
+    return float(max(camera.width[0], camera.height[0]))

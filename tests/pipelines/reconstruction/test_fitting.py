@@ -1,0 +1,303 @@
+"""Runs that fit Gaussians to their context before round 0."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from run_files import results, untimed
+from tiny_scan import write_colmap_scan, write_scan
+
+from gvtools.appearance.appearance import Appearance, applied
+from gvtools.appearance.blending import Blend
+from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.picture import Picture
+from gvtools.appearance.splat.project_kernels import VALUES
+from gvtools.errors import DegenerateError, MemoryFileError
+from gvtools.memory.projection import project
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.scenes.project import open_project
+from gvtools.settings import with_texts
+from pipelines.console import Console
+from pipelines.reconstruction import fitting, run_round
+from pipelines.reconstruction.fitting import Fitted, fit_appearance
+from pipelines.reconstruction.plan import Plan, make_plan
+from pipelines.reconstruction.run import _empty_memory, reconstruct
+from pipelines.reconstruction.settings import RunSettings
+
+SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "depth=auto",
+            "fusion.max_psnr_drop_db=none", "refine.most_gaussians=2000")  # fmt: skip
+FITTED = "round_000/appearance.npz"
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    return write_scan(tmp_path_factory.mktemp("fitting") / "scan", views=10)
+
+
+@pytest.fixture(scope="module")
+def whole(scan, tmp_path_factory):
+    """A run with Gaussians."""
+    return run(scan, tmp_path_factory.mktemp("runs") / "whole")
+
+
+def run(scan: Path, out: Path, *settings: str, resume: bool = False) -> Path:
+    config = with_texts(RunSettings(), (*SETTINGS, "refine.steps=20", *settings))
+    return reconstruct(open_project(scan), config, out, console=Console(quiet=True), resume=resume)
+
+
+def planned(scan: Path, *settings: str) -> Plan:
+    config = with_texts(RunSettings(), (*SETTINGS, "refine.steps=20", *settings))
+    return make_plan(open_project(scan), config)
+
+
+def memory_of_round_0(out: Path) -> SpatialMemory:
+    memory = SpatialMemory.load(out / "memory.npz")
+    for number in [number for number in reversed(memory.rounds) if number]:
+        memory.forget(round=number)
+    return memory
+
+
+def guidance_of(out: Path, number: int) -> np.ndarray:
+    (file,) = (out / f"round_{number:03d}").glob("guidance_*.png")
+    return np.asarray(Image.open(file).convert("RGB"))
+
+
+def not_to_be_called(*args, **kwargs):
+    raise AssertionError("called")
+
+
+def test_a_run_keeps_its_gaussians_beside_round_0(whole, scan):
+    fitted = Fitted.load(whole / FITTED)
+    assert 100 < len(fitted.appearance.gaussians) <= 2000
+    assert fitted.appearance.near > 0
+    assert (whole / "memory.npz").exists()
+    plan = planned(scan)
+    again = fit_appearance(plan, Console(quiet=True))
+    assert again is not None
+    np.testing.assert_array_equal(
+        again.appearance.gaussians.values, fitted.appearance.gaussians.values
+    )
+
+
+def test_targets_show_the_gaussians_where_the_memory_observed(whole, scan):
+    fitted, plan = Fitted.load(whole / FITTED), planned(scan)
+    memory = memory_of_round_0(whole)
+    camera = fitted.applied(plan).targets.cameras[[0]]
+    guidance = project(memory, camera, options=plan.config.splat)
+    shown = applied(fitted.appearance.picture(camera), guidance, blend=fitted.appearance.blend)
+    off = np.abs(shown.rgb[0] * 255 - guidance_of(whole, 1))[guidance.valid[0]]
+    assert off.max() <= 1
+    assert np.abs(guidance.rgb[0] * 255 - guidance_of(whole, 1))[guidance.valid[0]].max() > 1
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing catches it."""
+
+
+def test_resuming_after_round_0_gives_the_same_bytes_without_a_second_fit(
+    whole, scan, tmp_path, monkeypatch
+):
+    real = run_round.run_round
+
+    def until_round_1(plan, targets, number, **options):
+        if number:
+            raise Killed
+        return real(plan, targets, number, **options)
+
+    monkeypatch.setattr(run_round, "run_round", until_round_1)
+    with pytest.raises(Killed):
+        run(scan, tmp_path / "run")
+    monkeypatch.undo()
+    assert (tmp_path / "run" / FITTED).exists()
+    monkeypatch.setattr(fitting, "fit_appearance", not_to_be_called)
+    run(scan, tmp_path / "run", resume=True)
+    assert results(tmp_path / "run") == results(whole)
+    assert untimed(tmp_path / "run") == untimed(whole)
+
+
+def test_a_damaged_fit_is_named_when_a_run_is_resumed(scan, tmp_path):
+    out = run(scan, tmp_path / "run", "rounds=1")
+    (out / FITTED).write_bytes((out / FITTED).read_bytes()[:-3000])
+    with pytest.raises(MemoryFileError, match=r"appearance\.npz"):
+        run(scan, out, "rounds=1", resume=True)
+
+
+def test_a_run_that_nothing_can_be_fitted_to_goes_on_without_and_resumes(
+    scan, tmp_path, monkeypatch, capsys
+):
+    def nowhere(*args, **kwargs):
+        raise DegenerateError("no surface is known")
+
+    monkeypatch.setattr(fitting, "from_depth", nowhere)
+    out = run(scan, tmp_path / "run")
+    assert "no Gaussians are fitted: no surface is known" in capsys.readouterr().err
+    assert not (out / FITTED).exists()
+    before = results(out)
+    run(scan, out, resume=True)
+    assert results(out) == before
+    without = run(scan, tmp_path / "without", "refine.steps=0")
+    assert (without / "memory.npz").read_bytes() == (out / "memory.npz").read_bytes()
+
+
+@pytest.mark.parametrize("off", ["refine.steps=0", "refine.seconds=0"])
+def test_without_steps_or_time_a_run_knows_nothing_of_gaussians(scan, tmp_path, monkeypatch, off):
+    monkeypatch.setattr(fitting, "fit_appearance", not_to_be_called)
+    monkeypatch.setattr(Appearance, "picture", not_to_be_called)
+    out = run(scan, tmp_path / "run", off)
+    assert not (out / FITTED).exists()
+    plan = planned(scan, off)
+    memory = memory_of_round_0(out)
+    guidance = project(memory, plan.targets.cameras[[0]], options=plan.config.splat)
+    shown = guidance_of(out, 1)[guidance.valid[0]]
+    assert np.abs(guidance.rgb[0][guidance.valid[0]] * 255 - shown).max() <= 0.51
+    # The memory is that of the photographs at the given poses.
+    by_hand = _empty_memory(plan)
+    for name in plan.context:
+        view = plan.scene[name]
+        frame = view.load()
+        by_hand.observe(
+            frame.rgb, frame.depth, view.camera, round=0, mask=frame.mask,
+            options=plan.config.back_projection, pixel_binning=plan.config.savings.pixel_binning,
+        )  # fmt: skip
+    np.testing.assert_array_equal(by_hand.positions, memory.positions)
+
+
+def test_both_ways_to_fit_nothing_give_the_same_files(scan, tmp_path):
+    one, other = (
+        results(run(scan, tmp_path / off[-7:], f"refine.{off}")) for off in ("steps=0", "seconds=0")
+    )
+    for files in (one, other):
+        files.pop("run.json")
+    assert one == other
+
+
+@pytest.mark.parametrize("points", [60, 0])
+def test_photographs_alone_get_depth_by_the_gaussians(tmp_path, points):
+    """With sparse points, and without any: then a rough plane sweep tells where to begin."""
+    scan = write_colmap_scan(tmp_path / "scan", views=10, points=points)
+    out = run(scan, tmp_path / "run", "refine.steps=20")
+    fitted = Fitted.load(out / FITTED)
+    assert fitted.context_poses is None and fitted.target_poses is None
+    report = json.loads((out / "round_000" / "report.json").read_text())
+    assert {entry["source"] for entry in report["depth"]} <= {"fitted", "memory"}
+    assert report["depth"][0]["source"] == "fitted"
+    assert report["points"] > 500
+    shown = fitted.appearance.picture(planned(scan).scene["view_1.png"].camera)
+    # The wall is 3 units away, the square 1.8.
+    assert 1.5 < np.median(shown.depth[shown.solid]) < 3.5
+
+
+def test_few_sparse_points_are_not_begun_with(tmp_path, monkeypatch):
+    scan = write_colmap_scan(tmp_path / "scan", views=10, points=6)
+    monkeypatch.setattr(fitting, "from_points", not_to_be_called)
+    fit_appearance(planned(scan, "refine.steps=1"), Console(quiet=True))
+    monkeypatch.setattr(fitting, "FEWEST_POINTS", 50)
+    with pytest.raises(AssertionError, match="called"):
+        fit_appearance(planned(scan, "refine.steps=1"), Console(quiet=True))
+
+
+def test_refined_poses_move_context_and_targets(scan):
+    plan = planned(scan)
+    context = plan.scene.subset(plan.context).cameras.cam_from_world.copy()
+    targets = plan.targets.cameras.cam_from_world.copy()
+    context[:, 0, 3] += 0.01
+    targets[:, 1, 3] -= 0.02
+    appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1)
+    moved = Fitted(appearance, context, targets).applied(plan)
+    np.testing.assert_array_equal(moved.scene.subset(plan.context).cameras.cam_from_world, context)
+    np.testing.assert_array_equal(moved.targets.cameras.cam_from_world, targets)
+    others = [name for name in plan.scene.names if name not in plan.context]
+    np.testing.assert_array_equal(
+        moved.scene.subset(others).cameras.cam_from_world,
+        plan.scene.subset(others).cameras.cam_from_world,
+    )
+    kept = Fitted(appearance).applied(plan)
+    np.testing.assert_array_equal(
+        kept.scene.subset(plan.context).cameras.cam_from_world,
+        plan.scene.subset(plan.context).cameras.cam_from_world,
+    )
+    assert kept.config.voxel == plan.config.voxel and kept.source is plan.source
+
+
+def test_photographs_with_fitted_depth_enter_the_memory_smaller(tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "EVIDENCE_SIDE", 64)
+    plan = planned(write_colmap_scan(tmp_path / "scan", views=10))
+    appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1)
+    changed = Fitted(appearance).applied(plan)
+    assert changed.evidence is not None and plan.config.voxel is not None
+    camera = changed.evidence["view_0.png"].camera
+    assert (int(camera.width[0]), int(camera.height[0])) == (64, 48)
+    assert changed.config.voxel == pytest.approx(1.5 * plan.config.voxel)
+    assert changed.scene is plan.scene
+    assert changed.source.name == "fitted"
+
+
+def test_a_fit_comes_back_from_its_file_as_it_was(tmp_path):
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(5, VALUES)).astype(np.float32)
+    gaussians = Gaussians(values, frame=LocalFrame.at([1e6, 2, 3]))
+    poses = rng.normal(size=(2, 3, 4, 4))
+    fitted = Fitted(Appearance(gaussians, 0.125, Blend(0.35, 0.4)), poses[0], poses[1])
+    for saved in (fitted, replace(fitted, context_poses=None, target_poses=None)):
+        saved.save(tmp_path / "fit.npz")
+        back = Fitted.load(tmp_path / "fit.npz")
+        np.testing.assert_array_equal(back.appearance.gaussians.values, gaussians.values)
+        assert back.appearance.gaussians.frame.same_as(gaussians.frame)
+        assert back.appearance.near == 0.125
+        assert back.appearance.blend == Blend(0.35, 0.4)
+        for name in ("context_poses", "target_poses"):
+            np.testing.assert_array_equal(getattr(back, name), getattr(saved, name))
+    gaussians.save(tmp_path / "fit.npz")
+    with pytest.raises(MemoryFileError, match="no readable appearance"):
+        Fitted.load(tmp_path / "fit.npz")
+
+
+def test_the_blend_is_chosen_by_the_left_out_photographs(scan):
+    plan = planned(scan, "context=first:4")
+    memory = _empty_memory(plan)
+    for name in plan.context:
+        view = plan.scene[name]
+        frame = view.load()
+        memory.observe(frame.rgb, frame.depth, view.camera, round=0)
+    gaussians = Gaussians(np.zeros((1, VALUES), np.float32))
+    name = plan.context[1]
+    truth = (plan.scene[name].load().rgb / np.float32(255)).astype(np.float32)
+    alpha = np.ones(truth.shape[:2], np.float32)
+    good, bad = Picture(truth, alpha, alpha), Picture(1 - truth, alpha, alpha)
+    fitted = Fitted(Appearance(gaussians, 0.1), judged={name: good})
+    assert fitted.with_best_blend(plan, memory).appearance.blend.share == 0
+    fitted = Fitted(Appearance(gaussians, 0.1), judged={name: bad})
+    assert fitted.with_best_blend(plan, memory).appearance.blend == Blend(1.0, 4.0)
+    fitted = Fitted(Appearance(gaussians, 0.1, Blend(0.3, 0.3)))
+    assert fitted.with_best_blend(plan, memory) is fitted
+
+
+def test_a_photograph_does_not_judge_a_memory_that_has_seen_it(scan):
+    plan = planned(scan)
+    memory, name = _empty_memory(plan), plan.context[1]
+    view = plan.scene[name]
+    frame = view.load()
+    memory.observe(frame.rgb, frame.depth, view.camera, round=0)
+    ones = np.ones(frame.rgb.shape[:2], np.float32)
+    grey = Picture(np.full(frame.rgb.shape, 0.5, np.float32), ones, ones)
+    appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1)
+    fitted = Fitted(appearance, judged={name: grey})
+    assert fitted.with_best_blend(plan, memory).appearance.blend == Blend()
+
+
+def test_a_run_with_judges_keeps_the_blend_that_they_chose(tmp_path):
+    scan = write_scan(tmp_path / "scan", views=9)
+    settings = ("context=first:8", "targets=range:8-8")
+    out = run(scan, tmp_path / "run", *settings)
+    plan = planned(scan, *settings)
+    fitted = fit_appearance(plan, Console(quiet=True))
+    assert fitted is not None and list(fitted.judged) == [plan.context[4]]
+    chosen = fitted.with_best_blend(fitted.applied(plan), memory_of_round_0(out))
+    assert chosen.appearance.blend != Blend()
+    assert Fitted.load(out / FITTED).appearance.blend == chosen.appearance.blend

@@ -1,0 +1,210 @@
+"""A run whose Gaussians are fitted further, and made again with them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import refused
+from run_files import results
+from tiny_scan import write_scan
+
+from gvtools.appearance import fit
+from gvtools.errors import ProjectError
+from gvtools.files import write_json
+from gvtools.runs.run import load_run
+from gvtools.scenes.project import open_project
+from gvtools.settings import with_texts
+from pipelines.cli import main
+from pipelines.console import Console
+from pipelines.reconstruction import refine as module
+from pipelines.reconstruction.fitting import Fitted
+from pipelines.reconstruction.refine import refine
+from pipelines.reconstruction.run import reconstruct
+from pipelines.reconstruction.settings import RunSettings
+
+SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "completer=inpaint")
+QUIET = Console(quiet=True)
+APPEARANCE = "round_000/appearance.npz"
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    return write_scan(tmp_path_factory.mktemp("scan"), views=10)
+
+
+@pytest.fixture(scope="module")
+def whole(scan, tmp_path_factory):
+    return run(scan, tmp_path_factory.mktemp("runs") / "whole", "refine.steps=30")
+
+
+@pytest.fixture
+def copy(whole, tmp_path):
+    return Path(shutil.copytree(whole, tmp_path / "run"))
+
+
+def run(scan: Path, out: Path, *settings: str, resume: bool = False) -> Path:
+    config = with_texts(RunSettings(), (*SETTINGS, *settings))
+    return reconstruct(open_project(scan), config, out, console=QUIET, resume=resume)
+
+
+def test_the_fit_goes_on_where_it_ended(copy):
+    before = Fitted.load(copy / APPEARANCE)
+    refine(copy, steps=1, console=QUIET)
+    after = Fitted.load(copy / APPEARANCE)
+    change = np.abs(after.appearance.gaussians.values - before.appearance.gaussians.values)
+    assert change.max() > 0
+    # The step lengths of the last part of a fit: below 0.025 px at 0.02 scene units, then RATES.
+    assert change[:, :3].max() < 0.025 * 0.04
+    assert change[:, 3:].max() < 0.06
+    assert before.log_gains is not None and after.log_gains is not None
+    assert np.abs(before.log_gains).max() > 0
+    assert np.abs(after.log_gains - before.log_gains).max() < 0.003
+    assert after.appearance.blend == before.appearance.blend
+    assert json.loads((copy / "run.json").read_text())["refined"] == [{"steps": 1}]
+
+
+def test_refined_poses_go_on_from_the_saved_ones(copy):
+    saved = Fitted.load(copy / APPEARANCE)
+    scene, record = load_run(copy).scenes[0], load_run(copy).record
+    shifted = scene.subset(record["context"]).cameras.cam_from_world.copy()
+    shifted[1, :3, 3] += [0.004, 0, 0]
+    target = scene.subset(record["targets"]).cameras.cam_from_world
+    Fitted(saved.appearance, shifted, target, saved.log_gains).save(copy / APPEARANCE)
+    refine(copy, steps=2, console=QUIET)
+    after = Fitted.load(copy / APPEARANCE)
+    # Two steps neither find the way back nor predict neighbours better: the saved ones are kept.
+    np.testing.assert_array_equal(after.context_poses, shifted)
+    np.testing.assert_array_equal(after.target_poses, target)
+
+
+def test_poses_that_predict_neighbours_better_are_kept(copy, monkeypatch):
+    saved = Fitted.load(copy / APPEARANCE)
+    scene, record = load_run(copy).scenes[0], load_run(copy).record
+    given = scene.subset(record["context"]).cameras.cam_from_world
+    target = scene.subset(record["targets"]).cameras.cam_from_world
+    Fitted(saved.appearance, given, target, saved.log_gains, spread=True).save(copy / APPEARANCE)
+    errors = iter([1.0, 0.5])
+    monkeypatch.setattr(fit, "prediction_error", lambda views, poses: next(errors))
+    refine(copy, steps=4, console=QUIET)
+    after = Fitted.load(copy / APPEARANCE)
+    assert after.spread
+    assert after.context_poses is not None and after.target_poses is not None
+    for before, now in [(given, after.context_poses), (target, after.target_poses)]:
+        assert 0 < np.abs(now - before).max() < 0.003
+
+
+def test_photographs_are_shown_better_afterwards(copy):
+    def error() -> float:
+        appearance = Fitted.load(copy / APPEARANCE).appearance
+        scene = load_run(copy).scenes[0]
+        views = [scene[name] for name in load_run(copy).context]
+        off = [appearance.picture(v.camera).rgb - v.load().rgb / 255.0 for v in views]
+        return float(np.mean(np.square(off)))
+
+    before = error()
+    refine(copy, steps=60, console=QUIET)
+    assert error() < 0.8 * before
+
+
+def test_the_same_steps_give_the_same_bytes(whole, tmp_path):
+    runs = [Path(shutil.copytree(whole, tmp_path / name / "run")) for name in "ab"]
+    for path in runs:
+        refine(path, steps=5, console=QUIET)
+    assert results(runs[0]) == results(runs[1])
+    assert results(runs[0]).keys() == results(whole).keys()
+
+
+def test_a_stop_at_any_moment_leaves_the_run_as_it_was(copy, monkeypatch):
+    before = results(copy)
+    stops = [
+        (module, "fit_appearance"),
+        (module, "complete_run"),
+        (module, "_figures"),
+        (os, "rename"),
+    ]
+    for place, name in stops:
+
+        def stop(*args, **kwargs):
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(place, name, stop)
+            refine(copy, steps=1, console=QUIET)
+        assert results(copy) == before, name
+        assert os.listdir(copy.parent) == ["run"], name
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_run_as_it_was(copy, monkeypatch):
+    before = results(copy)
+
+    def full(self, path):
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(Fitted, "save", full)
+    with pytest.raises(ProjectError, match=r"No space left.*as it was"):
+        refine(copy, steps=1, console=QUIET)
+    assert results(copy) == before
+
+
+def test_a_run_without_a_fit_gets_one_and_is_resumed_with_it(scan, tmp_path):
+    out = run(scan, tmp_path / "run", "refine.steps=0")
+    assert not (out / APPEARANCE).exists()
+    refine(out, steps=5, console=QUIET)
+    refined = results(out)
+    assert APPEARANCE in refined
+    run(scan, out, "refine.steps=0", resume=True)
+    assert results(out) == refined
+
+
+def test_an_interrupted_run_is_finished(copy, capsys):
+    shutil.rmtree(copy / "round_002")
+    (copy / "metrics.json").unlink()
+    assert main(["refine", str(copy), "--steps", "2", "--quiet"]) == 0
+    assert load_run(copy).complete
+    assert (copy / "report.html").exists()
+
+
+def test_files_of_the_user_are_kept_and_named(copy, capsys):
+    (copy / "evaluation").mkdir()
+    write_json(copy / "evaluation" / "evaluation.json", {})
+    assert main(["refine", str(copy), "--steps", "2"]) == 0
+    said = capsys.readouterr()
+    assert "evaluation in" in said.err
+    assert "PSNR" in said.out
+    assert (copy / "evaluation" / "evaluation.json").exists()
+
+
+def test_what_cannot_be_refined_is_one_line_with_status_2(scan, copy, tmp_path, capsys):
+    before = results(copy)
+    assert "run.json" in refused(capsys, "refine", tmp_path)
+    assert "run.json" in refused(capsys, "refine", tmp_path / "nowhere")
+    assert not (tmp_path / "nowhere").exists()
+    assert "at least 1" in refused(capsys, "refine", copy, "--steps", 0)
+    assert "above 0" in refused(capsys, "refine", copy, "--seconds", "nan")
+    assert "not allowed with" in refused(capsys, "refine", copy, "--steps", 1, "--seconds", 1)
+    assert "gone" in refused(capsys, "refine", copy, "--project", tmp_path / "moved")
+    moved = Path(shutil.copytree(scan, tmp_path / "moved"))
+    (moved / "frame-000001.color.png").touch()
+    line = refused(capsys, "refine", copy, "--project", moved)
+    assert "fingerprint" in line
+    assert "project," not in line
+    assert results(copy) == before
+
+
+def test_too_few_photographs_with_depth_are_one_line(scan, tmp_path, capsys):
+    out = run(scan, tmp_path / "run", "refine.steps=0", "context=first:3")
+    before = results(out)
+    assert "eight with recorded depth" in refused(capsys, "refine", out, "--steps", 1)
+    assert results(out) == before
+    assert os.listdir(tmp_path) == ["run"]
+
+
+def test_a_moved_project_serves(scan, copy, tmp_path):
+    moved = Path(shutil.copytree(scan, tmp_path / "moved"))
+    refine(copy, steps=1, project=moved, console=QUIET)
+    assert json.loads((copy / "run.json").read_text())["project"] == str(moved)

@@ -1,0 +1,77 @@
+"""Folders are replaced as a whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from gvtools import files
+from gvtools.errors import ProjectError
+from gvtools.files import folder_replaced_when_written, recover_folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "run"
+    (path / "round_000").mkdir(parents=True)
+    (path / "round_000" / "memory").write_text("old")
+    (path / "notes.txt").write_text("mine")
+    (path / ".half.part").write_text("x")
+    return path
+
+
+def contents(path: Path) -> dict[str, str]:
+    return {str(p.relative_to(path)): p.read_text() for p in path.rglob("*") if p.is_file()}
+
+
+def replace_it(path: Path) -> None:
+    with folder_replaced_when_written(path) as new:
+        assert new.name == path.name
+        (new / "round_000").mkdir()
+        (new / "round_000" / "memory").write_text("new")
+
+
+def test_the_new_folder_takes_the_place_and_foreign_files_move_over(folder):
+    replace_it(folder)
+    assert contents(folder) == {"round_000/memory": "new", "notes.txt": "mine"}
+    assert os.listdir(folder.parent) == ["run"]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, OSError(28, "No space left")])
+def test_an_error_leaves_the_earlier_folder(folder, error):
+    before = contents(folder)
+    expected = ProjectError if isinstance(error, OSError) else error
+    with pytest.raises(expected), folder_replaced_when_written(folder) as new:
+        (new / "half").write_text("x")
+        raise error
+    assert contents(folder) == before
+    assert os.listdir(folder.parent) == ["run"]
+
+
+@pytest.mark.parametrize("moment", range(3))
+def test_a_kill_at_any_rename_leaves_one_of_both_whole(folder, monkeypatch, moment):
+    class Killed(BaseException):
+        """Nothing runs after it, as after a kill."""
+
+    before, rename, calls = contents(folder), os.rename, []
+
+    def killed(*names):
+        calls.append(names)
+        if len(calls) > moment:
+            raise Killed
+        rename(*names)
+
+    monkeypatch.setattr(files.os, "rename", killed)
+    with pytest.raises(Killed):
+        replace_it(folder)
+    monkeypatch.undo()
+    recover_folder(folder)
+    found = contents(folder)
+    assert found in (before, {"round_000/memory": "new"})
+    assert (found == before) == (moment < 2)
+    # The next replacement ends what was begun, and the user's file is there again.
+    replace_it(folder)
+    assert contents(folder) == {"round_000/memory": "new", "notes.txt": "mine"}
+    assert os.listdir(folder.parent) == ["run"]
