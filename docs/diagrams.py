@@ -107,6 +107,20 @@ DIAGRAMS = {
         [("pixel", "point", ""), ("point", "voxel", ""), ("voxel", "new", ""),
          ("voxel", "merge", ""), ("voxel", "reject", "")],
     ),
+    "appearance": Diagram(
+        {
+            "photos": (0, 0.5, "data", "context|photographs"),
+            "fit": (1, 0.5, "step", "fit Gaussians,|poses, exposures"),
+            "memory": (2, 0, "data", "memory:|the evidence"),
+            "gaussians": (2, 1, "data", "Gaussians:|the appearance"),
+            "judges": (3, 1.5, "step", "predict photographs|left out at first"),
+            "blend": (3, 0.5, "step", "blend colours of|observed pixels"),
+            "guidance": (4, 0.5, "result", "colours of the|guidance"),
+        },
+        [("photos", "fit", ""), ("fit", "memory", ""), ("fit", "gaussians", ""),
+         ("memory", "blend", ""), ("gaussians", "blend", ""), ("gaussians", "judges", ""),
+         ("judges", "blend", ""), ("blend", "guidance", "")],
+    ),
     "projection": Diagram(
         {
             "memory": (0, 0, "data", "observations"),
