@@ -124,18 +124,8 @@ def test_resuming_after_a_stop_gives_the_bytes_of_an_uninterrupted_run(
 @pytest.mark.parametrize("delay", [2.0, 3.0, 3.5, 4.0, 4.5, 5.0, 6.0])
 def test_resuming_after_a_kill_signal(whole, scan, tmp_path, delay):
     out = tmp_path / "run"
-    options = [f"--set={text}" for text in SETTINGS]
-    command = [
-        sys.executable,
-        "-m",
-        "pipelines.cli",
-        "reconstruct",
-        str(scan),
-        "--refine",
-        "0",
-        "--out",
-        str(out),
-    ]
+    options = [f"--set={text}" for text in ("refine.steps=0", *SETTINGS)]
+    command = [sys.executable, "-m", "pipelines.cli", "reconstruct", str(scan), "--out", str(out)]
     process = subprocess.Popen([*command, *options, "--quiet"])
     time.sleep(delay)
     process.send_signal(signal.SIGKILL)
