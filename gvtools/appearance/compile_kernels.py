@@ -21,11 +21,14 @@ def compile_splatting() -> None:
 def compile_steps() -> None:
     """Call each kernel of the loss and of the optimiser once."""
     from gvtools.appearance import kernels
+    from gvtools.appearance.smooth_depth import add_bending
     from gvtools.appearance.splat.project_kernels import VALUES
 
     picture = np.zeros((3, 16, 16), np.float32)
     weight, losses = np.ones((16, 16), np.float32), np.zeros(3)
     kernels.picture_loss(0, 3, picture, picture, weight, 0.2, np.zeros_like(picture), losses)
+    image = np.ones((5, 16, 16), np.float32)
+    add_bending(image, picture, 1.0, np.zeros_like(image))
     rows, gradients = np.zeros(1, np.int64), np.zeros((1, VALUES + 2), np.float32)
     values, moments = np.zeros((1, VALUES), np.float32), np.zeros((2, 1, VALUES), np.float32)
     rates, widths = np.zeros(VALUES, np.float32), np.ones(1, np.float32)

@@ -53,6 +53,11 @@ class Population:
         """Remove Gaussians that hardly show."""
         self.keep(self.values[:, LOGIT] >= np.log(FAINTEST / (1 - FAINTEST)))
 
+    def fade(self, share: float) -> None:
+        """Make all of them more transparent by a share of their opacity."""
+        opacity = (1 - share) / (1 + np.exp(-self.values[:, LOGIT]))
+        self.values[:, LOGIT] = np.log(opacity / (1 - opacity))
+
     def grow(self, threshold: float, most: int, *, wide: float, rng: np.random.Generator) -> None:
         """Double the Gaussians that pictures pull about most: they cover more than they can show.
 

@@ -14,32 +14,49 @@ WINDOW = 11
 HALF = WINDOW // 2
 C1, C2 = 0.01**2, 0.03**2
 _WEIGHTS = np.exp(-0.5 * ((np.arange(WINDOW) - HALF) / 1.5) ** 2)
-WEIGHTS = (_WEIGHTS / _WEIGHTS.sum()).astype(np.float32)
+# Ended by a tap that weighs nothing, so that four can be taken at a time.
+WEIGHTS = np.append(_WEIGHTS / _WEIGHTS.sum(), 0).astype(np.float32)
+
+
+@compiled(inline="always")
+def _add_four(line, lines, k):
+    """Add four weighted rows to ``line``, from tap ``k`` on; taps beyond the window weigh nothing."""
+    w0, w1, w2, w3 = WEIGHTS[k], WEIGHTS[k + 1], WEIGHTS[k + 2], WEIGHTS[k + 3]
+    a, b, c, d = lines
+    for x in range(len(line)):
+        line[x] += w0 * a[x] + w1 * b[x] + w2 * c[x] + w3 * d[x]
 
 
 @compiled(fastmath=FAST)
 def blur(picture, out, work):
-    """Blur one channel (H, W) by the window; ``work`` has the same shape."""
+    """Blur one channel (H, W) by the window.
+
+    Args:
+        picture: is blurred.
+        out: (H, W), written.
+        work: (at least W + 12,) is overwritten.
+    """
     height, width = picture.shape
+    work[:] = np.float32(0)
+    line = work[HALF : HALF + width]
     for y in range(height):
-        line = work[y]
         line[:] = np.float32(0)
-        for k in range(WINDOW):
+        for k in range(0, WINDOW, 4):
+            # Rows outside of the picture are black.
             at = y + k - HALF
-            if 0 <= at < height:
-                weight, source = WEIGHTS[k], picture[at]
-                for x in range(width):
-                    line[x] += weight * source[x]
-    for y in range(height):
-        line, result = work[y], out[y]
+            if at >= 0 and at + 3 < height:
+                rows = (picture[at], picture[at + 1], picture[at + 2], picture[at + 3])
+                _add_four(line, rows, k)
+            else:
+                for row in range(max(at, 0), min(at + 4, height)):
+                    weight, source = WEIGHTS[k + row - at], picture[row]
+                    for x in range(width):
+                        line[x] += weight * source[x]
+        result = out[y]
         result[:] = np.float32(0)
-        for k in range(WINDOW):
-            shift = k - HALF
-            weight = WEIGHTS[k]
-            count = width - abs(shift)
-            to, source = result[max(0, -shift) :], line[max(0, shift) :]
-            for x in range(count):
-                to[x] += weight * source[x]
+        for k in range(0, WINDOW, 4):
+            shifted = (work[k:], work[k + 1 :], work[k + 2 :], work[k + 3 :])
+            _add_four(result, shifted, k)
 
 
 @compiled(fastmath=FAST)
@@ -61,7 +78,7 @@ def picture_loss(first, last, picture, target, weight, share, d_picture, losses)
     channels, height, width = picture.shape[0], picture.shape[1], picture.shape[2]
     scale = np.float32(1 / (channels * height * width))
     k1, k2 = np.float32(1 - share) * scale, -np.float32(share) * scale
-    work, product = np.empty_like(target[0]), np.empty_like(target[0])
+    work, product = np.empty(width + WINDOW + 1, np.float32), np.empty_like(target[0])
     m, xx, xy = np.empty_like(target[0]), np.empty_like(target[0]), np.empty_like(target[0])
     mean, square = np.empty_like(target[0]), np.empty_like(target[0])
     for c in range(first, last):

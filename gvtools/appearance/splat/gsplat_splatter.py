@@ -23,7 +23,7 @@ from gvtools.appearance.splat.project_kernels import (
     SH,
     VALUES,
 )
-from gvtools.appearance.splat.splat import Lens, Splat
+from gvtools.appearance.splat.splat import EXACT, Lens, Splat
 
 
 def gsplat_installed() -> bool:
@@ -43,8 +43,10 @@ def splatter_on(device: str) -> type[Splat]:
 class GsplatSplat(Splat):
     """One picture of Gaussians on the CUDA device; see ``Splat``, but for ``projected``."""
 
-    def __init__(self, values: NDArray[Any], lens: Lens, *, degree: int = 2) -> None:
-        """Splat Gaussians; see ``Splat``, float32 alone."""
+    def __init__(
+        self, values: NDArray[Any], lens: Lens, *, degree: int = 2, faint: float = EXACT
+    ) -> None:
+        """Splat Gaussians; see ``Splat``. float32 alone; gradients leave nothing out."""
         from gsplat import rasterization
 
         self.values, self.lens, self.terms = values, lens, (degree + 1) ** 2

@@ -43,8 +43,6 @@ BLOCKS = HALVES * BLOCK_ROWS
 # Pixels that let less light through than this are finished.
 OPAQUE = 1e-4
 MOST_ALPHA = 0.99
-# The gradient leaves out blocks whose 16 pixels got less light than this from a Gaussian together.
-FAINT = 1e-4
 # Finished pixels are looked for after so many Gaussians.
 LOOK_EVERY = 16
 
@@ -143,7 +141,7 @@ def fill_tiles(
 
 
 @compiled(error_model="numpy", fastmath=FAST)
-def blend_tiles(first, last, tiles, tiles_x, offsets, lists, blocks, projected, image, used):
+def blend_tiles(first, last, tiles, tiles_x, offsets, lists, blocks, projected, image, used, faint):
     """Blend the tiles ``tiles[first:last]`` from front to back.
 
     Args:
@@ -158,6 +156,8 @@ def blend_tiles(first, last, tiles, tiles_x, offsets, lists, blocks, projected, 
         projected: see project_kernels.
         image: (5, H, W) red, green, blue, depth (weighted sums) and alpha, written.
         used: (tiles,) how many of its Gaussians a tile looked at, written.
+        faint: the gradient leaves out blocks whose 16 pixels got less light than this from a
+            Gaussian together.
     """
     dtype = projected.dtype.type
     zero, one, two, most = dtype(0), dtype(1), dtype(2), dtype(MOST_ALPHA)
@@ -167,7 +167,7 @@ def blend_tiles(first, last, tiles, tiles_x, offsets, lists, blocks, projected, 
     )  # fmt: skip
     height, width = image.shape[1], image.shape[2]
     acc = np.empty(5 * PIXELS, projected.dtype)
-    eight, opaque, faint = dtype(BLOCK_WIDTH), dtype(OPAQUE), dtype(FAINT)
+    eight, opaque, faint = dtype(BLOCK_WIDTH), dtype(OPAQUE), dtype(faint)
     for at in range(first, last):
         tile = tiles[at]
         left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
