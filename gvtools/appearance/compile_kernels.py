@@ -28,7 +28,7 @@ def compile_steps() -> None:
     weight, losses = np.ones((16, 16), np.float32), np.zeros(3)
     kernels.picture_loss(0, 3, picture, picture, weight, 0.2, np.zeros_like(picture), losses)
     image = np.ones((5, 16, 16), np.float32)
-    add_bending(image, picture, 1.0, np.zeros_like(image))
+    add_bending(image, picture, np.zeros_like(image), weight=1.0)
     rows, gradients = np.zeros(1, np.int64), np.zeros((1, VALUES + 2), np.float32)
     values, moments = np.zeros((1, VALUES), np.float32), np.zeros((2, 1, VALUES), np.float32)
     rates, widths = np.zeros(VALUES, np.float32), np.ones(1, np.float32)

@@ -33,10 +33,16 @@ SIZES = ((0.0, 4), (0.2, 2), (0.6, 1))
 # Each degree of the spherical harmonics joins after so much of the fit.
 DEGREE_EVERY = 0.12
 # Gaussians are added in this part of the fit, each time after such a share of it, if these are not
-# too few steps to tell where, and not later than after so many
-# steps. The share is the first number below, the second with fewer than ``FEW`` photographs.
+# too few steps to tell where, and not later than after so many steps. The share is the first number
+# below, the second with fewer than ``FEW`` photographs.
 GROWTH_END, FEWEST_BETWEEN, MOST_BETWEEN = 0.55, 25, 100
-GROWTH_SHARE, GROWTH_SHARE_FEW, FEW = 0.105, 0.25, 10
+GROWTH_SHARE, GROWTH_SHARE_FEW, FEW = 0.13, 0.25, 10
+# There are at most so many Gaussians for each step of the whole fit, and for each photograph: more
+# are not fitted in time, or fit what other directions contradict.
+PER_STEP, PER_VIEW = 65, 8000
+# Share of its steps that a timed fit has made early in its time is larger, since pictures are small
+# then: whole steps = steps so far / share of time * (first number + second * share of time).
+EARLY = (0.2, 0.95)
 # Positions move by at most about so many pixels a step, and by this share of it at the end.
 POSITION_RATE, POSITION_END = 0.32, 0.01
 # A fit that goes on with fitted Gaussians begins here: pictures have all of their size, and steps
@@ -44,6 +50,9 @@ POSITION_RATE, POSITION_END = 0.32, 0.01
 CONTINUED = 0.6
 # Step lengths of log scales, quaternions, logits, colours and the other harmonics.
 RATES = (0.02, 0.004, 0.05, 0.01, 5e-4)
+# Steps of all but positions shrink to this share of theirs, beginning after so much of the fit:
+# else each photograph undoes a part of what the others said.
+REST, REST_BEGINS = 0.1, 0.75
 # Steps of a fit whose length is not given: for each photograph, at least and at most.
 STEPS_PER_VIEW, FEWEST_STEPS, MOST_STEPS = 15, 300, 1200
 # Of so many photographs one is left out until this part of the fit, as a judge; at most so many.
@@ -53,8 +62,8 @@ JUDGE_OF, JUDGES_JOIN, MOST_JUDGES = 8, 0.75, 5
 # few directions that there are. After "DropGaussian" (Park et al. 2025).
 LEFT_OUT, MOST_LEFT_OUT = 1.2, 0.5
 # With few photographs, all opacities shrink by this share at each step: what photographs do not ask
-# for again fades, above all right before the cameras. After "Binocular-Guided 3D Gaussian Splatting"
-# (Han et al. 2024).
+# for again fades, above all right before the cameras. After "Binocular-Guided 3D Gaussian
+# Splatting" (Han et al. 2024).
 FADING = 0.003
 # Gradients leave out blocks of 16 pixels that got less light than this from a Gaussian together:
 # a tenth less time for the same pictures.
@@ -181,6 +190,8 @@ class Fit:
         self.steps = 0
         self.judged: dict[int, Picture] = {}
         self.begin = begin
+        # What an earlier fit left comes on top.
+        self._begun_with = len(start.values) if begin else 0
         self._judges = () if begin else judges(len(self.views))
         self._checks = tuple(share for share in POSE_CHECKS if share > begin)
         # Recorded depth tells as much as other directions.
@@ -260,14 +271,23 @@ class Fit:
             self.population.fade(FADING)
         self._note_pulls(lens, seen, rows)
         since = self.steps - self._grown[0]
-        due = since >= FEWEST_BETWEEN and share - self._grown[1] >= self._growth_share
+        periods = int(share / self._growth_share) - int(self._grown[1] / self._growth_share)
+        due = since >= FEWEST_BETWEEN and periods > 0
         if due or since >= MOST_BETWEEN:
             self._grown = (self.steps, share)
             if share < self.begin + (1 - self.begin) * GROWTH_END:
-                self.population.grow(
-                    self.options.growth, self.options.most_gaussians, wide=WIDE, rng=self.rng
-                )
+                most = self._most_gaussians(share)
+                self.population.grow(self.options.growth, most, wide=WIDE, rng=self.rng)
             self.population.remove_faint()
+
+    def _most_gaussians(self, share: float) -> int:
+        """How many Gaussians there may be after ``share`` of a whole fit."""
+        steps: float = self.options.steps_for(len(self.views))
+        if self.options.seconds is not None:
+            over = (share - self.begin) / (1 - self.begin)
+            steps = self.steps / over * (1.0 if self.begin else EARLY[0] + EARLY[1] * over)
+        most = self._begun_with + min(PER_STEP * int(steps), PER_VIEW * len(self.views))
+        return min(most, self.options.most_gaussians)
 
     def _check_poses(self) -> None:
         """Give poses back as they were unless they predict neighbouring photographs better now."""
@@ -338,7 +358,7 @@ class Fit:
         if view.depth is not None and options.depth > 0:
             gradient[3:] += options.depth * _depth_gradient(picture.image, view)
         if view.depth is None:
-            add_bending(picture.image, view.target, SMOOTH, gradient)
+            add_bending(picture.image, view.target, gradient, weight=SMOOTH)
         return gradient
 
     def _note_pulls(self, lens: Lens, seen: NDArray[np.int64], rows: NDArray[np.float32]) -> None:
@@ -363,6 +383,7 @@ def _rates(share: float) -> NDArray[np.float32]:
     rates[LOGIT] = opacity
     rates[SH : SH + 3] = color
     rates[SH + 3 :] = harmonic
+    rates[LOG_SCALE:] *= REST ** max(0.0, (share - REST_BEGINS) / (1 - REST_BEGINS))
     return rates
 
 

@@ -20,7 +20,7 @@ WEIGHTS = np.append(_WEIGHTS / _WEIGHTS.sum(), 0).astype(np.float32)
 
 @compiled(inline="always")
 def _add_four(line, lines, k):
-    """Add four weighted rows to ``line``, from tap ``k`` on; taps beyond the window weigh nothing."""
+    """Add four weighted rows to ``line``, from tap ``k`` on."""
     w0, w1, w2, w3 = WEIGHTS[k], WEIGHTS[k + 1], WEIGHTS[k + 2], WEIGHTS[k + 3]
     a, b, c, d = lines
     for x in range(len(line)):

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from gvtools.kernels import FAST, compiled
 
-# Inverse depth, in shares of its median, may bend by so much before the loss grows more slowly: from
-# there on linearly, before as its square.
+# Inverse depth, in shares of its median, may bend by so much before the loss grows more slowly:
+# from there on linearly, before as its square.
 SOFT = 0.002
 # Where a colour from 0 to 1 changes by 1 / EDGE, the loss counts 37 %.
 EDGE = 10.0
@@ -25,16 +25,17 @@ LEAST_ALPHA = 0.5
 def add_bending(
     image: NDArray[np.float32],
     target: NDArray[np.float32],
-    weight: float,
     gradient: NDArray[np.float32],
+    *,
+    weight: float,
 ) -> None:
     """Add the gradient of the bending of surfaces, summed over the picture, to (5, H, W).
 
     Args:
         image: (5, H, W), see ``Splat``; its last two channels get a gradient.
         target: (3, H, W) the photograph, 0 to 1.
-        weight: of the loss.
         gradient: is added to.
+        weight: of the loss.
     """
     some = image[3:, ::4, ::4]
     solid = some[1] > LEAST_ALPHA
@@ -71,7 +72,8 @@ def bending_gradient(image, target, median, weight, inverse, pull, gradient):
     for dy, dx in ((0, 1), (1, 0)):
         for y in range(dy, height - dy):
             for x in range(dx, width - dx):
-                before, here, after = inverse[y - dy, x - dx], inverse[y, x], inverse[y + dy, x + dx]
+                here = inverse[y, x]
+                before, after = inverse[y - dy, x - dx], inverse[y + dy, x + dx]
                 if before > 0 and here > 0 and after > 0:
                     change = zero
                     for c in range(3):
