@@ -19,7 +19,16 @@ from splat_scene import (
     walk,
 )
 
-from gvtools.appearance.fit import JUDGES_JOIN, Fit, FitOptions, Progress, judges
+from gvtools.appearance import fit as fit_module
+from gvtools.appearance.fit import (
+    JUDGES_JOIN,
+    PER_STEP,
+    PER_VIEW,
+    Fit,
+    FitOptions,
+    Progress,
+    judges,
+)
 from gvtools.appearance.fit_views import FitView, reduced
 from gvtools.appearance.splat.project_kernels import SH
 from gvtools.appearance.splat.splat import Lens, Splat
@@ -230,3 +239,31 @@ def test_there_are_never_more_gaussians_than_allowed(views):
         fit.step(share)
         counts.append(len(fit.gaussians))
     assert len(start) < max(counts) <= options.most_gaussians
+
+
+@pytest.mark.parametrize(
+    ("options", "begin", "made", "share", "most"),
+    [
+        ({"steps": 100}, 0.0, 3, 0.4, 100 * PER_STEP),
+        ({"steps": 10**6}, 0.0, 3, 0.4, 8 * PER_VIEW),
+        ({"steps": 10**6, "most_gaussians": 999}, 0.0, 3, 0.4, 999),
+        # 40 steps in two fifths of the time; later ones take longer.
+        ({"seconds": 9.0}, 0.0, 40, 0.4, 58 * PER_STEP),
+        # A tenth of what is left, and steps that all take the same.
+        ({"seconds": 9.0}, 0.6, 5, 0.64, 300 + 50 * PER_STEP),
+    ],
+)
+def test_steps_and_photographs_limit_how_many_gaussians_there_are(
+    views, options, begin, made, share, most
+):
+    fit = Fit(rough_gaussians(), (views * 8)[:8], options=FitOptions(**options), begin=begin)
+    fit.steps = made
+    fit._begun_with = 300 if begin else 0
+    assert fit._most_gaussians(share) == pytest.approx(most, rel=0.02)
+
+
+def test_steps_shorten_at_the_end():
+    start, late, end = (fit_module._rates(share) for share in (0.0, 0.75, 1.0))
+    np.testing.assert_array_equal(start[3:], late[3:])
+    np.testing.assert_allclose(end[3:], fit_module.REST * late[3:], rtol=1e-6)
+    assert (end[:3] < late[:3]).all()

@@ -106,3 +106,12 @@ def test_faint_ones_go_and_take_their_memory_with_them():
     assert people.values[:, SH].tolist() == kept
     np.testing.assert_array_equal(people.footprint, before.footprint[kept])
     np.testing.assert_array_equal(people.moments, before.moments[:, kept])
+
+
+def test_all_fade_by_a_share_of_their_opacity():
+    people = population()
+    people.values[:, LOGIT] = np.linspace(-4, 4, len(people))
+    before = 1 / (1 + np.exp(-people.values[:, LOGIT]))
+    people.fade(0.1)
+    after = 1 / (1 + np.exp(-people.values[:, LOGIT]))
+    np.testing.assert_allclose(after, 0.9 * before, rtol=1e-5)
