@@ -14,6 +14,8 @@ MOST_TURN, MOST_SHIFT = 0.035, 0.03
 # Views that a camera takes its correction from, and the distance (in shares of the depth) and angle
 # [rad] at which one counts 37 %.
 NEAR_VIEWS, NEAR_SHIFT, NEAR_TURN = 2, 0.03, 0.05
+# Refined poses must predict neighbouring photographs better by so much of the error.
+LEAST_BETTER = 0.01
 # Step lengths: of turns [rad], of shifts in shares of the depth, of the logarithm of exposures.
 # Those of poses are at the end smaller by the last number, so that right poses come to rest.
 TURN_RATE, SHIFT_RATE, GAIN_RATE, RATE_END = 1e-3, 1e-3, 2e-3, 0.02
@@ -78,16 +80,8 @@ class CameraCorrections:
         self, pose: NDArray[np.float64], *, but: Sequence[int] = ()
     ) -> NDArray[np.float64]:
         """(6,) mean motion of the views that stand and look most like a pose."""
-        centers = -np.einsum("vji,vj->vi", self.given[:, :3, :3], self.given[:, :3, 3])
-        center = -pose[:3, :3].T @ pose[:3, 3]
-        angle = np.arccos(np.clip(self.given[:, 2, :3] @ pose[2, :3], -1, 1))
-        apart = np.linalg.norm(centers - center, axis=1) / (NEAR_SHIFT * self.depth)
-        apart += angle / NEAR_TURN
-        apart[list(but)] = np.inf
-        near = np.argsort(apart, kind="stable")[:NEAR_VIEWS]
-        weight = np.exp(apart[near].min() - apart[near])
-        motions = np.stack([self._motion(row) for row in near])
-        return weight @ motions / weight.sum()
+        motions = np.stack([self._motion(row) for row in range(len(self.given))])
+        return mean_near(pose, self.given, motions, depth=self.depth, but=but)
 
     def give_back(self) -> None:
         """Take the poses as they were given, from now on."""
@@ -132,6 +126,33 @@ class CameraCorrections:
         self.log_gains[number] -= GAIN_RATE * _adam(
             self._gain_moments[:, number], gradient, self._gain_steps[number]
         )
+
+
+def mean_near(
+    pose: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    motions: NDArray[np.float64],
+    *,
+    depth: float,
+    but: Sequence[int] = (),
+) -> NDArray[np.float64]:
+    """(6,) mean motion of the cameras that stand and look most like a pose.
+
+    Args:
+        pose: (4, 4) camera from world.
+        poses: (V, 4, 4) of the cameras.
+        motions: (V, 6) theirs.
+        depth: typical depth, scene units.
+        but: cameras that do not count.
+    """
+    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    center = -pose[:3, :3].T @ pose[:3, 3]
+    angle = np.arccos(np.clip(poses[:, 2, :3] @ pose[2, :3], -1, 1))
+    apart = np.linalg.norm(centers - center, axis=1) / (NEAR_SHIFT * depth) + angle / NEAR_TURN
+    apart[list(but)] = np.inf
+    near = np.argsort(apart, kind="stable")[:NEAR_VIEWS]
+    weight = np.exp(apart[near].min() - apart[near])
+    return np.asarray(weight @ motions[near] / weight.sum())
 
 
 def moved(pose: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from gvtools.appearance import kernels
-from gvtools.appearance.camera_corrections import CameraCorrections
+from gvtools.appearance.camera_corrections import LEAST_BETTER, CameraCorrections
 from gvtools.appearance.fit_views import FitView, ReducedView, reduced
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.growth import Population
@@ -74,9 +74,8 @@ SMOOTH = 0.1
 KEPT_BYTES = 2**30
 # What the corrections of neighbours must gain for a camera to take them [dB].
 LEAST_GAIN = 0.1
-# Poses are checked at these parts of the fit, and at its end; they must then predict neighbouring
-# photographs by so much of the error better than those given.
-POSE_CHECKS, LEAST_BETTER = (0.3, 0.6), 0.01
+# Poses are checked at these parts of the fit, and at its end.
+POSE_CHECKS = (0.3, 0.6)
 # From so many pixels on a Gaussian is split, below it gets a twin.
 WIDE = 2.0
 

@@ -10,11 +10,17 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.fit_views import FitView, reduced
 
-# Photographs are compared at one over this of their size, each with so many neighbours.
-SMALLER, NEIGHBOURS = 2, 2
+# Photographs are compared at one over this of their size, each with so many neighbours, by one of
+# so many pixels.
+SMALLER, NEIGHBOURS, PIXELS = 2, 2, 4
 
 
-def prediction_error(views: Sequence[FitView], poses: NDArray[np.float64]) -> float:
+def prediction_error(
+    views: Sequence[FitView],
+    poses: NDArray[np.float64],
+    *,
+    at: NDArray[np.float64] | None = None,
+) -> float:
     """Mean over pairs of neighbouring photographs of the median colour difference, 0 to 1.
 
     Each pixel with depth is looked up in the neighbour; what is hidden there is a minority that the
@@ -23,7 +29,9 @@ def prediction_error(views: Sequence[FitView], poses: NDArray[np.float64]) -> fl
     Args:
         views: at least two, with depth.
         poses: (V, 4, 4) of the cameras, in the frame of the views.
+        at: (V, 4, 4) where each camera is when it is compared with the others; None: at its pose.
     """
+    at = poses if at is None else at
     small = [reduced(view, SMALLER) for view in views]
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     errors = []
@@ -33,10 +41,10 @@ def prediction_error(views: Sequence[FitView], poses: NDArray[np.float64]) -> fl
             np.linalg.norm(centers - centers[row], axis=1) + 1 - poses[:, 2, :3] @ poses[row, 2, :3]
         )
         for other in np.argsort(apart, kind="stable")[1 : NEIGHBOURS + 1]:
-            y, x = np.nonzero((view.depth > 0) & (view.weight > 0.5))
+            y, x = (each[::PIXELS] for each in np.nonzero((view.depth > 0) & (view.weight > 0.5)))
             rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))]).T @ np.linalg.inv(view.K).T
             points = rays * view.depth[y, x, None]
-            motion = poses[other] @ np.linalg.inv(poses[row])
+            motion = poses[other] @ np.linalg.inv(at[row])
             points = points @ motion[:3, :3].T + motion[:3, 3]
             found, inside = _looked_up(small[other].target, points, small[other].K)
             if inside.sum() > 100:

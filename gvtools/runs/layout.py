@@ -2,6 +2,7 @@
 
     run.json  rounds.jsonl  memory.npz  metrics.json
     round_000/report.json  round_000/context_depth_VIEW.npz  round_000/appearance.npz
+    round_000/poses.npz
     round_001/report.json  round_001/{guidance,valid,generated,after,depth}_TARGET.*
 
 Other modules of this package read and write these files; nothing outside knows their names.
@@ -17,7 +18,7 @@ from pathlib import Path, PurePosixPath
 from gvtools.errors import OptionError, ProjectError
 
 RECORD, REPORT, ROUNDS, METRICS = "run.json", "report.json", "rounds.jsonl", "metrics.json"
-MEMORY, APPEARANCE = "memory.npz", "appearance.npz"
+MEMORY, APPEARANCE, POSES = "memory.npz", "appearance.npz", "poses.npz"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 # Pictures that a round leaves of each target.
 GUIDANCE, VALID, COMPLETION, AFTER = "guidance", "valid", "generated", "after"

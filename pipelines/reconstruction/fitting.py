@@ -1,7 +1,7 @@
 """Before the first round: Gaussians are fitted to the context's photographs.
 
-The fit comes before the memory, because it refines the poses of RGB-D views that the memory is
-then built with, and because it gives photographs their depth.
+The fit comes before the memory, because it refines the poses of RGB-D views further, which the
+memory is then built with, and because it gives photographs their depth.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
 from gvtools.appearance.start import from_depth, from_points
-from gvtools.cameras import Cameras
 from gvtools.depth.choice import rough_source
 from gvtools.depth.source import MixedDepth, RecordedDepth
 from gvtools.errors import GvError, ShapeError
@@ -32,6 +31,7 @@ from gvtools.memory.projection import project
 from gvtools.scenes.reduced import reduced
 from gvtools.scenes.scene import Frame
 from gvtools.view_selection import evenly_spread
+from pipelines.reconstruction.poses import RunPoses
 from pipelines.reconstruction.prefetch import prefetch
 from pipelines.reconstruction.voxel_edge import grid_frame
 
@@ -52,8 +52,6 @@ WITH_DEPTH = 0.4
 # Longer side at which photographs with fitted depth enter the memory [px]: it need only tell what
 # is known, as the Gaussians show it.
 EVIDENCE_SIDE = 320
-# What a fit may leave of the cameras; the names are those of ``Fitted`` and of its file.
-CAMERA_ARRAYS = ("context_poses", "target_poses", "log_gains")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +60,7 @@ class Fitted:
 
     Attributes:
         appearance: the fitted Gaussians.
-        context_poses: (C, 4, 4) refined cam_from_world of the context; None where kept as given.
-        target_poses: (V, 4, 4) of the targets, corrected like the context near them; or None.
+        poses: of context and targets, as they were refined along; None where kept as given.
         log_gains: (C, 3) logarithms of the context's exposures; None where none was fitted.
         spread: whether the targets share the corrections of the context near them.
         judged: pictures of context views as they were predicted without their photographs; not
@@ -71,8 +68,7 @@ class Fitted:
     """
 
     appearance: Appearance
-    context_poses: NDArray[np.float64] | None = None
-    target_poses: NDArray[np.float64] | None = None
+    poses: RunPoses | None = None
     log_gains: NDArray[np.float64] | None = None
     spread: bool = False
     judged: Mapping[str, Picture] = field(default_factory=dict)
@@ -88,9 +84,10 @@ class Fitted:
             "blend": [self.appearance.blend.share, self.appearance.blend.tolerance],
             "spread": self.spread,
         }
-        for name in CAMERA_ARRAYS:
-            if (array := getattr(self, name)) is not None:
-                arrays[name] = array
+        if self.log_gains is not None:
+            arrays["log_gains"] = self.log_gains
+        if self.poses is not None:
+            arrays |= {"context_poses": self.poses.context, "target_poses": self.poses.targets}
         with path.open("wb") as file:
             np.savez(file, **arrays)
 
@@ -103,24 +100,22 @@ class Fitted:
         """
         appearance = Appearance.load(path)
         with np.load(path) as data:
-            cameras = {name: data[name] for name in CAMERA_ARRAYS if name in data}
-            return cls(appearance, **cameras, spread=bool(data.get("spread")))
+            known = "context_poses" in data
+            return cls(
+                appearance,
+                RunPoses(data["context_poses"], data["target_poses"]) if known else None,
+                data.get("log_gains"),
+                bool(data.get("spread")),
+            )
 
     def on(self, device: str) -> Fitted:
         """The same with what draws Gaussians on a device, "cpu" or "cuda"."""
         return replace(self, appearance=replace(self.appearance, splatter=splatter_on(device)))
 
-    def posed(self, plan: Plan) -> Plan:
-        """The plan with refined poses."""
-        if self.context_poses is None or self.target_poses is None:
-            return plan
-        scene = _with_poses(plan.scene, plan.context, self.context_poses)
-        cameras = _posed(plan.targets.cameras, self.target_poses)
-        return replace(plan, scene=scene, targets=replace(plan.targets, cameras=cameras))
-
     def applied(self, plan: Plan) -> Plan:
         """The plan with refined poses, and with the fitted depth for views that have no other."""
-        plan = self.posed(plan)
+        if self.poses is not None:
+            plan = self.poses.applied(plan)
         scene, source = plan.scene, plan.source
         if isinstance(source, RecordedDepth):
             return plan
@@ -168,7 +163,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     """Fit Gaussians to a run's context; None where that cannot be, and the console says why.
 
     Args:
-        plan: of the run, with its cameras as the project gives them.
+        plan: of the run.
         console: where progress goes.
         earlier: a fit of this run to go on with.
     """
@@ -178,7 +173,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     if fit.splatter is GsplatSplat:
         console.line("fitting: on the CUDA device, by gsplat")
     _run(fit, console)
-    return _fitted(fit, plan if earlier is None else earlier.posed(plan), earlier)
+    return _fitted(fit, _posed(plan, earlier), earlier)
 
 
 def _new_fit(plan: Plan, console: Console) -> Fit | None:
@@ -199,7 +194,7 @@ def _new_fit(plan: Plan, console: Console) -> Fit | None:
 
 def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
     start = earlier.appearance.gaussians
-    views = _views(earlier.posed(plan), start.frame)
+    views = _views(_posed(plan, earlier), start.frame)
     fit = Fit(
         start, views, options=plan.config.refine, seed=plan.config.seed, begin=CONTINUED,
         splatter=splatter_on(plan.config.device),
@@ -208,6 +203,11 @@ def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
     if earlier.log_gains is not None:
         fit.cameras.log_gains[:] = earlier.log_gains
     return fit
+
+
+def _posed(plan: Plan, earlier: Fitted | None) -> Plan:
+    """The plan with the poses of an earlier fit."""
+    return plan if earlier is None or earlier.poses is None else earlier.poses.applied(plan)
 
 
 def _run(fit: Fit, console: Console) -> None:
@@ -239,23 +239,14 @@ def _fitted(fit: Fit, plan: Plan, earlier: Fitted | None) -> Fitted:
         log_gains=cameras.log_gains,
         judged=judged,
     )
-    if cameras.with_poses:
-        given = frame.cam_from_local(plan.targets.cameras.cam_from_world)
-        targets = np.array([cameras.corrected(pose) for pose in given]).reshape(-1, 4, 4)
-        return replace(
-            found,
-            context_poses=frame.cam_from_world(cameras.poses()),
-            target_poses=frame.cam_from_world(targets),
-            spread=cameras.spread,
+    if not cameras.with_poses:
+        return (
+            found if earlier is None else replace(found, poses=earlier.poses, spread=earlier.spread)
         )
-    if earlier is None:
-        return found
-    return replace(
-        found,
-        context_poses=earlier.context_poses,
-        target_poses=earlier.target_poses,
-        spread=earlier.spread,
-    )
+    given = frame.cam_from_local(plan.targets.cameras.cam_from_world)
+    targets = np.array([cameras.corrected(pose) for pose in given]).reshape(-1, 4, 4)
+    poses = RunPoses(frame.cam_from_world(cameras.poses()), frame.cam_from_world(targets))
+    return replace(found, poses=poses, spread=cameras.spread)
 
 
 def _views(plan: Plan, frame: LocalFrame) -> list[FitView]:
@@ -288,21 +279,6 @@ def _start(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians
         found = source.depth(plan.scene, plan.scene[name], Frame(view.rgb, None, view.mask))
         rough.append(replace(view, depth=found.depth))
     return from_depth(rough, frame=frame, seed=seed, most=most)
-
-
-def _with_poses(scene: Scene, names: Sequence[str], poses: NDArray[np.float64]) -> Scene:
-    moved = dict(zip(names, poses, strict=True))
-    views = tuple(
-        replace(view, camera=_posed(view.camera, moved[view.name][None]))
-        if view.name in moved
-        else view
-        for view in scene.views
-    )
-    return replace(scene, views=views)
-
-
-def _posed(cameras: Cameras, cam_from_world: NDArray[np.float64]) -> Cameras:
-    return Cameras(cameras.K, cam_from_world, cameras.width, cameras.height, cameras.names)
 
 
 def _size(scene: Scene, names: Sequence[str]) -> float:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gvtools.completers.base import Completer
     from gvtools.depth.source import DepthSource
     from gvtools.scenes.scene import Scene
+    from pipelines.reconstruction.poses import RunPoses
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.reconstruction.targets import Targets
 
@@ -42,6 +43,7 @@ class Plan:
         ignored: settings of stereo that this source does not look at.
         weights: files of networks that decide the result.
         evidence: the scene as it enters the memory, where that is smaller; None for ``scene``.
+        poses: refined ones, which ``posed`` takes instead of the project's.
     """
 
     scene: Scene
@@ -56,31 +58,45 @@ class Plan:
     ignored: tuple[str, ...] = ()
     weights: tuple[Path, ...] = ()
     evidence: Scene | None = None
+    poses: RunPoses | None = None
 
     @property
     def derived(self) -> dict[str, Any]:
         """What the run's settings leave open, by dotted key: voxel edge, rounds, device, ..."""
         return changes(self.settings, self.config)
 
+    @property
+    def posed(self) -> Plan:
+        """The plan with refined poses."""
+        return self if self.poses is None else self.poses.applied(self)
+
 
 def make_plan(
-    scene: Scene, settings: RunSettings, *, say: Callable[[str], None] | None = None
+    scene: Scene,
+    settings: RunSettings,
+    *,
+    say: Callable[[str], None] | None = None,
+    round_0: Path | None = None,
 ) -> Plan:
-    """Resolve selections, depth source, voxel edge and schedule.
+    """Resolve selections, depth source, poses, voxel edge and schedule.
 
     Args:
         scene: the project.
         settings: as the user gave them.
         say: is told what is computed meanwhile.
+        round_0: folder of round 0 of the run that is gone on with: its poses are taken. Refining
+            them again would give the same only up to the order in which threads add.
 
     Raises:
         GvError: settings that the project cannot serve.
     """
     from gvtools.completers.base import create
     from gvtools.depth.choice import choose_source
+    from gvtools.depth.source import RecordedDepth
     from gvtools.errors import ProjectError
     from gvtools.scenes.reduced import reduced
     from gvtools.scenes.selection import select
+    from pipelines.reconstruction import poses
     from pipelines.reconstruction.targets import resolve_targets
 
     errors = [finding.message for finding in scene.findings if finding.level == "error"]
@@ -104,8 +120,14 @@ def make_plan(
     chosen = choose_source(
         scene, context, config.depth, stereo=config.stereo, foundation=config.da3
     )
+    found = None
+    if round_0 is not None:
+        found = poses.saved(round_0)
+    elif config.refine.poses and isinstance(chosen.source, RecordedDepth):
+        found = poses.refined(scene, context, targets.cameras, say=say)
     if config.voxel is None:
-        config = _with_voxel(config, scene, context, source=chosen.source, say=say)
+        posed = scene if found is None else found.scene(scene, context)
+        config = _with_voxel(config, posed, context, source=chosen.source, say=say)
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = config.replaced(rounds=len(schedule))
     weights = [*getattr(chosen.source, "files", ()), *completer.files]
@@ -121,6 +143,7 @@ def make_plan(
         completer,
         chosen.ignored,
         tuple(weights),
+        poses=found,
     )
 
 

@@ -68,6 +68,7 @@ def refine(
     describe(plan, console)
     earlier = _earlier(run, console)
     with folder_lock(place), folder_replaced_when_written(place) as folder:
+        plan = plan.posed
         fitted = fit_appearance(plan, console, earlier=earlier)
         if fitted is None:
             raise ProjectError(
@@ -104,7 +105,9 @@ def _reopened(run: Run, console: Console) -> tuple[Plan, Mapping[str, Any]]:
     root = Path(record["project"]) if run.project is None else run.project
     if not root.exists():
         raise ProjectError(f"{run.path}: its project {root} is gone; say by --project where it is")
-    plan = make_plan(open_as(root, record["reading"]), settings, say=console.line)
+    begun = round_folder(run.path, 0) if run.rounds else None
+    scene = open_as(root, record["reading"])
+    plan = make_plan(scene, settings, say=console.line, round_0=begun)
     identity = run_identity(plan, record["reading"])
     changed = changed_keys(identity, record)
     if run.project is not None and "project" in changed:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from gvtools.files import write_json
 from gvtools.runs.folder import RunDirectory
-from gvtools.runs.layout import APPEARANCE, MEMORY, REPORT
+from gvtools.runs.layout import APPEARANCE, MEMORY, POSES, REPORT
 from pipelines.console import Console
 from pipelines.reconstruction.compile_kernels import compile_kernels
 from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
@@ -55,9 +55,10 @@ def reconstruct(
         GvError: wrong input or options; nothing of an earlier run is lost.
     """
     compile_kernels(config, console)
-    plan = make_plan(scene, config, say=console.line)
-    describe(plan, console)
     directory = RunDirectory(out)
+    begun = directory.round_path(0) if resume and directory.reports() else None
+    plan = make_plan(scene, config, say=console.line, round_0=begun)
+    describe(plan, console)
     identity = run_identity(plan, reading or {})
     if dry_run:
         exists = directory.check(identity, resume=resume)
@@ -65,6 +66,7 @@ def reconstruct(
         console.line(f"dry run: {out}: {state}")
         return out
     with directory.open_or_resume(identity, resume=resume) as done:
+        plan = plan.posed
         fitted = _fitted(plan, directory, done, console=console)
         drawn = complete_run(plan, directory, done, fitted=fitted, console=console, draw=draw)
         say_results(directory, drawn, console)
@@ -83,7 +85,7 @@ def complete_run(
     """The rounds from number ``done`` on, and the end products.
 
     Args:
-        plan: with its cameras as the project gives them.
+        plan: with the cameras that were fitted to.
         directory: of the run, open.
         done: how many rounds are complete.
         fitted: Gaussians of the run; None leaves the memory's own colours.
@@ -166,6 +168,8 @@ def _run_rounds(
                     plan, targets, number, context=context or [], folder=folder, console=console
                 )
                 memory.save(folder / MEMORY)
+                if plan.poses is not None and number == 0:
+                    plan.poses.save(folder / POSES)
                 if fitted is not None and number == 0:
                     fitted = fitted.with_best_blend(plan, memory)
                     fitted.save(folder / APPEARANCE)

@@ -1,0 +1,86 @@
+"""Whether the poses that RGB-D views tell of themselves are better, and what they say of others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from kornia.geometry.liegroup import Se3
+from numpy.typing import NDArray
+
+from gvtools.appearance.camera_corrections import LEAST_BETTER, mean_near, moved
+from gvtools.appearance.fit_views import FitView
+from gvtools.appearance.pose_check import prediction_error
+from gvtools.appearance.pose_graph import pose_graph
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPoses:
+    """Poses on which RGB-D views agree, beside those that they were given.
+
+    Attributes:
+        given: (V, 4, 4) camera from world.
+        poses: (V, 4, 4) refined.
+        depth: typical depth, scene units.
+        spread: whether other cameras err like the views near them.
+        errors: mean difference of colours between neighbouring views where they show the same,
+            0 to 1, by given and by refined poses.
+    """
+
+    given: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    depth: float
+    spread: bool
+    errors: tuple[float, float]
+
+    @property
+    def motions(self) -> NDArray[np.float64]:
+        """(V, 6) shift and turn from the given pose to the refined one, on the camera's side."""
+        change = torch.from_numpy(self.poses @ np.linalg.inv(self.given))
+        return np.asarray(Se3.from_matrix(change).log().detach())
+
+    def corrected(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(4, 4) another camera's pose, moved as the views near it were if ``spread``."""
+        if not self.spread:
+            return pose
+        return moved(pose, mean_near(pose, self.given, self.motions, depth=self.depth))
+
+    def __str__(self) -> str:
+        shift = np.median(np.linalg.norm(self.motions[:, :3], axis=1))
+        turn = np.degrees(np.median(np.linalg.norm(self.motions[:, 3:], axis=1)))
+        before, after = self.errors
+        return (
+            f"moved by {shift:.3g} scene units and {turn:.2f} degrees (medians); neighbouring "
+            f"views differ by {after:.4f} instead of {before:.4f}"
+            + ("; targets moved like the context near them" if self.spread else "")
+        )
+
+
+def refined_poses(views: Sequence[FitView]) -> RefinedPoses | None:
+    """Poses on which neighbouring views agree; None where the given ones are as good.
+
+    Args:
+        views: all with depth, in the order of recording.
+    """
+    given = np.stack([view.cam_from_local for view in views])
+    if len(views) < 2:
+        return None
+    poses = pose_graph(views)
+    before, after = prediction_error(views, given), prediction_error(views, poses)
+    if not after < before * (1 - LEAST_BETTER):
+        return None
+    depth = np.concatenate([view.depth[::8, ::8].ravel() for view in views])  # type: ignore[index]
+    typical = float(np.median(depth[depth > 0]))
+    found = RefinedPoses(given, poses, typical, spread=False, errors=(before, after))
+    # Each view once as if it were another camera: is it nearer to its neighbours if it moves like
+    # them, or where it was given?
+    alike = [
+        moved(pose, mean_near(pose, given, found.motions, depth=typical, but=[row]))
+        for row, pose in enumerate(given)
+    ]
+    near = prediction_error(views, poses, at=np.stack(alike))
+    away = prediction_error(views, poses, at=given)
+    spread = near < away * (1 - LEAST_BETTER)
+    return RefinedPoses(given, poses, typical, spread=spread, errors=(before, after))
