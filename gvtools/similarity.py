@@ -195,6 +195,30 @@ def _degenerate(count: int, reason: str) -> SimilarityFit:
     )
 
 
+def align_poses(poses: Float64, target: Float64) -> Float64:
+    """The rigid motion T (4, 4) such that ``poses @ T`` are nearest to other poses.
+
+    Unlike ``fit_similarity`` it looks at rotations, too, so that it is determined for any cameras:
+    its rotation is the mean of what turns each pose into the other, then centres agree on average.
+
+    Args:
+        poses: (V, 4, 4) camera from world.
+        target: (V, 4, 4) camera from another world.
+
+    >>> other = np.eye(4)
+    >>> other[0, 3] = 2
+    >>> align_poses(np.eye(4)[None], other[None])[0, 3]
+    np.float64(2.0)
+    """
+    turns = np.einsum("vji,vjk->ik", poses[:, :3, :3], target[:, :3, :3])
+    left, _, right = np.linalg.svd(turns)
+    motion = np.eye(4)
+    motion[:3, :3] = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    ours, theirs = (-np.einsum("vji,vj->vi", p[:, :3, :3], p[:, :3, 3]) for p in (poses, target))
+    motion[:3, 3] = (ours - theirs @ motion[:3, :3].T).mean(axis=0)
+    return motion
+
+
 @dataclass(frozen=True)
 class ScaleFit:
     """reference_depth ≈ scale · depth on the pixels that both know.

@@ -16,18 +16,24 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from gvtools.appearance.fit_views import FitView
+from gvtools.similarity import align_poses
 
 # Pictures are compared at this length of the longer side [px], each with so many neighbours.
 SIDE, NEIGHBORS = 320, 3
 # Open3D's limits are metres for rooms; depth is scaled so that its median becomes this.
 TYPICAL_DEPTH = 2.0
 # Points that are farther apart than this do not belong together [scaled depth].
-APART = 0.07
+APART = 0.03
+# More than any scaled depth.
+FARTHEST = 1e3
 # A pair counts when this share of a picture overlaps, and moves by less than this [scaled depth,
 # rad] from the given poses: more is not a tracker's error but a comparison that went wrong.
 OVERLAP, MOST_SHIFT, MOST_TURN = 0.1, 0.12, 0.07
-# Steps of the comparison at a quarter, half and all of the size.
-ITERATIONS = (10, 10, 20)
+# Steps of the comparison at half and all of the size.
+ITERATIONS = (10, 5)
+# Relative poses are rounded to so many digits, so that they are the same every time: threads add in
+# any order. Open3D's tensor odometry, twice as fast, differs from time to time in the fifth digit.
+DIGITS = 9
 # Neighbours along the path keep their given relative pose by this share of a pair's weight, so that
 # views that overlap with none stay where they were.
 GIVEN_WEIGHT = 0.01
@@ -40,11 +46,12 @@ class _Camera(NamedTuple):
     size: tuple[int, int]
 
     @property
-    def tensor(self) -> o3d.core.Tensor:
-        """As Open3D wants it, which counts pixels from the first one's centre."""
-        K = self.K.copy()
-        K[:2, 2] -= 0.5
-        return o3d.core.Tensor(K)
+    def intrinsics(self) -> o3d.camera.PinholeCameraIntrinsic:
+        """As Open3D wants them, which counts pixels from the first one's centre."""
+        K = self.K
+        return o3d.camera.PinholeCameraIntrinsic(
+            *self.size, K[0, 0], K[1, 1], K[0, 2] - 0.5, K[1, 2] - 0.5
+        )
 
 
 def pose_graph(views: Iterable[FitView]) -> NDArray[np.float64]:
@@ -72,7 +79,7 @@ def pose_graph(views: Iterable[FitView]) -> NDArray[np.float64]:
     pairs = neighbors(np.stack(given))
     edges = [_edge(images, given, (i, j), camera=camera) for i, j in pairs]
     refined = _optimized(given, [edge for edge in edges if edge is not None])
-    moved = refined @ _alignment(refined, np.stack(given))
+    moved = refined @ align_poses(refined, np.stack(given))
     return np.asarray(unit @ moved @ np.linalg.inv(unit))
 
 
@@ -99,7 +106,7 @@ def _depth(view: FitView) -> NDArray[np.float32]:
     return view.depth if view.mask is None else view.depth * view.mask
 
 
-def _image(view: FitView, camera: _Camera, scale: float) -> o3d.t.geometry.RGBDImage:
+def _image(view: FitView, camera: _Camera, scale: float) -> o3d.geometry.RGBDImage:
     """A view as the common camera sees it, with scaled depth."""
     # Pixels count from the first one's corner in ``K``, from its centre in OpenCV.
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
@@ -112,45 +119,46 @@ def _image(view: FitView, camera: _Camera, scale: float) -> o3d.t.geometry.RGBDI
     depth = cv2.warpAffine(
         (_depth(view) * scale).astype(np.float32), smaller, camera.size, flags=cv2.INTER_NEAREST
     )
-    return o3d.t.geometry.RGBDImage(
-        o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(rgb))),
-        o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth[..., None]))),
+    return o3d.geometry.RGBDImage.create_from_color_and_depth(
+        o3d.geometry.Image(np.ascontiguousarray(rgb)),
+        o3d.geometry.Image(np.ascontiguousarray(depth)),
+        depth_scale=1.0,
+        depth_trunc=FARTHEST,
+        convert_rgb_to_intensity=True,
     )
 
 
 def _edge(
-    images: list[o3d.t.geometry.RGBDImage],
+    images: list[o3d.geometry.RGBDImage],
     given: list[NDArray[np.float64]],
     pair: tuple[int, int],
     *,
     camera: _Camera,
 ) -> o3d.pipelines.registration.PoseGraphEdge | None:
     """The relative pose of two views, or None if they do not tell it."""
-    odometry = o3d.t.pipelines.odometry
-    source, target = (images[row] for row in pair)
+    odometry = o3d.pipelines.odometry
     begin = given[pair[1]] @ np.linalg.inv(given[pair[0]])
-    farthest = 1e3
-    steps = [odometry.OdometryConvergenceCriteria(count) for count in ITERATIONS]
-    try:
-        found = odometry.rgbd_odometry_multi_scale(
-            source, target, camera.tensor, o3d.core.Tensor(begin), 1.0, farthest, steps,
-            odometry.Method.Hybrid, odometry.OdometryLossParams(APART, 0.05, 0.1),
-        )  # fmt: skip
-    except RuntimeError:  # too few pixels correspond
-        return None
-    motion = found.transformation.numpy()
+    found, motion, weight = odometry.compute_rgbd_odometry(
+        images[pair[0]],
+        images[pair[1]],
+        camera.intrinsics,
+        begin,
+        odometry.RGBDOdometryJacobianFromHybridTerm(),
+        odometry.OdometryOption(
+            iteration_number_per_pyramid_level=o3d.utility.IntVector(ITERATIONS),
+            depth_diff_max=APART,
+            depth_min=0.0,
+            depth_max=FARTHEST,
+        ),
+    )
     change = motion @ np.linalg.inv(begin)
     turn = np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1))
-    if np.linalg.norm(change[:3, 3]) > MOST_SHIFT or turn > MOST_TURN:
-        return None
-    weight = odometry.compute_odometry_information_matrix(
-        source.depth, target.depth, camera.tensor, found.transformation, APART, 1.0, farthest
-    ).numpy()
-    # Its last number counts the pixels that correspond.
-    if weight[5, 5] < OVERLAP * camera.size[0] * camera.size[1]:
+    right = np.linalg.norm(change[:3, 3]) < MOST_SHIFT and turn < MOST_TURN
+    # The last number of the weight counts the pixels that correspond.
+    if not (found and right and weight[5, 5] > OVERLAP * camera.size[0] * camera.size[1]):
         return None
     edge = o3d.pipelines.registration.PoseGraphEdge
-    return edge(pair[0], pair[1], motion, weight, uncertain=True)
+    return edge(*pair, motion.round(DIGITS), weight.round(), uncertain=True)
 
 
 def _optimized(
@@ -179,14 +187,3 @@ def _optimized(
             registration.GlobalOptimizationOption(reference_node=0),
         )
     return np.stack([np.linalg.inv(node.pose) for node in graph.nodes])
-
-
-def _alignment(poses: NDArray[np.float64], given: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) rigid motion T such that ``poses @ T`` are nearest to the given poses."""
-    left, _, right = np.linalg.svd(np.einsum("vji,vjk->ik", poses[:, :3, :3], given[:, :3, :3]))
-    rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    ours, theirs = (-np.einsum("vji,vj->vi", p[:, :3, :3], p[:, :3, 3]) for p in (poses, given))
-    motion = np.eye(4)
-    motion[:3, :3] = rotation
-    motion[:3, 3] = (ours - theirs @ rotation.T).mean(axis=0)
-    return motion

@@ -24,11 +24,13 @@ from gvtools.procedural.room_sample import RoomSample, check_options, room_views
 from gvtools.procedural.shading import Look
 from gvtools.scenes.sample_workspace import is_written, written_whole
 from gvtools.scenes.sevenscenes import INTRINSICS
+from gvtools.similarity import align_poses
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-# Of context poses, root mean square over views: length of the centre's error, angle of the turn.
+# Of context poses before alignment, root mean square over views: length of the centre's error,
+# angle of the turn.
 POSE_METRES, POSE_DEGREES = 0.01, 0.5
 POSE_SMOOTH = 2.0  # views over which half of the error's variance is drift
 EXPOSURE = 0.03  # standard deviation of the logarithm of exposure, over context views
@@ -49,9 +51,11 @@ def write_noisy_room(
     The layout is that of 7-Scenes (``NAME.color.png``, ``NAME.depth.png`` in millimetres,
     ``NAME.pose.txt`` camera-to-world, ``camera-intrinsics.txt``), depth as seen by the colour
     camera. The pictures are taken from the cameras of ``write_room`` with the same options. Context
-    poses in the files are jittered; target poses are the true ones, in the room's own frame, and
-    targets' pictures and depth maps are exact, so that what a run predicts is measured against the
-    truth. A run that moves the whole room with its context poses pays for it in the targets.
+    poses in the files are jittered, then moved together to where they agree with the true ones
+    best, as trajectories are aligned before they are measured: what all of them share no method
+    could know. Target poses are the true ones, and targets' pictures and depth maps are exact, so
+    that what a run predicts is measured against the truth. A run that moves the whole room with its
+    context poses pays for it in the targets.
 
     Args:
         folder: absent, empty, or written by the same call before.
@@ -71,7 +75,7 @@ def write_noisy_room(
     stems = [name.removesuffix(".png") for name in cameras.names]
     names = tuple(f"{stem}.color.png" for stem in stems)
     sample = RoomSample(folder, names[:count], names[count:], names[count:], seed)
-    record: dict[str, Any] = {"sample": "noisy-room", "version": 1, "width": width}
+    record: dict[str, Any] = {"sample": "noisy-room", "version": 2, "width": width}
     record |= {"height": height}
     record |= {key: value for key, value in asdict(sample).items() if key != "folder"}
     if is_written(folder, record):
@@ -81,7 +85,9 @@ def write_noisy_room(
     exposure = np.ones(len(cameras))
     exposure[:count] = np.exp(rng.normal(0, EXPOSURE, count))
     poses = cameras.world_from_cam
-    poses[:count] = invert_rigid(jittered(cameras.cam_from_world[:count], rng))
+    true = cameras.cam_from_world[:count]
+    off = jittered(true, rng)
+    poses[:count] = invert_rigid(off @ align_poses(off, true))
     depth[:count] = _measured(room, cameras[:count], depth[:count], rng)
     key = room.key / float(light.mean())
     K = cameras.K[0].copy()

@@ -14,6 +14,7 @@ from gvtools.procedural.room_sample import RoomSample, write_room
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
+from gvtools.similarity import align_poses
 from pipelines.cli import main
 
 SIZE = {"views": 10, "width": 240, "height": 180}
@@ -139,6 +140,7 @@ def test_targets_are_the_truth_at_the_true_poses(
     poses, true = scene.cameras.cam_from_world, twin.cameras.cam_from_world
     np.testing.assert_allclose(poses[CONTEXT:], true[CONTEXT:], atol=1e-9)
     assert np.abs(poses[:CONTEXT] - true[:CONTEXT]).max((1, 2)).min() > 1e-3
+    np.testing.assert_allclose(align_poses(poses[:CONTEXT], true[:CONTEXT]), np.eye(4), atol=1e-9)
     for view, other in zip(scene.views[CONTEXT:], twin.views[CONTEXT:], strict=True):
         frame, exact = view.load(), other.load()
         assert frame.depth is not None and exact.depth is not None

@@ -27,12 +27,13 @@ from pipelines.console import Console
 from pipelines.reconstruction import fitting, run_round
 from pipelines.reconstruction.fitting import Fitted, fit_appearance
 from pipelines.reconstruction.plan import Plan, make_plan
+from pipelines.reconstruction.poses import RunPoses
 from pipelines.reconstruction.run import _empty_memory, reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
 SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "depth=auto",
             "fusion.max_psnr_drop_db=none", "refine.most_gaussians=2000")  # fmt: skip
-FITTED = "round_000/appearance.npz"
+FITTED, POSES = "round_000/appearance.npz", "round_000/poses.npz"
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +184,7 @@ def test_photographs_alone_get_depth_by_the_gaussians(tmp_path, points):
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=points)
     out = run(scan, tmp_path / "run", "refine.steps=20")
     fitted = Fitted.load(out / FITTED)
-    assert fitted.context_poses is None and fitted.target_poses is None
+    assert fitted.poses is None and not (out / POSES).exists()
     report = json.loads((out / "round_000" / "report.json").read_text())
     assert {entry["source"] for entry in report["depth"]} <= {"fitted", "memory"}
     assert report["depth"][0]["source"] == "fitted"
@@ -209,7 +210,7 @@ def test_refined_poses_move_context_and_targets(scan):
     context[:, 0, 3] += 0.01
     targets[:, 1, 3] -= 0.02
     appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1)
-    moved = Fitted(appearance, context, targets).applied(plan)
+    moved = Fitted(appearance, RunPoses(context, targets)).applied(plan)
     np.testing.assert_array_equal(moved.scene.subset(plan.context).cameras.cam_from_world, context)
     np.testing.assert_array_equal(moved.targets.cameras.cam_from_world, targets)
     others = [name for name in plan.scene.names if name not in plan.context]
@@ -243,16 +244,17 @@ def test_a_fit_comes_back_from_its_file_as_it_was(tmp_path):
     values = rng.normal(size=(5, VALUES)).astype(np.float32)
     gaussians = Gaussians(values, frame=LocalFrame.at([1e6, 2, 3]))
     poses = rng.normal(size=(2, 3, 4, 4))
-    fitted = Fitted(Appearance(gaussians, 0.125, Blend(0.35, 0.4)), poses[0], poses[1])
-    for saved in (fitted, replace(fitted, context_poses=None, target_poses=None)):
+    fitted = Fitted(Appearance(gaussians, 0.125, Blend(0.35, 0.4)), RunPoses(*poses))
+    for saved in (fitted, replace(fitted, poses=None)):
         saved.save(tmp_path / "fit.npz")
         back = Fitted.load(tmp_path / "fit.npz")
         np.testing.assert_array_equal(back.appearance.gaussians.values, gaussians.values)
         assert back.appearance.gaussians.frame.same_as(gaussians.frame)
         assert back.appearance.near == 0.125
         assert back.appearance.blend == Blend(0.35, 0.4)
-        for name in ("context_poses", "target_poses"):
-            np.testing.assert_array_equal(getattr(back, name), getattr(saved, name))
+        assert (back.poses is None) == (saved.poses is None)
+        if back.poses is not None:
+            np.testing.assert_array_equal([back.poses.context, back.poses.targets], poses)
     gaussians.save(tmp_path / "fit.npz")
     with pytest.raises(MemoryFileError, match="no readable appearance"):
         Fitted.load(tmp_path / "fit.npz")

@@ -23,6 +23,7 @@ from pipelines.cli import main
 from pipelines.console import Console
 from pipelines.reconstruction import refine as module
 from pipelines.reconstruction.fitting import Fitted
+from pipelines.reconstruction.poses import RunPoses
 from pipelines.reconstruction.refine import refine
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
@@ -74,12 +75,13 @@ def test_refined_poses_go_on_from_the_saved_ones(copy):
     shifted = scene.subset(record["context"]).cameras.cam_from_world.copy()
     shifted[1, :3, 3] += [0.004, 0, 0]
     target = scene.subset(record["targets"]).cameras.cam_from_world
-    Fitted(saved.appearance, shifted, target, saved.log_gains).save(copy / APPEARANCE)
+    Fitted(saved.appearance, RunPoses(shifted, target), saved.log_gains).save(copy / APPEARANCE)
     refine(copy, steps=2, console=QUIET)
     after = Fitted.load(copy / APPEARANCE)
     # Two steps neither find the way back nor predict neighbours better: the saved ones are kept.
-    np.testing.assert_array_equal(after.context_poses, shifted)
-    np.testing.assert_array_equal(after.target_poses, target)
+    assert after.poses is not None
+    np.testing.assert_array_equal(after.poses.context, shifted)
+    np.testing.assert_array_equal(after.poses.targets, target)
 
 
 def test_poses_that_predict_neighbours_better_are_kept(copy, monkeypatch):
@@ -87,14 +89,15 @@ def test_poses_that_predict_neighbours_better_are_kept(copy, monkeypatch):
     scene, record = load_run(copy).scenes[0], load_run(copy).record
     given = scene.subset(record["context"]).cameras.cam_from_world
     target = scene.subset(record["targets"]).cameras.cam_from_world
-    Fitted(saved.appearance, given, target, saved.log_gains, spread=True).save(copy / APPEARANCE)
+    poses = RunPoses(given, target)
+    Fitted(saved.appearance, poses, saved.log_gains, spread=True).save(copy / APPEARANCE)
     errors = iter([1.0, 0.5])
     monkeypatch.setattr(fit, "prediction_error", lambda views, poses: next(errors))
     refine(copy, steps=4, console=QUIET)
     after = Fitted.load(copy / APPEARANCE)
     assert after.spread
-    assert after.context_poses is not None and after.target_poses is not None
-    for before, now in [(given, after.context_poses), (target, after.target_poses)]:
+    assert after.poses is not None
+    for before, now in [(given, after.poses.context), (target, after.poses.targets)]:
         assert 0 < np.abs(now - before).max() < 0.003
 
 

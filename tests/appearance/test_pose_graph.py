@@ -1,0 +1,152 @@
+"""Poses by odometry between views: back to the truth, and better for pictures than given ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from splat_scene import photographs, pose_errors, walk
+
+from gvtools.appearance.camera_corrections import moved
+from gvtools.appearance.fit_views import FitView
+from gvtools.appearance.pose_graph import neighbors, pose_graph
+from gvtools.appearance.refined_poses import refined_poses
+from gvtools.similarity import align_poses
+
+COUNT, SIZE = 8, 3
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return walk(COUNT)
+
+
+@pytest.fixture(scope="module")
+def views(truth):
+    return textured(truth)
+
+
+def textured(poses: np.ndarray) -> list[FitView]:
+    """Exact views of a square before a wall with patterns of all sizes."""
+    rng = np.random.default_rng(0)
+    waves = rng.normal(size=(24, 3)) * np.geomspace(3, 30, 24)[:, None]
+    phases = rng.uniform(0, 2 * np.pi, 24)
+    views = []
+    for view in photographs(poses, depth=True, size=SIZE):
+        height, width = view.rgb.shape[:2]
+        assert view.depth is not None
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        points = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view.K).T
+        points = (points * view.depth[..., None] - view.cam_from_local[:3, 3]) @ (
+            view.cam_from_local[:3, :3]
+        )
+        grey = 128 + 18 * np.sin(points @ waves.T + phases).sum(-1)
+        rgb = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=-1)
+        views.append(replace(view, rgb=rgb))
+    return views
+
+
+def off(views, *, scale: float = 1.0, seed: int = 1):
+    """The views with poses that err by some two centimetres and half a degree."""
+    rng = np.random.default_rng(seed)
+    motions = rng.normal(0, scale * np.repeat([0.02, 0.01], 3), (len(views), 6))
+    return [
+        replace(view, cam_from_local=moved(view.cam_from_local, motion))
+        for view, motion in zip(views, motions, strict=True)
+    ]
+
+
+def poses_of(views) -> np.ndarray:
+    return np.stack([view.cam_from_local for view in views])
+
+
+def test_relative_poses_come_back_and_the_whole_stays_where_it_was(views, truth):
+    some = off(views)
+    found = pose_graph(some)
+    before, after = pose_errors(poses_of(some), truth), pose_errors(found, truth)
+    assert after[0] < 0.35 * before[0]
+    assert after[1] < 0.35 * before[1]
+    np.testing.assert_allclose(align_poses(found, poses_of(some)), np.eye(4), atol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_unit_of_length_does_not_matter(views, truth, unit):
+    some = off(views)
+    other = []
+    for view in some:
+        pose = view.cam_from_local.copy()
+        pose[:3, 3] *= unit
+        assert view.depth is not None
+        other.append(replace(view, cam_from_local=pose, depth=view.depth * np.float32(unit)))
+    expected, found = pose_graph(some), pose_graph(other)
+    found[:, :3, 3] /= unit
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+def test_views_may_have_intrinsics_of_their_own(views, truth):
+    some = off(views)
+    wide = some[3]
+    K = wide.K.copy()
+    K[:2, 2] += 4
+    rgb = np.pad(wide.rgb, ((4, 0), (4, 0), (0, 0)), mode="edge")[:-4, :-4]
+    assert wide.depth is not None
+    depth = np.pad(wide.depth, ((4, 0), (4, 0)))[:-4, :-4]
+    some[3] = replace(wide, K=K, rgb=rgb, depth=depth)
+    before, after = pose_errors(poses_of(some), truth), pose_errors(pose_graph(some), truth)
+    assert after[0] < 0.5 * before[0]
+
+
+def test_views_that_see_nothing_in_common_stay_where_they_were(views):
+    apart = [
+        replace(view, cam_from_local=view.cam_from_local @ _shift(100 * row))
+        for row, view in enumerate(views[:3])
+    ]
+    np.testing.assert_allclose(pose_graph(apart), poses_of(apart), atol=1e-6)
+    empty = [replace(view, depth=np.zeros_like(view.depth)) for view in views[:3]]
+    np.testing.assert_array_equal(pose_graph(empty), poses_of(empty))
+
+
+def _shift(x: float) -> np.ndarray:
+    motion = np.eye(4)
+    motion[0, 3] = x
+    return motion
+
+
+def test_every_camera_is_compared_with_the_nearest():
+    poses = walk(6)
+    pairs = neighbors(poses, count=1)
+    assert all(second - first <= 2 for first, second in pairs)
+    assert {row for pair in pairs for row in pair} == set(range(6))
+    assert neighbors(poses[:1]) == []
+
+
+def test_right_poses_are_kept_and_wrong_ones_are_not(views, truth):
+    assert refined_poses(views[:1]) is None
+    found = refined_poses(off(views))
+    assert found is not None
+    assert found.errors[1] < found.errors[0]
+    assert pose_errors(found.poses, truth)[0] < 0.01
+    assert "degrees" in str(found)
+    assert refined_poses(views) is None
+
+
+def test_other_cameras_move_only_if_neighbours_err_alike(views, truth):
+    jumps = refined_poses(off(views))
+    assert jumps is not None and not jumps.spread
+    np.testing.assert_array_equal(jumps.corrected(truth[3]), truth[3])
+    # Half of the path is off by one motion, half by the opposite one.
+    motion = np.array([0.03, 0.01, 0, 0, 0.01, 0])
+    signs = np.where(np.arange(2 * COUNT) < COUNT, 1, -1)
+    path = walk(2 * COUNT)
+    drifting = [
+        replace(view, cam_from_local=moved(pose, sign * motion))
+        for view, pose, sign in zip(textured(path), path, signs, strict=True)
+    ]
+    drift = refined_poses(drifting)
+    assert drift is not None and drift.spread
+    for row in (3, 12):
+        other = moved(path[row], signs[row] * motion)
+        before = pose_errors(np.stack([other, path[8]]), path[[row, 8]])
+        after = pose_errors(np.stack([drift.corrected(other), path[8]]), path[[row, 8]])
+        assert after[0] < before[0]

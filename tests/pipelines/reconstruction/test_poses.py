@@ -1,0 +1,101 @@
+"""Runs on RGB-D views whose poses err: they are refined first, kept, and taken again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from run_files import results
+from tiny_scan import world_from_cam, write_scan
+
+from gvtools.errors import MemoryFileError
+from gvtools.procedural.noisy_room import jittered
+from gvtools.scenes.project import open_project
+from gvtools.settings import with_texts
+from pipelines.console import Console
+from pipelines.reconstruction import poses, run_round
+from pipelines.reconstruction.poses import RunPoses
+from pipelines.reconstruction.run import reconstruct
+from pipelines.reconstruction.settings import RunSettings
+
+SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "refine.steps=0")
+POSES = "round_000/poses.npz"
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory):
+    """Ten views whose poses err by two centimetres and a degree."""
+    folder = write_scan(tmp_path_factory.mktemp("poses") / "scan", views=10)
+    true = np.stack([world_from_cam(i) for i in range(10)])
+    rng = np.random.default_rng(0)
+    wrong = np.linalg.inv(jittered(jittered(np.linalg.inv(true), rng), rng))
+    for i, pose in enumerate(wrong):
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
+    return folder
+
+
+def run(scan: Path, out: Path, *settings: str, resume: bool = False) -> Path:
+    config = with_texts(RunSettings(), (*SETTINGS, *settings))
+    return reconstruct(open_project(scan), config, out, console=Console(quiet=True), resume=resume)
+
+
+@pytest.fixture(scope="module")
+def whole(scan, tmp_path_factory):
+    return run(scan, tmp_path_factory.mktemp("runs") / "whole")
+
+
+def relative_errors(context: np.ndarray) -> float:
+    """Mean angle between true and found turns from each view to the next [rad]."""
+    true = np.linalg.inv(np.stack([world_from_cam(i) for i in range(8)]))
+    turns = [(poses[1:] @ np.linalg.inv(poses[:-1]))[:, :3, :3] for poses in (true, context)]
+    cosine = (np.einsum("vij,vij->v", *turns) - 1) / 2
+    return float(np.arccos(np.clip(cosine, -1, 1)).mean())
+
+
+def test_poses_are_refined_and_kept_beside_round_0(scan, whole):
+    kept = RunPoses.load(whole / POSES)
+    scene = open_project(scan)
+    given = scene.subset(scene.names[:8]).cameras.cam_from_world
+    assert relative_errors(kept.context) < 0.6 * relative_errors(given)
+    assert kept.targets.shape == (2, 4, 4)
+
+
+def test_a_run_may_keep_the_given_poses(scan, whole, tmp_path):
+    out = run(scan, tmp_path / "given", "refine.poses=false")
+    assert not (out / POSES).exists()
+    assert (out / "memory.npz").read_bytes() != (whole / "memory.npz").read_bytes()
+
+
+def test_the_same_run_gives_the_same_poses(scan, whole, tmp_path):
+    again = run(scan, tmp_path / "again")
+    assert (again / POSES).read_bytes() == (whole / POSES).read_bytes()
+    assert (again / "memory.npz").read_bytes() == (whole / "memory.npz").read_bytes()
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing catches it."""
+
+
+def test_a_resumed_run_takes_the_poses_that_it_began_with(scan, whole, tmp_path, monkeypatch):
+    real = run_round.run_round
+
+    def until_round_1(plan, targets, number, **options):
+        if number:
+            raise Killed
+        return real(plan, targets, number, **options)
+
+    monkeypatch.setattr(run_round, "run_round", until_round_1)
+    with pytest.raises(Killed):
+        run(scan, tmp_path / "run")
+    monkeypatch.undo()
+
+    def refined_again(*args, **kwargs):
+        raise AssertionError("refined again")
+
+    monkeypatch.setattr(poses, "refined", refined_again)
+    run(scan, tmp_path / "run", resume=True)
+    assert results(tmp_path / "run") == results(whole)
+    (tmp_path / "run" / POSES).write_bytes(b"nothing")
+    with pytest.raises(MemoryFileError, match="expected refined poses"):
+        run(scan, tmp_path / "run", resume=True)
