@@ -37,7 +37,7 @@ def reference(image: torch.Tensor, target: torch.Tensor, median: float) -> torch
         before, here, after = (inverse.narrow(axis, k, size) for k in range(3))
         there = torch.stack([solid.narrow(axis, k, size) for k in range(3)]).all(0)
         colors = [target.narrow(1 + axis, k, size) for k in range(3)]
-        change = sum((colors[k] - colors[1]).abs().sum(0) for k in (0, 2))
+        change = (colors[0] - colors[1]).abs().sum(0) + (colors[2] - colors[1]).abs().sum(0)
         bend = (before - 2 * here + after)[there]
         each = huber_loss(bend / SOFT, torch.zeros_like(bend), reduction="none") * SOFT
         total = total + (each * torch.exp(-EDGE / 3 * change[there])).sum()

@@ -96,6 +96,6 @@ def test_a_resumed_run_takes_the_poses_that_it_began_with(scan, whole, tmp_path,
     monkeypatch.setattr(poses, "refined", refined_again)
     run(scan, tmp_path / "run", resume=True)
     assert results(tmp_path / "run") == results(whole)
-    (tmp_path / "run" / POSES).write_bytes(b"nothing")
+    (tmp_path / "run" / POSES).write_bytes((whole / POSES).read_bytes()[:-300])
     with pytest.raises(MemoryFileError, match="expected refined poses"):
         run(scan, tmp_path / "run", resume=True)
