@@ -112,7 +112,9 @@ def _run(case: Case, project: Path, budget: int, out: Path) -> dict[str, Any]:
     command += ["--context", case.context, "--targets", case.targets, "--out", str(out / stem)]
     refine = 0.0
     if budget:
-        rest = 14.0 + 0.25 * len(_selected(project, case.context))
+        # What the rest of a run takes, about: views with recorded depth have their poses refined.
+        views, recorded = len(_selected(project, case.context)), _has_depth(project)
+        rest = 8.0 + 0.8 * views if recorded else 10.0 + 0.33 * views
         refine = max(budget - rest, 5.0) / 2
     seconds = _seconds([*command, "--refine", f"{refine:g}"])
     figures = json.loads((out / stem / "metrics.json").read_text())
@@ -139,6 +141,13 @@ def _selected(project: Path, spec: str) -> list[int]:
 
     names = open_project(project).names
     return [names.index(name) for name in select(names, spec)]
+
+
+def _has_depth(project: Path) -> bool:
+    from gvtools import open_project
+
+    scene = open_project(project)
+    return bool(scene[scene.names[0]].has_depth)
 
 
 def _peer(case: Case, project: Path, budget: int, train: Path, out: Path) -> dict[str, Any]:
