@@ -17,6 +17,7 @@ import numpy as np
 
 from benchmarks.experiments.options import ExperimentOptions
 from benchmarks.experiments.rows import INPAINT, geoverse
+from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.completers.base import Completer, ContextView
 from gvtools.errors import DegenerateError
 from gvtools.evaluation.images import psnr
@@ -24,7 +25,6 @@ from gvtools.evaluation.pose_probe.located import Located
 from gvtools.evaluation.pose_probe.probe import PoseProbe
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.tables import Column, Table
-from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.training.hints import Clip
 from pipelines.reconstruction.rounds import Clock, complete_targets

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.fitted_depth import FittedDepth
+from gvtools.depth.fitted_depth import FittedDepth
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap, DepthSource, RecordedDepth, is_recorded
 from gvtools.errors import DegenerateError, ProjectError

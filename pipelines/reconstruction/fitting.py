@@ -19,12 +19,12 @@ from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend, best_blend
 from gvtools.appearance.fit import CONTINUED, Fit, Progress, judges
 from gvtools.appearance.fit_views import FitView
-from gvtools.appearance.fitted_depth import FittedDepth
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
 from gvtools.appearance.start import from_depth, from_points
 from gvtools.depth.choice import rough_source
+from gvtools.depth.fitted_depth import FittedDepth
 from gvtools.depth.source import MixedDepth, RecordedDepth
 from gvtools.errors import GvError, ShapeError
 from gvtools.memory.projection import project

@@ -6,8 +6,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
 from gvtools.appearance.appearance import Appearance
+from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.kernels import parallel_kernels_may_overlap
-from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.reconstruction.plan import Plan
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.completers.base import (
     Completer,
     Completion,
@@ -20,7 +21,6 @@ from gvtools.completers.base import (
 from gvtools.completers.scale_alignment import ScaleAlignment
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, concatenate
-from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.similarity import align_depth_scale

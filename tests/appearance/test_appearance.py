@@ -11,10 +11,10 @@ from splat_scene import HEIGHT, WALL, WIDTH, K, pose, rough_gaussians
 
 from gvtools.appearance.appearance import Appearance, applied
 from gvtools.appearance.blending import Blend, blended
-from gvtools.appearance.fitted_depth import LEAST_CONFIDENCE, OPAQUE, FittedDepth
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import LOGIT
 from gvtools.cameras import Cameras
+from gvtools.depth.fitted_depth import LEAST_CONFIDENCE, OPAQUE, FittedDepth
 from gvtools.guidance import Guidance
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.scenes.scene import Frame

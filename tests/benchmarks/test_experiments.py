@@ -124,6 +124,7 @@ def experiment(name: str, weights: Path, tmp_path: Path, *more: str) -> dict:
     return json.loads(out.read_text())
 
 
+@pytest.mark.slow
 def test_completion_compares_fillers_student_and_teacher(weights, tmp_path):
     teacher = str(weights / "denoiser" / "weights")
     tables = tmp_path / "tables.md"

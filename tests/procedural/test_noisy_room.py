@@ -182,6 +182,7 @@ def test_same_seed_same_bytes_and_another_is_refused(sample: RoomSample, tmp_pat
         write_noisy_room(tmp_path / "bad", seed=-1)
 
 
+@pytest.mark.slow
 def test_demo_takes_the_sample_by_name(tmp_path: Path) -> None:
     out = tmp_path / "run"
     assert main(["demo", "--sample", "noisy-room", "--out", str(out), "--dry-run", "--quiet"]) == 0

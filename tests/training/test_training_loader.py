@@ -24,6 +24,7 @@ def _equal(a: TrainingBatch, b: TrainingBatch) -> bool:
     return all(same) and torch.equal(a.images, b.images) and torch.equal(a.depth, b.depth)
 
 
+@pytest.mark.slow
 def test_workers_make_the_same_batches() -> None:
     """Two workers, one that begins later, and none: the same bytes."""
     parts = [range(4 * i, 4 * i + 4) for i in range(3)]

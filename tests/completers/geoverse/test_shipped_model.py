@@ -44,6 +44,7 @@ def test_its_rays_give_back_the_cameras_that_it_was_told():
     assert figures["gain_over_first_view"] > 2
 
 
+@pytest.mark.slow
 def test_it_completes_held_out_rooms_better_than_the_usual_fillers():
     found, _ = completion.run(ExperimentOptions(scenes=3))
     rows = {row["method"]: row for row in found["against_best_other_filler"]}

@@ -24,6 +24,7 @@ def run(*words: object) -> None:
     bench.run(parser.parse_args([str(word) for word in words]), Console())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("what", "rows"), [("fuse", 2), ("splat", 5)])
 def test_json_has_both_times_and_their_ratio(tmp_path, what, rows):
     file = tmp_path / "bench.json"

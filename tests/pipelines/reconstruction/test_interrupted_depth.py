@@ -129,6 +129,7 @@ def test_an_interrupt_keeps_what_is_whole_and_nothing_else(scan, whole, tmp_path
     assert results(out) == results(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", [("--set", "stereo.window=5"), ("--seed", "3")])
 def test_another_run_computes_its_own(scan, tmp_path, monkeypatch, asked, other):
     out = tmp_path / "run"

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from memory_scenes import camera, random_memory
 
+from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.cameras import concatenate
 from gvtools.kernels import parallel_kernels_may_overlap
-from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.reconstruction.plan import Plan
 from pipelines.reconstruction.round_targets import RoundTargets

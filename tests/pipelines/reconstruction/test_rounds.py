@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.cameras import Cameras
 from gvtools.completers.base import (
     Completer,
@@ -13,7 +14,6 @@ from gvtools.completers.base import (
 from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, concatenate
-from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.reconstruction.rounds import Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from gvtools import kernels as compiled
+from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.projection import _Projection
-from gvtools.memory.projection_cache import CachedProjection
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.cpu import CpuSplatter
