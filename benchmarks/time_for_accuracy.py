@@ -114,8 +114,9 @@ def _run(case: Case, project: Path, budget: int, out: Path) -> dict[str, Any]:
     if budget:
         # What the rest of a run takes, about: views with recorded depth have their poses refined.
         views, recorded = len(_selected(project, case.context)), _has_depth(project)
-        rest = 8.0 + 0.8 * views if recorded else 10.0 + 0.33 * views
-        refine = max(budget - rest, 5.0) / 2
+        rest = 8.0 + 0.8 * views if recorded else 10.0 + 0.2 * views
+        # A fit keeps 1.75 cores busy.
+        refine = max(budget - rest, 5.0) / 1.75
     seconds = _seconds([*command, "--refine", f"{refine:g}"])
     figures = json.loads((out / stem / "metrics.json").read_text())
     appearance = out / stem / "round_000" / "appearance.npz"

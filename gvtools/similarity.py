@@ -198,8 +198,8 @@ def _degenerate(count: int, reason: str) -> SimilarityFit:
 def align_poses(poses: Float64, target: Float64) -> Float64:
     """The rigid motion T (4, 4) such that ``poses @ T`` are nearest to other poses.
 
-    Unlike ``fit_similarity`` it looks at rotations, too, so that it is determined for any cameras:
-    its rotation is the mean of what turns each pose into the other, then centres agree on average.
+    Its rotation is the mean of those that turn each pose into the other, then centres agree on
+    average. So it holds for cameras on a line or in one place, where ``fit_similarity`` does not.
 
     Args:
         poses: (V, 4, 4) camera from world.

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gvtools.errors import ShapeError
-from gvtools.similarity import align_depth_scale, fit_similarity
+from gvtools.similarity import align_depth_scale, align_poses, fit_similarity
 
 
 def _points(seed: int, count: int = 12) -> np.ndarray:
@@ -146,3 +146,14 @@ def test_too_little_overlap_and_too_much_spread_are_refused():
     assert fit.status.startswith("unsupported: ") and np.isnan(fit.scale)
     with pytest.raises(ShapeError, match="one shape"):
         align_depth_scale(depth, reference[1:], valid=few)
+
+
+def test_poses_are_aligned_by_the_motion_of_their_world():
+    rng = np.random.default_rng(0)
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, :3] = Rotation.random(6, random_state=0).as_matrix()
+    poses[:, :3, 3] = rng.normal(size=(6, 3))
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec([0.3, -1.1, 0.4]).as_matrix()
+    motion[:3, 3] = [3, -20, 5]
+    np.testing.assert_allclose(align_poses(poses, poses @ motion), motion, atol=1e-12)

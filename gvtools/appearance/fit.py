@@ -37,7 +37,7 @@ DEGREE_EVERY = 0.12
 # below, the second with fewer than ``FEW`` photographs.
 GROWTH_END, FEWEST_BETWEEN, MOST_BETWEEN = 0.55, 25, 100
 GROWTH_SHARE, GROWTH_SHARE_FEW, FEW = 0.13, 0.25, 10
-# There are at most so many Gaussians for each step of the whole fit, and for each photograph: more
+# Gaussians are added up to so many for each step of the whole fit, and for each photograph: more
 # are not fitted in time, or fit what other directions contradict.
 PER_STEP, PER_VIEW = 65, 8000
 # Share of its steps that a timed fit has made early in its time is larger, since pictures are small
@@ -45,8 +45,7 @@ PER_STEP, PER_VIEW = 65, 8000
 EARLY = (0.2, 0.95)
 # Positions move by at most about so many pixels a step, and by this share of it at the end.
 POSITION_RATE, POSITION_END = 0.32, 0.01
-# A fit that goes on with fitted Gaussians begins here: pictures have all of their size, and steps
-# are as short as at the end of the fit before.
+# A fit that goes on with fitted Gaussians begins here: pictures have all of their size.
 CONTINUED = 0.6
 # Step lengths of log scales, quaternions, logits, colours and the other harmonics.
 RATES = (0.02, 0.004, 0.05, 0.01, 5e-4)
@@ -195,6 +194,7 @@ class Fit:
         self._checks = tuple(share for share in POSE_CHECKS if share > begin)
         # Recorded depth tells as much as other directions.
         self._left_out = 0.0 if recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
+        self._fading = len(self.views) < FEW and not recorded
         self._grown = (0, begin)
         self._growth_share = GROWTH_SHARE_FEW if len(self.views) < FEW else GROWTH_SHARE
         self._order: list[int] = []
@@ -266,7 +266,7 @@ class Fit:
             self.population.values, self.population.moments, _rates(share),
             self.population.footprint, self.steps,
         )  # fmt: skip
-        if self._left_out:
+        if self._fading:
             self.population.fade(FADING)
         self._note_pulls(lens, seen, rows)
         since = self.steps - self._grown[0]

@@ -15,6 +15,8 @@ from gvtools.appearance.fit_views import FitView, ReducedView, reduced
 # Photographs are compared at one over this of their size, each with so many neighbours, by one of
 # so many pixels.
 SMALLER, NEIGHBOURS, PIXELS = 2, 2, 4
+# With fewer of these inside, a pair does not count.
+FEWEST = 25
 
 
 def prediction_error(
@@ -36,20 +38,25 @@ def prediction_error(
     at = poses if at is None else at
     small = [_blurred(reduced(view, SMALLER)) for view in views]
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    known = np.concatenate([view.depth[view.depth > 0] for view in small])  # type: ignore[index]
+    typical = float(np.median(known)) if len(known) else 1.0
     errors = []
     for row, view in enumerate(small):
         assert view.depth is not None
         apart = (
-            np.linalg.norm(centers - centers[row], axis=1) + 1 - poses[:, 2, :3] @ poses[row, 2, :3]
+            np.linalg.norm(centers - centers[row], axis=1) / typical
+            + 1
+            - poses[:, 2, :3] @ poses[row, 2, :3]
         )
-        for other in np.argsort(apart, kind="stable")[1 : NEIGHBOURS + 1]:
+        apart[row] = np.inf
+        for other in np.argsort(apart, kind="stable")[: min(NEIGHBOURS, len(views) - 1)]:
             y, x = (each[::PIXELS] for each in np.nonzero((view.depth > 0) & (view.weight > 0.5)))
             rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))]).T @ np.linalg.inv(view.K).T
             points = rays * view.depth[y, x, None]
             motion = poses[other] @ np.linalg.inv(at[row])
             points = points @ motion[:3, :3].T + motion[:3, 3]
             found, inside = _looked_up(small[other].target, points, small[other].K)
-            if inside.sum() > 100:
+            if inside.sum() > FEWEST:
                 errors.append(float(np.median(np.abs(found - view.target[:, y, x])[:, inside])))
     return float(np.mean(errors)) if errors else float("nan")
 

@@ -31,8 +31,9 @@ FARTHEST = 1e3
 OVERLAP, MOST_SHIFT, MOST_TURN = 0.1, 0.12, 0.07
 # Steps of the comparison at half and all of the size.
 ITERATIONS = (10, 5)
-# Relative poses are rounded to so many digits, so that they are the same every time: threads add in
-# any order. Open3D's tensor odometry, twice as fast, differs from time to time in the fifth digit.
+# Relative poses are rounded to so many digits, so that they are, but for a rare case, the same
+# every time: threads add in any order. Open3D's tensor odometry is twice as fast, but differs from
+# time to time in the fifth digit.
 DIGITS = 9
 # Neighbours along the path keep their given relative pose by this share of a pair's weight, so that
 # views that overlap with none stay where they were.
@@ -58,7 +59,7 @@ def pose_graph(views: Iterable[FitView]) -> NDArray[np.float64]:
     """Poses on which neighbouring views agree.
 
     Args:
-        views: all with depth, in the order of recording.
+        views: all with depth, neighbours along the path beside each other.
 
     Returns:
         (V, 4, 4) refined ``cam_from_local``; all are moved together so that they are, on average,
@@ -67,8 +68,11 @@ def pose_graph(views: Iterable[FitView]) -> NDArray[np.float64]:
     views = list(views)
     height, width = views[0].rgb.shape[:2]
     scale = min(1.0, SIDE / max(height, width))
-    K = np.diag([scale, scale, 1]) @ np.median([view.K for view in views], axis=0)
-    camera = _Camera(K, (round(width * scale), round(height * scale)))
+    size = (round(width * scale), round(height * scale))
+    smaller = [np.diag([*(np.array(size) / view.rgb.shape[1::-1]), 1]) for view in views]
+    K = np.median([a @ view.K for a, view in zip(smaller, views, strict=True)], axis=0)
+    K[0, 1] = 0  # Open3D knows no skew; views that have some are warped
+    camera = _Camera(K, size)
     depths = [_depth(view)[::8, ::8] for view in views]
     known = np.concatenate([depth[depth > 0] for depth in depths])
     if not len(known):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gvtools.appearance.appearance import Appearance, Picture, applied
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
@@ -71,3 +74,18 @@ class CachedProjection:
                 self._guidance = applied(self._picture, self._guidance, blend=self.appearance.blend)
             self._at = at
         return self._guidance
+
+    def colored(self, guidance: Guidance, rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A completion's colours (1, H, W, 3), with the Gaussians' where these show a surface.
+
+        Some photograph did see most of it, though not well enough to tell its depth. It remains
+        generated: nothing observed supports it. Its depth remains the completer's.
+
+        Args:
+            guidance: that was completed; the Gaussians' colours come where it is not valid.
+            rgb: of the completion, 0 to 1.
+        """
+        if self._picture is None:
+            return rgb
+        where = ~guidance.valid[0] & self._picture.solid
+        return np.where(where[..., None], self._picture.rgb, rgb[0])[None]

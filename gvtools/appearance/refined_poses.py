@@ -62,7 +62,7 @@ def refined_poses(views: Sequence[FitView]) -> RefinedPoses | None:
     """Poses on which neighbouring views agree; None where the given ones are as good.
 
     Args:
-        views: all with depth, in the order of recording.
+        views: all with depth, neighbours along the path beside each other.
     """
     given = np.stack([view.cam_from_local for view in views])
     if len(views) < 2:
@@ -74,10 +74,11 @@ def refined_poses(views: Sequence[FitView]) -> RefinedPoses | None:
     depth = np.concatenate([view.depth[::8, ::8].ravel() for view in views])  # type: ignore[index]
     typical = float(np.median(depth[depth > 0]))
     found = RefinedPoses(given, poses, typical, spread=False, errors=(before, after))
-    # Each view once as if it were another camera: is it nearer to its neighbours if it moves like
-    # them, or where it was given?
+    # Each view is once treated as another camera: does it look more like its refined neighbours
+    # where it was given, or moved as they were?
+    motions = found.motions
     alike = [
-        moved(pose, mean_near(pose, given, found.motions, depth=typical, but=[row]))
+        moved(pose, mean_near(pose, given, motions, depth=typical, but=[row]))
         for row, pose in enumerate(given)
     ]
     near = prediction_error(views, poses, at=np.stack(alike))

@@ -52,10 +52,9 @@ def write_noisy_room(
     ``NAME.pose.txt`` camera-to-world, ``camera-intrinsics.txt``), depth as seen by the colour
     camera. The pictures are taken from the cameras of ``write_room`` with the same options. Context
     poses in the files are jittered, then moved together to where they agree with the true ones
-    best, as trajectories are aligned before they are measured: what all of them share no method
-    could know. Target poses are the true ones, and targets' pictures and depth maps are exact, so
-    that what a run predicts is measured against the truth. A run that moves the whole room with its
-    context poses pays for it in the targets.
+    best: no method could know an error that all of them share. Target poses are the true ones, and
+    targets' pictures and depth maps are exact, so that what a run predicts is measured against the
+    truth. A run that moves the whole room with its context poses pays for it in the targets.
 
     Args:
         folder: absent, empty, or written by the same call before.

@@ -15,6 +15,7 @@ from gvtools.errors import MemoryFileError, ProjectError
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import round_folder
 from gvtools.runs.memory_file import load_memory
+from gvtools.runs.poses import refined_poses_of, with_poses
 from gvtools.runs.record import read_record, read_reports, resolved_settings
 from gvtools.runs.target_files import TargetFiles, entry_camera, read_target
 
@@ -129,9 +130,15 @@ class Run:
         root = self.project or Path(self.record["project"])
         scene = reduced(open_as(root, self.record["reading"]), max_side)
         other = self.record["targets_project"]
+        truths = scene if self.record["targets_kind"] == "hold-out" else None
         if other is not None:
-            return scene, reduced(open_project(Path(other)), max_side)
-        return scene, scene if self.record["targets_kind"] == "hold-out" else None
+            truths = reduced(open_project(Path(other)), max_side)
+        poses = refined_poses_of(self.path)
+        if poses is None:
+            return scene, truths
+        if truths is not None:
+            truths = with_poses(truths, self.record["targets"], poses.targets)
+        return with_poses(scene, self.context, poses.context), truths
 
     def targets(self) -> Iterator[tuple[RunTarget, TargetFiles, View | None]]:
         """Each completed target, its files, and the view with its true picture, if any.

@@ -28,10 +28,11 @@ from gvtools.depth.fitted_depth import FittedDepth
 from gvtools.depth.source import MixedDepth, RecordedDepth
 from gvtools.errors import GvError, ShapeError
 from gvtools.memory.projection import project
+from gvtools.runs.poses import RunPoses
 from gvtools.scenes.reduced import reduced
 from gvtools.scenes.scene import Frame
 from gvtools.view_selection import evenly_spread
-from pipelines.reconstruction.poses import RunPoses
+from pipelines.reconstruction import poses as run_poses
 from pipelines.reconstruction.prefetch import prefetch
 from pipelines.reconstruction.voxel_edge import grid_frame
 
@@ -87,7 +88,7 @@ class Fitted:
         if self.log_gains is not None:
             arrays["log_gains"] = self.log_gains
         if self.poses is not None:
-            arrays |= {"context_poses": self.poses.context, "target_poses": self.poses.targets}
+            arrays |= self.poses.arrays
         with path.open("wb") as file:
             np.savez(file, **arrays)
 
@@ -100,12 +101,8 @@ class Fitted:
         """
         appearance = Appearance.load(path)
         with np.load(path) as data:
-            known = "context_poses" in data
             return cls(
-                appearance,
-                RunPoses(data["context_poses"], data["target_poses"]) if known else None,
-                data.get("log_gains"),
-                bool(data.get("spread")),
+                appearance, RunPoses.load(path), data.get("log_gains"), bool(data.get("spread"))
             )
 
     def on(self, device: str) -> Fitted:
@@ -115,7 +112,7 @@ class Fitted:
     def applied(self, plan: Plan) -> Plan:
         """The plan with refined poses, and with the fitted depth for views that have no other."""
         if self.poses is not None:
-            plan = self.poses.applied(plan)
+            plan = run_poses.applied(self.poses, plan)
         scene, source = plan.scene, plan.source
         if isinstance(source, RecordedDepth):
             return plan
@@ -134,15 +131,17 @@ class Fitted:
     def with_best_blend(self, plan: Plan, memory: SpatialMemory) -> Fitted:
         """The same with the blend that predicts the left-out photographs best.
 
+        Without recorded depth, the Gaussians' colours stay alone: the memory's depth is theirs, and
+        its detail lowers structural similarity.
+
         Args:
             plan: after ``applied``.
             memory: of the context.
         """
-        if not self.judged:
-            return self
         recorded = all(plan.scene[name].has_depth for name in plan.context)
-        least = WITH_DEPTH if recorded else 0.0
-        blend = best_blend(self._samples(plan, memory), least_tolerance=least)
+        if not (recorded and self.judged):
+            return self
+        blend = best_blend(self._samples(plan, memory), least_tolerance=WITH_DEPTH)
         return replace(self, appearance=replace(self.appearance, blend=blend))
 
     def _samples(
@@ -205,9 +204,16 @@ def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
     return fit
 
 
+def _first_blend(plan: Plan) -> Blend:
+    recorded = all(plan.scene[name].has_depth for name in plan.context)
+    return Blend() if recorded else Blend(share=0.0)
+
+
 def _posed(plan: Plan, earlier: Fitted | None) -> Plan:
     """The plan with the poses of an earlier fit."""
-    return plan if earlier is None or earlier.poses is None else earlier.poses.applied(plan)
+    if earlier is None or earlier.poses is None:
+        return plan
+    return run_poses.applied(earlier.poses, plan)
 
 
 def _run(fit: Fit, console: Console) -> None:
@@ -232,7 +238,7 @@ def _run(fit: Fit, console: Console) -> None:
 def _fitted(fit: Fit, plan: Plan, earlier: Fitted | None) -> Fitted:
     """What a fit that has ended leaves; what it did not change is that of an earlier one."""
     cameras, frame = fit.cameras, fit.frame
-    blend = Blend() if earlier is None else earlier.appearance.blend
+    blend = _first_blend(plan) if earlier is None else earlier.appearance.blend
     judged = {plan.context[number]: picture for number, picture in fit.judged.items()}
     found = Fitted(
         Appearance(fit.gaussians, fit.near, blend, fit.splatter),

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from gvtools.completers.base import Completer
     from gvtools.depth.source import DepthSource
+    from gvtools.runs.poses import RunPoses
     from gvtools.scenes.scene import Scene
-    from pipelines.reconstruction.poses import RunPoses
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.reconstruction.targets import Targets
 
@@ -68,7 +68,9 @@ class Plan:
     @property
     def posed(self) -> Plan:
         """The plan with refined poses."""
-        return self if self.poses is None else self.poses.applied(self)
+        from pipelines.reconstruction.poses import applied
+
+        return self if self.poses is None else applied(self.poses, self)
 
 
 def make_plan(
@@ -85,7 +87,7 @@ def make_plan(
         settings: as the user gave them.
         say: is told what is computed meanwhile.
         round_0: folder of round 0 of the run that is gone on with: its poses are taken. Refining
-            them again would give the same only up to the order in which threads add.
+            them again may differ in the last digits, by the order in which threads add.
 
     Raises:
         GvError: settings that the project cannot serve.
@@ -94,6 +96,7 @@ def make_plan(
     from gvtools.depth.choice import choose_source
     from gvtools.depth.source import RecordedDepth
     from gvtools.errors import ProjectError
+    from gvtools.runs.poses import with_poses
     from gvtools.scenes.reduced import reduced
     from gvtools.scenes.selection import select
     from pipelines.reconstruction import poses
@@ -122,11 +125,13 @@ def make_plan(
     )
     found = None
     if round_0 is not None:
-        found = poses.saved(round_0)
-    elif config.refine.poses and isinstance(chosen.source, RecordedDepth):
+        found = poses.saved(round_0, context, targets.cameras)
+    elif (
+        config.refine.poses and scene.kind != "colmap" and isinstance(chosen.source, RecordedDepth)
+    ):
         found = poses.refined(scene, context, targets.cameras, say=say)
     if config.voxel is None:
-        posed = scene if found is None else found.scene(scene, context)
+        posed = scene if found is None else with_poses(scene, context, found.context)
         config = _with_voxel(config, posed, context, source=chosen.source, say=say)
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = config.replaced(rounds=len(schedule))

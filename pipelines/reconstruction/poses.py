@@ -3,70 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gvtools.appearance.fit_views import FitView
-from gvtools.cameras import Cameras
-from gvtools.errors import MemoryFileError
 from gvtools.runs.layout import POSES
+from gvtools.runs.poses import RunPoses, posed, with_poses
 from pipelines.reconstruction.prefetch import prefetch
+from pipelines.reconstruction.voxel_edge import grid_frame
 
 if TYPE_CHECKING:
+    from gvtools.cameras import Cameras
     from gvtools.scenes.scene import Scene
     from pipelines.reconstruction.plan import Plan
 
 
-@dataclass(frozen=True, eq=False)
-class RunPoses:
-    """Poses of a run other than those of its project.
-
-    Attributes:
-        context: (C, 4, 4) cam_from_world.
-        targets: (V, 4, 4).
-    """
-
-    context: NDArray[np.float64]
-    targets: NDArray[np.float64]
-
-    def applied(self, plan: Plan) -> Plan:
-        """The plan with these poses."""
-        targets = replace(plan.targets, cameras=_posed(plan.targets.cameras, self.targets))
-        return replace(plan, scene=self.scene(plan.scene, plan.context), targets=targets)
-
-    def scene(self, scene: Scene, context: Sequence[str]) -> Scene:
-        """The scene with these poses of the context."""
-        moved = dict(zip(context, self.context, strict=True))
-        views = tuple(
-            replace(view, camera=_posed(view.camera, moved[view.name][None]))
-            if view.name in moved
-            else view
-            for view in scene.views
-        )
-        return replace(scene, views=views)
-
-    def save(self, path: Path) -> None:
-        """Write them into one file."""
-        with path.open("wb") as file:
-            np.savez(file, context=self.context, targets=self.targets)
-
-    @classmethod
-    def load(cls, path: Path) -> RunPoses:
-        """Read what ``save`` wrote.
-
-        Raises:
-            MemoryFileError: damaged.
-        """
-        try:
-            with np.load(path) as data:
-                return cls(data["context"], data["targets"])
-        except (OSError, ValueError, KeyError, BadZipFile) as error:
-            raise MemoryFileError(f"{path}: expected refined poses; found none: {error}") from error
+def applied(poses: RunPoses, plan: Plan) -> Plan:
+    """A plan with other poses of its context and targets."""
+    targets = replace(plan.targets, cameras=posed(plan.targets.cameras, poses.targets))
+    scene = with_poses(plan.scene, plan.context, poses.context)
+    return replace(plan, scene=scene, targets=targets)
 
 
 def refined(
@@ -89,29 +48,37 @@ def refined(
         return None
     from gvtools.appearance.refined_poses import refined_poses
 
+    # Lengths stay small there, also in a world whose origin is far away.
+    frame = grid_frame(scene, context)
+    given = frame.cam_from_local(scene.subset(context).cameras.cam_from_world)
     frames = prefetch(lambda view: view.load(), views)
-    found = refined_poses([
-        FitView(frame.rgb, view.camera.K[0], view.camera.cam_from_world[0], frame.mask, frame.depth)
-        for view, frame in zip(views, frames, strict=True)
+    result = refined_poses([
+        FitView(loaded.rgb, view.camera.K[0], pose, loaded.mask, loaded.depth)
+        for view, pose, loaded in zip(views, given, frames, strict=True)
     ])  # fmt: skip
     if say is not None:
         same = "as given; no others agree better with neighbouring views"
-        say(f"poses: {same if found is None else found}")
-    if found is None:
+        say(f"poses: {same if result is None else result}")
+    if result is None:
         return None
-    moved = [found.corrected(pose) for pose in targets.cam_from_world]
-    return RunPoses(found.poses, np.array(moved).reshape(-1, 4, 4))
+    moved = [result.corrected(pose) for pose in frame.cam_from_local(targets.cam_from_world)]
+    return RunPoses(
+        frame.cam_from_world(result.poses),
+        frame.cam_from_world(np.array(moved).reshape(-1, 4, 4)),
+    )
 
 
-def saved(round_0: Path) -> RunPoses | None:
+def saved(round_0: Path, context: Sequence[str], targets: Cameras) -> RunPoses | None:
     """The refined poses of a run whose round 0 is complete; None where the given ones stayed.
+
+    None, too, where they are of another number of views: the run is another one then, and is
+    refused for that.
 
     Raises:
         MemoryFileError: damaged.
     """
     path = round_0 / POSES
-    return RunPoses.load(path) if path.exists() else None
-
-
-def _posed(cameras: Cameras, cam_from_world: NDArray[np.float64]) -> Cameras:
-    return Cameras(cameras.K, cam_from_world, cameras.width, cameras.height, cameras.names)
+    poses = RunPoses.load(path) if path.exists() else None
+    if poses is None or (len(poses.context), len(poses.targets)) != (len(context), len(targets)):
+        return None
+    return poses

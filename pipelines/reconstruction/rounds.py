@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -184,8 +184,11 @@ def complete_targets(
     results: list[TargetResult] = []
     total = FuseReport()
 
-    def fuse_and_record(guidance: Guidance, completion: Completion) -> None:
+    def fuse_and_record(
+        target: CachedProjection, guidance: Guidance, completion: Completion
+    ) -> None:
         nonlocal total
+        completion = replace(completion, rgb=target.colored(guidance, completion.rgb))
         result, report = _align_and_fuse(
             guidance, completion, number, memory=memory, config=config, clock=clock
         )
@@ -198,15 +201,16 @@ def complete_targets(
             guidances = [target.guidance() for target in targets]
         with clock.stage("complete"):
             completions = _completed_together(completer, context, guidances, seed=seed)
-        for pair in progress(list(zip(guidances, completions, strict=True)), f"round {number}"):
-            fuse_and_record(*pair)
+        together = list(zip(targets, guidances, completions, strict=True))
+        for target, guidance, completion in progress(together, f"round {number}"):
+            fuse_and_record(target, guidance, completion)
         return results, total
     for target in progress(list(targets), f"round {number}"):
         with clock.stage("project"):
             guidance = target.guidance()
         with clock.stage("complete"):
             completion = run_completer(completer, context, guidance, seed=seed)
-        fuse_and_record(guidance, completion)
+        fuse_and_record(target, guidance, completion)
     return results, total
 
 

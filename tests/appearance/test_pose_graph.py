@@ -70,6 +70,35 @@ def test_relative_poses_come_back_and_the_whole_stays_where_it_was(views, truth)
     np.testing.assert_allclose(align_poses(found, poses_of(some)), np.eye(4), atol=1e-9)
 
 
+def test_views_may_be_of_different_sizes(views, truth):
+    some = off(views)
+    for row in (0, 5):
+        view = some[row]
+        assert view.depth is not None
+        some[row] = replace(
+            view,
+            rgb=view.rgb[::2, ::2],
+            depth=view.depth[::2, ::2],
+            K=np.diag([0.5, 0.5, 1]) @ view.K,
+        )
+    before, after = pose_errors(poses_of(some), truth), pose_errors(pose_graph(some), truth)
+    assert after[0] < 0.6 * before[0]
+
+
+def test_views_without_depth_and_masked_pixels_are_passed_over(views, truth):
+    some = off(views)
+    assert some[2].depth is not None and some[4].depth is not None
+    some[2] = replace(some[2], depth=np.zeros_like(some[2].depth))
+    mask = np.ones(some[4].depth.shape, bool)
+    mask[:, :60] = False
+    wrong = np.where(mask, some[4].depth, np.float32(9))
+    some[4] = replace(some[4], depth=wrong, mask=mask)
+    found = pose_graph(some)
+    rows = [0, 1, 3, 4, 5, 6, 7]
+    before, after = (pose_errors(p[rows], truth[rows]) for p in (poses_of(some), found))
+    assert after[0] < 0.5 * before[0]
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 def test_the_unit_of_length_does_not_matter(views, truth, unit):
     some = off(views)

@@ -9,13 +9,15 @@ import pytest
 from run_files import results
 from tiny_scan import world_from_cam, write_scan
 
-from gvtools.errors import MemoryFileError
+from gvtools.appearance.camera_corrections import moved
+from gvtools.errors import MemoryFileError, ProjectError
 from gvtools.procedural.noisy_room import jittered
+from gvtools.runs.poses import RunPoses
+from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.console import Console
 from pipelines.reconstruction import poses, run_round
-from pipelines.reconstruction.poses import RunPoses
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
@@ -99,3 +101,30 @@ def test_a_resumed_run_takes_the_poses_that_it_began_with(scan, whole, tmp_path,
     (tmp_path / "run" / POSES).write_bytes((whole / POSES).read_bytes()[:-300])
     with pytest.raises(MemoryFileError, match="expected refined poses"):
         run(scan, tmp_path / "run", resume=True)
+
+
+def test_targets_move_with_the_context_and_are_measured_where_they_were_moved_to(tmp_path):
+    """Half of the path errs by one motion, half by the opposite one."""
+    folder = write_scan(tmp_path / "scan", views=16)
+    for i in range(16):
+        sign = 1 if i < 8 else -1
+        motion = sign * np.array([0.02, 0.01, 0, 0, 0.01, 0])
+        pose = np.linalg.inv(moved(np.linalg.inv(world_from_cam(i)), motion))
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
+    out = run(folder, tmp_path / "run", "context=every:2", "targets=every:2+1", "views_per_round=8")
+    kept = RunPoses.load(out / POSES)
+    assert kept is not None
+    loaded = load_run(out)
+    given = open_project(folder).subset(loaded.record["targets"]).cameras.cam_from_world
+    assert np.abs(kept.targets - given).max() > 1e-3
+    for number, (_, files, truth) in enumerate(loaded.targets()):
+        assert truth is not None
+        np.testing.assert_array_equal(truth.camera.cam_from_world[0], kept.targets[number])
+        np.testing.assert_allclose(files.camera.cam_from_world[0], kept.targets[number])
+    context = loaded.scenes[0].subset(loaded.context).cameras.cam_from_world
+    np.testing.assert_array_equal(context, kept.context)
+
+
+def test_another_context_is_refused_as_another_run(scan, whole):
+    with pytest.raises(ProjectError, match="belongs to another run"):
+        run(scan, whole, "context=first:6", resume=True)

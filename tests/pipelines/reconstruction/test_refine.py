@@ -16,6 +16,7 @@ from tiny_scan import write_scan
 from gvtools.appearance import fit
 from gvtools.errors import ProjectError
 from gvtools.files import write_json
+from gvtools.runs.poses import RunPoses
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
@@ -23,7 +24,6 @@ from pipelines.cli import main
 from pipelines.console import Console
 from pipelines.reconstruction import refine as module
 from pipelines.reconstruction.fitting import Fitted
-from pipelines.reconstruction.poses import RunPoses
 from pipelines.reconstruction.refine import refine
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings

@@ -1,0 +1,89 @@
+"""Poses of a run other than those of its project."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.appearance.gaussians import UNREADABLE
+from gvtools.cameras import Cameras
+from gvtools.errors import MemoryFileError
+from gvtools.runs.layout import APPEARANCE, POSES, round_folder
+from gvtools.scenes.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class RunPoses:
+    """Refined poses of a run's context and targets.
+
+    Attributes:
+        context: (C, 4, 4) cam_from_world, in the order of the run's context.
+        targets: (V, 4, 4) of the targets.
+    """
+
+    context: NDArray[np.float64]
+    targets: NDArray[np.float64]
+
+    def save(self, path: Path) -> None:
+        """Write them into one file."""
+        with path.open("wb") as file:
+            np.savez(file, **self.arrays)
+
+    @property
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """As ``load`` finds them in a file, which may hold more."""
+        return {"context_poses": self.context, "target_poses": self.targets}
+
+    @classmethod
+    def load(cls, path: Path) -> RunPoses | None:
+        """Read what ``save`` wrote; None where the file holds no poses.
+
+        Raises:
+            MemoryFileError: damaged.
+        """
+        try:
+            with np.load(path) as data:
+                if "context_poses" not in data:
+                    return None
+                poses = cls(data["context_poses"], data["target_poses"])
+        except UNREADABLE as error:
+            raise MemoryFileError(
+                f"{path}: expected refined poses; found none: {error}; start the run again with "
+                "another --out"
+            ) from error
+        return poses
+
+
+def refined_poses_of(run: Path) -> RunPoses | None:
+    """The poses that a run's memory was built from; None where these are its project's.
+
+    Raises:
+        MemoryFileError: damaged.
+    """
+    folder = round_folder(run, 0)
+    for path in (folder / APPEARANCE, folder / POSES):
+        poses = RunPoses.load(path) if path.exists() else None
+        if poses is not None:
+            return poses
+    return None
+
+
+def with_poses(scene: Scene, names: Sequence[str], poses: NDArray[np.float64]) -> Scene:
+    """A scene with other poses (V, 4, 4) of some views."""
+    moved = dict(zip(names, poses, strict=True))
+    views = tuple(
+        replace(view, camera=posed(view.camera, moved[view.name][None]))
+        if view.name in moved
+        else view
+        for view in scene.views
+    )
+    return replace(scene, views=views)
+
+
+def posed(cameras: Cameras, cam_from_world: NDArray[np.float64]) -> Cameras:
+    """Cameras with other poses (V, 4, 4)."""
+    return Cameras(cameras.K, cam_from_world, cameras.width, cameras.height, cameras.names)
