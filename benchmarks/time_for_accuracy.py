@@ -1,6 +1,6 @@
 """What more time buys: held-out pictures after 15 s to 7 min of fitting, beside plain splatting.
 
-    python benchmarks/time_for_accuracy.py SHARED OUT [--scenes fox,fern] [--no-peer]
+    python benchmarks/time_for_accuracy.py SHARED OUT [--scenes "fox;fern, 3 views"] [--no-peer]
 
 SHARED is the folder of real scenes; its ``tools/peer_gaussians`` is plain 3D Gaussian splatting,
 which is run right after gvtools for the same processor time. Seconds are of the processor, of all
@@ -57,13 +57,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("shared", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--scenes", default=",".join(CASES))
+    parser.add_argument("--scenes", default=";".join(CASES))
     parser.add_argument("--no-peer", action="store_true")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     rows = []
     for name, case in CASES.items():
-        if name not in args.scenes.split(","):
+        if name not in args.scenes.split(";"):
             continue
         project = _project(case, args.shared, args.out)
         for budget in (0, *case.budgets):

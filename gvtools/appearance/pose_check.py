@@ -38,7 +38,8 @@ def prediction_error(
     at = poses if at is None else at
     small = [_blurred(reduced(view, SMALLER)) for view in views]
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
-    known = np.concatenate([view.depth[view.depth > 0] for view in small])  # type: ignore[index]
+    depths = np.concatenate([view.depth.ravel() for view in small if view.depth is not None])
+    known = depths[depths > 0]
     typical = float(np.median(known)) if len(known) else 1.0
     errors = []
     for row, view in enumerate(small):

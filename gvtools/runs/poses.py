@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ class RunPoses:
             np.savez(file, **self.arrays)
 
     @property
-    def arrays(self) -> dict[str, NDArray[np.float64]]:
+    def arrays(self) -> dict[str, Any]:
         """As ``load`` finds them in a file, which may hold more."""
         return {"context_poses": self.context, "target_poses": self.targets}
 

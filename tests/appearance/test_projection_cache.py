@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from gvtools import kernels as compiled
+from gvtools.appearance.appearance import Appearance
+from gvtools.appearance.blending import Blend
+from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.picture import Picture
 from gvtools.appearance.projection_cache import CachedProjection
+from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
 from gvtools.memory.back_projection import back_project
@@ -101,6 +106,25 @@ def test_observed_views_are_splatted_once(memory, monkeypatch):
         assert splatted and (sum(splatted) == 0) == reuse
         memory.forget(round=1)
         splatted.clear()
+
+
+def test_holes_take_the_colours_of_gaussians_that_show_a_surface(memory, monkeypatch):
+    plain = CachedProjection(memory, camera(-1.2, -0.3))
+    known = plain.guidance()
+    completed = np.full(known.rgb.shape, 0.25, np.float32)
+    assert plain.colored(known, completed) is completed
+    valid = known.valid[0]
+    assert valid.any() and not valid.all()
+    alpha = np.zeros(valid.shape, np.float32)
+    alpha[:, ::2] = 1
+    shown = Picture(np.full((*valid.shape, 3), 0.75, np.float32), np.ones_like(alpha), alpha)
+
+    monkeypatch.setattr(Appearance, "picture", lambda self, camera: shown)
+    appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1, Blend(share=0.0))
+    target = CachedProjection(memory, camera(-1.2, -0.3), appearance=appearance)
+    colors = target.colored(target.guidance(), completed)[0]
+    guess = ~valid & (alpha > 0.5)
+    assert (colors[guess] == 0.75).all() and (colors[~guess] == 0.25).all()
 
 
 def test_a_camera_that_sees_nothing_sees_what_comes(memory):

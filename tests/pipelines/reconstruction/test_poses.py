@@ -57,6 +57,7 @@ def relative_errors(context: np.ndarray) -> float:
 
 def test_poses_are_refined_and_kept_beside_round_0(scan, whole):
     kept = RunPoses.load(whole / POSES)
+    assert kept is not None
     scene = open_project(scan)
     given = scene.subset(scene.names[:8]).cameras.cam_from_world
     assert relative_errors(kept.context) < 0.6 * relative_errors(given)
