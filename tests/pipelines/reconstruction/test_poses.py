@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -129,3 +130,15 @@ def test_targets_move_with_the_context_and_are_measured_where_they_were_moved_to
 def test_another_context_is_refused_as_another_run(scan, whole):
     with pytest.raises(ProjectError, match="belongs to another run"):
         run(scan, whole, "context=first:6", resume=True)
+
+
+def test_a_world_whose_origin_is_far_away_is_refined_as_well(scan, whole, tmp_path):
+    far = tmp_path / "far"
+    shutil.copytree(scan, far)
+    for path in far.glob("*.pose.txt"):
+        pose = np.loadtxt(path)
+        pose[:3, 3] += [4e5, -5e6, 100]
+        np.savetxt(path, pose)
+    kept, near = (RunPoses.load(run / POSES) for run in (run(far, tmp_path / "run"), whole))
+    assert kept is not None and near is not None
+    np.testing.assert_allclose(kept.context[:, :3, :3], near.context[:, :3, :3], atol=1e-5)
