@@ -16,7 +16,7 @@ from pydantic import Field
 
 from gvtools.appearance import kernels
 from gvtools.appearance.camera_corrections import LEAST_BETTER, CameraCorrections
-from gvtools.appearance.fit_views import FitView, ReducedView, reduced
+from gvtools.appearance.fit_views import FitView, ReducedView, pixel_width, reduced
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.growth import Population
 from gvtools.appearance.picture import Picture
@@ -106,7 +106,8 @@ class FitOptions(Settings):
     depth: float = Field(0.1, ge=0)
     """Weight of recorded depth in the loss, by relative difference; 0 ignores it."""
     poses: bool = True
-    """Whether the poses of views with recorded depth, which come from a tracker, are refined."""
+    """Whether a tracker's poses, those of views with recorded depth, are refined: before a run,
+    also one that fits nothing, and along with the fit."""
     exposure: bool = True
     """Whether each photograph's red, green and blue may be brighter than the others'."""
 
@@ -396,22 +397,3 @@ def _depth_gradient(image: NDArray[np.float32], view: ReducedView) -> NDArray[np
     d = np.where(known, view.depth, np.float32(1))
     sign = np.sign(image[3] - image[4] * d) * known * view.weight
     return np.stack([sign / d, -sign])
-
-
-def pixel_width(positions: NDArray[np.float32], views: Sequence[FitView]) -> NDArray[np.float32]:
-    """(N,) width of a pixel at each position in the nearest view that sees it, scene units.
-
-    What no view sees gets the median of the others.
-    """
-    width = np.full(len(positions), np.inf)
-    for view in views:
-        points = positions @ view.cam_from_local[:3, :3].T + view.cam_from_local[:3, 3]
-        z, size = points[:, 2], np.array(view.rgb.shape[1::-1])
-        ahead = z > 0
-        focal = np.array([view.K[0, 0], view.K[1, 1]])
-        xy = points[:, :2] / np.where(ahead, z, 1)[:, None] * focal + view.K[:2, 2]
-        inside = ahead & (xy > -0.3 * size).all(axis=1) & (xy < 1.3 * size).all(axis=1)
-        width[inside] = np.minimum(width[inside], z[inside] / focal[0])
-    seen = np.isfinite(width)
-    width[~seen] = np.median(width[seen]) if seen.any() else 1.0
-    return width.astype(np.float32)

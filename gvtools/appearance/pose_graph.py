@@ -55,7 +55,7 @@ class _Camera(NamedTuple):
         )
 
 
-def pose_graph(views: Iterable[FitView]) -> NDArray[np.float64]:
+def agreeing_poses(views: Iterable[FitView]) -> NDArray[np.float64]:
     """Poses on which neighbouring views agree.
 
     Args:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gvtools.appearance.camera_corrections import LEAST_BETTER, mean_near, moved
 from gvtools.appearance.fit_views import FitView
 from gvtools.appearance.pose_check import prediction_error
-from gvtools.appearance.pose_graph import pose_graph
+from gvtools.appearance.pose_graph import agreeing_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ def refined_poses(views: Sequence[FitView]) -> RefinedPoses | None:
     given = np.stack([view.cam_from_local for view in views])
     if len(views) < 2:
         return None
-    poses = pose_graph(views)
+    poses = agreeing_poses(views)
     before, after = prediction_error(views, given), prediction_error(views, poses)
     if not after < before * (1 - LEAST_BETTER):
         return None

@@ -138,8 +138,7 @@ class Fitted:
             plan: after ``applied``.
             memory: of the context.
         """
-        recorded = all(plan.scene[name].has_depth for name in plan.context)
-        if not (recorded and self.judged):
+        if not (_recorded(plan) and self.judged):
             return self
         blend = best_blend(self._samples(plan, memory), least_tolerance=WITH_DEPTH)
         return replace(self, appearance=replace(self.appearance, blend=blend))
@@ -204,9 +203,14 @@ def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
     return fit
 
 
+def _recorded(plan: Plan) -> bool:
+    """Whether all of the context has recorded depth."""
+    return all(plan.scene[name].has_depth for name in plan.context)
+
+
 def _first_blend(plan: Plan) -> Blend:
-    recorded = all(plan.scene[name].has_depth for name in plan.context)
-    return Blend() if recorded else Blend(share=0.0)
+    """Until left-out photographs choose one; without recorded depth they choose none."""
+    return Blend() if _recorded(plan) else Blend(share=0.0)
 
 
 def _posed(plan: Plan, earlier: Fitted | None) -> Plan:

@@ -10,7 +10,7 @@ from splat_scene import photographs, pose_errors, walk
 
 from gvtools.appearance.camera_corrections import moved
 from gvtools.appearance.fit_views import FitView
-from gvtools.appearance.pose_graph import neighbors, pose_graph
+from gvtools.appearance.pose_graph import agreeing_poses, neighbors
 from gvtools.appearance.refined_poses import refined_poses
 from gvtools.similarity import align_poses
 
@@ -63,7 +63,7 @@ def poses_of(views) -> np.ndarray:
 
 def test_relative_poses_come_back_and_the_whole_stays_where_it_was(views, truth):
     some = off(views)
-    found = pose_graph(some)
+    found = agreeing_poses(some)
     before, after = pose_errors(poses_of(some), truth), pose_errors(found, truth)
     assert after[0] < 0.35 * before[0]
     assert after[1] < 0.35 * before[1]
@@ -81,7 +81,7 @@ def test_views_may_be_of_different_sizes(views, truth):
             depth=view.depth[::2, ::2],
             K=np.diag([0.5, 0.5, 1]) @ view.K,
         )
-    before, after = pose_errors(poses_of(some), truth), pose_errors(pose_graph(some), truth)
+    before, after = pose_errors(poses_of(some), truth), pose_errors(agreeing_poses(some), truth)
     assert after[0] < 0.6 * before[0]
 
 
@@ -93,7 +93,7 @@ def test_views_without_depth_and_masked_pixels_are_passed_over(views, truth):
     mask[:, :60] = False
     wrong = np.where(mask, some[4].depth, np.float32(9))
     some[4] = replace(some[4], depth=wrong, mask=mask)
-    found = pose_graph(some)
+    found = agreeing_poses(some)
     rows = [0, 1, 3, 4, 5, 6, 7]
     before, after = (pose_errors(p[rows], truth[rows]) for p in (poses_of(some), found))
     assert after[0] < 0.5 * before[0]
@@ -108,7 +108,7 @@ def test_the_unit_of_length_does_not_matter(views, truth, unit):
         pose[:3, 3] *= unit
         assert view.depth is not None
         other.append(replace(view, cam_from_local=pose, depth=view.depth * np.float32(unit)))
-    expected, found = pose_graph(some), pose_graph(other)
+    expected, found = agreeing_poses(some), agreeing_poses(other)
     found[:, :3, 3] /= unit
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
@@ -122,7 +122,7 @@ def test_views_may_have_intrinsics_of_their_own(views, truth):
     assert wide.depth is not None
     depth = np.pad(wide.depth, ((4, 0), (4, 0)))[:-4, :-4]
     some[3] = replace(wide, K=K, rgb=rgb, depth=depth)
-    before, after = pose_errors(poses_of(some), truth), pose_errors(pose_graph(some), truth)
+    before, after = pose_errors(poses_of(some), truth), pose_errors(agreeing_poses(some), truth)
     assert after[0] < 0.5 * before[0]
 
 
@@ -131,9 +131,9 @@ def test_views_that_see_nothing_in_common_stay_where_they_were(views):
         replace(view, cam_from_local=view.cam_from_local @ _shift(100 * row))
         for row, view in enumerate(views[:3])
     ]
-    np.testing.assert_allclose(pose_graph(apart), poses_of(apart), atol=1e-6)
+    np.testing.assert_allclose(agreeing_poses(apart), poses_of(apart), atol=1e-6)
     empty = [replace(view, depth=np.zeros_like(view.depth)) for view in views[:3]]
-    np.testing.assert_array_equal(pose_graph(empty), poses_of(empty))
+    np.testing.assert_array_equal(agreeing_poses(empty), poses_of(empty))
 
 
 def _shift(x: float) -> np.ndarray:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from run_files import results, untimed
+from run_files import Killed, kill_after_round_0, results, untimed
 from tiny_scan import write_colmap_scan, write_scan
 
 from gvtools.appearance.appearance import Appearance, applied
@@ -25,7 +25,7 @@ from gvtools.runs.poses import RunPoses
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.console import Console
-from pipelines.reconstruction import fitting, run_round
+from pipelines.reconstruction import fitting
 from pipelines.reconstruction.fitting import Fitted, fit_appearance
 from pipelines.reconstruction.plan import Plan, make_plan
 from pipelines.reconstruction.run import _empty_memory, reconstruct
@@ -97,21 +97,10 @@ def test_targets_show_the_gaussians_where_the_memory_observed(whole, scan):
     assert np.abs(guidance.rgb[0] * 255 - guidance_of(whole, 1))[guidance.valid[0]].max() > 1
 
 
-class Killed(BaseException):
-    """Stands for a kill: nothing catches it."""
-
-
 def test_resuming_after_round_0_gives_the_same_bytes_without_a_second_fit(
     whole, scan, tmp_path, monkeypatch
 ):
-    real = run_round.run_round
-
-    def until_round_1(plan, targets, number, **options):
-        if number:
-            raise Killed
-        return real(plan, targets, number, **options)
-
-    monkeypatch.setattr(run_round, "run_round", until_round_1)
+    kill_after_round_0(monkeypatch)
     with pytest.raises(Killed):
         run(scan, tmp_path / "run")
     monkeypatch.undo()

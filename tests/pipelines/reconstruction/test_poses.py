@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_files import results
+from run_files import Killed, kill_after_round_0, results
 from tiny_scan import world_from_cam, write_scan
 
 from gvtools.appearance.camera_corrections import moved
@@ -18,7 +18,7 @@ from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.console import Console
-from pipelines.reconstruction import poses, run_round
+from pipelines.reconstruction import poses
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
@@ -77,19 +77,8 @@ def test_the_same_run_gives_the_same_poses(scan, whole, tmp_path):
     assert (again / "memory.npz").read_bytes() == (whole / "memory.npz").read_bytes()
 
 
-class Killed(BaseException):
-    """Stands for a kill: nothing catches it."""
-
-
 def test_a_resumed_run_takes_the_poses_that_it_began_with(scan, whole, tmp_path, monkeypatch):
-    real = run_round.run_round
-
-    def until_round_1(plan, targets, number, **options):
-        if number:
-            raise Killed
-        return real(plan, targets, number, **options)
-
-    monkeypatch.setattr(run_round, "run_round", until_round_1)
+    kill_after_round_0(monkeypatch)
     with pytest.raises(Killed):
         run(scan, tmp_path / "run")
     monkeypatch.undo()
