@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gvtools.appearance.blending import Blend, blended
 from gvtools.appearance.gaussians import UNREADABLE, Gaussians
-from gvtools.appearance.picture import Picture
+from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError
@@ -22,6 +23,7 @@ class Appearance:
 
     Attributes:
         gaussians: in their frame.
+        others: of further fits to the same photographs, in the same frame; pictures are averaged.
         near: nothing nearer is drawn, scene units.
         blend: how much of the memory's colours is taken.
         splatter: draws the Gaussians.
@@ -31,6 +33,7 @@ class Appearance:
     near: float
     blend: Blend = field(default_factory=Blend)
     splatter: type[Splat] = Splat
+    others: tuple[Gaussians, ...] = ()
 
     @classmethod
     def load(cls, path: Path) -> Appearance:
@@ -39,19 +42,45 @@ class Appearance:
         Raises:
             MemoryFileError: missing or damaged.
         """
-        gaussians = Gaussians.load(path)
+        loaded = Gaussians.load(path)
         try:
             with np.load(path) as data:
-                return cls(gaussians, float(data["near"]), Blend(*data["blend"].tolist()))
+                ends = np.cumsum(data["counts"])[:-1]
+                first, *others = (
+                    Gaussians(values, frame=loaded.frame)
+                    for values in np.split(loaded.values, ends)
+                )
+                blend = Blend(*data["blend"].tolist())
+                return cls(first, float(data["near"]), blend, others=tuple(others))
         except UNREADABLE as error:
             raise MemoryFileError(f"{path}: no readable appearance ({error})") from None
 
+    @property
+    def fits(self) -> tuple[Gaussians, ...]:
+        """The Gaussians of all fits."""
+        return (self.gaussians, *self.others)
+
+    def arrays(self) -> dict[str, Any]:
+        """What ``load`` reads, by name."""
+        return {
+            "values": np.concatenate([fit.values for fit in self.fits]),
+            "counts": [len(fit) for fit in self.fits],
+            "origin": self.gaussians.frame.origin,
+            "axes": self.gaussians.frame.axes,
+            "near": self.near,
+            "blend": [self.blend.share, self.blend.tolerance],
+        }
+
     def picture(self, camera: Cameras) -> Picture:
-        """What a camera sees, a batch of one."""
+        """What a camera sees, a batch of one: the mean of all fits."""
+        return mean_picture(self.pictures(camera))
+
+    def pictures(self, camera: Cameras) -> list[Picture]:
+        """What a camera sees, a batch of one, by each fit."""
         pose = self.gaussians.frame.cam_from_local(camera.cam_from_world)[0]
         size = (int(camera.width[0]), int(camera.height[0]))
         lens = Lens.of(pose, camera.K[0], size=size, near=self.near)
-        return Picture.of(self.splatter(self.gaussians.values, lens))
+        return [Picture.of(self.splatter(fit.values, lens)) for fit in self.fits]
 
 
 def applied(picture: Picture, guidance: Guidance, *, blend: Blend) -> Guidance:

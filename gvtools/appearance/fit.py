@@ -7,8 +7,8 @@ position moves by shares of a pixel where it lies, so no scale of the scene ente
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,9 +40,9 @@ GROWTH_SHARE, GROWTH_SHARE_FEW, FEW = 0.13, 0.25, 10
 # Gaussians are added up to so many for each step of the whole fit, and for each photograph: more
 # are not fitted in time, or fit what other directions contradict.
 PER_STEP, PER_VIEW = 65, 8000
-# Share of its steps that a timed fit has made early in its time is larger, since pictures are small
-# then: whole steps = steps so far / share of time * (first number + second * share of time).
-EARLY = (0.2, 0.95)
+# Steps with small pictures are quick: a fit that has made these shares of its steps is through these
+# shares of its time.
+OF_STEPS, OF_TIME = (0.0, 0.5, 0.86, 1.0), (0.0, 0.2, 0.6, 1.0)
 # Positions move by at most about so many pixels a step, and by this share of it at the end.
 POSITION_RATE, POSITION_END = 0.32, 0.01
 # A fit that goes on with fitted Gaussians begins here: pictures have all of their size.
@@ -54,6 +54,8 @@ RATES = (0.02, 0.004, 0.05, 0.01, 5e-4)
 REST, REST_BEGINS = 0.1, 0.75
 # Steps of a fit whose length is not given: for each photograph, at least and at most.
 STEPS_PER_VIEW, FEWEST_STEPS, MOST_STEPS = 15, 300, 1200
+# So many steps for each photograph, and at least so many, gain what one fit can.
+WHOLE_PER_VIEW, WHOLE_LEAST = 80, 500
 # Of so many photographs one is left out until this part of the fit, as a judge; at most so many.
 JUDGE_OF, JUDGES_JOIN, MOST_JUDGES = 8, 0.75, 5
 # With few photographs, a random share of the Gaussians is left out of each step, growing to this
@@ -123,28 +125,11 @@ class FitOptions(Settings):
         return min(max(STEPS_PER_VIEW * views, FEWEST_STEPS), MOST_STEPS)
 
 
-@dataclass
-class Progress:
-    """How far a fit is.
-
-    Attributes:
-        share: of its time or its steps that is over, 0 to 1.
-        steps: made so far.
-        gaussians: how many there are.
-        psnr: of the last photographs, each before its own step [dB].
-    """
-
-    share: float
-    steps: int
-    gaussians: int
-    psnr: float
-
-
 class Fit:
     """A fit in progress.
 
     Attributes:
-        people: the Gaussians.
+        population: the Gaussians.
         cameras: corrections of poses and exposures.
         steps: made so far.
         judged: pictures of the photographs that were left out, by their numbers, as they were
@@ -172,7 +157,7 @@ class Fit:
                 photographs before; all of them are then fitted from the first step.
             splatter: draws the Gaussians.
         """
-        self.splatter = splatter
+        self.start, self.seed, self.splatter = start, seed, splatter
         self.views, self.options = list(views), options or FitOptions()
         self.frame = start.frame
         self.rng = np.random.default_rng(seed)
@@ -202,43 +187,77 @@ class Fit:
         self._reduced: dict[int, ReducedView] = {}
         self._factor = 0
         self._errors: list[float] = []
+        # PSNR of judges, in turns.
+        self._told: list[float] = []
 
     @property
     def gaussians(self) -> Gaussians:
         """As fitted so far."""
         return Gaussians(self.population.values, frame=self.frame)
 
+    def again(self, number: int, options: FitOptions) -> Fit:
+        """A new fit from the same start at the poses of this one, which has ended.
+
+        Args:
+            number: of the fit; random choices differ with it.
+            options: of the new fit.
+        """
+        poses = self.cameras.poses()
+        views = [replace(v, cam_from_local=p) for v, p in zip(self.views, poses, strict=True)]
+        kept = options.replaced(poses=False)
+        seed = self.seed + number
+        return Fit(self.start, views, options=kept, seed=seed, splatter=self.splatter)
+
     def run(
         self,
         *,
         clock: Callable[[], float] = time.perf_counter,
-        report: Callable[[Progress], object] = lambda progress: None,
+        report: Callable[[float], object] = lambda share: None,
     ) -> None:
-        """Fit for the time or the number of steps that the options give.
+        """Fit for the time or the number of steps that the options give, or until it is whole.
 
         Args:
             clock: tells seconds.
-            report: is called now and then, and at the end.
+            report: is called now and then, and at the end, with the share of it that is over.
         """
         options, began = self.options, clock()
-        steps = options.steps_for(len(self.views))
+        most = np.inf if self.begin else whole_steps(len(self.views))
+        if options.seconds is None:
+            most = min(options.steps_for(len(self.views)), most)
         while True:
-            if options.seconds is None:
-                over = self.steps / max(steps, 1)
-            else:
-                over = (clock() - began) / max(options.seconds, 1e-9)
+            over = self.steps / most if most else 1.0
+            if not self.begin:
+                over = float(np.interp(over, OF_STEPS, OF_TIME))
+            if options.seconds is not None:
+                over = max(over, (clock() - began) / max(options.seconds, 1e-9))
             if over >= 1:
                 break
             self.step(self.begin + (1 - self.begin) * over)
             if self.steps % 50 == 0:
-                report(self.progress(over))
+                report(over)
         self._check_poses()
-        report(self.progress(1.0))
+        report(1.0)
 
-    def progress(self, share: float) -> Progress:
-        """Figures so far."""
-        error = float(np.mean(self._errors[-50:])) if self._errors else 1.0
-        return Progress(share, self.steps, len(self.population), -10 * np.log10(max(error, 1e-10)))
+    @property
+    def psnr(self) -> float:
+        """Of the last photographs, each before its own step [dB]."""
+        return _psnr(float(np.mean(self._errors[-50:])) if self._errors else 1.0)
+
+    def judged_psnr(self) -> float | None:
+        """Mean PSNR of the left-out photographs [dB]; None without any.
+
+        While they are left out, each call predicts one of them anew: all would take too long.
+        """
+        if self._judges:
+            row = self._judges[len(self._told) % len(self._judges)]
+            shown = self._picture(row, self.cameras.given[row])
+            self._told.append(-self._error(row, shown))
+            return float(np.mean(self._told[-len(self._judges) :]))
+        return self.judge(self.judged) if self.judged else None
+
+    def judge(self, pictures: Mapping[int, Picture]) -> float:
+        """Mean PSNR of pictures of photographs, by their numbers [dB]."""
+        return -float(np.mean([self._error(row, shown) for row, shown in pictures.items()]))
 
     def step(self, share: float) -> None:
         """One step, on one photograph; ``share`` of a whole fit is over."""
@@ -285,7 +304,10 @@ class Fit:
         steps: float = self.options.steps_for(len(self.views))
         if self.options.seconds is not None:
             over = (share - self.begin) / (1 - self.begin)
-            steps = self.steps / over * (1.0 if self.begin else EARLY[0] + EARLY[1] * over)
+            made = over if self.begin else float(np.interp(over, OF_TIME, OF_STEPS))
+            steps = self.steps / made
+        if not self.begin:
+            steps = min(steps, whole_steps(len(self.views)))
         most = self._begun_with + min(PER_STEP * int(steps), PER_VIEW * len(self.views))
         return min(most, self.options.most_gaussians)
 
@@ -368,10 +390,19 @@ class Fit:
         people.pulls[seen] += 1
 
 
+def whole_steps(views: int) -> int:
+    """After how many steps a fit of so many photographs has gained what it can."""
+    return max(WHOLE_PER_VIEW * views, WHOLE_LEAST)
+
+
 def judges(views: int) -> tuple[int, ...]:
     """Numbers of the photographs that are left out at first, of so many in all."""
     count = min(views // JUDGE_OF, MOST_JUDGES)
     return tuple((2 * k + 1) * views // (2 * count) for k in range(count))
+
+
+def _psnr(error: float) -> float:
+    return -10 * float(np.log10(max(error, 1e-10)))
 
 
 def _rates(share: float) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,3 +43,33 @@ class Picture:
     def solid(self) -> NDArray[np.bool_]:
         """(H, W) pixels that show a surface."""
         return self.alpha > SOLID
+
+
+def mean_picture(pictures: Sequence[Picture]) -> Picture:
+    """The mean of what several fits show; depth is the median of those that show a surface.
+
+    With an even number it is the nearer of the middle two: their mean may be where neither has one.
+
+    >>> near, far = (
+    ...     Picture(*(np.full((1, 1, *more), value, np.float32) for more, value in parts))
+    ...     for parts in (
+    ...         [([3], 0.2), ([], 2.0), ([], 1.0)],
+    ...         [([3], 0.4), ([], 8.0), ([], 1.0)],
+    ...     )
+    ... )
+    >>> both = mean_picture([near, far])
+    >>> round(float(both.rgb[0, 0, 0]), 2), float(both.depth[0, 0])
+    (0.3, 2.0)
+    """
+    if len(pictures) == 1:
+        return pictures[0]
+    solid = np.array([picture.solid for picture in pictures])
+    depth = np.array([picture.depth for picture in pictures])
+    order = np.sort(np.where(solid, depth, np.float32(np.inf)), axis=0)
+    middle = np.maximum(solid.sum(axis=0) - 1, 0) // 2
+    median = np.take_along_axis(order, middle[None], axis=0)[0]
+    return Picture(
+        np.mean([picture.rgb for picture in pictures], axis=0),
+        np.where(np.isfinite(median), median, depth[0]),
+        np.mean([picture.alpha for picture in pictures], axis=0),
+    )

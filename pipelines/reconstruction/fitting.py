@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend, best_blend
-from gvtools.appearance.fit import CONTINUED, Fit, Progress, judges
+from gvtools.appearance.fit import CONTINUED, Fit, judges, whole_steps
 from gvtools.appearance.fit_views import FitView
+from gvtools.appearance.fits import LEAST_SHARE, run_fits
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.picture import Picture
+from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
 from gvtools.appearance.start import from_depth, from_points
 from gvtools.depth.choice import rough_source
@@ -66,6 +67,7 @@ class Fitted:
         spread: whether the targets share the corrections of the context near them.
         judged: pictures of context views as they were predicted without their photographs; not
             kept in the file.
+        steps: of the first fit, with those of the one that it went on with.
     """
 
     appearance: Appearance
@@ -73,18 +75,11 @@ class Fitted:
     log_gains: NDArray[np.float64] | None = None
     spread: bool = False
     judged: Mapping[str, Picture] = field(default_factory=dict)
+    steps: int = 0
 
     def save(self, path: Path) -> None:
         """Write all of it into one file."""
-        gaussians = self.appearance.gaussians
-        arrays: dict[str, Any] = {
-            "values": gaussians.values,
-            "origin": gaussians.frame.origin,
-            "axes": gaussians.frame.axes,
-            "near": self.appearance.near,
-            "blend": [self.appearance.blend.share, self.appearance.blend.tolerance],
-            "spread": self.spread,
-        }
+        arrays = {**self.appearance.arrays(), "spread": self.spread, "steps": self.steps}
         if self.log_gains is not None:
             arrays["log_gains"] = self.log_gains
         if self.poses is not None:
@@ -102,8 +97,9 @@ class Fitted:
         appearance = Appearance.load(path)
         with np.load(path) as data:
             return cls(
-                appearance, RunPoses.load(path), data.get("log_gains"), bool(data.get("spread"))
-            )
+                appearance, RunPoses.load(path), data.get("log_gains"), bool(data.get("spread")),
+                steps=int(data.get("steps", 0)),
+            )  # fmt: skip
 
     def on(self, device: str) -> Fitted:
         """The same with what draws Gaussians on a device, "cpu" or "cuda"."""
@@ -165,17 +161,22 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         console: where progress goes.
         earlier: a fit of this run to go on with.
     """
-    fit = _new_fit(plan, console) if earlier is None else _continued_fit(plan, earlier)
+    plan = _posed(plan, earlier)
+    fit = _new_fit(plan, console, earlier) if _whole(plan, earlier) else _continued_fit(plan, earlier)
     if fit is None:
         return None
     if fit.splatter is GsplatSplat:
         console.line("fitting: on the CUDA device, by gsplat")
-    _run(fit, console)
-    return _fitted(fit, _posed(plan, earlier), earlier)
+    return _fitted(_run(fit, console), plan, earlier)
 
 
-def _new_fit(plan: Plan, console: Console) -> Fit | None:
+def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None:
+    """A fit from the start; with an earlier one, at its poses and with other random choices."""
     frame = grid_frame(plan.scene, plan.context)
+    options, seed = plan.config.refine, plan.config.seed
+    if earlier is not None:
+        frame = earlier.appearance.gaussians.frame
+        options, seed = options.replaced(poses=False), seed + len(earlier.appearance.fits)
     views = _views(plan, frame)
     if all(view.depth is not None for view in views) and not judges(len(views)):
         # Recorded depth shows a few views as well, and no photograph can be left out to tell.
@@ -186,16 +187,19 @@ def _new_fit(plan: Plan, console: Console) -> Fit | None:
     except GvError as error:
         console.warn(f"no Gaussians are fitted: {error}")
         return None
-    options, splatter = plan.config.refine, splatter_on(plan.config.device)
-    return Fit(start, views, options=options, seed=plan.config.seed, splatter=splatter)
+    return Fit(start, views, options=options, seed=seed, splatter=splatter_on(plan.config.device))
+
+
+def _whole(plan: Plan, earlier: Fitted | None) -> bool:
+    """Whether more steps gain less than another fit, or there is no fit yet."""
+    return earlier is None or earlier.steps >= LEAST_SHARE * whole_steps(len(plan.context))
 
 
 def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
     start = earlier.appearance.gaussians
-    views = _views(_posed(plan, earlier), start.frame)
     fit = Fit(
-        start, views, options=plan.config.refine, seed=plan.config.seed, begin=CONTINUED,
-        splatter=splatter_on(plan.config.device),
+        start, _views(plan, start.frame), options=plan.config.refine, seed=plan.config.seed,
+        begin=CONTINUED, splatter=splatter_on(plan.config.device),
     )  # fmt: skip
     fit.cameras.spread = earlier.spread
     if earlier.log_gains is not None:
@@ -220,34 +224,49 @@ def _posed(plan: Plan, earlier: Fitted | None) -> Plan:
     return run_poses.applied(earlier.poses, plan)
 
 
-def _run(fit: Fit, console: Console) -> None:
-    """Run a fit and say now and then how far it is."""
+def _run(first: Fit, console: Console) -> list[Fit]:
+    """Run a fit and further ones; say now and then how far they are."""
     began, told = time.perf_counter(), 0.0
 
-    def say(progress: Progress) -> None:
+    def say(fit: Fit, share: float) -> None:
         nonlocal told
         now = time.perf_counter() - began
-        if now - told >= SAY_EVERY or progress.share >= 1:
+        if now - told >= SAY_EVERY or share >= 1:
             told = now
+            judged = fit.judged_psnr()
+            left_out = "" if judged is None else f", left-out photographs {judged:.2f} dB"
             console.line(
-                f"fitting: {progress.share:.0%}, {now:.0f} s, step {progress.steps}, "
-                f"{progress.gaussians:,} Gaussians, {progress.psnr:.2f} dB"
+                f"fitting: {share:.0%}, {now:.0f} s, step {fit.steps}, "
+                f"{len(fit.population):,} Gaussians, {fit.psnr:.2f} dB{left_out}"
             )
 
-    fit.run(report=say)
-    if fit.cameras.with_poses:
-        console.line(f"fitting: {fit.cameras.summary()}")
+    fits = run_fits(first, report=say)
+    if first.cameras.with_poses:
+        console.line(f"fitting: {first.cameras.summary()}")
+    if len(fits) > 1:
+        console.line(f"fitting: the mean of {len(fits)} fits")
+    return fits
 
 
-def _fitted(fit: Fit, plan: Plan, earlier: Fitted | None) -> Fitted:
-    """What a fit that has ended leaves; what it did not change is that of an earlier one."""
-    cameras, frame = fit.cameras, fit.frame
+def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
+    """What fits that have ended leave; what they did not change is that of an earlier one."""
+    first = fits[0]
+    cameras, frame = first.cameras, first.frame
+    sets, steps = [fit.gaussians for fit in fits], first.steps
+    if earlier is not None:
+        if first.begin:
+            sets, steps = [*sets, *earlier.appearance.others], steps + earlier.steps
+        else:
+            sets, steps = [*earlier.appearance.fits, *sets], earlier.steps
     blend = _first_blend(plan) if earlier is None else earlier.appearance.blend
-    judged = {plan.context[number]: picture for number, picture in fit.judged.items()}
     found = Fitted(
-        Appearance(fit.gaussians, fit.near, blend, fit.splatter),
+        Appearance(sets[0], first.near, blend, first.splatter, tuple(sets[1:])),
         log_gains=cameras.log_gains,
-        judged=judged,
+        judged={
+            plan.context[row]: mean_picture([fit.judged[row] for fit in fits])
+            for row in first.judged
+        },
+        steps=steps,
     )
     if not cameras.with_poses:
         return (

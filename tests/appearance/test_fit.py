@@ -22,12 +22,14 @@ from splat_scene import (
 from gvtools.appearance import fit as fit_module
 from gvtools.appearance.fit import (
     JUDGES_JOIN,
+    OF_STEPS,
+    OF_TIME,
     PER_STEP,
     PER_VIEW,
     Fit,
     FitOptions,
-    Progress,
     judges,
+    whole_steps,
 )
 from gvtools.appearance.fit_views import FitView, reduced
 from gvtools.appearance.splat.project_kernels import SH
@@ -80,22 +82,46 @@ def test_the_same_number_of_steps_gives_the_same_bytes(fitted, views):
 @pytest.mark.parametrize(("seconds", "steps"), [(5.0, 4), (0.5, 0), (0.0, 0)])
 def test_a_fit_for_a_time_ends_in_time(views, seconds, steps):
     now = iter(range(1000))
-    told: list[Progress] = []
+    told: list[float] = []
     fit = Fit(rough_gaussians(), views, options=FitOptions(seconds=seconds, steps=9))
     fit.run(clock=lambda: float(next(now)), report=told.append)
     # The clock is a second further at each look: once at the beginning, and before each step.
     assert fit.steps == steps
     assert next(now) == steps + 2
-    assert [(progress.share, progress.steps) for progress in told] == [(1.0, steps)]
+    assert told == [1.0]
 
 
-def test_progress_tells_what_the_fit_has_reached(views):
-    told: list[Progress] = []
-    fit = Fit(rough_gaussians(), views, options=FitOptions(steps=100))
-    fit.run(report=told.append)
-    assert [progress.steps for progress in told] == [50, 100, 100]
-    assert told[0].psnr < told[1].psnr < 40
-    assert told[-1].gaussians == len(fit.gaussians)
+def test_a_fit_tells_now_and_then_what_it_has_reached():
+    told: list[tuple[float, int, float, float | None]] = []
+    fit = Fit(rough_gaussians(), photographs(walk(8)), options=FitOptions(steps=100))
+    fit.run(report=lambda share: told.append((share, fit.steps, fit.psnr, fit.judged_psnr())))
+    assert [(share, steps) for share, steps, *_ in told] == [
+        (pytest.approx(np.interp(0.49, OF_STEPS, OF_TIME)), 50),
+        (pytest.approx(np.interp(0.99, OF_STEPS, OF_TIME)), 100),
+        (1.0, 100),
+    ]
+    assert told[0][2] < told[1][2] < 40
+    # One photograph is left out until three quarters of the fit are over.
+    assert told[0][3] is not None and told[1][3] is not None
+    assert told[0][3] < told[1][3] == told[2][3]
+    assert fit.judged_psnr() == fit.judge(fit.judged)
+
+
+def test_without_judges_nothing_is_told_of_them(fitted):
+    assert fitted.judged_psnr() is None
+
+
+@pytest.mark.parametrize("options", [{"steps": 40}, {"seconds": 40.0}])
+def test_a_fit_ends_when_it_is_whole(views, monkeypatch, options):
+    monkeypatch.setattr(fit_module, "WHOLE_PER_VIEW", 2)
+    monkeypatch.setattr(fit_module, "WHOLE_LEAST", 5)
+    now = iter(range(1000))
+    fit = Fit(rough_gaussians(), views, options=FitOptions(**options))
+    fit.run(clock=lambda: float(next(now)))
+    assert fit.steps == 10
+    further = Fit(rough_gaussians(), views, options=FitOptions(**options), begin=0.6)
+    further.run(clock=lambda: float(next(now)))
+    assert further.steps > 30
 
 
 @pytest.mark.parametrize(
@@ -169,7 +195,7 @@ def test_photographs_of_different_brightness_are_explained_by_gains(views):
     assert np.abs(found.mean(axis=0)).max() < 1e-6
     assert np.abs(found - logs).mean() < 0.4 * np.abs(logs).mean()
     assert all((fits[False].cameras.gain(number) == 1).all() for number in range(5))
-    assert fits[True].progress(1).psnr > fits[False].progress(1).psnr + 0.3
+    assert fits[True].psnr > fits[False].psnr + 0.3
 
 
 def test_recorded_depth_pulls_gaussians_to_where_it_is():
@@ -245,10 +271,11 @@ def test_there_are_never_more_gaussians_than_allowed(views):
     ("options", "begin", "made", "share", "most"),
     [
         ({"steps": 100}, 0.0, 3, 0.4, 100 * PER_STEP),
-        ({"steps": 10**6}, 0.0, 3, 0.4, 8 * PER_VIEW),
+        ({"steps": 10**6}, 0.0, 3, 0.4, whole_steps(8) * PER_STEP),
+        ({"steps": 10**6}, 0.6, 3, 0.7, 300 + 8 * PER_VIEW),
         ({"steps": 10**6, "most_gaussians": 999}, 0.0, 3, 0.4, 999),
         # 40 steps in two fifths of the time; later ones take longer.
-        ({"seconds": 9.0}, 0.0, 40, 0.4, 58 * PER_STEP),
+        ({"seconds": 9.0}, 0.0, 34, 0.4, 50 * PER_STEP),
         # A tenth of what is left, and steps that all take the same.
         ({"seconds": 9.0}, 0.6, 5, 0.64, 300 + 50 * PER_STEP),
     ],

@@ -1,0 +1,92 @@
+"""Several fits to the same photographs, whose pictures are averaged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from splat_scene import photographs, rough_gaussians, walk
+
+from gvtools.appearance import fit as fit_module
+from gvtools.appearance import fits as module
+from gvtools.appearance.fit import Fit, FitOptions
+from gvtools.appearance.fits import run_fits
+
+WHOLE = 10
+
+
+@pytest.fixture(autouse=True)
+def short_fits(monkeypatch):
+    monkeypatch.setattr(fit_module, "WHOLE_PER_VIEW", 2)
+    monkeypatch.setattr(fit_module, "WHOLE_LEAST", WHOLE)
+
+
+def fit_of(count: int = 5, **options: float) -> Fit:
+    views = photographs(walk(count))
+    bare = [view.__class__(view.rgb, view.K, view.cam_from_local) for view in views]
+    return Fit(rough_gaussians(), bare, options=FitOptions(**options))
+
+
+@pytest.mark.parametrize(
+    ("steps", "made"),
+    [(9, [9]), (14, [10]), (15, [10, 5]), (22, [10, 10]), (36, [10, 9, 8, 9]), (900, [10] * 6)],
+)
+def test_a_whole_fit_is_followed_by_others(steps, made):
+    assert [fit.steps for fit in run_fits(fit_of(steps=steps))] == made
+
+
+def test_time_is_shared_by_whole_fits():
+    now = iter(range(10_000))
+    # A step takes a second of this clock, and each fit two more.
+    fits = run_fits(fit_of(seconds=40.0), clock=lambda: float(next(now)))
+    assert [fit.steps for fit in fits][:2] == [10, 10]
+    assert len(fits) == 3
+
+
+def test_each_fit_chooses_anew_and_all_can_be_repeated():
+    one, other = (run_fits(fit_of(steps=30)) for _ in range(2))
+    values = [fit.gaussians.values.tobytes() for fit in one]
+    assert len(set(values)) == 3
+    assert values == [fit.gaussians.values.tobytes() for fit in other]
+
+
+def test_progress_grows_to_the_end():
+    told: list[float] = []
+    run_fits(fit_of(steps=30), report=lambda fit, share: told.append(share))
+    assert told == sorted(told)
+    assert told == pytest.approx([1 / 3, 2 / 3, 1.0, 1.0])
+
+
+def test_fits_end_when_left_out_photographs_gain_nothing(monkeypatch):
+    gains = iter([0.5, 0.01, 0.5])
+    monkeypatch.setattr(module, "_gain", lambda fits, fit: next(gains))
+    assert len(run_fits(fit_of(8, steps=160))) == 3
+    gains = iter([0.5, -0.01, 0.5])
+    assert len(run_fits(fit_of(8, steps=160))) == 2
+
+
+def test_the_mean_of_two_fits_predicts_left_out_photographs_better():
+    first, second = fit_of(8, steps=60), fit_of(8, steps=60)
+    second.rng = np.random.default_rng(5)
+    for fit in (first, second):
+        fit.run()
+    gain = module._gain([first], second)
+    assert gain is not None and abs(gain) < 3
+    assert module._gain([first], first) == pytest.approx(0, abs=1e-6)
+    assert module._gain([first], fit_of(steps=1)) is None
+
+
+def test_a_fit_that_goes_on_with_another_stays_the_only_one():
+    first = fit_of(steps=100)
+    further = Fit(first.start, first.views, options=first.options, begin=0.6)
+    assert run_fits(further) == [further]
+    assert further.steps == 100
+
+
+def test_further_fits_are_made_at_the_poses_of_the_first():
+    first = Fit(rough_gaussians(), photographs(walk(5)), options=FitOptions(steps=30))
+    first.run()
+    moved = first.cameras.poses()
+    again = first.again(1, first.options)
+    np.testing.assert_array_equal([view.cam_from_local for view in again.views], moved)
+    assert not again.cameras.with_poses
+    assert again.seed == 1
