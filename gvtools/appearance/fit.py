@@ -40,8 +40,8 @@ GROWTH_SHARE, GROWTH_SHARE_FEW, FEW = 0.13, 0.25, 10
 # Gaussians are added up to so many for each step of the whole fit, and for each photograph: more
 # are not fitted in time, or fit what other directions contradict.
 PER_STEP, PER_VIEW = 65, 8000
-# Steps with small pictures are quick: a fit that has made these shares of its steps is through these
-# shares of its time.
+# Steps with small pictures are quick: a fit that has made these shares of its steps is through
+# these shares of its time.
 OF_STEPS, OF_TIME = (0.0, 0.5, 0.86, 1.0), (0.0, 0.2, 0.6, 1.0)
 # Positions move by at most about so many pixels a step, and by this share of it at the end.
 POSITION_RATE, POSITION_END = 0.32, 0.01

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from gvtools.appearance.appearance import Appearance
-from gvtools.appearance.picture import mean_picture
 from gvtools.depth.source import DepthMap
 from gvtools.scenes.scene import Frame, Scene, View
 

@@ -162,7 +162,10 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         earlier: a fit of this run to go on with.
     """
     plan = _posed(plan, earlier)
-    fit = _new_fit(plan, console, earlier) if _whole(plan, earlier) else _continued_fit(plan, earlier)
+    if earlier is None or _whole(plan, earlier):
+        fit = _new_fit(plan, console, earlier)
+    else:
+        fit = _continued_fit(plan, earlier)
     if fit is None:
         return None
     if fit.splatter is GsplatSplat:
@@ -190,9 +193,9 @@ def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None
     return Fit(start, views, options=options, seed=seed, splatter=splatter_on(plan.config.device))
 
 
-def _whole(plan: Plan, earlier: Fitted | None) -> bool:
-    """Whether more steps gain less than another fit, or there is no fit yet."""
-    return earlier is None or earlier.steps >= LEAST_SHARE * whole_steps(len(plan.context))
+def _whole(plan: Plan, earlier: Fitted) -> bool:
+    """Whether more steps gain less than another fit."""
+    return earlier.steps >= LEAST_SHARE * whole_steps(len(plan.context))
 
 
 def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
