@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gvtools.appearance.blending import Blend, blended
+from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.gaussians import UNREADABLE, Gaussians
 from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.splat import Lens, Splat
@@ -23,6 +24,7 @@ class Appearance:
 
     Attributes:
         gaussians: in their frame.
+        exposures: of the photographs, which tell those of other cameras; None takes all as equal.
         others: of further fits to the same photographs, in the same frame; pictures are averaged.
         near: nothing nearer is drawn, scene units.
         blend: how much of the memory's colours is taken.
@@ -34,6 +36,7 @@ class Appearance:
     blend: Blend = field(default_factory=Blend)
     splatter: type[Splat] = Splat
     others: tuple[Gaussians, ...] = ()
+    exposures: Exposures | None = None
 
     @classmethod
     def load(cls, path: Path) -> Appearance:
@@ -51,7 +54,11 @@ class Appearance:
                     for values in np.split(loaded.values, ends)
                 )
                 blend = Blend(*data["blend"].tolist())
-                return cls(first, float(data["near"]), blend, others=tuple(others))
+                exposures = Exposures(data["poses"], data["log_gains"], float(data["depth"]))
+                return cls(
+                    first, float(data["near"]), blend, others=tuple(others),
+                    exposures=exposures if len(exposures.poses) else None,
+                )  # fmt: skip
         except UNREADABLE as error:
             raise MemoryFileError(f"{path}: no readable appearance ({error})") from None
 
@@ -62,6 +69,7 @@ class Appearance:
 
     def arrays(self) -> dict[str, Any]:
         """What ``load`` reads, by name."""
+        exposures = self.exposures
         return {
             "values": np.concatenate([fit.values for fit in self.fits]),
             "counts": [len(fit) for fit in self.fits],
@@ -69,6 +77,9 @@ class Appearance:
             "axes": self.gaussians.frame.axes,
             "near": self.near,
             "blend": [self.blend.share, self.blend.tolerance],
+            "poses": exposures.poses if exposures else np.zeros((0, 4, 4)),
+            "log_gains": exposures.log_gains if exposures else np.zeros((0, 3)),
+            "depth": exposures.depth if exposures else 0.0,
         }
 
     def picture(self, camera: Cameras) -> Picture:
@@ -80,7 +91,8 @@ class Appearance:
         pose = self.gaussians.frame.cam_from_local(camera.cam_from_world)[0]
         size = (int(camera.width[0]), int(camera.height[0]))
         lens = Lens.of(pose, camera.K[0], size=size, near=self.near)
-        return [Picture.of(self.splatter(fit.values, lens)) for fit in self.fits]
+        gain = self.exposures.at(pose) if self.exposures else None
+        return [Picture.of(self.splatter(fit.values, lens), gain=gain) for fit in self.fits]
 
 
 def applied(picture: Picture, guidance: Guidance, *, blend: Blend) -> Guidance:

@@ -131,28 +131,33 @@ class CameraCorrections:
 def mean_near(
     pose: NDArray[np.float64],
     poses: NDArray[np.float64],
-    motions: NDArray[np.float64],
+    values: NDArray[np.float64],
     *,
     depth: float,
     but: Sequence[int] = (),
+    count: int = NEAR_VIEWS,
+    reach: tuple[float, float] = (NEAR_SHIFT, NEAR_TURN),
 ) -> NDArray[np.float64]:
-    """(6,) mean motion of the cameras that stand and look most like a pose.
+    """(C,) mean of what belongs to the cameras that stand and look most like a pose.
 
     Args:
         pose: (4, 4) camera from world.
         poses: (V, 4, 4) of the cameras.
-        motions: (V, 6) theirs.
+        values: (V, C) theirs.
         depth: typical depth, scene units.
         but: cameras that do not count.
+        count: how many cameras count.
+        reach: distance (in shares of the depth) and angle [rad] at which one counts 37 %.
     """
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     center = -pose[:3, :3].T @ pose[:3, 3]
     angle = np.arccos(np.clip(poses[:, 2, :3] @ pose[2, :3], -1, 1))
-    apart = np.linalg.norm(centers - center, axis=1) / (NEAR_SHIFT * depth) + angle / NEAR_TURN
+    shift, turn = reach
+    apart = np.linalg.norm(centers - center, axis=1) / (shift * depth) + angle / turn
     apart[list(but)] = np.inf
-    near = np.argsort(apart, kind="stable")[:NEAR_VIEWS]
+    near = np.argsort(apart, kind="stable")[:count]
     weight = np.exp(apart[near].min() - apart[near])
-    return np.asarray(weight @ motions[near] / weight.sum())
+    return np.asarray(weight @ values[near] / weight.sum())
 
 
 def moved(pose: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64]:

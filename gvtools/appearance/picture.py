@@ -32,10 +32,16 @@ class Picture:
     alpha: NDArray[np.float32]
 
     @classmethod
-    def of(cls, splat: Splat) -> Picture:
-        """The picture of Gaussians that were splatted."""
+    def of(cls, splat: Splat, *, gain: NDArray[np.float32] | None = None) -> Picture:
+        """The picture of Gaussians that were splatted.
+
+        Args:
+            splat: of one camera.
+            gain: (3,) what its red, green and blue are multiplied by; None leaves them.
+        """
         alpha = splat.image[4]
-        rgb = np.clip(splat.image[:3], 0, 1).transpose(1, 2, 0)
+        rgb = splat.image[:3] if gain is None else splat.image[:3] * gain[:, None, None]
+        rgb = np.clip(rgb, 0, 1).transpose(1, 2, 0)
         depth = splat.image[3] / np.maximum(alpha, np.float32(1e-6))
         return cls(np.ascontiguousarray(rgb), depth, alpha)
 

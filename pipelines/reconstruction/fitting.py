@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend, best_blend
+from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit import CONTINUED, Fit, judges, whole_steps
 from gvtools.appearance.fit_views import FitView
 from gvtools.appearance.fits import LEAST_SHARE, run_fits
@@ -63,7 +64,6 @@ class Fitted:
     Attributes:
         appearance: the fitted Gaussians.
         poses: of context and targets, as they were refined along; None where kept as given.
-        log_gains: (C, 3) logarithms of the context's exposures; None where none was fitted.
         spread: whether the targets share the corrections of the context near them.
         judged: pictures of context views as they were predicted without their photographs; not
             kept in the file.
@@ -72,7 +72,6 @@ class Fitted:
 
     appearance: Appearance
     poses: RunPoses | None = None
-    log_gains: NDArray[np.float64] | None = None
     spread: bool = False
     judged: Mapping[str, Picture] = field(default_factory=dict)
     steps: int = 0
@@ -80,8 +79,6 @@ class Fitted:
     def save(self, path: Path) -> None:
         """Write all of it into one file."""
         arrays = {**self.appearance.arrays(), "spread": self.spread, "steps": self.steps}
-        if self.log_gains is not None:
-            arrays["log_gains"] = self.log_gains
         if self.poses is not None:
             arrays |= self.poses.arrays
         with path.open("wb") as file:
@@ -97,7 +94,7 @@ class Fitted:
         appearance = Appearance.load(path)
         with np.load(path) as data:
             return cls(
-                appearance, RunPoses.load(path), data.get("log_gains"), bool(data.get("spread")),
+                appearance, RunPoses.load(path), bool(data.get("spread")),
                 steps=int(data.get("steps", 0)),
             )  # fmt: skip
 
@@ -205,8 +202,8 @@ def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
         begin=CONTINUED, splatter=splatter_on(plan.config.device),
     )  # fmt: skip
     fit.cameras.spread = earlier.spread
-    if earlier.log_gains is not None:
-        fit.cameras.log_gains[:] = earlier.log_gains
+    if earlier.appearance.exposures is not None:
+        fit.cameras.log_gains[:] = earlier.appearance.exposures.log_gains
     return fit
 
 
@@ -262,9 +259,10 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
         else:
             sets, steps = [*earlier.appearance.fits, *sets], earlier.steps
     blend = _first_blend(plan) if earlier is None else earlier.appearance.blend
+    log_gains = cameras.log_gains - cameras.log_gains.mean(axis=0)
+    exposures = Exposures(cameras.poses(), log_gains, cameras.depth)
     found = Fitted(
-        Appearance(sets[0], first.near, blend, first.splatter, tuple(sets[1:])),
-        log_gains=cameras.log_gains,
+        Appearance(sets[0], first.near, blend, first.splatter, tuple(sets[1:]), exposures),
         judged={
             plan.context[row]: mean_picture([fit.judged[row] for fit in fits])
             for row in first.judged

@@ -62,9 +62,10 @@ def test_the_fit_goes_on_where_it_ended(copy):
     # The step lengths of the last part of a fit: below 0.025 px at 0.02 scene units, then RATES.
     assert change[:, :3].max() < 0.025 * 0.04
     assert change[:, 3:].max() < 0.06
-    assert before.log_gains is not None and after.log_gains is not None
-    assert np.abs(before.log_gains).max() > 0
-    assert np.abs(after.log_gains - before.log_gains).max() < 0.003
+    was, now = (one.appearance.exposures for one in (before, after))
+    assert was is not None and now is not None
+    assert np.abs(was.log_gains).max() > 0
+    assert np.abs(now.log_gains - was.log_gains).max() < 0.003
     assert after.appearance.blend == before.appearance.blend
     assert json.loads((copy / "run.json").read_text())["refined"] == [{"steps": 1}]
 
@@ -75,7 +76,7 @@ def test_refined_poses_go_on_from_the_saved_ones(copy):
     shifted = scene.subset(record["context"]).cameras.cam_from_world.copy()
     shifted[1, :3, 3] += [0.004, 0, 0]
     target = scene.subset(record["targets"]).cameras.cam_from_world
-    Fitted(saved.appearance, RunPoses(shifted, target), saved.log_gains).save(copy / APPEARANCE)
+    Fitted(saved.appearance, RunPoses(shifted, target)).save(copy / APPEARANCE)
     refine(copy, steps=2, console=QUIET)
     after = Fitted.load(copy / APPEARANCE)
     # Two steps neither find the way back nor predict neighbours better: the saved ones are kept.
@@ -90,7 +91,7 @@ def test_poses_that_predict_neighbours_better_are_kept(copy, monkeypatch):
     given = scene.subset(record["context"]).cameras.cam_from_world
     target = scene.subset(record["targets"]).cameras.cam_from_world
     poses = RunPoses(given, target)
-    Fitted(saved.appearance, poses, saved.log_gains, spread=True).save(copy / APPEARANCE)
+    Fitted(saved.appearance, poses, spread=True).save(copy / APPEARANCE)
     errors = iter([1.0, 0.5])
     monkeypatch.setattr(fit, "prediction_error", lambda views, poses: next(errors))
     refine(copy, steps=4, console=QUIET)

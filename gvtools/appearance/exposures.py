@@ -1,0 +1,63 @@
+"""Exposures of cameras from those of the photographs near them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.appearance.camera_corrections import mean_near
+
+# Photographs that tell a camera's exposure, and the distance (in shares of the depth) and angle
+# [rad] at which one counts 37 %.
+COUNT, SHIFT, TURN = 4, 0.2, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures:
+    """How bright photographs are, and therefore a camera that stands among them.
+
+    Phones expose for what they see, so photographs near each other are alike. How much of that
+    holds in a scene, the photographs tell themselves: each is predicted from the others.
+
+    Attributes:
+        poses: (V, 4, 4) camera from local.
+        log_gains: (V, 3) logarithms of the brightness of red, green and blue, with mean zero.
+        depth: typical depth, scene units.
+
+    >>> poses = np.tile(np.eye(4), (9, 1, 1))
+    >>> poses[:, 0, 3] = places = np.linspace(0, 1, 9)
+    >>> rising = Exposures(poses, np.outer(places - 0.5, [0.2, 0.2, 0.2]), depth=1.0)
+    >>> dark, bright = rising.at(poses[0]), rising.at(poses[8])
+    >>> bool(dark[0] < 1 < bright[0])
+    True
+    """
+
+    poses: NDArray[np.float64]
+    log_gains: NDArray[np.float64]
+    depth: float
+
+    @cached_property
+    def share(self) -> float:
+        """By what the photographs near one are multiplied to predict it best, 0 to 1."""
+        if len(self.poses) < 2:
+            return 0.0
+        near = np.array([self._near(pose, but=row) for row, pose in enumerate(self.poses)])
+        squares = float(np.square(near).sum())
+        if not squares > 0:
+            return 0.0
+        return float(np.clip((near * self.log_gains).sum() / squares, 0, 1))
+
+    def at(self, pose: NDArray[np.float64]) -> NDArray[np.float32]:
+        """(3,) what red, green and blue are multiplied by in a camera at a pose (4, 4)."""
+        if self.share == 0:
+            return np.ones(3, np.float32)
+        return np.exp(self.share * self._near(pose)).astype(np.float32)
+
+    def _near(self, pose: NDArray[np.float64], *, but: int | None = None) -> NDArray[np.float64]:
+        return mean_near(
+            pose, self.poses, self.log_gains, depth=self.depth,
+            but=() if but is None else (but,), count=COUNT, reach=(SHIFT, TURN),
+        )  # fmt: skip
