@@ -55,7 +55,7 @@ def reconstruct(
         targets: which cameras to complete, such as ``"every:2+1"`` or ``"orbit:24"``; None takes
             twelve between the context views.
         completer: by registered name; None takes ``inpaint``.
-        profile: fast, balanced or accurate.
+        profile: fast, balanced, accurate or finest.
         settings: any setting by its dotted name, such as ``{"voxel": 0.01, "rounds": 2}``.
         resume: continue after the last whole round.
         quiet: False prints progress and figures.

@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from gvtools.appearance import kernels
 from gvtools.appearance.camera_corrections import LEAST_BETTER, CameraCorrections
+from gvtools.appearance.fit_options import FitOptions, most_gaussians, whole_steps
 from gvtools.appearance.fit_views import FitView, ReducedView, pixel_width, reduced
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.growth import Population
@@ -26,7 +26,6 @@ from gvtools.appearance.smooth_depth import add_bending
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH, VALUES
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.kernels import in_threads
-from gvtools.settings import Settings
 
 # Share of the fit from which pictures are taken at a quarter, half and all of their size.
 SIZES = ((0.0, 4), (0.2, 2), (0.6, 1))
@@ -37,9 +36,6 @@ DEGREE_EVERY = 0.12
 # below, the second with fewer than ``FEW`` photographs.
 GROWTH_END, FEWEST_BETWEEN, MOST_BETWEEN = 0.55, 25, 100
 GROWTH_SHARE, GROWTH_SHARE_FEW, FEW = 0.13, 0.25, 10
-# Gaussians are added up to so many for each step of the whole fit, and for each photograph: more
-# are not fitted in time, or fit what other directions contradict.
-PER_STEP, PER_VIEW = 65, 8000
 # Steps with small pictures are quick: a fit that has made these shares of its steps is through
 # these shares of its time.
 OF_STEPS, OF_TIME = (0.0, 0.5, 0.86, 1.0), (0.0, 0.2, 0.6, 1.0)
@@ -52,10 +48,6 @@ RATES = (0.02, 0.004, 0.05, 0.01, 5e-4)
 # Steps of all but positions shrink to this share of theirs, beginning after so much of the fit:
 # else each photograph undoes a part of what the others said.
 REST, REST_BEGINS = 0.1, 0.75
-# Steps of a fit whose length is not given: for each photograph, at least and at most.
-STEPS_PER_VIEW, FEWEST_STEPS, MOST_STEPS = 15, 300, 1200
-# So many steps for each photograph, and at least so many, gain what one fit can.
-WHOLE_PER_VIEW, WHOLE_LEAST = 80, 500
 # Of so many photographs one is left out until this part of the fit, as a judge; at most so many.
 JUDGE_OF, JUDGES_JOIN, MOST_JUDGES = 8, 0.75, 5
 # With few photographs, a random share of the Gaussians is left out of each step, growing to this
@@ -81,56 +73,14 @@ POSE_CHECKS = (0.3, 0.6)
 WIDE = 2.0
 
 
-class FitOptions(Settings):
-    """How Gaussians are fitted to photographs.
-
-    >>> FitOptions().steps_for(40), FitOptions(steps=100).steps_for(40)
-    (600, 100)
-    >>> FitOptions(seconds=0.0).wanted
-    False
-    """
-
-    section = "refine"
-
-    seconds: float | None = Field(None, ge=0)
-    """How long they are fitted; none counts steps instead, which gives the same result every time;
-    0 leaves the memory's own colours. [s]"""
-    steps: int | None = Field(None, ge=0)
-    """How many steps, where no time is given; none makes as many as take about as long as the rest
-    of a run, by the number of photographs; 0 leaves the memory's own colours."""
-    most_gaussians: int = Field(200_000, ge=1)
-    """How many there may be."""
-    growth: float = Field(2e-4, gt=0)
-    """Gaussians are added where pictures pull at those that are there more than this; less gives
-    more of them."""
-    ssim: float = Field(0.2, ge=0, le=1)
-    """Share of structural similarity in the loss; the rest is absolute difference."""
-    depth: float = Field(0.1, ge=0)
-    """Weight of recorded depth in the loss, by relative difference; 0 ignores it."""
-    poses: bool = True
-    """Whether a tracker's poses, those of views with recorded depth, are refined: before a run,
-    also one that fits nothing, and along with the fit."""
-    exposure: bool = True
-    """Whether each photograph's red, green and blue may be brighter than the others'."""
-
-    @property
-    def wanted(self) -> bool:
-        """Whether there is time or a step for it."""
-        return self.seconds != 0 if self.seconds is not None else self.steps != 0
-
-    def steps_for(self, views: int) -> int:
-        """How many steps a fit of so many photographs makes, where no time is given."""
-        if self.steps is not None:
-            return self.steps
-        return min(max(STEPS_PER_VIEW * views, FEWEST_STEPS), MOST_STEPS)
-
-
 class Fit:
     """A fit in progress.
 
     Attributes:
         population: the Gaussians.
         cameras: corrections of poses and exposures.
+        recorded: whether all photographs have recorded depth.
+        whole: after how many steps the fit has gained what it can.
         steps: made so far.
         judged: pictures of the photographs that were left out, by their numbers, as they were
             predicted before these joined the fit.
@@ -163,11 +113,12 @@ class Fit:
         self.rng = np.random.default_rng(seed)
         width = pixel_width(start.values[:, :LOG_SCALE], self.views)
         self.population = Population(start.values.copy(), width)
-        recorded = all(view.depth is not None for view in self.views)
+        self.recorded = all(view.depth is not None for view in self.views)
+        self.whole = whole_steps(len(self.views), recorded=self.recorded)
         self.cameras = CameraCorrections(
             np.array([view.cam_from_local for view in self.views]),
             depth=float(np.median(width)) * float(np.median([v.K[0, 0] for v in self.views])),
-            with_poses=self.options.poses and recorded,
+            with_poses=self.options.poses and self.recorded,
             exposure=self.options.exposure,
         )
         self.near = 0.02 * self.cameras.depth
@@ -179,8 +130,8 @@ class Fit:
         self._judges = () if begin else judges(len(self.views))
         self._checks = tuple(share for share in POSE_CHECKS if share > begin)
         # Recorded depth tells as much as other directions.
-        self._left_out = 0.0 if recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
-        self._fading = len(self.views) < FEW and not recorded
+        self._left_out = 0.0 if self.recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
+        self._fading = len(self.views) < FEW and not self.recorded
         self._grown = (0, begin)
         self._growth_share = GROWTH_SHARE_FEW if len(self.views) < FEW else GROWTH_SHARE
         self._order: list[int] = []
@@ -221,7 +172,7 @@ class Fit:
             report: is called now and then, and at the end, with the share of it that is over.
         """
         options, began = self.options, clock()
-        most = np.inf if self.begin else whole_steps(len(self.views))
+        most = np.inf if self.begin else self.whole
         if options.seconds is None:
             most = min(options.steps_for(len(self.views)), most)
         while True:
@@ -307,9 +258,9 @@ class Fit:
             made = over if self.begin else float(np.interp(over, OF_TIME, OF_STEPS))
             steps = self.steps / made
         if not self.begin:
-            steps = min(steps, whole_steps(len(self.views)))
-        most = self._begun_with + min(PER_STEP * int(steps), PER_VIEW * len(self.views))
-        return min(most, self.options.most_gaussians)
+            steps = min(steps, self.whole)
+        most = most_gaussians(int(steps), len(self.views), recorded=self.recorded)
+        return min(self._begun_with + most, self.options.most_gaussians)
 
     def _check_poses(self) -> None:
         """Give poses back as they were unless they predict neighbouring photographs better now."""
@@ -388,11 +339,6 @@ class Fit:
         pull = np.hypot(rows[:, VALUES] * lens.width, rows[:, VALUES + 1] * lens.height)
         people.pull[seen] += pull * (0.5 / (lens.width * lens.height))
         people.pulls[seen] += 1
-
-
-def whole_steps(views: int) -> int:
-    """After how many steps a fit of so many photographs has gained what it can."""
-    return max(WHOLE_PER_VIEW * views, WHOLE_LEAST)
 
 
 def judges(views: int) -> tuple[int, ...]:

@@ -111,7 +111,7 @@ def _chosen(
     if choice == "plane-sweep":
         return ChosenSource(_stereo(scene, views, stereo), "asked for")
     if recorded == len(views):
-        return ChosenSource(RecordedDepth(), "every context view has recorded depth")
+        return ChosenSource(RecordedDepth(views), "every context view has recorded depth")
     if recorded and len(views) < 2 and foundation.weights is None:
         return ChosenSource(RecordedDepth(), "a single view leaves nothing to compute from")
     if foundation.weights is not None:
@@ -125,7 +125,7 @@ def _chosen(
     if not recorded:
         return ChosenSource(source, f"no context view has recorded depth; {how}")
     return ChosenSource(
-        MixedDepth(RecordedDepth(), source),
+        MixedDepth(RecordedDepth(views), source),
         f"{recorded} of {len(views)} views have recorded depth; the others {how}",
     )
 
@@ -139,7 +139,7 @@ def _asked_recorded(
     what = "stereo maps" if choice == "colmap" else "it"
     if recorded:
         reason = f"asked for; {recorded} of {len(views)} views have {what}"
-        return ChosenSource(RecordedDepth(), reason)
+        return ChosenSource(RecordedDepth(views), reason)
     if choice == "colmap" and has_patch_match():
         return ChosenSource(ColmapPatchMatch(scene, views), "asked for; computed now with CUDA")
     advice = "add depth maps, or use auto"

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.cameras import Cameras
+from gvtools.depth.contradicted import contradicted
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Frame, Scene, View
+from gvtools.view_selection import nearest_views
+
+# Nearest views that are asked whether they look through a view's depth.
+WITNESSES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,11 +29,13 @@ class DepthMap:
         depth: (H, W) float32 z-depth, scene units, 0 = none.
         confidence: (H, W) float32 in (0, 1].
         source: name of the source.
+        contradicted: pixels whose depth was dropped because other views look through it.
     """
 
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
     source: str
+    contradicted: int = 0
 
 
 class DepthSource(Protocol):
@@ -55,16 +65,23 @@ class RecordedDepth:
 
     The error of triangulated depth, by structured light or by stereo, grows with its square; the
     confidence falls likewise beyond the scene's near range (the view's 10th percentile).
+
+    Args:
+        views: names of views with depth that contradict each other where one looks through what
+            another has measured; none take all as it is.
     """
 
     name = "recorded"
+
+    def __init__(self, views: Sequence[str] = ()) -> None:
+        self.views = tuple(views)
 
     def covers(self, view: View) -> bool:
         """Views with a depth map."""
         return view.has_depth
 
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
-        """The depth that was loaded with the picture.
+        """The depth that was loaded with the picture, but for what other views look through.
 
         Raises:
             ProjectError: the view has none.
@@ -75,11 +92,31 @@ class RecordedDepth:
                 "add its depth map"
             )
         depth = frame.depth
+        others = [name for name in self.views if name != view.name and scene[name].has_depth]
+        wrong = np.zeros(depth.shape, np.bool_)
+        if others:
+            near = nearest_views(scene.subset(others).cameras, view.camera, WITNESSES)
+            wrong = contradicted(depth, view.camera, [_seen(scene[others[row]]) for row in near])
+        depth = np.where(wrong, np.float32(0), depth)
         known = depth[depth > 0]
-        near = float(np.percentile(known, 10)) if known.size else 1.0
+        near_depth = float(np.percentile(known, 10)) if known.size else 1.0
         with np.errstate(divide="ignore"):
-            confidence = np.minimum((near / depth) ** 2, 1.0, dtype=np.float32)
-        return DepthMap(depth, np.where(depth > 0, confidence, np.float32(1)), self.name)
+            confidence = np.minimum((near_depth / depth) ** 2, 1.0, dtype=np.float32)
+        confidence = np.where(depth > 0, confidence, np.float32(1))
+        return DepthMap(depth, confidence, self.name, int(wrong.sum()))
+
+
+def _seen(view: View) -> tuple[NDArray[np.float32], Cameras]:
+    depth = _loaded_depth(view.load)
+    return depth, view.camera
+
+
+@lru_cache(maxsize=2 * WITNESSES)
+def _loaded_depth(load: Callable[[], Frame]) -> NDArray[np.float32]:
+    """Views that are asked for one after the other have most of their neighbours in common."""
+    depth = load().depth
+    assert depth is not None
+    return depth
 
 
 class MixedDepth:

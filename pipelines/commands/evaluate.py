@@ -75,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--stride", type=int, metavar="N", help="views from one to the next (default: widest)"
     )
     group.add_argument("--completer", metavar="NAME", help="default inpaint")
-    group.add_argument("--profile", metavar="NAME", help="fast, balanced or accurate")
+    group.add_argument("--profile", metavar="NAME", help="fast, balanced, accurate or finest")
     group.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
     add_lpips_arguments(parser)
     add_scene_arguments(parser)

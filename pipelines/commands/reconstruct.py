@@ -49,7 +49,7 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
         "--max-side", metavar="PIXELS", help="reduce larger pictures to it, or none (default 1600)"
     )
     parser.add_argument("--completer", metavar="NAME", help="default inpaint")
-    parser.add_argument("--profile", metavar="NAME", help="fast, balanced or accurate")
+    parser.add_argument("--profile", metavar="NAME", help="fast, balanced, accurate or finest")
     parser.add_argument(
         "--refine",
         type=float,

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend, best_blend
 from gvtools.appearance.exposures import Exposures
-from gvtools.appearance.fit import CONTINUED, Fit, judges, whole_steps
+from gvtools.appearance.fit import CONTINUED, Fit
+from gvtools.appearance.fit_options import whole_steps
 from gvtools.appearance.fit_views import FitView
 from gvtools.appearance.fits import LEAST_SHARE, run_fits
 from gvtools.appearance.gaussians import Gaussians
@@ -116,7 +117,7 @@ class Fitted:
         assert plan.config.voxel is not None
         return replace(
             plan,
-            source=MixedDepth(RecordedDepth(), fitted) if some else fitted,
+            source=MixedDepth(RecordedDepth(plan.context), fitted) if some else fitted,
             evidence=evidence,
             config=plan.config.replaced(voxel=plan.config.voxel * factor),
         )
@@ -178,10 +179,6 @@ def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None
         frame = earlier.appearance.gaussians.frame
         options, seed = options.replaced(poses=False), seed + len(earlier.appearance.fits)
     views = _views(plan, frame)
-    if all(view.depth is not None for view in views) and not judges(len(views)):
-        # Recorded depth shows a few views as well, and no photograph can be left out to tell.
-        console.line(f"no Gaussians are fitted: {len(views)} views with recorded depth")
-        return None
     try:
         start = _start(plan, views, frame)
     except GvError as error:
@@ -192,7 +189,8 @@ def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None
 
 def _whole(plan: Plan, earlier: Fitted) -> bool:
     """Whether more steps gain less than another fit."""
-    return earlier.steps >= LEAST_SHARE * whole_steps(len(plan.context))
+    whole = whole_steps(len(plan.context), recorded=_recorded(plan))
+    return earlier.steps >= LEAST_SHARE * whole
 
 
 def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:

@@ -72,8 +72,8 @@ def refine(
         fitted = fit_appearance(plan, console, earlier=earlier)
         if fitted is None:
             raise ProjectError(
-                f"{path}: no Gaussians can be fitted to its context; expected photographs with "
-                "sparse points, or eight with recorded depth; the run is as it was"
+                f"{path}: no Gaussians can be fitted to its context; expected photographs "
+                "with sparse points or recorded depth; the run is as it was"
             )
         directory = RunDirectory(folder)
         history = [*run.record.get(REFINED, []), asked]

@@ -94,6 +94,9 @@ def observe_context(
             frame = next(frames)
             depth_map = source.depth(view, frame)
             reports.append(depth_report(scene, name, depth_map))
+            if depth_map.contradicted:
+                reason = "depth that other views look through"
+                dropped[reason] = dropped.get(reason, 0) + depth_map.contradicted
         with clock.stage("fuse"):
             report = memory.observe(
                 frame.rgb,

@@ -9,7 +9,8 @@ import pytest
 from splat_scene import photographs, picture, pose, pose_errors, rough_gaussians, walk
 
 from gvtools.appearance.camera_corrections import CameraCorrections, moved
-from gvtools.appearance.fit import JUDGES_JOIN, Fit, FitOptions, judges
+from gvtools.appearance.fit import JUDGES_JOIN, Fit, judges
+from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.pose_check import prediction_error
 from gvtools.appearance.start import from_depth
 from gvtools.memory.store.local_frame import LocalFrame

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from splat_scene import photographs, rough_gaussians, walk
 
-from gvtools.appearance import fit as fit_module
+from gvtools.appearance import fit_options
 from gvtools.appearance import fits as module
-from gvtools.appearance.fit import Fit, FitOptions
+from gvtools.appearance.fit import Fit
+from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.fits import run_fits
 
 WHOLE = 10
@@ -16,8 +17,8 @@ WHOLE = 10
 
 @pytest.fixture(autouse=True)
 def short_fits(monkeypatch):
-    monkeypatch.setattr(fit_module, "WHOLE_PER_VIEW", 2)
-    monkeypatch.setattr(fit_module, "WHOLE_LEAST", WHOLE)
+    monkeypatch.setattr(fit_options, "WHOLE_PER_VIEW", 2)
+    monkeypatch.setattr(fit_options, "WHOLE_LEAST", WHOLE)
 
 
 def fit_of(count: int = 5, **options: float) -> Fit:

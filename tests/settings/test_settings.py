@@ -72,7 +72,7 @@ def test_options_of_the_completer_go_by_its_name(tmp_path):
         ("device=gpu", "device 'gpu'; expected 'auto', 'cpu' or 'cuda'"),
         ("splat.depth_band", "expected KEY=VALUE"),
         ("seed=", "seed ''; expected a valid integer"),
-        ("profile=quick", "profile 'quick'; expected one of fast, balanced, accurate"),
+        ("profile=quick", "profile 'quick'; expected one of fast, balanced, accurate, finest"),
         ("da3.device=tpu", "da3.device 'tpu'; expected 'auto', 'cpu' or 'cuda'"),
         ("stereo.window=4", "stereo.window 4; expected an odd number"),
         ("stereo.views=5", "stereo.views 5 is more than stereo.sources 4"),

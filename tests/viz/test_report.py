@@ -13,7 +13,7 @@ import pytest
 from browser import Browser, open_browser
 from command_line import refused
 
-from gvtools.appearance.fit import FitOptions
+from gvtools.appearance.fit_options import FitOptions
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
 from pipelines.reconstruction.plan import make_plan

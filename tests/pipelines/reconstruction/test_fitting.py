@@ -151,8 +151,9 @@ def test_without_steps_or_time_a_run_knows_nothing_of_gaussians(scan, tmp_path, 
     for name in plan.context:
         view = plan.scene[name]
         frame = view.load()
+        depth = plan.source.depth(plan.scene, view, frame).depth
         by_hand.observe(
-            frame.rgb, frame.depth, view.camera, round=0, mask=frame.mask,
+            frame.rgb, depth, view.camera, round=0, mask=frame.mask,
             options=plan.config.back_projection, pixel_binning=plan.config.savings.pixel_binning,
         )  # fmt: skip
     np.testing.assert_array_equal(by_hand.positions, memory.positions)

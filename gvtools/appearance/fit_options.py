@@ -1,0 +1,76 @@
+"""Options of fitting, and how long a fit is worth while."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from gvtools.settings import Settings
+
+# Steps of a fit whose length is not given: for each photograph, at least and at most.
+STEPS_PER_VIEW, FEWEST_STEPS, MOST_STEPS = 15, 300, 1200
+# So many steps for each photograph, and at least so many, gain what one fit can; the last number is
+# the least with recorded depth, which keeps surfaces where they are however long a fit is.
+WHOLE_PER_VIEW, WHOLE_LEAST, WHOLE_LEAST_RECORDED = 80, 400, 3000
+# Gaussians are added up to so many for each step of the whole fit: more are not fitted in time.
+# Without recorded depth no more than so many for each photograph: they would fit what other
+# directions contradict.
+PER_STEP, PER_VIEW = 65, 8000
+
+
+class FitOptions(Settings):
+    """How Gaussians are fitted to photographs.
+
+    >>> FitOptions().steps_for(40), FitOptions(steps=100).steps_for(40)
+    (600, 100)
+    >>> FitOptions(seconds=0.0).wanted
+    False
+    """
+
+    section = "refine"
+
+    seconds: float | None = Field(None, ge=0)
+    """How long they are fitted; none counts steps instead, which gives the same result every time;
+    0 leaves the memory's own colours. [s]"""
+    steps: int | None = Field(None, ge=0)
+    """How many steps, where no time is given; none makes as many as take about as long as the rest
+    of a run, by the number of photographs; 0 leaves the memory's own colours."""
+    most_gaussians: int = Field(200_000, ge=1)
+    """How many there may be."""
+    growth: float = Field(2e-4, gt=0)
+    """Gaussians are added where pictures pull at those that are there more than this; less gives
+    more of them."""
+    ssim: float = Field(0.2, ge=0, le=1)
+    """Share of structural similarity in the loss; the rest is absolute difference."""
+    depth: float = Field(0.1, ge=0)
+    """Weight of recorded depth in the loss, by relative difference; 0 ignores it."""
+    poses: bool = True
+    """Whether a tracker's poses, those of views with recorded depth, are refined: before a run,
+    also one that fits nothing, and along with the fit."""
+    exposure: bool = True
+    """Whether each photograph's red, green and blue may be brighter than the others'."""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there is time or a step for it."""
+        return self.seconds != 0 if self.seconds is not None else self.steps != 0
+
+    def steps_for(self, views: int) -> int:
+        """How many steps a fit of so many photographs makes, where no time is given."""
+        if self.steps is not None:
+            return self.steps
+        return min(max(STEPS_PER_VIEW * views, FEWEST_STEPS), MOST_STEPS)
+
+
+def whole_steps(views: int, *, recorded: bool) -> int:
+    """After how many steps a fit has gained what it can.
+
+    Args:
+        views: how many photographs there are.
+        recorded: whether all of them have recorded depth.
+    """
+    return max(WHOLE_PER_VIEW * views, WHOLE_LEAST_RECORDED if recorded else WHOLE_LEAST)
+
+
+def most_gaussians(steps: int, views: int, *, recorded: bool) -> int:
+    """How many Gaussians a fit of so many steps can do with; see ``whole_steps``."""
+    return PER_STEP * steps if recorded else min(PER_STEP * steps, PER_VIEW * views)
