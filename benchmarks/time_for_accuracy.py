@@ -114,7 +114,7 @@ def _run(case: Case, project: Path, budget: int, out: Path) -> dict[str, Any]:
     if budget:
         # What the rest of a run takes, about: views with recorded depth have their poses refined.
         views, recorded = len(_selected(project, case.context)), _has_depth(project)
-        rest = 8.0 + 0.8 * views if recorded else 10.0 + 0.2 * views
+        rest = 6.0 + 0.9 * views if recorded else 9.0 + 0.2 * views
         # A fit keeps 1.75 cores busy.
         refine = max(budget - rest, 5.0) / 1.75
     seconds = _seconds([*command, "--refine", f"{refine:g}"])

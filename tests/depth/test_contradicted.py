@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -91,7 +92,7 @@ def test_recorded_depth_is_dropped_counted_and_not_trusted():
         view("c", -0.1, wall()),
         replace(view("d", 0.2, wall()), has_depth=False),
     )
-    scene = Scene("rgbd", ".", views)
+    scene = Scene(Path("."), "rgbd", views)
     first = views[0]
     alone = RecordedDepth().depth(scene, first, first.load())
     assert alone.contradicted == 0
