@@ -39,8 +39,9 @@ def sweep(
     left_out = []
     for label, settings in planned.items():
         trial = runs.kept(label, settings)
-        # A trial is expected to take as long as the start.
-        if trial is None and trials and clock() + trials[0].seconds > end:
+        # A trial is expected to take as long as the start, and the time that its fit is given.
+        fit = settings.get("refine.seconds") or 0.0
+        if trial is None and trials and clock() + trials[0].seconds + fit > end:
             left_out.append(label)
             continue
         try:

@@ -79,6 +79,18 @@ def test_the_limit_holds_and_what_was_left_out_is_named(capsys):
     assert [trial.label for trial in swept(limit=1e-9)] == [START]
 
 
+def test_a_long_fit_needs_its_time(capsys):
+    planned = {
+        START: {},
+        "profile long": {"refine.seconds": 3600.0, "edge": 4},
+        "edge 4": {"edge": 4},
+    }
+    runs = Runs()
+    made = sweep(planned, runs, limit=600, console=Console(), clock=lambda: runs.now)
+    assert [trial.label for trial in made] == [START, "edge 4"]
+    assert "profile long" in capsys.readouterr().err
+
+
 def test_a_refused_setting_is_named_and_the_sweep_goes_on(capsys):
     trials = swept(Runs(refuse=4))
     assert "edge 4: refused, edge is refused" in capsys.readouterr().out

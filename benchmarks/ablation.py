@@ -1,0 +1,99 @@
+"""What each part of fitting and of judging depth is worth, one taken away at a time.
+
+    python -m benchmarks.ablation SHARED OUT [--scenes "fox;kitchen"]
+
+SHARED is the folder of real scenes. Fits go by steps, so that the figures do not depend on the
+machine's other work. Rows that are in OUT already are not measured again; ``ablation.md`` is the
+table: PSNR and SSIM of whole held-out pictures, and on pixels that the memory knows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from contextlib import ExitStack
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+# Project below SHARED/data, context, targets, steps of the fit.
+SCENES = {
+    "fox": ("fox_colmap", "not:every:8", "every:8", 1200),
+    "fox, 7 views": ("fox_colmap", "every:8", "every:8+4", 1680),
+    "kitchen": ("sevenscenes_reg", "every:2", "every:2+1", 600),
+}
+# What is taken away: settings, and constants by module and name.
+PARTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "nothing": ({}, {}),
+    "fitting": ({"refine.steps": 0}, {}),
+    "several fits": ({}, {"appearance.fits.MOST_FITS": 1}),
+    "exposures": ({"refine.exposure": False}, {}),
+    "exposures of new cameras": ({}, {"appearance.exposures.Exposures.share": 0.0}),
+    "bending of surfaces": ({}, {"appearance.fit.SMOOTH": 0.0}),
+    "Gaussians left out": ({}, {"appearance.fit.LEFT_OUT": 0.0}),
+    "fading": ({}, {"appearance.fit.FADING": 0.0}),
+    "refined poses": ({"refine.poses": False}, {}),
+    "recorded depth": ({"refine.depth": 0.0}, {}),
+    "contradictions": ({}, {"depth.contradicted.LEAST": 255}),
+    "completions of little confidence": ({"fusion.min_confidence": 0.35}, {}),
+    "Gaussians' colours in holes": (
+        {},
+        {"appearance.projection_cache.CachedProjection.colored": lambda self, guidance, rgb: rgb},
+    ),
+}
+
+
+def main() -> None:
+    """Measure what is missing, then write the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("shared", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--scenes", default=";".join(SCENES))
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    lines = ["| scene | without | PSNR | SSIM | PSNR, known pixels |", "|---|---|---|---|---|"]
+    for scene in args.scenes.split(";"):
+        for part in PARTS:
+            file = args.out / f"{scene} {part}.json"
+            if not file.exists():
+                file.write_text(json.dumps(_measured(scene, part, args.shared, args.out)))
+            found = json.loads(file.read_text())
+            lines.append(
+                f"| {scene} | {part} | {found['psnr']:.2f} | {found['ssim']:.3f} | "
+                f"{found['psnr_valid']:.2f} |"
+            )
+            sys.stdout.write(lines[-1] + "\n")
+            sys.stdout.flush()
+    (args.out / "ablation.md").write_text("\n".join(lines) + "\n")
+
+
+def _measured(scene: str, part: str, shared: Path, out: Path) -> dict[str, Any]:
+    from gvtools import reconstruct
+
+    project, context, targets, steps = SCENES[scene]
+    settings, constants = PARTS[part]
+    run = out / f"{scene} {part}".replace(" ", "_").replace(",", "")
+    with ExitStack() as changes:
+        for path, value in constants.items():
+            holder, name = f"gvtools.{path}".rsplit(".", 1)
+            changes.enter_context(patch.object(_named(holder), name, value))
+        reconstruct(
+            shared / "data" / project, run, context=context, targets=targets,
+            settings={"refine.steps": steps, **settings},
+        )  # fmt: skip
+    return json.loads((run / "metrics.json").read_text())
+
+
+def _named(path: str) -> Any:
+    """A module, or a class of one."""
+    try:
+        return import_module(path)
+    except ModuleNotFoundError:
+        module, name = path.rsplit(".", 1)
+        return getattr(import_module(module), name)
+
+
+if __name__ == "__main__":
+    main()
