@@ -9,12 +9,12 @@ import torch
 from kornia.geometry.liegroup import Se3
 from numpy.typing import NDArray
 
-# A pose moves by at most this angle [rad], and this share of the typical depth.
+# Each component of a pose's correction stays below this angle [rad] and share of the typical depth.
 MOST_TURN, MOST_SHIFT = 0.035, 0.03
-# Views that a camera takes its correction from, and the distance (in shares of the depth) and angle
-# [rad] at which one counts 37 %.
+# Views that a camera takes its correction from, and how fast their weight falls: it is proportional
+# to exp(-(distance / (NEAR_SHIFT typical depths) + angle of viewing directions [rad] / NEAR_TURN)).
 NEAR_VIEWS, NEAR_SHIFT, NEAR_TURN = 2, 0.03, 0.05
-# Refined poses must predict neighbouring photographs better by so much of the error.
+# Refined poses are kept if the error of predicting neighbouring photographs falls by this share.
 LEAST_BETTER = 0.01
 # Step lengths: of turns [rad], of shifts in shares of the depth, of the logarithm of exposures.
 # Those of poses are at the end smaller by the last number, so that right poses come to rest.
@@ -27,10 +27,11 @@ class CameraCorrections:
     The corrections of all views have mean zero, so that the scene as a whole stays where it is.
 
     Attributes:
-        twists: (V, 6) shift (in shares of the depth) and turn [rad], applied on the camera's side.
+        twists: (V, 6) in se(3), shift (in shares of the depth), then turn [rad]; multiplied from
+            the left: exp(twist) cam_from_local.
         log_gains: (V, 3) logarithms of the brightness of red, green and blue.
         depth: typical depth, scene units.
-        spread: whether other cameras share the corrections of the views near them.
+        spread: whether cameras that are not fitted take the mean correction of the views near them.
     """
 
     def __init__(
@@ -141,13 +142,14 @@ def mean_near(
     """(C,) mean of what belongs to the cameras that stand and look most like a pose.
 
     Args:
-        pose: (4, 4) camera from world.
-        poses: (V, 4, 4) of the cameras.
-        values: (V, C) theirs.
+        pose: (4, 4) camera from any frame.
+        poses: (V, 4, 4) of the cameras, in the same frame.
+        values: (V, C) what belongs to each camera.
         depth: typical depth, scene units.
         but: cameras that do not count.
         count: how many cameras count.
-        reach: distance (in shares of the depth) and angle [rad] at which one counts 37 %.
+        reach: how fast weights fall with distance (in shares of the depth) and angle [rad], see
+            ``NEAR_SHIFT``.
     """
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     center = -pose[:3, :3].T @ pose[:3, 3]

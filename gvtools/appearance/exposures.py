@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.camera_corrections import mean_near
 
-# Photographs that tell a camera's exposure, and the distance (in shares of the depth) and angle
-# [rad] at which one counts 37 %.
+# Photographs that tell a camera's exposure, and how fast their weight falls: it is proportional to
+# exp(-(distance / (SHIFT typical depths) + angle between viewing directions [rad] / TURN)).
 COUNT, SHIFT, TURN = 4, 0.2, 0.3
 
 
@@ -19,11 +19,11 @@ COUNT, SHIFT, TURN = 4, 0.2, 0.3
 class Exposures:
     """How bright photographs are, and therefore a camera that stands among them.
 
-    Phones expose for what they see, so photographs near each other are alike. How much of that
-    holds in a scene, the photographs tell themselves: each is predicted from the others.
+    Phones expose for what they see, so photographs near each other are exposed alike. How far that
+    holds in a scene is found by predicting each photograph's exposure from the others'.
 
     Attributes:
-        poses: (V, 4, 4) camera from local.
+        poses: (V, 4, 4) cam_from_local, in the Gaussians' own frame.
         log_gains: (V, 3) logarithms of the brightness of red, green and blue, with mean zero.
         depth: typical depth, scene units.
 
@@ -40,8 +40,11 @@ class Exposures:
     depth: float
 
     @cached_property
-    def share(self) -> float:
-        """By what the photographs near one are multiplied to predict it best, 0 to 1."""
+    def shrinkage(self) -> float:
+        """Slope of the photographs' logarithms by those predicted from the others, 0 to 1.
+
+        0: neighbours tell nothing, and new cameras are exposed like the mean of all photographs.
+        """
         if len(self.poses) < 2:
             return 0.0
         near = np.array([self._near(pose, but=row) for row, pose in enumerate(self.poses)])
@@ -51,10 +54,10 @@ class Exposures:
         return float(np.clip((near * self.log_gains).sum() / squares, 0, 1))
 
     def at(self, pose: NDArray[np.float64]) -> NDArray[np.float32]:
-        """(3,) what red, green and blue are multiplied by in a camera at a pose (4, 4)."""
-        if self.share == 0:
+        """(3,) what red, green and blue are multiplied by in a camera, cam_from_local (4, 4)."""
+        if self.shrinkage == 0:
             return np.ones(3, np.float32)
-        return np.exp(self.share * self._near(pose)).astype(np.float32)
+        return np.exp(self.shrinkage * self._near(pose)).astype(np.float32)
 
     def _near(self, pose: NDArray[np.float64], *, but: int | None = None) -> NDArray[np.float64]:
         return mean_near(

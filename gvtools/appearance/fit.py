@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.appearance import kernels
 from gvtools.appearance.camera_corrections import LEAST_BETTER, CameraCorrections
-from gvtools.appearance.fit_options import FitOptions, most_gaussians, whole_steps
+from gvtools.appearance.fit_options import FitOptions, converged_steps, most_gaussians
 from gvtools.appearance.fit_views import FitView, ReducedView, pixel_width, reduced
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.growth import Population
@@ -27,17 +27,19 @@ from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNIO
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.kernels import in_threads
 
-# Share of the fit from which pictures are taken at a quarter, half and all of their size.
+# The progress of a fit runs from 0 to 1: the share of its time, not of its steps, that is over.
+# Numbers below that name a part of the fit are progress.
+# Pictures are taken at a quarter, half and all of their size from here on.
 SIZES = ((0.0, 4), (0.2, 2), (0.6, 1))
-# Each degree of the spherical harmonics joins after so much of the fit.
+# Each degree of the spherical harmonics joins after so much progress.
 DEGREE_EVERY = 0.12
-# Gaussians are added in this part of the fit, each time after such a share of it, if these are not
-# too few steps to tell where, and not later than after so many steps. The share is the first number
-# below, the second with fewer than ``FEW`` photographs.
+# Until GROWTH_END, Gaussians are added every GROWTH_SHARE of progress (GROWTH_SHARE_FEW with fewer
+# than FEW photographs), at least FEWEST_BETWEEN steps apart, since fewer tell too little of where
+# they are needed, and at most MOST_BETWEEN steps apart.
 GROWTH_END, FEWEST_BETWEEN, MOST_BETWEEN = 0.55, 25, 100
 GROWTH_SHARE, GROWTH_SHARE_FEW, FEW = 0.13, 0.25, 10
-# Steps with small pictures are quick: a fit that has made these shares of its steps is through
-# these shares of its time.
+# Early steps are quick because pictures are small: shares of the steps that are made (OF_STEPS) and
+# of the time that is over by then (OF_TIME), with straight lines between.
 OF_STEPS, OF_TIME = (0.0, 0.5, 0.86, 1.0), (0.0, 0.2, 0.6, 1.0)
 # Positions move by at most about so many pixels a step, and by this share of it at the end.
 POSITION_RATE, POSITION_END = 0.32, 0.01
@@ -45,14 +47,15 @@ POSITION_RATE, POSITION_END = 0.32, 0.01
 CONTINUED = 0.6
 # Step lengths of log scales, quaternions, logits, colours and the other harmonics.
 RATES = (0.02, 0.004, 0.05, 0.01, 5e-4)
-# Steps of all but positions shrink to this share of theirs, beginning after so much of the fit:
-# else each photograph undoes a part of what the others said.
+# From REST_BEGINS on, step lengths of all but positions fall to the share REST of theirs: else each
+# photograph undoes a part of what the others said.
 REST, REST_BEGINS = 0.1, 0.75
-# Of so many photographs one is left out until this part of the fit, as a judge; at most so many.
+# Judges: one of JUDGE_OF photographs, at most MOST_JUDGES, is not fitted until JUDGES_JOIN, so that
+# it tells how well the others predict it.
 JUDGE_OF, JUDGES_JOIN, MOST_JUDGES = 8, 0.75, 5
-# With few photographs, a random share of the Gaussians is left out of each step, growing to this
-# share divided by the number of photographs, so that none relies on others that hide it from the
-# few directions that there are. After "DropGaussian" (Park et al. 2025).
+# Dropout: without recorded depth, each step ignores a random share of the Gaussians, progress times
+# LEFT_OUT / number of photographs, at most MOST_LEFT_OUT, so that none relies on others that hide
+# it from the few directions that there are. After "DropGaussian" (Park et al. 2025).
 LEFT_OUT, MOST_LEFT_OUT = 1.2, 0.5
 # With few photographs, all opacities shrink by this share at each step: what photographs do not ask
 # for again fades, above all right before the cameras. After "Binocular-Guided 3D Gaussian
@@ -65,7 +68,8 @@ FAINT = 0.01
 SMOOTH = 0.1
 # Reduced photographs are kept for later steps where all of them together take less.
 KEPT_BYTES = 2**30
-# What the corrections of neighbours must gain for a camera to take them [dB].
+# What judges must gain, on average, by their neighbours' corrections of poses for other cameras to
+# take these [dB].
 LEAST_GAIN = 0.1
 # Poses are checked at these parts of the fit, and at its end.
 POSE_CHECKS = (0.3, 0.6)
@@ -80,7 +84,7 @@ class Fit:
         population: the Gaussians.
         cameras: corrections of poses and exposures.
         recorded: whether all photographs have recorded depth.
-        whole: after how many steps the fit has gained what it can.
+        converged_after: steps after which more of them gain next to nothing.
         steps: made so far.
         judged: pictures of the photographs that were left out, by their numbers, as they were
             predicted before these joined the fit.
@@ -103,8 +107,8 @@ class Fit:
             views: at least one.
             options: see FitOptions.
             seed: of the order of photographs and of where Gaussians are added.
-            begin: share of a whole fit that is left out because ``start`` was fitted to the same
-                photographs before; all of them are then fitted from the first step.
+            begin: progress at which the fit begins, above 0 where ``start`` was fitted to the same
+                photographs before; none of them is a judge then.
             splatter: draws the Gaussians.
         """
         self.start, self.seed, self.splatter = start, seed, splatter
@@ -114,7 +118,7 @@ class Fit:
         width = pixel_width(start.values[:, :LOG_SCALE], self.views)
         self.population = Population(start.values.copy(), width)
         self.recorded = all(view.depth is not None for view in self.views)
-        self.whole = whole_steps(len(self.views), recorded=self.recorded)
+        self.converged_after = converged_steps(len(self.views), recorded=self.recorded)
         self.cameras = CameraCorrections(
             np.array([view.cam_from_local for view in self.views]),
             depth=float(np.median(width)) * float(np.median([v.K[0, 0] for v in self.views])),
@@ -125,11 +129,11 @@ class Fit:
         self.steps = 0
         self.judged: dict[int, Picture] = {}
         self.begin = begin
-        # What an earlier fit left comes on top.
+        # The limit of Gaussians does not count those of an earlier fit.
         self._begun_with = len(start.values) if begin else 0
         self._judges = () if begin else judges(len(self.views))
         self._checks = tuple(share for share in POSE_CHECKS if share > begin)
-        # Recorded depth tells as much as other directions.
+        # Recorded depth holds Gaussians as more directions would.
         self._left_out = 0.0 if self.recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
         self._fading = len(self.views) < FEW and not self.recorded
         self._grown = (0, begin)
@@ -138,7 +142,7 @@ class Fit:
         self._reduced: dict[int, ReducedView] = {}
         self._factor = 0
         self._errors: list[float] = []
-        # PSNR of judges, in turns.
+        # PSNR of judges, one of them at each call of ``judged_psnr``.
         self._told: list[float] = []
 
     @property
@@ -165,14 +169,14 @@ class Fit:
         clock: Callable[[], float] = time.perf_counter,
         report: Callable[[float], object] = lambda share: None,
     ) -> None:
-        """Fit for the time or the number of steps that the options give, or until it is whole.
+        """Fit for the time or the number of steps that the options give, or until it converged.
 
         Args:
             clock: tells seconds.
             report: is called now and then, and at the end, with the share of it that is over.
         """
         options, began = self.options, clock()
-        most = np.inf if self.begin else self.whole
+        most = np.inf if self.begin else self.converged_after
         if options.seconds is None:
             most = min(options.steps_for(len(self.views)), most)
         while True:
@@ -191,7 +195,7 @@ class Fit:
 
     @property
     def psnr(self) -> float:
-        """Of the last photographs, each before its own step [dB]."""
+        """Of the last 50 steps' photographs, each before its step and at its size then [dB]."""
         return _psnr(float(np.mean(self._errors[-50:])) if self._errors else 1.0)
 
     def judged_psnr(self) -> float | None:
@@ -211,7 +215,7 @@ class Fit:
         return -float(np.mean([self._error(row, shown) for row, shown in pictures.items()]))
 
     def step(self, share: float) -> None:
-        """One step, on one photograph; ``share`` of a whole fit is over."""
+        """One step, on one photograph, at a progress of ``share``."""
         self.steps += 1
         if self._checks and share >= self._checks[0]:
             self._checks = self._checks[1:]
@@ -251,14 +255,14 @@ class Fit:
             self.population.remove_faint()
 
     def _most_gaussians(self, share: float) -> int:
-        """How many Gaussians there may be after ``share`` of a whole fit."""
+        """How many Gaussians there may be at a progress of ``share``."""
         steps: float = self.options.steps_for(len(self.views))
         if self.options.seconds is not None:
             over = (share - self.begin) / (1 - self.begin)
             made = over if self.begin else float(np.interp(over, OF_TIME, OF_STEPS))
             steps = self.steps / made
         if not self.begin:
-            steps = min(steps, self.whole)
+            steps = min(steps, self.converged_after)
         most = most_gaussians(int(steps), len(self.views), recorded=self.recorded)
         return min(self._begun_with + most, self.options.most_gaussians)
 
@@ -335,10 +339,10 @@ class Fit:
         return gradient
 
     def _note_pulls(self, lens: Lens, seen: NDArray[np.int64], rows: NDArray[np.float32]) -> None:
-        people = self.population
+        population = self.population
         pull = np.hypot(rows[:, VALUES] * lens.width, rows[:, VALUES + 1] * lens.height)
-        people.pull[seen] += pull * (0.5 / (lens.width * lens.height))
-        people.pulls[seen] += 1
+        population.pull[seen] += pull * (0.5 / (lens.width * lens.height))
+        population.pulls[seen] += 1
 
 
 def judges(views: int) -> tuple[int, ...]:

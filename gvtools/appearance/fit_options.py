@@ -8,12 +8,13 @@ from gvtools.settings import Settings
 
 # Steps of a fit whose length is not given: for each photograph, at least and at most.
 STEPS_PER_VIEW, FEWEST_STEPS, MOST_STEPS = 15, 300, 1200
-# So many steps for each photograph, and at least so many, gain what one fit can; the last number is
-# the least with recorded depth, which keeps surfaces where they are however long a fit is.
-WHOLE_PER_VIEW, WHOLE_LEAST, WHOLE_LEAST_RECORDED = 80, 400, 3000
-# Gaussians are added up to so many for each step of the whole fit: more are not fitted in time.
-# Without recorded depth no more than so many for each photograph: they would fit what other
-# directions contradict.
+# A fit has converged after so many steps for each photograph, at least CONVERGED_LEAST; with
+# recorded depth at least CONVERGED_LEAST_RECORDED, since depth keeps surfaces where they are, so
+# that more steps go on helping.
+CONVERGED_PER_VIEW, CONVERGED_LEAST, CONVERGED_LEAST_RECORDED = 80, 400, 3000
+# Gaussians are added up to PER_STEP for each step of the fit: more are not fitted in time. Without
+# recorded depth there are at most PER_VIEW for each photograph: more fit the photographs closely
+# and look wrong from other directions.
 PER_STEP, PER_VIEW = 65, 8000
 
 
@@ -32,13 +33,13 @@ class FitOptions(Settings):
     """How long they are fitted; none counts steps instead, which gives the same result every time;
     0 leaves the memory's own colours. [s]"""
     steps: int | None = Field(None, ge=0)
-    """How many steps, where no time is given; none makes as many as take about as long as the rest
-    of a run, by the number of photographs; 0 leaves the memory's own colours."""
+    """How many steps, where no time is given; none: 15 for each photograph, at least 300 and at
+    most 1200, which take about as long as the rest of a run; 0 leaves the memory's own colours."""
     most_gaussians: int = Field(200_000, ge=1)
     """How many there may be."""
     growth: float = Field(2e-4, gt=0)
-    """Gaussians are added where pictures pull at those that are there more than this; less gives
-    more of them."""
+    """Gaussians are split or doubled where the mean length of the loss's gradient by their centre
+    in the picture (half a picture being 1) is above this; less gives more of them."""
     ssim: float = Field(0.2, ge=0, le=1)
     """Share of structural similarity in the loss; the rest is absolute difference."""
     depth: float = Field(0.1, ge=0)
@@ -61,16 +62,18 @@ class FitOptions(Settings):
         return min(max(STEPS_PER_VIEW * views, FEWEST_STEPS), MOST_STEPS)
 
 
-def whole_steps(views: int, *, recorded: bool) -> int:
-    """After how many steps a fit has gained what it can.
+def converged_steps(views: int, *, recorded: bool) -> int:
+    """After how many steps a fit has converged: more gain next to nothing.
 
     Args:
         views: how many photographs there are.
         recorded: whether all of them have recorded depth.
     """
-    return max(WHOLE_PER_VIEW * views, WHOLE_LEAST_RECORDED if recorded else WHOLE_LEAST)
+    return max(
+        CONVERGED_PER_VIEW * views, CONVERGED_LEAST_RECORDED if recorded else CONVERGED_LEAST
+    )
 
 
 def most_gaussians(steps: int, views: int, *, recorded: bool) -> int:
-    """How many Gaussians a fit of so many steps can do with; see ``whole_steps``."""
+    """How many Gaussians a fit of so many steps can do with; see ``converged_steps``."""
     return PER_STEP * steps if recorded else min(PER_STEP * steps, PER_VIEW * views)

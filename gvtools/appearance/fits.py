@@ -1,8 +1,8 @@
 """Several fits to the same photographs, whose pictures are averaged.
 
-A fit is whole after a number of steps that grows with the photographs; more steps then gain next to
-nothing. Another fit that makes its random choices anew errs elsewhere, above all where few
-photographs leave much open, so that the mean of their pictures is nearer to the truth.
+A fit has converged after a number of steps that grows with the number of photographs; more steps
+gain next to nothing. Further fits with other random choices make other errors, above all where few
+photographs leave much open, so the mean of their pictures is nearer to the truth than each.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from gvtools.appearance.picture import mean_picture
 
 # More fits than this gain nothing that was measured.
 MOST_FITS = 6
-# Fits go on while the left-out photographs gain this from another one [dB].
+# No further fit is made when the last one raised the PSNR of left-out photographs by less [dB].
 LEAST_GAIN = 0.05
-# Another fit needs this share of what the first one took.
+# No further fit begins with less left than this share of the time, or steps, that the first took.
 LEAST_SHARE = 0.5
 
 
@@ -27,11 +27,11 @@ def run_fits(
     clock: Callable[[], float] = time.perf_counter,
     report: Callable[[Fit, float], object] = lambda fit, share: None,
 ) -> list[Fit]:
-    """Run a fit; if it is whole before its time or its steps are over, run further ones.
+    """Run a fit; if it converges before its time or its steps are over, run further ones.
 
-    They end when the time or the steps are over, when there are ``MOST_FITS`` of them, or when
-    photographs that were left out of them gain nothing more. A fit that goes on with an earlier
-    one stays the only one.
+    There are no more when the time or the steps are over, when there are ``MOST_FITS``, or when
+    photographs that were left out of the fits gain less than ``LEAST_GAIN`` by the last one. A fit
+    that continues an earlier one (``Fit.begin`` above 0) is followed by none.
 
     Args:
         first: has not been run.
@@ -43,24 +43,26 @@ def run_fits(
     """
     options, began = first.options, clock()
     timed = options.seconds is not None
-    whole = options.seconds if timed else options.steps_for(len(first.views))
-    assert whole is not None
+    # In seconds where a time is given, else in steps.
+    budget = options.seconds if timed else options.steps_for(len(first.views))
+    assert budget is not None
     made, kept = [first], [first]
 
     def used() -> float:
         return clock() - began if timed else sum(fit.steps for fit in made)
 
     def tell(share: float) -> None:
-        report(made[-1], min(used() / whole, 1.0) if whole else 1.0)
+        report(made[-1], min(used() / budget, 1.0) if budget else 1.0)
 
     first.run(clock=clock, report=tell)
     taken = used()
     while len(made) < MOST_FITS and not first.begin:
-        left = whole - used()
+        left = budget - used()
         if left < LEAST_SHARE * taken or left <= 0:
             break
-        box = left / max(round(left / taken), 1)
-        more = options.replaced(**({"seconds": box} if timed else {"steps": round(box)}))
+        # What is left is shared evenly by the fits that find room in it.
+        part = left / max(round(left / taken), 1)
+        more = options.replaced(**({"seconds": part} if timed else {"steps": round(part)}))
         fit = first.again(len(made), more)
         made.append(fit)
         fit.run(clock=clock, report=tell)

@@ -1,8 +1,8 @@
-"""Recorded depth that other views contradict: what they see through cannot be there.
+"""Check of recorded depth by other views: where these measured free space, nothing can be.
 
 A sensor's depth of foil, glass or dark cardboard is off by centimetres, and differs from view to
-view. A pixel's point that other views look through, to something farther, floats in front of what
-is there, and hides it.
+view. A point where other views measured something farther floats in front of what is there, and
+hides it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.kernels import compiled, in_threads
 
-# Relative difference of depth up to which views agree, and from which on one sees through.
+# Another view agrees with a point if its depth there differs by less than AGREE of the point's, and
+# looks through it if its depth is greater by more than THROUGH.
 AGREE, THROUGH = 0.02, 0.04
-# So many views have to see through a point, and more than agree, for it to be dropped.
+# Depth is contradicted where at least so many views look through it, and more than agree.
 LEAST = 2
 
 
@@ -26,12 +27,12 @@ def contradicted(
     camera: Cameras,
     others: Sequence[tuple[NDArray[np.float32], Cameras]],
 ) -> NDArray[np.bool_]:
-    """Which pixels other views look through.
+    """Which pixels' depth other views contradict.
 
     Args:
-        depth: (H, W) z-depth, scene units, 0 = none.
+        depth: (H, W) float32 z-depth, scene units, 0 = none.
         camera: of the depth, a batch of one.
-        others: depth (H', W') and camera of each other view.
+        others: the same two of each other view, whose size may differ.
 
     Returns:
         (H, W) bool.
@@ -49,11 +50,12 @@ def contradicted(
 
 
 @compiled(error_model="numpy")
-def _compare(first, last, depth, other, matrix, offset, near, far, agree, through):
-    """Count per pixel of rows ``first`` to ``last`` whether another view agrees or sees through.
+def _compare(first, last, depth, other, matrix, offset, below, above, agree, through):
+    """Count per pixel of rows ``first`` to before ``last`` if another view agrees or looks through.
 
-    In: depth (H, W); other (H', W'); matrix (3, 3) and offset (3,) carry a pixel with its depth
-    into the other picture. ``agree`` and ``through`` (H, W) are added to.
+    In: depth (H, W) and other (H', W') z-depth, 0 = none; z matrix (u, v, 1) + offset is the point
+    of a pixel in homogeneous pixels of the other view, its last coordinate the z-depth there; below
+    and above are AGREE and THROUGH. ``agree`` and ``through`` (H, W) are added to.
     """
     height, width = other.shape
     for row in range(first, last):
@@ -73,7 +75,7 @@ def _compare(first, last, depth, other, matrix, offset, near, far, agree, throug
             theirs = other[int(y), int(x)]
             if not theirs > 0:
                 continue
-            if abs(theirs - z2) < near * z2:
+            if abs(theirs - z2) < below * z2:
                 agree[row, column] += 1
-            elif theirs > (1 + far) * z2:
+            elif theirs > (1 + above) * z2:
                 through[row, column] += 1

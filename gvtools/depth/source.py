@@ -17,8 +17,8 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.view_selection import nearest_views
 
-# Nearest views that are asked whether they look through a view's depth.
-WITNESSES = 8
+# How many of the nearest views each depth map is checked against.
+CHECKING_VIEWS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class DepthMap:
         depth: (H, W) float32 z-depth, scene units, 0 = none.
         confidence: (H, W) float32 in (0, 1].
         source: name of the source.
-        contradicted: pixels whose depth was dropped because other views look through it.
+        contradicted: how many pixels' depth was dropped because other views look through it.
     """
 
     depth: NDArray[np.float32]
@@ -63,12 +63,12 @@ class DepthSource(Protocol):
 class RecordedDepth:
     """Depth that the project itself holds: a sensor's, or COLMAP's stereo maps.
 
-    The error of triangulated depth, by structured light or by stereo, grows with its square; the
-    confidence falls likewise beyond the scene's near range (the view's 10th percentile).
+    The error of triangulated depth, by structured light or by stereo, grows with the square of
+    depth. Confidence is (d / depth)^2, at most 1, where d is the view's 10th percentile of depth.
 
     Args:
-        views: names of views with depth that contradict each other where one looks through what
-            another has measured; none take all as it is.
+        views: names of the views whose recorded depth each depth map is checked against, see
+            ``contradicted``; without any, depth is taken as it is.
     """
 
     name = "recorded"
@@ -95,7 +95,7 @@ class RecordedDepth:
         others = [name for name in self.views if name != view.name and scene[name].has_depth]
         wrong = np.zeros(depth.shape, np.bool_)
         if others:
-            near = nearest_views(scene.subset(others).cameras, view.camera, WITNESSES)
+            near = nearest_views(scene.subset(others).cameras, view.camera, CHECKING_VIEWS)
             wrong = contradicted(depth, view.camera, [_seen(scene[others[row]]) for row in near])
         depth = np.where(wrong, np.float32(0), depth)
         known = depth[depth > 0]
@@ -111,9 +111,9 @@ def _seen(view: View) -> tuple[NDArray[np.float32], Cameras]:
     return depth, view.camera
 
 
-@lru_cache(maxsize=2 * WITNESSES)
+@lru_cache(maxsize=2 * CHECKING_VIEWS)
 def _loaded_depth(load: Callable[[], Frame]) -> NDArray[np.float32]:
-    """Views that are asked for one after the other have most of their neighbours in common."""
+    """A view's depth, kept: views that are lifted one after the other share most neighbours."""
     depth = load().depth
     assert depth is not None
     return depth

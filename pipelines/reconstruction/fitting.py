@@ -19,7 +19,7 @@ from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend, best_blend
 from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit import CONTINUED, Fit
-from gvtools.appearance.fit_options import whole_steps
+from gvtools.appearance.fit_options import converged_steps
 from gvtools.appearance.fit_views import FitView
 from gvtools.appearance.fits import LEAST_SHARE, run_fits
 from gvtools.appearance.gaussians import Gaussians
@@ -160,7 +160,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         earlier: a fit of this run to go on with.
     """
     plan = _posed(plan, earlier)
-    if earlier is None or _whole(plan, earlier):
+    if earlier is None or _converged(plan, earlier):
         fit = _new_fit(plan, console, earlier)
     else:
         fit = _continued_fit(plan, earlier)
@@ -187,10 +187,10 @@ def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None
     return Fit(start, views, options=options, seed=seed, splatter=splatter_on(plan.config.device))
 
 
-def _whole(plan: Plan, earlier: Fitted) -> bool:
-    """Whether more steps gain less than another fit."""
-    whole = whole_steps(len(plan.context), recorded=_recorded(plan))
-    return earlier.steps >= LEAST_SHARE * whole
+def _converged(plan: Plan, earlier: Fitted) -> bool:
+    """Whether an earlier fit has converged: further steps would gain less than another fit."""
+    steps = converged_steps(len(plan.context), recorded=_recorded(plan))
+    return earlier.steps >= LEAST_SHARE * steps
 
 
 def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:

@@ -25,7 +25,7 @@ def smooth() -> Exposures:
 
 def test_a_camera_between_photographs_is_exposed_like_them():
     exposures = smooth()
-    assert exposures.share > 0.9
+    assert exposures.shrinkage > 0.9
     gain = exposures.at(along(0.75)[0])
     np.testing.assert_allclose(np.log(gain), [0.05, 0, -0.05], atol=0.01)
 
@@ -34,7 +34,7 @@ def test_exposures_that_neighbours_do_not_share_tell_nothing():
     places = np.linspace(0, 1, 12)
     gains = np.repeat(np.tile([0.1, -0.1], 6)[:, None], 3, axis=1)
     exposures = Exposures(along(*places), gains, depth=1.0)
-    assert exposures.share == 0
+    assert exposures.shrinkage == 0
     np.testing.assert_array_equal(exposures.at(along(0.5)[0]), 1)
 
 
@@ -48,7 +48,7 @@ def test_pictures_are_exposed_and_kept_so(tmp_path):
     camera = Cameras(K[None], pose(0.0)[None], np.array([WIDTH]), np.array([HEIGHT]), ("one",))
     exposures = Exposures(np.stack([pose(0.0), pose(0.05)]), np.full((2, 3), [-0.2, 0.1, 0]), 2.0)
     # Two alike photographs predict each other.
-    assert exposures.share == 1
+    assert exposures.shrinkage == 1
     plain = Appearance(rough_gaussians(), 0.05)
     exposed = Appearance(plain.gaussians, 0.05, exposures=exposures)
     dark, usual = exposed.picture(camera), plain.picture(camera)

@@ -26,8 +26,8 @@ from gvtools.appearance.fit_options import (
     PER_STEP,
     PER_VIEW,
     FitOptions,
+    converged_steps,
     most_gaussians,
-    whole_steps,
 )
 from gvtools.appearance.fit_views import FitView, reduced
 from gvtools.appearance.splat.project_kernels import SH
@@ -110,9 +110,9 @@ def test_without_judges_nothing_is_told_of_them(fitted):
 
 
 @pytest.mark.parametrize("options", [{"steps": 40}, {"seconds": 40.0}])
-def test_a_fit_ends_when_it_is_whole(views, monkeypatch, options):
-    monkeypatch.setattr(fit_options, "WHOLE_PER_VIEW", 2)
-    monkeypatch.setattr(fit_options, "WHOLE_LEAST", 5)
+def test_a_fit_ends_when_it_has_converged(views, monkeypatch, options):
+    monkeypatch.setattr(fit_options, "CONVERGED_PER_VIEW", 2)
+    monkeypatch.setattr(fit_options, "CONVERGED_LEAST", 5)
     now = iter(range(1000))
     fit = Fit(rough_gaussians(), views, options=FitOptions(**options))
     fit.run(clock=lambda: float(next(now)))
@@ -269,7 +269,7 @@ def test_there_are_never_more_gaussians_than_allowed(views):
     ("options", "begin", "made", "share", "most"),
     [
         ({"steps": 100}, 0.0, 3, 0.4, 100 * PER_STEP),
-        ({"steps": 10**6}, 0.0, 3, 0.4, whole_steps(8, recorded=False) * PER_STEP),
+        ({"steps": 10**6}, 0.0, 3, 0.4, converged_steps(8, recorded=False) * PER_STEP),
         ({"steps": 10**6}, 0.6, 3, 0.7, 300 + 8 * PER_VIEW),
         ({"steps": 10**6, "most_gaussians": 999}, 0.0, 3, 0.4, 999),
         # 40 steps in two fifths of the time; later ones take longer.
@@ -288,13 +288,13 @@ def test_steps_and_photographs_limit_how_many_gaussians_there_are(
 
 
 def test_recorded_depth_lets_a_fit_go_on_and_grow():
-    bare, recorded = whole_steps(8, recorded=False), whole_steps(8, recorded=True)
-    assert bare < recorded == whole_steps(1, recorded=True)
+    bare, recorded = converged_steps(8, recorded=False), converged_steps(8, recorded=True)
+    assert bare < recorded == converged_steps(1, recorded=True)
     assert most_gaussians(10**6, 8, recorded=False) == 8 * PER_VIEW
     assert most_gaussians(10**6, 8, recorded=True) == 10**6 * PER_STEP
     views = photographs(walk(3), depth=True)
     fit = Fit(rough_gaussians(), views, options=FitOptions(steps=10**6))
-    assert (fit.recorded, fit.whole) == (True, recorded)
+    assert (fit.recorded, fit.converged_after) == (True, recorded)
 
 
 def test_steps_shorten_at_the_end():

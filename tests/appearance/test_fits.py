@@ -17,8 +17,8 @@ WHOLE = 10
 
 @pytest.fixture(autouse=True)
 def short_fits(monkeypatch):
-    monkeypatch.setattr(fit_options, "WHOLE_PER_VIEW", 2)
-    monkeypatch.setattr(fit_options, "WHOLE_LEAST", WHOLE)
+    monkeypatch.setattr(fit_options, "CONVERGED_PER_VIEW", 2)
+    monkeypatch.setattr(fit_options, "CONVERGED_LEAST", WHOLE)
 
 
 def fit_of(count: int = 5, **options: float) -> Fit:
