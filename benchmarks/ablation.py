@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 from contextlib import ExitStack
 from importlib import import_module
@@ -57,7 +58,7 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     lines = ["| scene | without | PSNR | SSIM | PSNR, known pixels |", "|---|---|---|---|---|"]
-    for scene in args.scenes.split(";"):
+    for scene in map(str.strip, args.scenes.split(";")):
         for part in PARTS:
             file = args.out / f"{scene} {part}.json"
             if not file.exists():
@@ -78,6 +79,7 @@ def _measured(scene: str, part: str, shared: Path, out: Path) -> dict[str, Any]:
     project, context, targets, steps = SCENES[scene]
     settings, constants = PARTS[part]
     run = out / f"{scene} {part}".replace(" ", "_").replace(",", "")
+    shutil.rmtree(run, ignore_errors=True)
     with ExitStack() as changes:
         for path, value in constants.items():
             holder, name = f"gvtools.{path}".rsplit(".", 1)

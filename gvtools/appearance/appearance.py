@@ -55,9 +55,13 @@ class Appearance:
                 )
                 blend = Blend(*data["blend"].tolist())
                 exposures = Exposures(data["poses"], data["log_gains"], float(data["depth"]))
+                count = len(exposures.poses)
+                shapes = exposures.poses.shape, exposures.log_gains.shape
+                if shapes != ((count, 4, 4), (count, 3)):
+                    raise ValueError(f"exposures of shapes {shapes}")
                 return cls(
                     first, float(data["near"]), blend, others=tuple(others),
-                    exposures=exposures if len(exposures.poses) else None,
+                    exposures=exposures if count else None,
                 )  # fmt: skip
         except UNREADABLE as error:
             raise MemoryFileError(f"{path}: no readable appearance ({error})") from None

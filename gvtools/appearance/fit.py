@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.appearance import kernels
 from gvtools.appearance.camera_corrections import LEAST_BETTER, CameraCorrections
+from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit_options import FitOptions, converged_steps, most_gaussians
 from gvtools.appearance.fit_views import FitView, ReducedView, pixel_width, reduced
 from gvtools.appearance.gaussians import Gaussians
@@ -191,6 +192,7 @@ class Fit:
             if self.steps % 50 == 0:
                 report(over)
         self._check_poses()
+        self._reduced = {}
         report(1.0)
 
     @property
@@ -289,13 +291,24 @@ class Fit:
             if np.mean(gain) > LEAST_GAIN:
                 cameras.spread, self.judged = True, near
         cameras.start_like_neighbours(rows)
+        known = self._exposures()
+        for row in rows:
+            cameras.log_gains[row] = np.log(known.at(cameras.given[row]))
+        cameras.log_gains -= cameras.log_gains.mean(axis=0)
         self._judges = ()
 
     def _picture(self, number: int, pose: NDArray[np.float64]) -> Picture:
         view = self.views[number]
         height, width = view.rgb.shape[:2]
         lens = Lens.of(pose, view.K, size=(width, height), near=self.near)
-        return Picture.of(self.splatter(self.population.values, lens))
+        gain = self._exposures().at(pose)
+        return Picture.of(self.splatter(self.population.values, lens), gain=gain)
+
+    def _exposures(self) -> Exposures:
+        """Of the photographs that are fitted."""
+        given = [row for row in range(len(self.views)) if row not in self._judges]
+        gains = self.cameras.log_gains[given]
+        return Exposures(self.cameras.given[given], gains - gains.mean(axis=0), self.cameras.depth)
 
     def _error(self, number: int, picture: Picture) -> float:
         """Negative PSNR of a picture of a photograph [dB]."""

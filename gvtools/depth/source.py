@@ -11,7 +11,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
 from gvtools.depth.contradicted import contradicted
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Frame, Scene, View
@@ -75,6 +74,8 @@ class RecordedDepth:
 
     def __init__(self, views: Sequence[str] = ()) -> None:
         self.views = tuple(views)
+        # Views that are lifted one after the other share most neighbours.
+        self._kept_depth = lru_cache(maxsize=2 * CHECKING_VIEWS)(_usable_depth)
 
     def covers(self, view: View) -> bool:
         """Views with a depth map."""
@@ -96,7 +97,11 @@ class RecordedDepth:
         wrong = np.zeros(depth.shape, np.bool_)
         if others:
             near = nearest_views(scene.subset(others).cameras, view.camera, CHECKING_VIEWS)
-            wrong = contradicted(depth, view.camera, [_seen(scene[others[row]]) for row in near])
+            checking = [scene[others[row]] for row in near]
+            seen = [(self._kept_depth(other.load), other.camera) for other in checking]
+            wrong = contradicted(depth, view.camera, seen)
+            if frame.mask is not None:
+                wrong &= frame.mask
         depth = np.where(wrong, np.float32(0), depth)
         known = depth[depth > 0]
         near_depth = float(np.percentile(known, 10)) if known.size else 1.0
@@ -106,17 +111,11 @@ class RecordedDepth:
         return DepthMap(depth, confidence, self.name, int(wrong.sum()))
 
 
-def _seen(view: View) -> tuple[NDArray[np.float32], Cameras]:
-    depth = _loaded_depth(view.load)
-    return depth, view.camera
-
-
-@lru_cache(maxsize=2 * CHECKING_VIEWS)
-def _loaded_depth(load: Callable[[], Frame]) -> NDArray[np.float32]:
-    """A view's depth, kept: views that are lifted one after the other share most neighbours."""
-    depth = load().depth
-    assert depth is not None
-    return depth
+def _usable_depth(load: Callable[[], Frame]) -> NDArray[np.float32]:
+    """A view's depth, 0 where its mask leaves pixels out."""
+    frame = load()
+    assert frame.depth is not None
+    return frame.depth if frame.mask is None else np.where(frame.mask, frame.depth, np.float32(0))
 
 
 class MixedDepth:

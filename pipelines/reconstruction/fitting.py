@@ -21,15 +21,15 @@ from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit import CONTINUED, Fit
 from gvtools.appearance.fit_options import converged_steps
 from gvtools.appearance.fit_views import FitView
-from gvtools.appearance.fits import LEAST_SHARE, run_fits
+from gvtools.appearance.fits import LEAST_SHARE, MOST_FITS, run_fits
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
 from gvtools.appearance.start import from_depth, from_points
 from gvtools.depth.choice import rough_source
 from gvtools.depth.fitted_depth import FittedDepth
-from gvtools.depth.source import MixedDepth, RecordedDepth
-from gvtools.errors import GvError, ShapeError
+from gvtools.depth.source import MixedDepth, RecordedDepth, is_recorded
+from gvtools.errors import GvError, OptionError, ShapeError
 from gvtools.memory.projection import project
 from gvtools.runs.poses import RunPoses
 from gvtools.scenes.reduced import reduced
@@ -111,7 +111,7 @@ class Fitted:
         if isinstance(source, RecordedDepth):
             return plan
         fitted = FittedDepth(self.appearance)
-        some = any(scene[name].has_depth for name in plan.context)
+        some = any(is_recorded(source, scene[name]) for name in plan.context)
         evidence = scene if some else reduced(scene, EVIDENCE_SIDE)
         factor = _size(scene, plan.context) / _size(evidence, plan.context)
         assert plan.config.voxel is not None
@@ -157,7 +157,11 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     Args:
         plan: of the run.
         console: where progress goes.
-        earlier: a fit of this run to go on with.
+        earlier: fits of this run. The first is continued until it has converged; further ones are
+            then added.
+
+    Raises:
+        OptionError: an earlier fit has converged, and time or steps do not suffice for another.
     """
     plan = _posed(plan, earlier)
     if earlier is None or _converged(plan, earlier):
@@ -168,7 +172,26 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         return None
     if fit.splatter is GsplatSplat:
         console.line("fitting: on the CUDA device, by gsplat")
-    return _fitted(_run(fit, console), plan, earlier)
+    fits = _run(fit, console)
+    if earlier is not None and not fit.begin:
+        fits = _worth_adding(fits, earlier)
+    return _fitted(fits, plan, earlier)
+
+
+def _worth_adding(fits: Sequence[Fit], earlier: Fitted) -> Sequence[Fit]:
+    """Those of new fits that are long enough to be averaged with earlier ones.
+
+    Raises:
+        OptionError: none is.
+    """
+    least = round(LEAST_SHARE * fits[0].converged_after)
+    long = [fit for fit in fits if fit.steps >= least]
+    if not long:
+        raise OptionError(
+            f"{fits[0].steps} steps of another fit; expected {least}, since this run's fit has "
+            "converged; give more --seconds or --steps; the run is as it was"
+        )
+    return long[: MOST_FITS - len(earlier.appearance.fits)]
 
 
 def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None:
@@ -176,6 +199,11 @@ def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None
     frame = grid_frame(plan.scene, plan.context)
     options, seed = plan.config.refine, plan.config.seed
     if earlier is not None:
+        if len(earlier.appearance.fits) >= MOST_FITS:
+            raise OptionError(
+                f"{MOST_FITS} fits that have converged; expected fewer, since more gain nothing; "
+                "the run is as it was"
+            )
         frame = earlier.appearance.gaussians.frame
         options, seed = options.replaced(poses=False), seed + len(earlier.appearance.fits)
     views = _views(plan, frame)
@@ -189,8 +217,7 @@ def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None
 
 def _converged(plan: Plan, earlier: Fitted) -> bool:
     """Whether an earlier fit has converged: further steps would gain less than another fit."""
-    steps = converged_steps(len(plan.context), recorded=_recorded(plan))
-    return earlier.steps >= LEAST_SHARE * steps
+    return earlier.steps >= converged_steps(len(plan.context), recorded=_recorded(plan))
 
 
 def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
@@ -206,8 +233,8 @@ def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
 
 
 def _recorded(plan: Plan) -> bool:
-    """Whether all of the context has recorded depth."""
-    return all(plan.scene[name].has_depth for name in plan.context)
+    """Whether the run takes recorded depth for all of its context."""
+    return all(is_recorded(plan.source, plan.scene[name]) for name in plan.context)
 
 
 def _first_blend(plan: Plan) -> Blend:
@@ -282,9 +309,12 @@ def _views(plan: Plan, frame: LocalFrame) -> list[FitView]:
     poses = frame.cam_from_local(plan.scene.subset(plan.context).cameras.cam_from_world)
     frames = prefetch(lambda view: view.load(), views)
     return [
-        FitView(loaded.rgb, view.camera.K[0], pose, loaded.mask, loaded.depth)
+        FitView(
+            loaded.rgb, view.camera.K[0], pose, loaded.mask,
+            loaded.depth if is_recorded(plan.source, view) else None,
+        )
         for view, pose, loaded in zip(views, poses, frames, strict=True)
-    ]
+    ]  # fmt: skip
 
 
 def _start(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians:

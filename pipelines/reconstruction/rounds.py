@@ -97,6 +97,8 @@ def observe_context(
             if depth_map.contradicted:
                 reason = "depth that other views look through"
                 dropped[reason] = dropped.get(reason, 0) + depth_map.contradicted
+                # Lifting counts them as well, as pixels without depth.
+                dropped["no depth"] = dropped.get("no depth", 0) - depth_map.contradicted
         with clock.stage("fuse"):
             report = memory.observe(
                 frame.rgb,

@@ -39,9 +39,9 @@ def sweep(
     left_out = []
     for label, settings in planned.items():
         trial = runs.kept(label, settings)
-        # A trial is expected to take as long as the start, and the time that its fit is given.
+        # A trial is expected to take as long as the start, or the time that its fit is given.
         fit = settings.get("refine.seconds") or 0.0
-        if trial is None and trials and clock() + trials[0].seconds + fit > end:
+        if trial is None and trials and clock() + max(trials[0].seconds, fit) > end:
             left_out.append(label)
             continue
         try:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from splat_scene import HEIGHT, WIDTH, K, pose, rough_gaussians
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.exposures import Exposures
 from gvtools.cameras import Cameras
+from gvtools.errors import MemoryFileError
 
 
 def along(*places: float) -> np.ndarray:
@@ -60,3 +62,12 @@ def test_pictures_are_exposed_and_kept_so(tmp_path):
         np.savez(file, **exposed.arrays())
     again = Appearance.load(tmp_path / "a.npz")
     np.testing.assert_array_equal(again.picture(camera).rgb, dark.rgb)
+
+
+def test_a_file_with_exposures_of_other_views_is_refused(tmp_path):
+    exposures = Exposures(np.stack([pose(0.0), pose(0.05)]), np.zeros((1, 3)), 2.0)
+    wrong = Appearance(rough_gaussians(), 0.05, exposures=exposures)
+    with (tmp_path / "a.npz").open("wb") as file:
+        np.savez(file, **wrong.arrays())
+    with pytest.raises(MemoryFileError, match="exposures"):
+        Appearance.load(tmp_path / "a.npz")

@@ -220,13 +220,32 @@ def test_judges_are_spread_over_the_photographs():
     assert len(judges(1000)) == len(set(judges(1000))) == 5
 
 
+def test_judges_begin_with_the_exposure_that_their_neighbours_tell():
+    views = photographs(walk(16))
+    brightness = np.exp(np.linspace(-0.1, 0.1, 16))
+    views = [
+        replace(view, rgb=np.clip(view.rgb * bright, 0, 255).astype(np.uint8))
+        for view, bright in zip(views, brightness, strict=True)
+    ]
+    fit = Fit(rough_gaussians(), views, options=FitOptions())
+    for share in np.linspace(0, JUDGES_JOIN - 1e-6, 300):
+        fit.step(share)
+    rows = list(judges(16))
+    assert not fit.cameras.log_gains[rows].any()
+    fit._let_judges_join()
+    gains = fit.cameras.log_gains[:, 0]
+    assert gains[rows[0]] < -0.01 < 0.01 < gains[rows[1]]
+    np.testing.assert_allclose(fit.cameras.log_gains.mean(axis=0), 0, atol=1e-12)
+
+
 def test_judges_are_left_out_until_they_join():
     views = photographs(walk(8))
     (judge,) = judges(8)
     noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
     altered = [*views]
     altered[judge] = replace(views[judge], rgb=noise)
-    fits = [Fit(rough_gaussians(), each, options=FitOptions()) for each in (views, altered)]
+    options = FitOptions(exposure=False)
+    fits = [Fit(rough_gaussians(), each, options=options) for each in (views, altered)]
     before = JUDGES_JOIN - 1e-6
     for fit in fits:
         for share in np.linspace(0, before, 24):

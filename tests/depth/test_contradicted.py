@@ -81,6 +81,40 @@ def test_a_real_object_in_front_of_a_wall_stays():
     assert wrong.sum() <= 0.1 * (seen(0.0) < FAR).sum()
 
 
+def test_beside_something_thin_a_view_does_not_look_through():
+    bar = wall()
+    bar[:, 30] = 2.0
+    # Its pose is off by a pixel, so that it shows the wall where the bar is.
+    off = wall()
+    off[:, 31] = 2.0
+    witnesses = [(off, camera()), (off, camera()), (off, camera())]
+    assert not contradicted(bar, camera(), witnesses).any()
+
+
+def test_what_masks_leave_out_neither_speaks_nor_counts():
+    def view(name: str, depth: np.ndarray, use: bool) -> View:
+        frame = Frame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), depth, np.full(depth.shape, use))
+        return View(name, camera(0.0, name), lambda: frame, has_depth=True)
+
+    for first, others in ((True, False), (False, True)):
+        views = (
+            view("a", with_blob(), first),
+            view("b", wall(), others),
+            view("c", wall(), others),
+        )
+        scene = Scene(Path("."), "rgbd", views)
+        source = RecordedDepth([each.name for each in views])
+        found = source.depth(scene, views[0], views[0].load())
+        assert found.contradicted == 0
+        np.testing.assert_array_equal(found.depth, with_blob())
+
+
+def test_views_of_another_size_are_compared_where_they_look():
+    half = np.full((HEIGHT // 2, WIDTH // 2), FAR, np.float32)
+    small = [(half, each.resized(WIDTH // 2, HEIGHT // 2)) for each in OTHERS]
+    np.testing.assert_array_equal(contradicted(with_blob(), camera(), small), with_blob() < FAR)
+
+
 def test_recorded_depth_is_dropped_counted_and_not_trusted():
     def view(name: str, x: float, depth: np.ndarray) -> View:
         frame = Frame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), depth, None)

@@ -13,7 +13,7 @@ from command_line import refused
 from run_files import results
 from tiny_scan import write_scan
 
-from gvtools.appearance import fit
+from gvtools.appearance import fit, fit_options
 from gvtools.errors import ProjectError
 from gvtools.files import write_json
 from gvtools.runs.poses import RunPoses
@@ -22,6 +22,7 @@ from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.cli import main
 from pipelines.console import Console
+from pipelines.reconstruction import fitting
 from pipelines.reconstruction import refine as module
 from pipelines.reconstruction.fitting import Fitted
 from pipelines.reconstruction.refine import refine
@@ -205,6 +206,23 @@ def test_a_few_photographs_with_depth_are_fitted_as_well(scan, tmp_path):
     assert not (out / APPEARANCE).exists()
     refine(out, steps=1, console=QUIET)
     assert len(Fitted.load(out / APPEARANCE).appearance.gaussians) > 0
+
+
+def test_a_converged_fit_is_joined_by_another_if_there_are_steps(copy, monkeypatch, capsys):
+    monkeypatch.setattr(fit_options, "CONVERGED_PER_VIEW", 2)
+    monkeypatch.setattr(fit_options, "CONVERGED_LEAST_RECORDED", 20)
+    before = results(copy)
+    line = refused(capsys, "refine", copy, "--steps", 9)
+    assert "9 steps" in line and "expected 10" in line
+    assert results(copy) == before
+    earlier = Fitted.load(copy / APPEARANCE).appearance
+    refine(copy, steps=12, console=QUIET)
+    after = Fitted.load(copy / APPEARANCE).appearance
+    assert len(after.fits) == 2
+    np.testing.assert_array_equal(after.gaussians.values, earlier.gaussians.values)
+    assert after.others[0].values.tobytes() != earlier.gaussians.values.tobytes()
+    monkeypatch.setattr(fitting, "MOST_FITS", 2)
+    assert "2 fits" in refused(capsys, "refine", copy, "--steps", 12)
 
 
 def test_a_moved_project_serves(scan, copy, tmp_path):
