@@ -210,13 +210,21 @@ def _write(rows: list[dict[str, Any]], out: Path) -> None:
     figure, axes = plt.subplots(2, -(-len(scenes) // 2), figsize=(3.2 * -(-len(scenes) // 2), 6),
                                 squeeze=False)  # fmt: skip
     for axis, scene in zip(axes.ravel(), scenes, strict=False):
-        for method in ("gvtools", "splatting"):
-            shown = [row for row in rows if (row["scene"], row["method"]) == (scene, method)]
-            axis.plot([r["seconds"] for r in shown], [r["psnr"] for r in shown], "o-", label=method)
-        axis.set_title(scene, fontsize=9)
+        for method, label in (("gvtools", "gvtools"), ("splatting", "plain Gaussian splatting")):
+            mine = [row for row in rows if (row["scene"], row["method"]) == (scene, method)]
+            shown = [row for row in mine if row["budget"]]
+            axis.plot([r["seconds"] for r in shown], [r["psnr"] for r in shown], "o-", label=label)
+            alone = [row for row in mine if not row["budget"]]
+            for row in alone:
+                axis.plot(row["seconds"], row["psnr"], "kx", label="gvtools, the memory alone")
+        axis.set_xscale("log")
+        axis.set_xticks([10, 30, 100, 300], ["10", "30", "100", "300"])
+        axis.minorticks_off()
+        axis.grid(alpha=0.3)
+        axis.set_title(scene.replace(" views", " photographs"), fontsize=9)
         axis.set_xlabel("processor time [s]", fontsize=8)
         axis.set_ylabel("PSNR [dB]", fontsize=8)
-    axes[0, 0].legend(fontsize=8)
+    axes[0, 0].legend(fontsize=7, loc="lower right")
     figure.tight_layout()
     figure.savefig(out / "front.png", dpi=110)
     plt.close(figure)

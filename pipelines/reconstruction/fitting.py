@@ -172,7 +172,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         return None
     if fit.splatter is GsplatSplat:
         console.line("fitting: on the CUDA device, by gsplat")
-    fits = _run(fit, console)
+    fits: Sequence[Fit] = _run(fit, console)
     if earlier is not None and not fit.begin:
         fits = _worth_adding(fits, earlier)
     return _fitted(fits, plan, earlier)

@@ -80,12 +80,12 @@ def test_the_limit_holds_and_what_was_left_out_is_named(capsys):
 
 
 def test_a_long_fit_needs_its_time(capsys):
-    planned = {
+    planned: dict[str, Any] = {
         START: {},
         "profile long": {"refine.seconds": 3600.0, "edge": 4},
         "edge 4": {"edge": 4},
     }
-    runs = Runs()
+    runs: Any = Runs()
     made = sweep(planned, runs, limit=600, console=Console(), clock=lambda: runs.now)
     assert [trial.label for trial in made] == [START, "edge 4"]
     assert "profile long" in capsys.readouterr().err
