@@ -20,7 +20,8 @@ ROOT = Path(gvtools.__file__).parent
 DOCTESTED = (
     "gvtools",
     "gvtools.appearance.blending",
-    "gvtools.appearance.fit",
+    "gvtools.appearance.exposures",
+    "gvtools.appearance.fit_options",
     "gvtools.appearance.gaussians",
     "gvtools.appearance.splat.splat",
     "gvtools.cameras",

@@ -16,7 +16,7 @@ START = "start"
 
 
 def planned_trials(plan: Plan, profiles: Mapping[str, Settings]) -> dict[str, Settings]:
-    """Settings of each trial by its label, the start first; those that change nothing are absent.
+    """Settings of each trial by its label, the start first; those that are like another are absent.
 
     Every trial completes pictures of the start's size.
 
@@ -30,13 +30,14 @@ def planned_trials(plan: Plan, profiles: Mapping[str, Settings]) -> dict[str, Se
     }
     for key, values in _values(plan).items():
         trials |= {f"{key} {_shown(value)}": {key: value} for value in values}
-    config = plan.config
-    differing = {
-        label: settings
-        for label, settings in trials.items()
-        if applied(config, settings).replaced(profile=config.profile) != config
-    }
-    return {START: {}, **differing}
+    differing: dict[str, Settings] = {START: {}}
+    made = [plan.config]
+    for label, settings in trials.items():
+        config = applied(plan.config, settings).replaced(profile=plan.config.profile)
+        if config not in made:
+            made.append(config)
+            differing[label] = settings
+    return differing
 
 
 def _values(plan: Plan) -> dict[str, tuple[Any, ...]]:
