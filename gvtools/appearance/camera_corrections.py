@@ -18,7 +18,7 @@ NEAR_VIEWS, NEAR_SHIFT, NEAR_TURN = 2, 0.03, 0.05
 LEAST_BETTER = 0.01
 # Step lengths: of turns [rad], of shifts in shares of the depth, of the logarithm of exposures.
 # Those of poses are at the end smaller by the last number, so that right poses come to rest.
-TURN_RATE, SHIFT_RATE, GAIN_RATE, RATE_END = 1e-3, 1e-3, 2e-3, 0.02
+TURN_RATE, SHIFT_RATE, GAIN_RATE, RATE_END = 1e-3, 1e-3, 6e-3, 0.02
 
 
 class CameraCorrections:

@@ -66,7 +66,7 @@ def test_the_fit_goes_on_where_it_ended(copy):
     was, now = (one.appearance.exposures for one in (before, after))
     assert was is not None and now is not None
     assert np.abs(was.log_gains).max() > 0
-    assert np.abs(now.log_gains - was.log_gains).max() < 0.003
+    assert np.abs(now.log_gains - was.log_gains).max() < 0.009
     assert after.appearance.blend == before.appearance.blend
     assert json.loads((copy / "run.json").read_text())["refined"] == [{"steps": 1}]
 
