@@ -30,7 +30,8 @@ from gvtools.kernels import in_threads
 
 # The progress of a fit runs from 0 to 1: the share of its time, not of its steps, that is over.
 # Numbers below that name a part of the fit are progress.
-# Pictures are taken at a quarter, half and all of their size from here on.
+
+# The progress from which pictures are taken at a quarter, half and all of their size.
 SIZES = ((0.0, 4), (0.2, 2), (0.6, 1))
 # Each degree of the spherical harmonics joins after so much progress.
 DEGREE_EVERY = 0.12

@@ -30,8 +30,8 @@ def run_fits(
     """Run a fit; if it converges before its time or its steps are over, run further ones.
 
     There are no more when the time or the steps are over, when there are ``MOST_FITS``, or when
-    photographs that were left out of the fits gain less than ``LEAST_GAIN`` by the last one. A fit
-    that continues an earlier one (``Fit.begin`` above 0) is followed by none.
+    photographs that were left out of the fits gain less than ``LEAST_GAIN`` by the last one. None
+    come after a fit that continues an earlier one (``Fit.begin`` above 0).
 
     Args:
         first: has not been run.

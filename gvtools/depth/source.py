@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.depth.contradicted import contradicted
+from gvtools.depth.view_check import contradicted
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.view_selection import nearest_views

@@ -23,12 +23,12 @@ def compile_kernels(
         more: kernels that are needed besides.
     """
     from gvtools.completers.base import completer_type
-    from gvtools.depth import contradicted
+    from gvtools.depth import view_check
     from gvtools.kernels import compile_side_by_side
     from gvtools.memory import compile_kernels as memory
 
     completer = completer_type(config.completer)
-    sets = [memory.KERNELS, contradicted.KERNELS, *completer.kernels, *more]
+    sets = [memory.KERNELS, view_check.KERNELS, *completer.kernels, *more]
     if completer.costly and config.effort.inpaint_below > 0:
         sets += completer_type("inpaint").kernels
     if config.refine.wanted:
