@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.appearance.blending import Blend, blended
 from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.gaussians import UNREADABLE, Gaussians
 from gvtools.appearance.picture import Picture, mean_picture
+from gvtools.appearance.splat.median_depth import median_depth
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError
@@ -92,11 +94,28 @@ class Appearance:
 
     def pictures(self, camera: Cameras) -> list[Picture]:
         """What a camera sees, a batch of one, by each fit."""
-        pose = self.gaussians.frame.cam_from_local(camera.cam_from_world)[0]
-        size = (int(camera.width[0]), int(camera.height[0]))
-        lens = Lens.of(pose, camera.K[0], size=size, near=self.near)
+        pose, lens = self._pose_and_lens(camera)
         gain = self.exposures.at(pose) if self.exposures else None
         return [Picture.of(self.splatter(fit.values, lens), gain=gain) for fit in self.fits]
+
+    def depth(self, camera: Cameras) -> NDArray[np.float32]:
+        """(H, W) z-depth that a camera sees, a batch of one; 0 where no fit has a surface.
+
+        With several fits it is the median of those that have one; with an even number the nearer of
+        the middle two, since their mean may be where neither has a surface.
+        """
+        lens = self._pose_and_lens(camera)[1]
+        depths = np.array([median_depth(fit.values, lens) for fit in self.fits])
+        ordered = np.sort(np.where(depths > 0, depths, np.float32(np.inf)), axis=0)
+        middle = np.maximum((depths > 0).sum(axis=0) - 1, 0) // 2
+        found = np.take_along_axis(ordered, middle[None], axis=0)[0]
+        return np.where(np.isfinite(found), found, np.float32(0))
+
+    def _pose_and_lens(self, camera: Cameras) -> tuple[NDArray[np.float64], Lens]:
+        """The pose in the Gaussians' frame, and the lens there."""
+        pose = self.gaussians.frame.cam_from_local(camera.cam_from_world)[0]
+        size = (int(camera.width[0]), int(camera.height[0]))
+        return pose, Lens.of(pose, camera.K[0], size=size, near=self.near)
 
 
 def applied(picture: Picture, guidance: Guidance, *, blend: Blend) -> Guidance:

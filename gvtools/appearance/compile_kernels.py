@@ -10,12 +10,14 @@ from gvtools.kernels import KernelSet
 def compile_splatting() -> None:
     """Call each kernel of splatting once."""
     from gvtools.appearance.gaussians import Gaussians
+    from gvtools.appearance.splat.median_depth import median_depth
     from gvtools.appearance.splat.splat import Lens, Splat
 
     some = Gaussians.at([[0.0, 0.0, 2.0]], [[255, 0, 0]], sizes=[0.5])
     lens = Lens.of(np.eye(4), np.diag([16.0, 16.0, 1.0]), size=(16, 16), near=0.1)
     picture = Splat(some.values, lens)
     picture.backward(np.ones_like(picture.image))
+    median_depth(some.values, lens)
 
 
 def compile_steps() -> None:

@@ -35,5 +35,5 @@ class FittedDepth:
         shown = self.appearance.picture(view.camera)
         off = np.abs(shown.rgb - frame.rgb / np.float32(255)).mean(axis=2)
         confidence = np.exp(-np.square(off / TOLERANCE)).astype(np.float32)
-        known = np.where(shown.alpha > OPAQUE, shown.depth, 0).astype(np.float32)
+        known = np.where(shown.alpha > OPAQUE, self.appearance.depth(view.camera), np.float32(0))
         return DepthMap(known, np.maximum(confidence, LEAST_CONFIDENCE), self.name)

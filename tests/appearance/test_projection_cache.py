@@ -117,7 +117,7 @@ def test_holes_take_the_colours_of_gaussians_that_show_a_surface(memory, monkeyp
     assert valid.any() and not valid.all()
     alpha = np.zeros(valid.shape, np.float32)
     alpha[:, ::2] = 1
-    shown = Picture(np.full((*valid.shape, 3), 0.75, np.float32), np.ones_like(alpha), alpha)
+    shown = Picture(np.full((*valid.shape, 3), 0.75, np.float32), alpha)
 
     monkeypatch.setattr(Appearance, "picture", lambda self, camera: shown)
     appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1, Blend(share=0.0))

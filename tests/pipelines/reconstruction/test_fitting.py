@@ -179,9 +179,9 @@ def test_photographs_alone_get_depth_by_the_gaussians(tmp_path, points):
     assert {entry["source"] for entry in report["depth"]} <= {"fitted", "memory"}
     assert report["depth"][0]["source"] == "fitted"
     assert report["points"] > 500
-    shown = fitted.appearance.picture(planned(scan).scene["view_1.png"].camera)
+    shown = fitted.appearance.depth(planned(scan).scene["view_1.png"].camera)
     # The wall is 3 units away, the square 1.8.
-    assert 1.5 < np.median(shown.depth[shown.solid]) < 3.5
+    assert 1.5 < np.median(shown[shown > 0]) < 3.5
 
 
 def test_few_sparse_points_are_not_begun_with(tmp_path, monkeypatch):
@@ -261,7 +261,7 @@ def test_the_blend_is_chosen_by_the_left_out_photographs(scan):
     name = plan.context[1]
     truth = (plan.scene[name].load().rgb / np.float32(255)).astype(np.float32)
     alpha = np.ones(truth.shape[:2], np.float32)
-    good, bad = Picture(truth, alpha, alpha), Picture(1 - truth, alpha, alpha)
+    good, bad = Picture(truth, alpha), Picture(1 - truth, alpha)
     fitted = Fitted(Appearance(gaussians, 0.1), judged={name: good})
     assert fitted.with_best_blend(plan, memory).appearance.blend.share == 0
     fitted = Fitted(Appearance(gaussians, 0.1), judged={name: bad})
@@ -277,7 +277,7 @@ def test_a_photograph_does_not_judge_a_memory_that_has_seen_it(scan):
     frame = view.load()
     memory.observe(frame.rgb, frame.depth, view.camera, round=0)
     ones = np.ones(frame.rgb.shape[:2], np.float32)
-    grey = Picture(np.full(frame.rgb.shape, 0.5, np.float32), ones, ones)
+    grey = Picture(np.full(frame.rgb.shape, 0.5, np.float32), ones)
     appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1)
     fitted = Fitted(appearance, judged={name: grey})
     assert fitted.with_best_blend(plan, memory).appearance.blend == Blend()
