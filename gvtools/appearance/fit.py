@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.appearance import kernels
 from gvtools.appearance.camera_corrections import LEAST_BETTER, CameraCorrections
+from gvtools.appearance.depth_loss import add_depth
 from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit_options import FitOptions, converged_steps, most_gaussians
 from gvtools.appearance.fit_views import FitView, ReducedView, pixel_width, reduced
@@ -346,8 +347,7 @@ class Fit:
         self._errors.append(float(((shown - target) ** 2 * view.weight).mean()))
         self.cameras.step_gain(number, (gradient[:3] * shown).sum(axis=(1, 2)) / pixels)
         gradient[:3] *= gain[:, None, None]
-        if view.depth is not None and options.depth > 0:
-            gradient[3:] += options.depth * _depth_gradient(picture.image, view)
+        add_depth(picture.image, view, gradient, weight=options.depth)
         if view.depth is None:
             add_bending(picture.image, view.target, gradient, weight=SMOOTH)
         return gradient
@@ -380,15 +380,3 @@ def _rates(share: float) -> NDArray[np.float32]:
     rates[SH + 3 :] = harmonic
     rates[LOG_SCALE:] *= REST ** max(0.0, (share - REST_BEGINS) / (1 - REST_BEGINS))
     return rates
-
-
-def _depth_gradient(image: NDArray[np.float32], view: ReducedView) -> NDArray[np.float32]:
-    """(2, H, W) gradient of |D - A d| / d over the pixels with recorded depth d.
-
-    D is the image's depth times alpha and A its alpha, so opaque pixels should have D = d.
-    """
-    assert view.depth is not None
-    known = view.depth > 0
-    d = np.where(known, view.depth, np.float32(1))
-    sign = np.sign(image[3] - image[4] * d) * known * view.weight
-    return np.stack([sign / d, -sign])

@@ -22,7 +22,8 @@ class FitView:
         K: (3, 3) intrinsics [px].
         cam_from_local: (4, 4) pose in the Gaussians' frame.
         mask: (H, W) bool, True = use; None uses all.
-        depth: (H, W) float32 z-depth, scene units, 0 = none; None has none.
+        depth: (H, W) float32 recorded z-depth, scene units, 0 = none; None has none.
+        estimate: (H, W) float32 likewise, estimated by a network and wrong by some percent.
     """
 
     rgb: NDArray[np.uint8]
@@ -30,6 +31,7 @@ class FitView:
     cam_from_local: NDArray[np.float64]
     mask: NDArray[np.bool_] | None = None
     depth: NDArray[np.float32] | None = None
+    estimate: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +42,14 @@ class ReducedView:
         target: (3, H, W) float32 colours from 0 to 1.
         weight: (H, W) float32, the share of each pixel that is used.
         depth: (H, W) float32, 0 = none; None has none.
+        estimate: likewise.
         K: (3, 3) intrinsics of this size.
     """
 
     target: NDArray[np.float32]
     weight: NDArray[np.float32]
     depth: NDArray[np.float32] | None
+    estimate: NDArray[np.float32] | None
     K: NDArray[np.float64]
 
     @property
@@ -69,18 +73,25 @@ def reduced(view: FitView, factor: int) -> ReducedView:
     both = torch.cat([target * weight, weight])
     if (rows, columns) != (height, width):
         both = torch.nn.functional.interpolate(both[None], (rows, columns), mode="area")[0]
-    depth = view.depth
-    if depth is not None and (rows, columns) != (height, width):
-        y = ((np.arange(rows) + 0.5) * height / rows).astype(int)
-        x = ((np.arange(columns) + 0.5) * width / columns).astype(int)
-        depth = np.ascontiguousarray(depth[y][:, x])
+    depth, estimate = (
+        None if full is None else _picked(full, rows, columns)
+        for full in (view.depth, view.estimate)
+    )
     K = view.K.copy()
     K[0] *= columns / width
     K[1] *= rows / height
     arrays = both.contiguous().numpy()
     if view.mask is not None:
         arrays[:3] /= np.maximum(arrays[3], np.float32(1e-6))
-    return ReducedView(arrays[:3], arrays[3], depth, K)
+    return ReducedView(arrays[:3], arrays[3], depth, estimate, K)
+
+
+def _picked(depth: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
+    """The pixels of (H, W) depth that are nearest to those of a smaller picture."""
+    height, width = depth.shape
+    y = ((np.arange(rows) + 0.5) * height / rows).astype(int)
+    x = ((np.arange(columns) + 0.5) * width / columns).astype(int)
+    return np.ascontiguousarray(depth[y][:, x])
 
 
 def pixel_width(positions: NDArray[np.float32], views: Sequence[FitView]) -> NDArray[np.float32]:

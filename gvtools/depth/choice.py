@@ -10,7 +10,7 @@ from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.source import DepthSource, MixedDepth, RecordedDepth
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.scene import Scene
+from gvtools.scenes.scene import Scene, View
 from gvtools.settings import changes
 
 CHOICES = ("auto", "sensor", "colmap", "plane-sweep", "da3")
@@ -90,6 +90,15 @@ def rough_source(scene: Scene, source: DepthSource) -> DepthSource:
     side, levels = min(options.max_side, ROUGH_SIDE), min(options.levels, ROUGH_LEVELS)
     options = options.replaced(max_side=side, levels=levels, align=False)
     return PlaneSweepStereo(scene, options=options, views=source.views)
+
+
+def is_estimated(source: DepthSource, view: View) -> bool:
+    """Whether a network that has learnt depth gives that of ``view``."""
+    from gvtools.depth.foundation.source import FoundationDepth
+
+    if isinstance(source, MixedDepth):
+        return not source.recorded.covers(view) and is_estimated(source.computed, view)
+    return isinstance(source, FoundationDepth) and source.covers(view)
 
 
 def _chosen(

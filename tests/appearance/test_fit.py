@@ -21,6 +21,7 @@ from splat_scene import (
 
 from gvtools.appearance import fit as fit_module
 from gvtools.appearance import fit_options
+from gvtools.appearance.depth_loss import ESTIMATE, ESTIMATE_TOLERANCE, add_depth
 from gvtools.appearance.fit import JUDGES_JOIN, OF_STEPS, OF_TIME, Fit, judges
 from gvtools.appearance.fit_options import (
     PER_STEP,
@@ -196,23 +197,48 @@ def test_photographs_of_different_brightness_are_explained_by_gains(views):
     assert fits[True].psnr > fits[False].psnr + 0.3
 
 
-def test_recorded_depth_pulls_gaussians_to_where_it_is():
+@pytest.mark.parametrize("given", ["depth", "estimate"])
+def test_depth_pulls_gaussians_to_where_it_is(given):
     # One photograph alone does not tell depth.
     view = photograph(pose(0.0))
+    truth = view.depth
+    assert truth is not None
     start = rough_gaussians()
     start.values[:, :3] *= 1.08
     errors = {}
-    for weight in (0.0, 0.1):
-        fit = Fit(start, [view], options=FitOptions(steps=120, depth=weight, poses=False))
+    for some in (None, truth):
+        told = replace(view, depth=None, estimate=some)
+        if given == "depth":
+            told = replace(view, depth=some)
+        fit = Fit(start, [told], options=FitOptions(steps=120, poses=False))
         fit.run()
         lens = Lens.of(view.cam_from_local, K, size=(WIDTH, HEIGHT), near=0.05)
         _, _, _, weighted, alpha = Splat(fit.gaussians.values, lens).image
-        assert view.depth is not None
         solid = alpha > 0.5
-        off = np.abs(weighted[solid] / alpha[solid] / view.depth[solid] - 1)
-        errors[weight] = float(np.median(off))
-    assert errors[0.0] > 0.03
-    assert errors[0.1] < 0.5 * errors[0.0]
+        off = np.abs(weighted[solid] / alpha[solid] / truth[solid] - 1)
+        errors[some is None] = float(np.median(off))
+    assert errors[True] > 0.03
+    assert errors[False] < 0.5 * errors[True]
+
+
+def test_an_estimate_pulls_less_where_it_is_missed_by_less_than_its_tolerance():
+    view = replace(photograph(pose(0.0)), depth=None)
+    estimate = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    estimate[:, :9] = 0
+    small = reduced(replace(view, estimate=estimate), 1)
+    image = np.ones((5, HEIGHT, WIDTH), np.float32)
+    pulls = []
+    for missed in (0.0, 0.5, 1.0, 3.0, -3.0):
+        image[3] = 2 * (1 + missed * ESTIMATE_TOLERANCE)
+        gradient = np.zeros_like(image)
+        add_depth(image, small, gradient, weight=0.0)
+        assert not gradient[:3].any() and not gradient[:, :, :9].any()
+        np.testing.assert_allclose(gradient[4], -2 * gradient[3])
+        pulls.append(float(gradient[3, 0, 20]))
+    np.testing.assert_allclose(pulls, ESTIMATE * np.array([0, 0.25, 0.5, 0.5, -0.5]), atol=1e-5)
+    gradient = np.zeros_like(image)
+    add_depth(image, reduced(view, 1), gradient, weight=1.0)
+    assert not gradient.any()
 
 
 def test_judges_are_spread_over_the_photographs():

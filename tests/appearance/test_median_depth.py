@@ -13,8 +13,7 @@ from gvtools.cameras import Cameras
 SIZE = 45, 37
 K = np.array([[40.0, 0, 22.0], [0, 40.0, 19.0], [0, 0, 1]])
 LENS = Lens.of(np.eye(4), K, size=SIZE, near=0.05)
-SIDES = np.array([[45], [37]])
-CAMERA = Cameras(K[None], np.eye(4)[None], *SIDES, ("one",))
+CAMERA = Cameras(K[None], np.eye(4)[None], np.array([45]), np.array([37]), ("one",))
 
 
 def sheets(*depths_and_alphas):

@@ -17,6 +17,8 @@ from gvtools.appearance.blending import Blend
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture
 from gvtools.appearance.splat.project_kernels import VALUES
+from gvtools.depth.foundation.source import FoundationDepth
+from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError, MemoryFileError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -293,3 +295,24 @@ def test_a_run_with_judges_keeps_the_blend_that_they_chose(tmp_path):
     chosen = fitted.with_best_blend(fitted.applied(plan), memory_of_round_0(out))
     assert chosen.appearance.blend != Blend()
     assert Fitted.load(out / FITTED).appearance.blend == chosen.appearance.blend
+
+
+def test_a_networks_depth_guides_the_fit_and_its_failures_do_not_stop_it(tmp_path, monkeypatch):
+    scan = write_colmap_scan(tmp_path / "scan", views=10)
+    (tmp_path / "model.safetensors").write_bytes(b"only looked for")
+    plan = planned(scan, "depth=da3", f"da3.weights={tmp_path}")
+    assert isinstance(plan.source, FoundationDepth)
+
+    def depth(self, scene, view, frame):
+        if view.name == plan.context[1]:
+            raise DegenerateError("no scale")
+        found = np.full(frame.rgb.shape[:2], 3, np.float32)
+        return DepthMap(found, np.ones_like(found), self.name)
+
+    monkeypatch.setattr(FoundationDepth, "depth", depth)
+    frame = fitting.grid_frame(plan.scene, plan.context)
+    first, second, *_ = fitting._views(plan, frame)
+    assert first.depth is None and first.estimate is not None and (first.estimate == 3).all()
+    assert second.estimate is None
+    plain = fitting._views(planned(scan), frame)
+    assert all(view.depth is None and view.estimate is None for view in plain)

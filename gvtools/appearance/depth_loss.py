@@ -1,0 +1,47 @@
+"""Depth that is known or estimated, in the loss of a fit."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.appearance.fit_views import ReducedView
+
+# Weight of depth that a network estimated, and the share by which it may be wrong. With depth of a
+# fit to all photographs in its place, made wrong by 2 %, three and seven photographs gain 0.4 dB;
+# by 5 %, 0.2 dB; by 10 %, nothing.
+ESTIMATE, ESTIMATE_TOLERANCE = 0.3, 0.03
+# Recorded depth pulls with all its weight from any distance.
+EXACT = 1e-6
+
+
+def add_depth(
+    image: NDArray[np.float32],
+    view: ReducedView,
+    gradient: NDArray[np.float32],
+    *,
+    weight: float,
+) -> None:
+    """Add the gradient of |D - A d| / d over the pixels with depth d to (5, H, W).
+
+    D is the image's depth times alpha and A its alpha, so opaque pixels should have D = d. Where an
+    estimate is missed by less than its tolerance, the loss is quadratic and pulls less.
+
+    Args:
+        image: (5, H, W), see ``Splat``; its last two channels get a gradient.
+        view: the photograph with its recorded depth, else with an estimate; without either nothing
+            is added.
+        gradient: is added to.
+        weight: of recorded depth.
+    """
+    depth, tolerance = view.depth, EXACT
+    if depth is None:
+        depth, tolerance, weight = view.estimate, ESTIMATE_TOLERANCE, ESTIMATE
+    if depth is None or not weight:
+        return
+    known = depth > 0
+    d = np.where(known, depth, np.float32(1))
+    off = (image[3] - image[4] * d) / (d * np.float32(tolerance))
+    pull = np.float32(weight) * np.clip(off, -1, 1) * known * view.weight
+    gradient[3] += pull / d
+    gradient[4] -= pull
