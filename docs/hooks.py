@@ -76,18 +76,19 @@ def settings_page() -> str:
     text = [
         "# Settings",
         "",
-        "Settings come from the defaults, then `--profile`, then a JSON file (`--config`), then "
-        "the options, then `--set NAME=VALUE`. The resolved ones are written to `run.json`. A name "
+        "Settings come from the defaults, then `--profile` and `--protocol`, then a JSON file "
+        "(`--config`), then the options, then `--set NAME=VALUE`. The resolved ones are written to `run.json`. A name "
         "that does not exist is an error which names the nearest one. `gvtools reconstruct "
         "--help-settings` prints this list.",
         "",
         markdown(settings, *options_of_all()),
-        "## Profiles",
-        "",
     ]
-    for name, changes in settings.profiles.items():
-        changed = ", ".join(f"`{key}={value}`" for key, value in changes.items())
-        text.append(f"- `{name}`: {changed or 'the defaults'}")
+    for field, presets in settings.presets.items():
+        text += [f"## {field.capitalize()}s", ""]
+        for name, changes in presets.items():
+            changed = ", ".join(f"`{key}={value}`" for key, value in changes.items())
+            text.append(f"- `{name}`: {changed or 'the defaults'}")
+        text.append("")
     return "\n".join(text) + "\n"
 
 

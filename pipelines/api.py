@@ -68,13 +68,13 @@ def reconstruct(
     """
     from gvtools.runs.run import load_run
     from gvtools.scenes.project import open_project
-    from gvtools.settings import with_profile, with_values
+    from gvtools.settings import with_values
     from pipelines.console import Console
     from pipelines.reconstruction.run import reconstruct as run_reconstruct
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.report.write import draw_run
 
-    config = with_profile(RunSettings(), profile)
+    config = with_values(RunSettings(), {"profile": profile})
     named = {"context": context, "targets": targets, "completer": completer}
     chosen = {key: value for key, value in named.items() if value is not None}
     config = with_values(config, {**chosen, **(settings or {})})

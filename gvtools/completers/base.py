@@ -75,7 +75,7 @@ class ContextView:
 class Completion:
     """Completed target views. Where the guidance was valid, its rgb stands unchanged.
 
-    So does its depth there, unless the completer's depth is in a unit of its own, which the run
+    (Not in ``whole`` views.) So does its depth there, unless the completer's depth is in a unit of its own, which the run
     finds by comparing it with the guidance's (``scale_alignment`` None).
 
     Attributes:
@@ -87,6 +87,7 @@ class Completion:
         scale_alignment: for each view, how the completer brought its depth into scene units; the
             generated depth of a refused view is 0. None, of a view or of all, leaves the alignment
             to the run, which compares depth with the memory's.
+        whole: all pixels are generated anew, those that the memory shows, too.
     """
 
     rgb: Float32
@@ -94,6 +95,7 @@ class Completion:
     confidence: Float32
     rays: Float32 | None = None
     scale_alignment: tuple[ScaleAlignment | None, ...] | None = None
+    whole: bool = False
 
     def __post_init__(self) -> None:
         shape = self.depth.shape
@@ -197,7 +199,7 @@ def run_completer(
     """Call ``completer.complete`` and check what it returns.
 
     That is its type, shapes, finite values, and that pixels which are valid in ``guidance`` kept
-    their colour.
+    their colour, unless whole views were generated.
 
     Raises:
         ShapeError: it returned something else, of another size, or with NaN or infinity; or the
@@ -220,7 +222,7 @@ def run_completer(
                 f"completer {completer.name}: {what} holds NaN or infinity; expected finite "
                 "values, and a depth of 0 where there is none"
             )
-    if (completion.rgb != guidance.rgb)[guidance.valid].any():
+    if not completion.whole and (completion.rgb != guidance.rgb)[guidance.valid].any():
         raise OptionError(
             f"completer {completer.name} changed colours where the guidance is valid; expected "
             "them unchanged there"

@@ -95,4 +95,5 @@ def _merged(guidance: Guidance, parts: Sequence[tuple[Sequence[int], Completion]
         for row, alignment in zip(at, part.scale_alignment or [None] * len(at), strict=True):
             alignments[row] = alignment
     unaligned = all(alignment is None for alignment in alignments)
-    return Completion(rgb, depth, confidence, rays, None if unaligned else tuple(alignments))
+    whole = any(part.whole for _, part in parts)
+    return Completion(rgb, depth, confidence, rays, None if unaligned else tuple(alignments), whole)

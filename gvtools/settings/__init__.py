@@ -8,7 +8,6 @@ from gvtools.settings.parser import (
     changes,
     dotted,
     with_file,
-    with_profile,
     with_texts,
     with_values,
 )
@@ -20,7 +19,6 @@ __all__ = [
     "listing",
     "markdown",
     "with_file",
-    "with_profile",
     "with_texts",
     "with_values",
 ]

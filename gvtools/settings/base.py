@@ -49,8 +49,9 @@ class Settings(BaseModel):
 
     # What the settings are called on the command line, before the dot; "" at the top.
     section: ClassVar[str] = ""
-    # What each profile changes, as dotted keys; a class with profiles has a field ``profile``.
-    profiles: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    # Fields whose value stands for several other settings, such as ``profile``: what each of their
+    # values changes, as dotted keys.
+    presets: ClassVar[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {}
     # Plain fields that take options below them, and the mapping field that keeps those unchecked;
     # ``.name`` below such a field is the field itself.
     options_of: ClassVar[Mapping[str, str]] = {}

@@ -35,13 +35,13 @@ def with_texts(settings: S, texts: Iterable[str]) -> S:
     return with_values(settings, pairs)
 
 
-def with_file(settings: S, path: Path, *, profile: str | None = None) -> S:
-    """``settings`` with those of a JSON file over those of a profile.
+def with_file(settings: S, path: Path, *, presets: Mapping[str, str] | None = None) -> S:
+    """``settings`` with those of a JSON file over those of presets.
 
     Args:
         settings: to start from.
         path: the file.
-        profile: in place of the one that the file may name.
+        presets: names of presets by field, in place of those that the file may name.
 
     Raises:
         OptionError: unreadable, no JSON object, an unknown key or a wrong value.
@@ -52,21 +52,10 @@ def with_file(settings: S, path: Path, *, profile: str | None = None) -> S:
         raise OptionError(f"{path}: no readable JSON settings ({error})") from None
     if not isinstance(data, dict):
         raise OptionError(f"{path}: holds a {type(data).__name__}; expected an object of settings")
-    if settings.profiles:
-        data |= {} if profile is None else {"profile": profile}
     try:
-        return with_values(settings, dotted(data))
+        return with_values(settings, dotted({**data, **(presets or {})}))
     except OptionError as error:
         raise OptionError(f"{path}: {error}") from None
-
-
-def with_profile(settings: S, name: str) -> S:
-    """``settings`` with those of a profile.
-
-    Raises:
-        OptionError: no such profile.
-    """
-    return with_values(settings, [("profile", name)])
 
 
 def with_values(settings: S, values: Iterable[tuple[str, Any]] | Mapping[str, Any]) -> S:
@@ -92,12 +81,12 @@ def dotted(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def changes(before: Settings, after: Settings) -> dict[str, Any]:
-    """The dotted settings that make ``before`` to ``after``, but for the profile's name."""
+    """The dotted settings that make ``before`` to ``after``, but for the presets' names."""
     old, new = dotted(before.to_dict()), dotted(after.to_dict())
     prefixes = {f"{field}.": f"{head}." for head, field in after.options_of.items()}
     changed = {}
     for key, value in new.items():
-        if key == "profile" or (key in old and old[key] == value):
+        if key in after.presets or (key in old and old[key] == value):
             continue
         inner = next((prefix for prefix in prefixes if key.startswith(prefix)), None)
         changed[key if inner is None else prefixes[inner] + key.removeprefix(inner)] = value
@@ -105,14 +94,16 @@ def changes(before: Settings, after: Settings) -> dict[str, Any]:
 
 
 def _expanded(settings: Settings, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[str, Any]]:
-    """The pairs, those that a profile stands for below all others."""
+    """The pairs, those that presets stand for below all others."""
     given = list(pairs)
-    for key, value in given:
-        if key == "profile" and settings.profiles:
-            if str(value) not in settings.profiles:
-                known = ", ".join(settings.profiles)
-                raise OptionError(f"profile {value!r}; expected one of {known}")
-            yield from settings.profiles[value].items()
+    for field, presets in settings.presets.items():
+        for key, value in given:
+            if key != field:
+                continue
+            if str(value) not in presets:
+                known = ", ".join(presets)
+                raise OptionError(f"{field} {value!r}; expected one of {known}")
+            yield from presets[value].items()
     yield from given
 
 

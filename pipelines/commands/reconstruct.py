@@ -51,6 +51,9 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
     parser.add_argument("--completer", metavar="NAME", help="default inpaint")
     parser.add_argument("--profile", metavar="NAME", help="fast, balanced, accurate or finest")
     parser.add_argument(
+        "--protocol", metavar="NAME", help="gvtools, or paper: GeoVerse as it was published"
+    )
+    parser.add_argument(
         "--refine",
         type=float,
         metavar="SECONDS",
@@ -116,25 +119,25 @@ def copy_figures(args: argparse.Namespace, out: Path) -> None:
 
 
 def config_from(args: argparse.Namespace) -> RunSettings:
-    """Defaults, then the profile, then --config, then the options, then --set.
+    """Defaults, then profile and protocol, then --config, then the options, then --set.
 
     ``--set profile=NAME`` stands for ``--profile NAME``.
     """
-    from gvtools.settings import with_file, with_profile, with_texts, with_values
+    from gvtools.settings import with_file, with_texts, with_values
     from pipelines.reconstruction.settings import RunSettings
 
-    config, profile = RunSettings(), args.profile
-    texts = []
+    config, texts = RunSettings(), []
+    presets = {name: getattr(args, name) for name in config.presets if getattr(args, name)}
     for text in args.set:
         key, equals, value = text.partition("=")
-        if key.strip() == "profile" and equals:
-            profile = value.strip()
+        if key.strip() in config.presets and equals:
+            presets[key.strip()] = value.strip()
         else:
             texts.append(text)
     if args.config:
-        config = with_file(config, args.config, profile=profile)
-    elif profile:
-        config = with_profile(config, profile)
+        config = with_file(config, args.config, presets=presets)
+    else:
+        config = with_values(config, presets)
     names = ("context", "targets", "views_per_round", "rounds", "max_side", "depth", "completer",
              "voxel", "device", "seed")  # fmt: skip
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}

@@ -81,7 +81,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     scene, plan = _planned(args, config, console)
     config = config.replaced(voxel=plan.config.voxel, memory=plan.config.memory)
     planned = planned_trials(
-        plan, {name: changes(config, asked_for(args, name)) for name in config.profiles}
+        plan, {name: changes(config, asked_for(args, name)) for name in config.presets["profile"]}
     )
     with folder_lock(args.out):
         identity = run_identity(plan, reading_of(args))
@@ -131,14 +131,14 @@ def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunSettin
 
     A profile finds its own voxel edge, unless one is given.
     """
-    from gvtools.settings import changes, with_file, with_profile, with_texts
+    from gvtools.settings import changes, with_file, with_texts, with_values
     from pipelines.reconstruction.settings import RunSettings
 
     config = RunSettings()
     if args.config:
-        config = with_file(config, args.config, profile=profile)
+        config = with_file(config, args.config, presets={"profile": profile} if profile else None)
     elif profile is not None:
-        config = with_profile(config, profile)
+        config = with_values(config, {"profile": profile})
     named = [text for text in args.set if text.partition("=")[0].strip() == "profile"]
     texts = args.set if profile is None else [text for text in args.set if text not in named]
     config = with_texts(config, texts)

@@ -49,7 +49,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _list_options(option: _Add) -> None:
     option(
-        "config", nargs="?", metavar="CONFIG", help="base, tiny or a config.json; all by default"
+        "config",
+        nargs="?",
+        metavar="CONFIG",
+        help="base, gld, tiny or a config.json; all by default",
     )
 
 
@@ -60,7 +63,7 @@ def _check_options(option: _Add) -> None:
 
 
 def _create_options(option: _Add) -> None:
-    option("config", metavar="NAME", help="base, tiny or a config.json")
+    option("config", metavar="NAME", help="base, gld, tiny or a config.json")
     option("folder", type=Path, metavar="DIR", help="the folder to make")
     option("--seed", type=int, default=0, metavar="N", help="of the numbers (0)")
 
@@ -239,7 +242,7 @@ def _config(name: str) -> GeoVerseConfig:
         path = path / "config.json"
     if path.is_file():
         return read(path)
-    raise OptionError(f"no configuration {name!r}; expected {' or '.join(NAMES)}, or a config.json")
+    raise OptionError(f"no configuration {name!r}; expected {', '.join(NAMES)} or a config.json")
 
 
 # Name: what it does, its options, a summary, examples.

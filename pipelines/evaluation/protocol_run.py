@@ -11,7 +11,7 @@ from gvtools.evaluation.protocol import protocol_split
 from gvtools.files import write_json
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import RECORD
-from gvtools.settings import with_profile, with_texts, with_values
+from gvtools.settings import with_texts, with_values
 from pipelines.console import Console
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
@@ -61,7 +61,7 @@ def run_protocol(
     split = protocol_split(
         scene.names, context=context, targets=targets, rounds=rounds, stride=stride, seed=seed
     )
-    start = RunSettings() if profile is None else with_profile(RunSettings(), profile)
+    start = RunSettings() if profile is None else with_values(RunSettings(), {"profile": profile})
     decided = {
         "context": ",".join(split.context),
         "targets": ",".join(split.targets),

@@ -193,7 +193,8 @@ def complete_targets(
         target: CachedProjection, guidance: Guidance, completion: Completion
     ) -> None:
         nonlocal total
-        completion = replace(completion, rgb=target.colored(guidance, completion.rgb))
+        if not completion.whole:
+            completion = replace(completion, rgb=target.colored(guidance, completion.rgb))
         result, report = _align_and_fuse(
             guidance, completion, number, memory=memory, config=config, clock=clock
         )
@@ -252,6 +253,7 @@ def _row(completion: Completion, index: int) -> Completion:
         completion.confidence[rows],
         rays,
         None if completion.scale_alignment is None else completion.scale_alignment[rows],
+        completion.whole,
     )
 
 
@@ -268,8 +270,10 @@ def _align_and_fuse(
     confidence = completion.confidence[0]
     with clock.stage("align"):
         alignment = _scale_alignment(guidance, completion, config)
-    filled = ~valid & (depth > 0)
-    if alignment.accepted:
+    everywhere = completion.whole and config.fusion.pixels == "all"
+    filled = depth > 0 if everywhere else ~valid & (depth > 0)
+    as_observed = config.fusion.generated_as_observed
+    if alignment.accepted and not as_observed:
         with clock.stage("fuse"):
             scale = np.float32(alignment.scale)
             depth = memory.behind_free_space(depth * scale, guidance.cameras, where=filled) / scale
@@ -285,7 +289,7 @@ def _align_and_fuse(
                 (depth * np.float32(alignment.scale)).astype(np.float32),
                 guidance.cameras,
                 round=number,
-                generated=True,
+                generated=not as_observed,
                 # Confidence has to be positive everywhere; outside the mask it is not used.
                 confidence=np.where(fused, confidence, np.float32(1)),
                 mask=fused,

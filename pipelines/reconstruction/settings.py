@@ -1,4 +1,4 @@
-"""The settings of a run and its profiles."""
+"""The settings of a run, its profiles and protocols."""
 
 from __future__ import annotations
 
@@ -26,6 +26,13 @@ class FusionOptions(Settings):
     min_confidence: float = Field(0.0, ge=0, le=1)
     """Generated pixels below this are not fused; 0 keeps all that nothing observed contradicts, so
     that later views agree with them."""
+    pixels: Literal["holes", "all"] = "holes"
+    """Which pixels of a whole generated view are fused: those that the memory did not know, or all
+    with depth (the paper)."""
+    generated_as_observed: bool = False
+    """Whether generated points count as observed ones do (the paper): they then enter voxels that
+    hold observed ones and places that observed rays crossed, and figures of what was observed
+    include them."""
     max_scale_residual: float = Field(0.1, gt=0)
     """A completion whose depth fits the memory's worse than this relative residual is refused."""
     voxel_percentile: float = Field(10.0, ge=0, le=100)
@@ -70,21 +77,50 @@ ACCURATE: Mapping[str, Any] = {
 }
 
 
+# The paper's: GeoVerse alone, whole decoded views, all of their pixels fused with the similarity's
+# scale, nothing saved.
+PAPER: Mapping[str, Any] = {
+    "completer": "geoverse",
+    "completer.output": "views",
+    "completer.composition": "decoded",
+    "completer.alignment": "centres",
+    "completer.color_alignment": "none",
+    "completer.steps": 3,
+    "completer.cascade_steps": 1,
+    "completer.cfg_scale": 1.0,
+    "completer.cascade_cfg_scale": 1.0,
+    "completer.temperature": 1.0,
+    "effort.inpaint_below": 0.0,
+    "fusion.pixels": "all",
+    "fusion.generated_as_observed": True,
+    "fusion.max_psnr_drop_db": None,
+    "savings.reuse": False,
+    "savings.pixel_binning": 0.0,
+    "savings.depth_from_memory": None,
+    "memory.voxels_per_footprint": 0.0,
+    "refine.steps": 0,
+    "refine.poses": False,
+}
+
+
 class RunSettings(Settings):
     """Everything that decides what a run computes."""
 
-    profiles: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "fast": {
-            "max_side": 480,
-            "views_per_round": 12,
-            "effort.inpaint_below": 0.05,
-            "refine.steps": 0,
+    presets: ClassVar[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {
+        "profile": {
+            "fast": {
+                "max_side": 480,
+                "views_per_round": 12,
+                "effort.inpaint_below": 0.05,
+                "refine.steps": 0,
+            },
+            # The defaults.
+            "balanced": {},
+            "accurate": {**ACCURATE, "refine.seconds": 300.0},
+            # Fits end long before that, when another one gains nothing.
+            "finest": {**ACCURATE, "refine.seconds": 3600.0},
         },
-        # The defaults.
-        "balanced": {},
-        "accurate": {**ACCURATE, "refine.seconds": 300.0},
-        # Fits end long before that, when another one gains nothing.
-        "finest": {**ACCURATE, "refine.seconds": 3600.0},
+        "protocol": {"gvtools": {}, "paper": PAPER},
     }
     options_of: ClassVar[Mapping[str, str]] = {"completer": "completer_options"}
 
@@ -105,6 +141,9 @@ class RunSettings(Settings):
     """What fills the holes, by registered name; ``completer.KEY`` is an option of its own."""
     profile: str = "balanced"
     """Fast, balanced, accurate or finest: sets several of the others."""
+    protocol: str = "gvtools"
+    """What the completer's pixels are used for: gvtools keeps what was observed and fuses holes,
+    paper runs GeoVerse as published; sets several of the others."""
     voxel: float | None = Field(None, gt=0)
     """Voxel edge; none derives it from the pixel footprints. [scene units]"""
     seed: int = Field(0, ge=0)

@@ -17,7 +17,7 @@ from gvtools.completers.inpaint import InpaintCompleter
 from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
-from gvtools.settings import with_profile, with_values
+from gvtools.settings import with_values
 from pipelines.reconstruction.settings import RunSettings
 
 HEIGHT, WIDTH = 60, 80
@@ -129,7 +129,7 @@ def test_scale_alignment_is_absent_where_neither_has_a_scale_to_find():
 
 def test_a_faster_profile_makes_less_effort():
     shares = [
-        with_profile(RunSettings(), profile).effort.inpaint_below
+        with_values(RunSettings(), {"profile": profile}).effort.inpaint_below
         for profile in ("accurate", "balanced", "fast")
     ]
     assert shares == sorted(set(shares)) and shares[0] == 0

@@ -92,7 +92,7 @@ def test_the_list_is_readable(capsys: pytest.CaptureFixture[str], micro_file: Pa
 
 
 def test_an_unknown_configuration_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "'large'; expected base or tiny, or a config.json" in refused(capsys, "list", "large")
+    assert "'large'; expected base, gld, tiny or a config.json" in refused(capsys, "list", "large")
 
 
 # check

@@ -17,7 +17,6 @@ from gvtools.settings import (
     listing,
     markdown,
     with_file,
-    with_profile,
     with_texts,
     with_values,
 )
@@ -135,14 +134,16 @@ FIELDS = st.fixed_dictionaries(
 )
 
 
-@given(FIELDS, st.sampled_from(list(RunSettings.profiles)))
+@given(FIELDS, st.sampled_from(list(RunSettings.presets["profile"])))
 def test_what_changed_makes_the_same_settings_again(values, profile):
-    config = with_values(with_profile(RUN, profile), values)
+    config = with_values(with_values(RUN, {"profile": profile}), values)
     assert with_values(RUN, changes(RUN, config)) == config.replaced(profile="balanced")
     assert changes(config, config) == {}
     assert "profile" not in changes(RUN, config)
     plain = {key: value for key, value in values.items() if not key.startswith("co")}
-    texts = with_texts(with_profile(RUN, profile), [f"{k}={v}" for k, v in plain.items()])
+    texts = with_texts(
+        with_values(RUN, {"profile": profile}), [f"{k}={v}" for k, v in plain.items()]
+    )
     left = {"context": config.context, "completer_options": config.completer_options}
     assert texts.replaced(**left) == config
 
@@ -158,7 +159,7 @@ def test_saved_settings_read_back_equal(tmp_path):
 def test_a_file_stands_over_its_profile_and_over_one_named_beside_it(tmp_path, profile, direction):
     path = tmp_path / "c.json"
     path.write_text('{"memory": {"observations_per_voxel": 8}, "profile": "accurate"}')
-    config = with_file(RUN, path, profile=profile)
+    config = with_file(RUN, path, presets={"profile": profile} if profile else None)
     assert config.memory.observations_per_voxel == 8
     assert (config.profile, config.memory.merge_angle_deg) == (profile or "accurate", direction)
 

@@ -113,10 +113,10 @@ class GeoVerseCompleter(Completer):
         if not context:
             raise OptionError("completer geoverse needs at least one context view, and got none")
         check_views(context, guidance)
-        canvas = _Canvas(guidance)
+        canvas = _Canvas(guidance, whole=self.settings.output == "views")
         # A pass is one run of the model over at most ``views`` views: first the context views,
         # then as many targets as still fit.
-        incomplete = [index for index in range(len(guidance)) if not guidance.valid[index].all()]
+        incomplete = [index for index in range(len(guidance)) if not canvas.kept[index].all()]
         views = self.settings.views or self.config.views
         context_count = min(self.settings.context_views or self.config.context, views - 1)
         targets_per_pass = views - min(context_count, len(context))
@@ -145,9 +145,9 @@ class GeoVerseCompleter(Completer):
 
     def _sampling(self, part: Guidance) -> _Sampling:
         """The model's own steps and picture size, or those of the settings."""
-        bounds = self.config.flow.level1
-        if self.settings.steps is not None:
-            bounds = interval_bounds(self.settings.steps) if self.settings.steps else ()
+        bounds, steps = self.config.flow.level1, self.settings.steps
+        if steps is not None:
+            bounds = interval_bounds(steps, shift=self._shift) if steps else ()
         longest = min(self.settings.image_size or math.inf, self.config.image_size)
         size = model_size(*part.depth.shape[1:], longest=int(longest), patch=self.config.patch)
         return _Sampling(bounds, size)
@@ -170,7 +170,8 @@ class GeoVerseCompleter(Completer):
         # "correction": the model's change is added to ``base``, the projection with its holes
         # filled. "decoded": the decoded pictures themselves are the result, and base is None.
         base = None
-        if self.config.composition == "correction" and options.composition != "decoded":
+        corrects = self.config.composition == "correction" and options.composition != "decoded"
+        if corrects and options.output == "holes":
             base = averaged(part) if fill is None else fill
         # Depth of ``base`` is in scene units. Only its pixels without depth take decoded depth,
         # which has to be brought to the memory's scale first.
@@ -182,8 +183,11 @@ class GeoVerseCompleter(Completer):
                 seed=seed,
                 names=[names],
                 bounds=sampling.bounds,
-                cascade_bounds=interval_bounds(cascade) if cascade else self.config.flow.cascade,
+                cascade_bounds=interval_bounds(cascade, shift=self._shift)
+                if cascade
+                else self.config.flow.cascade,
                 cfg_scale=options.cfg_scale,
+                cascade_cfg_scale=options.cascade_cfg_scale,
                 temperature=options.temperature,
                 targets_alone=base_is_complete,
             )
@@ -208,6 +212,10 @@ class GeoVerseCompleter(Completer):
         )
 
     @property
+    def _shift(self) -> float:
+        return self.config.flow.sampling_shift
+
+    @property
     def _device(self) -> torch.device:
         if self.settings.device == "auto":
             return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -221,11 +229,19 @@ class GeoVerseCompleter(Completer):
 
 
 class _Canvas:
-    """The completion under construction: first the memory's pixels, then what each pass adds."""
+    """The completion under construction: first the memory's pixels, then what each pass adds.
 
-    def __init__(self, guidance: Guidance) -> None:
+    Args:
+        guidance: of all targets.
+        whole: whether the passes' pixels take the place of the memory's, too.
+
+    Attributes:
+        kept: (V, H, W) pixels that stay the memory's.
+    """
+
+    def __init__(self, guidance: Guidance, *, whole: bool) -> None:
         valid = guidance.valid
-        self.valid = valid
+        self.whole, self.kept = whole, np.zeros_like(valid) if whole else valid
         self.rgb = np.where(valid[..., None], guidance.rgb, np.float32(0))
         self.depth = np.where(valid, guidance.depth, np.float32(0))
         known = np.where(valid, np.minimum(guidance.confidence, 1), 0)
@@ -239,7 +255,7 @@ class _Canvas:
     def put(self, rows: Sequence[int], completed: Completed) -> None:
         """Fill the holes of some views."""
         for position, row in enumerate(rows):
-            hole = ~self.valid[row]
+            hole = ~self.kept[row]
             self.rgb[row][hole] = completed.rgb[position][hole]
             self.depth[row][hole] = completed.depth[position][hole]
             self.confidence[row][hole] = completed.confidence[position][hole]
@@ -255,4 +271,5 @@ class _Canvas:
             self.confidence,
             self.rays,
             scale_alignment=tuple(self.alignment),
+            whole=self.whole,
         )

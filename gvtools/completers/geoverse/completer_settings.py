@@ -16,11 +16,17 @@ class GeoVerseSettings(CompleterSettings):
     """Folder of a GeoVerse model, see ``gvtools weights list``; none takes the small model that
     ships."""
     steps: int | None = Field(None, ge=0)
-    """Level-1 steps, equally spaced in time; 0 decodes the features of the filled projections."""
+    """Level-1 steps, equally spaced in time before the model's time shift; 0 decodes the features
+    of the filled projections."""
     cascade_steps: int | None = Field(None, ge=1)
-    """Level-0 steps, equally spaced in time."""
+    """Level-0 steps, likewise."""
     cfg_scale: float | None = Field(None, ge=0)
-    """Scale of classifier-free guidance; 1 does without."""
+    """Scale of classifier-free guidance over the cameras, of level 1; 1 does without."""
+    cascade_cfg_scale: float | None = Field(None, ge=0)
+    """Likewise, of level 0."""
+    output: Literal["holes", "views"] = "holes"
+    """``holes`` keeps what the memory shows of a view and takes the model's pixels elsewhere;
+    ``views`` gives whole views as the model decodes them (the paper)."""
     temperature: float | None = Field(None, ge=0)
     """Standard deviation of the noise that level 1 starts from."""
     context_views: int | None = Field(None, ge=1)

@@ -34,7 +34,8 @@ class HintConfig:
         fill: "none": holes are black; "push-pull": they are filled before encoding; "surfaces":
             likewise, and callers fill what they can along surfaces first (``surface_fill``).
         encode: "jointly": context and projections in one pass (Eq. 1); "alone": the context views
-            by themselves, as GLD does, and the projections with them in a second pass.
+            by themselves, and the projections with them in a second pass; "context": the context
+            views by themselves and no projections, as GLD does.
         mask: features of a token count where at least this share of its pixels is valid; 0: the
             features are not masked (of use with filled holes).
         cameras: known cameras go into the encoder's camera tokens.
@@ -56,7 +57,7 @@ class HintConfig:
 
     def __post_init__(self) -> None:
         check_choice("hints.fill", self.fill, ("none", "push-pull", "surfaces"))
-        check_choice("hints.encode", self.encode, ("jointly", "alone"))
+        check_choice("hints.encode", self.encode, ("jointly", "alone", "context"))
         check_choice("hints.camera_unit", self.camera_unit, ("median", "depth"))
         check_choice("hints.cascade_context", self.cascade_context, ("alone", "jointly"))
         check_choice("hints.token", self.token, ("first-context", "own"))
@@ -199,6 +200,8 @@ def encode_hints(
     mask[:, :context] = 1
     # With a share of 0 all tokens count, but a view without a valid pixel still tells nothing.
     informative = mask.flatten(2).any(2) & batch.valid.flatten(2).any(2)
+    if config.encode == "context":
+        mask[:, context:], informative[:, context:] = 0, False
     informative[:, :context] = True
     # Only where it is asked for: with everything encoded jointly it is not.
     alone = cache(lambda: encode_views(network, batch, slice(0, context), config=config))

@@ -1,4 +1,8 @@
-"""The whole model's configuration: ``base`` (the paper's), ``tiny`` (trainable on a CPU)."""
+"""The whole model's configuration.
+
+``base`` is the paper's, ``gld`` that of the networks which it begins with and which are public,
+``tiny`` can be trained on a CPU.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ from gvtools.errors import CheckpointError, OptionError
 from gvtools.networks.config_json import check_choice, check_range, from_json, to_json
 from gvtools.networks.depth_anything.network import DepthAnythingConfig
 
-NAMES = ("base", "tiny")
+NAMES = ("base", "gld", "tiny")
 
 
 @dataclass(frozen=True)
@@ -30,12 +34,15 @@ class FlowConfig:
             "clean" latents, from which the velocity follows.
         skip: with "clean": the denoiser returns the difference from the hints' features.
         least_time: t below which a clean prediction's velocity is not divided further.
-        level1: interval bounds of level 1, from 1 to 0; one denoiser evaluation an interval.
+        level1: interval bounds of level 1, from 1 to 0 (Geometric Latent Diffusion ends a little
+            above); one denoiser evaluation an interval.
         cascade: interval bounds of level 0.
+        sampling_shift: of steps whose number the user chooses instead, as ``shift``.
         shift: of the training times, t' = s t / (1 + (s - 1) t); 1 for none (the paper).
         most_time: training times are drawn below it, before the shift; 1 for the paper's U(0, 1),
             0.999 is Geometric Latent Diffusion's.
         cfg_scale: classifier-free guidance scale over the cameras; 1 for none (the paper).
+        cascade_cfg_scale: likewise, of level 0.
         temperature: of the noise that level 1 starts from, its standard deviation; 1 draws from
             what the model has learned (the paper), less stays nearer to its mean.
     """
@@ -45,9 +52,11 @@ class FlowConfig:
     least_time: float = 0.05
     level1: tuple[float, ...] = (1.0, 2 / 3, 1 / 3, 0.0)
     cascade: tuple[float, ...] = (1.0, 0.0)
+    sampling_shift: float = 1.0
     shift: float = 1.0
     most_time: float = 0.999
     cfg_scale: float = 1.0
+    cascade_cfg_scale: float = 1.0
     temperature: float = 1.0
 
     def __post_init__(self) -> None:
@@ -56,11 +65,13 @@ class FlowConfig:
             raise OptionError("flow.skip needs flow.prediction = 'clean'")
         check_range("flow.least_time", self.least_time, gt=0, le=1)
         check_range("flow.shift", self.shift, gt=0)
+        check_range("flow.sampling_shift", self.sampling_shift, gt=0)
         check_range("flow.cfg_scale", self.cfg_scale, ge=0)
+        check_range("flow.cascade_cfg_scale", self.cascade_cfg_scale, ge=0)
         check_range("flow.temperature", self.temperature, ge=0)
         check_range("flow.most_time", self.most_time, gt=0, le=1)
-        check_bounds(self.level1, whole=True)
-        check_bounds(self.cascade, whole=True)
+        check_bounds(self.level1)
+        check_bounds(self.cascade)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ Data flow of one pass (tensor shapes in the README.md beside this file; equation
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -85,6 +86,7 @@ class GeoVerse(GeoVerseNetworks):
         noise: Tensor,
         *,
         bounds: Sequence[float] | None = None,
+        cfg_scale: float | None = None,
         clock: Clock = no_clock,
     ) -> Tensor:
         """Level-0 latents of (B, V, C, h, w) level-1 latents; the mean without a cascade."""
@@ -99,7 +101,21 @@ class GeoVerse(GeoVerseNetworks):
             with clock(stages.LEVEL0):
                 return cascade(state, t, conditions, positions=positions)
 
-        return sample(velocity, noise, bounds or self.config.flow.cascade)
+        flow = self.config.flow
+        scale = flow.cascade_cfg_scale if cfg_scale is None else cfg_scale
+        if scale == 1:
+            return sample(velocity, noise, bounds or flow.cascade)
+        # As GLD's evaluation runs its cascade: poses are dropped, intrinsics kept.
+        without = replace(conditions, camera=conditions.camera.unconditional("old"))
+        elsewhere = Positions(cascade.config, without.camera, grid)
+
+        def unconditional(state: Tensor, t: Tensor) -> Tensor:
+            with clock(stages.LEVEL0):
+                return cascade(state, t, without, positions=elsewhere)
+
+        return sample(
+            velocity, noise, bounds or flow.cascade, unconditional=unconditional, cfg_scale=scale
+        )
 
     @torch.no_grad()
     def generate(
@@ -111,6 +127,7 @@ class GeoVerse(GeoVerseNetworks):
         bounds: Sequence[float] | None = None,
         cascade_bounds: Sequence[float] | None = None,
         cfg_scale: float | None = None,
+        cascade_cfg_scale: float | None = None,
         temperature: float | None = None,
         video: VideoFeatures | None = None,
         targets_alone: bool = False,
@@ -127,6 +144,7 @@ class GeoVerse(GeoVerseNetworks):
                 denoised, and the hints' own features stand for level 1.
             cascade_bounds: level-0 interval bounds; the configuration's by default.
             cfg_scale: of classifier-free guidance; the configuration's by default.
+            cascade_cfg_scale: likewise, of level 0.
             temperature: of level 1; the configuration's by default.
             video: features computed before, for the same views.
             targets_alone: without all views' geometry; the same pictures and depth, sooner.
@@ -153,7 +171,14 @@ class GeoVerse(GeoVerseNetworks):
                 temperature=temperature,
                 clock=clock,
             )
-        level0 = self.sample0(prepared, level1, noise("level0"), bounds=cascade_bounds, clock=clock)
+        level0 = self.sample0(
+            prepared,
+            level1,
+            noise("level0"),
+            bounds=cascade_bounds,
+            cfg_scale=cascade_cfg_scale,
+            clock=clock,
+        )
         with clock(stages.DECODE):
             decoded = self.decode(
                 prepared, level0, level1, targets_alone=targets_alone, clock=clock

@@ -70,6 +70,8 @@ class GeoVerseNetworks(nn.Module):
             )
         # Not a submodule: its weights live in a folder of their own and are never trained.
         self._video: list[VideoPrior] = []
+        # True passes the video prior over: its branch is untrained and adds nothing.
+        self.without_video = False
         self.freeze()
 
     def freeze(self) -> None:
@@ -134,7 +136,7 @@ class GeoVerseNetworks(nn.Module):
             grid = (hints.level1.shape[-2], hints.level1.shape[-1])
             positions = Positions(config.level1, camera, grid)
             prepared = Prepared(batch, hints, conditions, positions)
-        if config.injection == "none":
+        if config.injection == "none" or (self.without_video and video is None):
             return prepared
         with clock(stages.VIDEO):
             features = self._video_features(source, seed) if video is None else video

@@ -107,11 +107,17 @@ def test_the_publishers_other_geometry_head_takes_the_place_of_the_first(
         assert torch.equal(state[name], own), name
     assert "1 others in the file ignored" in report(folder, "geometry_head").summary
     content = torch.load(folder / published.DPT_HEAD)["model"]
+    kept = content.pop("decoder.norm.weight")
     torch.save({"model": {**content, "pred.colour": torch.zeros(2)}}, folder / published.DPT_HEAD)
-    refused(folder, r"dpt_decoder\.pt: .*unexpected: colour")
-    content.pop("decoder.norm.weight")
-    torch.save({"model": content}, folder / published.DPT_HEAD)
-    refused(folder, r"dpt_decoder\.pt: .*missing: norm\.weight")
+    said = report(folder, "geometry_head")
+    assert said.ok
+    assert "missing, as its publisher's code lets pass: norm.weight" in said.summary
+    assert "unexpected, as its publisher's code lets pass: colour" in said.summary
+    state = load(folder).state_dict()
+    name = "geometry.head.norm.weight"
+    assert torch.equal(state[name], before[name]) and not torch.equal(state[name], kept)
+    torch.save({"model": {**content, "decoder.norm.weight": kept[1:]}}, folder / published.DPT_HEAD)
+    refused(folder, r"dpt_decoder\.pt: .*of another shape: norm\.weight")
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])

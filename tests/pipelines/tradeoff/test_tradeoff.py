@@ -11,7 +11,7 @@ import pytest
 from tiny_scan import write_scan
 
 from gvtools.runs.folder_lock import folder_lock
-from gvtools.settings import changes, with_profile, with_texts
+from gvtools.settings import changes, with_texts, with_values
 from pipelines.cli import build_parser, main
 from pipelines.commands.tradeoff import asked_for
 from pipelines.reconstruction.settings import RunSettings
@@ -85,8 +85,10 @@ def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
     args = build_parser().parse_args(arguments + [word for text in own for word in ("--set", text)])
     start = asked_for(args)
     assert start.profile == "accurate" and start.memory.merge_angle_deg == 0
-    for name in RunSettings.profiles:
-        wanted = with_texts(with_profile(RunSettings(), name), ["effort.inpaint_below=0.07"])
+    for name in RunSettings.presets["profile"]:
+        wanted = with_texts(
+            with_values(RunSettings(), {"profile": name}), ["effort.inpaint_below=0.07"]
+        )
         wanted = with_texts(wanted, [text for text in own if "profile" not in text])
         wanted = wanted.replaced(context=start.context, targets=start.targets)
         assert asked_for(args, name) == wanted, name

@@ -87,7 +87,9 @@ def check_is_folder(folder: Path) -> None:
 
 
 def config_of(folder: Path) -> GeoVerseConfig:
-    """The folder's own configuration; ``base`` for published files without one.
+    """The folder's own configuration.
+
+    Published files without one are ``base`` where the video prior is beside them, else ``gld``.
 
     Raises:
         CheckpointError: there is no such folder, nothing of use in it, or a damaged config.json.
@@ -100,9 +102,9 @@ def config_of(folder: Path) -> GeoVerseConfig:
             f"{folder}: {WHOLE_FILE} without its {CONFIG_FILE}; expected both; save or copy the "
             "model again"
         )
-    base = configs.named("base")
-    if any(part.find(folder) for part in parts_of(base)):
-        return base
+    config = configs.named("base" if (folder / VIDEO_FOLDER).is_dir() else "gld")
+    if any(part.find(folder) for part in parts_of(config)):
+        return config
     raise CheckpointError(
         f"{folder}: neither {CONFIG_FILE} nor a published file in it; gvtools weights list names "
         "what a weights folder holds"
@@ -139,12 +141,22 @@ def examine(
         return PartReport(part.name, path, False, summary, bytes=size), {}
     expected = expected_of(model, part)
     found = fit(tensors, expected)
+    left = {}
+    if part.lenient:
+        left = {"missing": found.missing, "unexpected": found.unexpected}
+        found = replace(found, missing=(), unexpected=())
+        tensors = {name: tensor for name, tensor in tensors.items() if name in expected}
     bad = not_finite(tensors) if found.ok and numbers else None
     ok = found.ok and bad is None
     summary = str(found) if bad is None else f"{bad} holds values that are not finite"
     types = sorted({str(t.dtype).removeprefix("torch.") for t in tensors.values()})
     if ok:
         summary += f", {' and '.join(types)}"
+    for kind, names in left.items():
+        if not names:
+            continue
+        also = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        summary += f"; {kind}, as its publisher's code lets pass: {names[0]}{also}"
     if ignored:
         summary += f"; {len(ignored)} others in the file ignored"
     report = PartReport(
@@ -179,7 +191,10 @@ def check_folder(folder: Path | str, config: GeoVerseConfig | None = None) -> li
     config = config or config_of(folder)
     model = empty_model(config, where=folder)
     reports = [examine(folder, part, model)[0] for part in parts_in(folder, config)]
-    if config.video is not None:
+    if config.video is not None and not needs_video(folder, config):
+        absent = "absent, and not needed before the branch that takes its features is trained"
+        reports.append(PartReport("video", None, True, absent))
+    elif config.video is not None:
         video = folder / VIDEO_FOLDER
         try:
             check_video_folder(video)
@@ -208,9 +223,21 @@ def check_headers(folder: Path | str) -> GeoVerseConfig:
     folder = Path(folder)
     config = config_of(folder)
     _tensors(folder, empty_model(config, where=folder), numbers=False)
-    if config.video is not None:
+    if needs_video(folder, config):
         check_video_folder(folder / VIDEO_FOLDER)
     return config
+
+
+def needs_video(folder: Path, config: GeoVerseConfig) -> bool:
+    """Whether a model is to be loaded with its video prior.
+
+    Published files come without the control branch, whose outputs are then zero: without features
+    of a video model the result is the same to the bit, and 15 GB are not needed.
+    """
+    if config.video is None:
+        return False
+    there = (folder / VIDEO_FOLDER).exists()
+    return there or config.injection != "control" or WHOLE.find(folder) is not None
 
 
 def check_video_folder(folder: Path) -> None:
@@ -238,7 +265,7 @@ def from_pretrained(
         config: instead of the folder's ``config.json``; ``base`` where a folder of published files
             has none.
         device: of the weights.
-        video: load the video prior, where the configuration has one.
+        video: load the video prior, where the configuration has one; see ``needs_video``.
 
     Raises:
         CheckpointError: a file or a tensor is missing, unexpected, of another shape or not finite.
@@ -247,7 +274,7 @@ def from_pretrained(
     check_is_folder(folder)
     config = config or config_of(folder)
     model = empty_model(config, where=folder)
-    video = video and config.video is not None
+    wanted, video = video, video and needs_video(folder, config)
     if video:
         check_video_folder(folder / VIDEO_FOLDER)
     tensors = _tensors(folder, model)
@@ -261,6 +288,7 @@ def from_pretrained(
             folder / VIDEO_FOLDER, config=config.video, device=device
         )
         model.attach_video(prior)
+    model.without_video = wanted and not video
     return model
 
 

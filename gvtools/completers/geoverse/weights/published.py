@@ -1,4 +1,4 @@
-"""Which published files the ``base`` configuration is made of, and how their keys become ours.
+"""Which published files the ``gld`` and ``base`` configurations are made of, and how their keys become ours.
 
 Facts about the files (names, sizes, licences, key prefixes) are those of their publishers' pages
 and code in November 2026; the shapes come from our own modules, not from the files.
@@ -46,7 +46,9 @@ class Part:
             prefix is taken off as well.
         names: keys other than these are no tensors of the module and are ignored.
         tied: names that are one tensor in the publisher's network; a file may hold any of them.
-        optional: the model can do without it; where the file is there it has to fit all the same.
+        optional: the model can do without it.
+        lenient: unexpected names are left aside, and missing tensors stay another part's, as its
+            publisher's code has it; a line says which.
         stated_bytes: the file's size as published, where it holds other networks, too.
         note: what else a user should know.
     """
@@ -61,6 +63,7 @@ class Part:
     names: tuple[str, ...] = ()
     tied: tuple[tuple[str, ...], ...] = ()
     optional: bool = False
+    lenient: bool = False
     stated_bytes: int | None = None
     note: str = ""
 
@@ -139,8 +142,8 @@ PARTS = (
     ),
 )
 
-# Read where it is there, as GLD does. GLD takes of it what has a name of the geometry head and says
-# nothing of the rest; here it has to be the whole head, and nothing else under its two prefixes.
+# Read where it is there, as GLD does: what has a name of the geometry head counts, the rest is left
+# aside, and tensors that it lacks stay Depth Anything 3's. Another shape is refused, as GLD does.
 GEOMETRY_HEAD = Part(
     "geometry_head",
     "geometry.head.",
@@ -150,6 +153,7 @@ GEOMETRY_HEAD = Part(
     only=("decoder.", "pred."),
     tied=da3.tied_norms(""),
     optional=True,
+    lenient=True,
     stated_bytes=400_000_000,
     note="GLD's geometry head, in place of Depth Anything 3's own",
 )
