@@ -77,7 +77,8 @@ def settings_page() -> str:
         "# Settings",
         "",
         "Settings come from the defaults, then `--profile` and `--protocol`, then a JSON file "
-        "(`--config`), then the options, then `--set NAME=VALUE`. The resolved ones are written to `run.json`. A name "
+        "(`--config`), then the options, then `--set NAME=VALUE`. The resolved ones are written "
+        "to `run.json`. A name "
         "that does not exist is an error which names the nearest one. `gvtools reconstruct "
         "--help-settings` prints this list.",
         "",

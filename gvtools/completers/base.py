@@ -75,8 +75,8 @@ class ContextView:
 class Completion:
     """Completed target views. Where the guidance was valid, its rgb stands unchanged.
 
-    (Not in ``whole`` views.) So does its depth there, unless the completer's depth is in a unit of its own, which the run
-    finds by comparing it with the guidance's (``scale_alignment`` None).
+    (Not in ``whole`` views.) So does its depth there, unless the completer's depth is in a unit of
+    its own, which the run finds by comparing it with the guidance's (``scale_alignment`` None).
 
     Attributes:
         rgb: (V, H, W, 3) float32 in [0, 1].

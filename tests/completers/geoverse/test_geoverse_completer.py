@@ -14,6 +14,7 @@ import torch
 
 from gvtools.cameras import Cameras
 from gvtools.completers import Completer, Completion, ContextView, ScaleStatus, create
+from gvtools.completers.base import run_completer
 from gvtools.completers.geoverse import completer as completer_module
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.completers.geoverse.conditioning import ViewBatch
@@ -89,6 +90,21 @@ def test_observed_pixels_are_kept_bit_for_bit_and_holes_are_filled(weights, size
     direction, moment = result.rays[..., :3], result.rays[..., 3:]
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, rtol=1e-4)
     np.testing.assert_allclose((direction * moment).sum(-1), 0, atol=1e-3)
+
+
+def test_whole_views_are_the_models_pixels_everywhere(weights, monkeypatch):
+    seen = watched(monkeypatch)
+    context, known = micro.context_views(2), micro.guidance(2, size=(24, 32))
+    known.valid[1] = True
+    known.rgb[1], known.depth[1], known.confidence[1] = 0.25, 3, 1
+    completer = create("geoverse", weights=str(weights), alignment="hint", output="views")
+    result = run_completer(completer, context, known)
+    assert result.whole and len(seen) == 1
+    decoded = seen[0][2].decoded.rgb[0].permute(0, 2, 3, 1).clamp(0, 1).numpy()
+    np.testing.assert_allclose(result.rgb, decoded, atol=1e-6)
+    assert (result.confidence <= GENERATED).all() and (result.depth > 0).all()
+    kept = create("geoverse", weights=str(weights), alignment="hint").complete(context, known)
+    assert not kept.whole and (kept.rgb[1] == 0.25).all()
 
 
 def test_the_same_seed_gives_the_same_bytes(weights):

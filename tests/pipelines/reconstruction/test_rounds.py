@@ -15,6 +15,7 @@ from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.settings import with_texts
 from pipelines.reconstruction.rounds import Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
 
@@ -36,11 +37,12 @@ class Recorder(Completer):
         super().__init__()
         self.batches_targets, self.fill, self.factor = batches_targets, fill, factor
         self.status = ScaleStatus.CAMERA_CENTRES
+        self.whole = False
         self.batches: list[tuple[str, ...]] = []
 
     def complete(self, context, guidance: Guidance, *, seed: int = 0) -> Completion:
         self.batches.append(guidance.cameras.names)
-        hole = ~guidance.valid & self.fill
+        hole = (~guidance.valid | self.whole) & self.fill
         rgb = np.where(hole[..., None], np.float32(0.5), guidance.rgb)
         depth = np.where(hole, np.float32(2), guidance.depth)
         confidence = np.where(hole, np.float32(0.5), np.minimum(guidance.confidence, 1))
@@ -48,7 +50,9 @@ class Recorder(Completer):
             depth = (depth * self.factor).astype(np.float32)
             return Completion(rgb, depth, confidence.astype(np.float32))
         alignment = (ScaleAlignment(self.status),) * len(rgb)
-        return Completion(rgb, depth, confidence.astype(np.float32), scale_alignment=alignment)
+        return Completion(
+            rgb, depth, confidence.astype(np.float32), scale_alignment=alignment, whole=self.whole
+        )
 
 
 @pytest.fixture
@@ -60,7 +64,7 @@ def memory() -> SpatialMemory:
     return out
 
 
-def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras]):
+def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras], *settings: str):
     calls: list[str] = []
     project = memory.project
 
@@ -78,7 +82,7 @@ def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras])
         memory=memory,
         completer=completer,
         context=(),
-        config=RunSettings(),
+        config=with_texts(RunSettings(), settings),
         clock=Clock(),
         progress=lambda items, _: items,
     )
@@ -126,6 +130,30 @@ def test_a_scale_that_the_completer_refuses_gives_no_points(memory):
     assert not total.added and not result.fused.any()
     assert not result.report["scale"]["accepted"]
     assert result.report["scale"]["description"].startswith("refused: known depth contradicts")
+
+
+@pytest.mark.parametrize("pixels", ["holes", "all"])
+@pytest.mark.parametrize("as_observed", ["false", "true"])
+def test_whole_generated_views_are_fused_as_the_settings_say(memory, pixels, as_observed):
+    completer = Recorder(batches_targets=True)
+    completer.whole = True
+    target, before = camera("t0", (24, 32), x=0.4), len(memory)
+    settings = (f"fusion.pixels={pixels}", f"fusion.generated_as_observed={as_observed}")
+    ((result,), _, _) = complete(memory, completer, [target], *settings)
+    assert (result.completion.rgb == 0.5).all()
+    known = result.guidance.valid[0]
+    assert 0 < known.sum() < known.size
+    assert (result.fused | known).all()
+    assert result.fused[known].all() if pixels == "all" else not result.fused[known].any()
+    shown = memory.project(target)
+    if as_observed == "true":
+        assert not memory.generated.any() and len(memory) > before
+        grey = np.abs(shown.rgb[0][known] - 0.5).max(-1) < 0.1
+        assert (grey.mean() > 0.5) == (pixels == "all")
+    else:
+        assert memory.generated.any() and shown.generated[0][~known].any()
+        # What was observed stands, whatever is generated there.
+        assert (shown.rgb[0][known] > 0.7).all()
 
 
 def test_nothing_is_projected_again_while_nothing_is_fused(memory):

@@ -1,4 +1,4 @@
-"""Which published files the ``gld`` and ``base`` configurations are made of, and how their keys become ours.
+"""Which published files make ``gld`` and ``base``, and how their keys become ours.
 
 Facts about the files (names, sizes, licences, key prefixes) are those of their publishers' pages
 and code in November 2026; the shapes come from our own modules, not from the files.
