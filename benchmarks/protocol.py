@@ -1,9 +1,9 @@
-"""Each departure from the paper's protocol, switched to the paper's way by itself.
+"""What each departure from the paper's protocol does to the pictures.
 
     python benchmarks/protocol.py PROJECT CONTEXT TARGETS OUT [--weights DIR]
 
 Runs ``gvtools reconstruct`` with the completer ``geoverse`` as it is by default, but for the fit of
-Gaussians, then with one group of settings of ``--protocol paper`` at a time, then with all of them.
+Gaussians, then with more and more of the settings of ``--protocol paper``, then with all of them.
 Prints a Markdown table of the completed held-out pictures; runs that are in OUT are not made again.
 """
 
@@ -18,31 +18,27 @@ from pathlib import Path
 from pipelines.reconstruction.settings import PAPER
 
 ALWAYS = ("completer=geoverse", "refine.steps=0")
+ALWAYS_SET = [text.partition("=")[0] for text in ALWAYS]
+DECODED = ("completer.composition",)
+UNALIGNED = (*DECODED, "completer.alignment", "completer.color_alignment")
+WHOLE = (*UNALIGNED, "completer.output", "effort.inpaint_below")
+# Of the first part each row adds to the one above it.
 GROUPS = {
     "as gvtools does, without a fit": (),
-    "decoded pictures, not corrections of filled projections": ("completer.composition",),
-    "scale by camera centres, colours not aligned": (
-        "completer.composition",
-        "completer.alignment",
-        "completer.color_alignment",
-    ),
-    "whole views as output": ("completer.output",),
-    "whole views, all pixels fused": ("completer.output", "fusion.pixels"),
-    "whole views, fused like observed ones": (
-        "completer.output",
-        "fusion.pixels",
-        "fusion.generated_as_observed",
-    ),
-    "views with small holes are not left to inpaint": ("effort.inpaint_below",),
-    "nothing saved in memory and projection": (
+    "decoded pictures, not corrections of filled projections": DECODED,
+    "and scale by camera centres, colours not aligned with the memory's": UNALIGNED,
+    "and whole views as output, also of views with small holes": WHOLE,
+    "and all of their pixels fused": (*WHOLE, "fusion.pixels"),
+    "and fused like observed ones": (*WHOLE, "fusion.pixels", "fusion.generated_as_observed"),
+    "by itself: nothing saved in memory and projection": (
         "fusion.max_psnr_drop_db",
         "savings.reuse",
         "savings.pixel_binning",
         "savings.depth_from_memory",
         "memory.voxels_per_footprint",
     ),
-    "trackers' poses as given": ("refine.poses",),
-    "all of these": tuple(key for key in PAPER if key not in ("completer", "refine.steps")),
+    "by itself: trackers' poses as given": ("refine.poses",),
+    "all of --protocol paper": tuple(key for key in PAPER if key not in ALWAYS_SET),
 }
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 SUMMARY = "tell which weights the generative core needs, and whether a folder of them fits"
 EXAMPLES = ("gvtools weights list base", "gvtools weights check weights/base --json check.json")
 
+# What ``list`` calls the networks that give depth alone.
+DEPTH = "depth"
 # Seconds between two lines of progress.
 _INTERVAL = 10.0
 _Add = Callable[..., Any]
@@ -98,13 +100,16 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 def _list(args: argparse.Namespace, console: Console) -> None:
     from gvtools.completers.geoverse.config import NAMES
-    from pipelines.weights.report import print_needed
+    from pipelines.weights.report import print_depth, print_needed
 
-    names = NAMES if args.config is None else (args.config,)
+    names = (DEPTH, *NAMES) if args.config is None else (args.config,)
     for number, name in enumerate(names):
         if number:
             console.line("")
-        print_needed(_config(name), console)
+        if name == DEPTH:
+            print_depth(console)
+        else:
+            print_needed(_config(name), console)
 
 
 def _pack(args: argparse.Namespace, console: Console) -> None:

@@ -84,7 +84,7 @@ PAPER: Mapping[str, Any] = {
     "completer.output": "views",
     "completer.composition": "decoded",
     "completer.alignment": "centres",
-    "completer.color_alignment": "none",
+    "completer.color_alignment": "unchanged",
     "completer.steps": 3,
     "completer.cascade_steps": 1,
     "completer.cfg_scale": 1.0,

@@ -8,6 +8,8 @@ from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
+
 from gvtools.completers.geoverse import config as configs
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse, empty_model
@@ -24,12 +26,62 @@ from gvtools.completers.geoverse.weights.published import (
     expected_of,
     parts_of,
 )
+from gvtools.networks.depth_anything.network import DepthAnything3
+from gvtools.networks.depth_anything.weights import RELEASED, tied_norms
 from gvtools.networks.tensors import Shapes
 
 if TYPE_CHECKING:
     from pipelines.console import Console
 
 _FLOAT32 = 4
+
+
+# What is done with the files of each configuration, one step a line.
+GLD_STEPS = (
+    "put the files above into DIR, under the same names: hf download SeonghuJeon/GLD --local-dir "
+    "DIR has all but model_stats/, which is in the code repository "
+    "cvlab-kaist/Geometric-Latent-Diffusion",
+    "gvtools weights check DIR",
+)
+STEPS = {
+    "depth": (
+        "put model.safetensors of one of them into DIR: hf download depth-anything/NAME "
+        "model.safetensors --local-dir DIR",
+        "gvtools reconstruct PROJECT --depth da3 --set da3.weights=DIR --out RUN",
+    ),
+    "gld": (
+        *GLD_STEPS,
+        "gvtools reconstruct PROJECT --completer geoverse --set completer.weights=DIR --out RUN",
+    ),
+    "base": (
+        *GLD_STEPS,
+        "without video/ the folder is gld, and base begins as that: nothing published is trained "
+        "to use the video prior",
+        "for training: gvtools weights truncate-wan SOURCE DIR/video, then gvtools weights "
+        "empty-prompt TEXT_ENCODER DIR/video",
+        "gvtools train base --init DIR --out TRAINING, then gvtools weights pack TRAINING WEIGHTS",
+    ),
+}
+
+
+def print_depth(console: Console) -> None:
+    """The models that give depth alone."""
+    console.line(
+        "depth of photographs, by one of the models of depth-anything (approximate sizes):"
+    )
+    for name, released in RELEASED.items():
+        with torch.device("meta"):
+            network = DepthAnything3(released.config)
+        twice = {name for names in tied_norms("head.") for name in names[1:]}
+        numbers = sum(p.numel() for name, p in network.named_parameters() if name not in twice)
+        figures = [size_text(_FLOAT32 * numbers), f"{numbers:,} numbers", released.licence]
+        console.line(f"  {name}, model.safetensors: {', '.join(figures)}")
+    _print_steps("depth", console)
+
+
+def _print_steps(name: str, console: Console) -> None:
+    for number, step in enumerate(STEPS.get(name, ()), 1):
+        console.line(f"  step {number}: {step}")
 
 
 def print_needed(config: GeoVerseConfig, console: Console) -> None:
@@ -54,6 +106,7 @@ def print_needed(config: GeoVerseConfig, console: Console) -> None:
     if config.video is not None:
         console.line(f"{config.name}, beside either of the two:")
         _print_video(config.video, console)
+    _print_steps(config.name, console)
 
 
 @lru_cache(maxsize=1)

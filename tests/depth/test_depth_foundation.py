@@ -288,14 +288,14 @@ def test_wrong_options_and_folders_are_one_clear_line(tmp_path, weights, capsys)
 
 def test_the_released_small_model_is_known_by_its_width(tmp_path):
     with torch.device("meta"):
-        whole = DepthAnything3(RELEASED[384])
+        whole = DepthAnything3(RELEASED["DA3-SMALL"].config)
     state = whole.state_dict()
     tensors = {
         f"model.{name}": torch.zeros(t.shape, dtype=torch.float16) for name, t in state.items()
     }
     save_file(tensors, tmp_path / "model.safetensors")
     network = load_depth_anything(tmp_path)
-    assert network.config == RELEASED[384]
+    assert network.config == RELEASED["DA3-SMALL"].config
     assert not any(parameter.requires_grad for parameter in network.parameters())
     assert next(network.parameters()).dtype == torch.float32
 

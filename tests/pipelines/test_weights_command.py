@@ -80,6 +80,27 @@ def test_published_files_have_their_published_numbers(capsys: pytest.CaptureFixt
     assert "  video/" in lines
 
 
+def test_depth_alone_and_gld_are_listed_with_their_steps(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert weights("list", "depth") == 0
+    text = capsys.readouterr().out
+    # The official network of DA3-LARGE has 643 tensors of these many numbers.
+    for line in (
+        "DA3-SMALL, model.safetensors: 137 MB, 34,299,463 numbers, Apache-2.0",
+        "DA3-BASE, model.safetensors: 541 MB, 135,366,599 numbers, Apache-2.0",
+        "DA3-LARGE-1.1, model.safetensors: 1.64 GB, 410,941,767 numbers, CC BY-NC 4.0",
+        "step 2: gvtools reconstruct PROJECT --depth da3 --set da3.weights=DIR --out RUN",
+    ):
+        assert line in text
+    assert weights("list", "gld") == 0
+    text = capsys.readouterr().out
+    assert all(f"  {path}\n" in text for path in PUBLISHED)
+    assert "video/" not in text
+    assert "step 2: gvtools weights check DIR" in text
+    assert "--completer geoverse --set completer.weights=DIR" in text
+
+
 def test_the_list_is_readable(capsys: pytest.CaptureFixture[str], micro_file: Path) -> None:
     assert weights("list", micro_file) == 0
     text = capsys.readouterr().out

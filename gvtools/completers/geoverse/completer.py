@@ -208,7 +208,10 @@ class GeoVerseCompleter(Completer):
             return decoded_in_scene_units(options.color_alignment or self.config.color_alignment)
         generated = seamless(generated, self.config.patch)
         return corrected(
-            generated, part, base, back=None if base_is_complete else decoded_in_scene_units("none")
+            generated,
+            part,
+            base,
+            back=None if base_is_complete else decoded_in_scene_units("unchanged"),
         )
 
     @property

@@ -39,7 +39,7 @@ class GeoVerseSettings(CompleterSettings):
     alignment: Literal["centres", "hint", "field"] | None = None
     """How decoded depth gets the memory's scale: by camera centres, by one factor to the memory's
     depth, or by a smooth field of factors."""
-    color_alignment: Literal["none", "field"] | None = None
+    color_alignment: Literal["unchanged", "field"] | None = None
     """Whether decoded colours follow the memory's by a smooth field."""
     composition: Literal["decoded", "correction"] | None = None
     """``decoded`` shows the decoding itself where the model corrects filled projections."""

@@ -111,8 +111,8 @@ class GeoVerseConfig:
             paper), "hint" or "field".
         composition: the completion is the model's "decoded" pictures and depth (the paper), or a
             "correction" of the filled projection, see ``correction``; it needs ``hints.fill``.
-        color_alignment: whether generated colours follow the memory's, "none" (the paper)
-            or by a "field", see ``postprocess.aligned_color``.
+        color_alignment: whether generated colours stay "unchanged" (the paper) or follow the
+            memory's by a "field", see ``postprocess.aligned_color``.
         video: the video prior; None for a model without one.
         injection: how video features enter: "control", "shared" (MoT) or "none".
         control: of the control branch.
@@ -137,7 +137,7 @@ class GeoVerseConfig:
     flow: FlowConfig = field(default_factory=FlowConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     alignment: str = "centres"
-    color_alignment: str = "none"
+    color_alignment: str = "unchanged"
     composition: str = "decoded"
     video: VideoPriorConfig | None = field(default_factory=VideoPriorConfig)
     injection: str = "control"
@@ -151,7 +151,7 @@ class GeoVerseConfig:
         levels = len(encoder.taps)
         check_choice("injection", self.injection, ("control", "shared", "none"))
         check_choice("composition", self.composition, ("decoded", "correction"))
-        check_choice("color_alignment", self.color_alignment, ("none", "field"))
+        check_choice("color_alignment", self.color_alignment, ("unchanged", "field"))
         check_choice("alignment", self.alignment, ("centres", "hint", "field"))
         if self.composition == "correction" and self.hints.fill == "none":
             raise OptionError("composition = 'correction' needs filled hints; set hints.fill")

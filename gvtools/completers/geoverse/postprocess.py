@@ -71,7 +71,7 @@ def to_scene_scale(
         cameras: of all views, at the model's size.
         known: (C, h, w) depth of the context at the model's size.
         alignment: see ``depth_scale``.
-        color_alignment: "field" for ``aligned_color``, or "none".
+        color_alignment: "field" for ``aligned_color``, or "unchanged".
     """
     geometry, context = generated.decoded.geometry, len(known)
     full = (guidance.depth.shape[1], guidance.depth.shape[2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,44 @@ from gvtools.networks.depth_anything.network import DepthAnything3, DepthAnythin
 from gvtools.networks.tensor_files import TensorFiles, read_tensors
 from gvtools.networks.tensors import load, not_finite, share_tied
 
-# Released models by the width of their tokens.
+
+@dataclass(frozen=True)
+class Released:
+    """A released model.
+
+    Attributes:
+        config: its dimensions.
+        licence: of its weights.
+    """
+
+    config: DepthAnythingConfig
+    licence: str
+
+
+# By their publisher's name, below depth-anything/ of Hugging Face.
 RELEASED = {
-    384: DepthAnythingConfig(
-        EncoderConfig(width=384, heads=6), GeometryHeadConfig(768, 64, (48, 96, 192, 384))
+    "DA3-SMALL": Released(
+        DepthAnythingConfig(
+            EncoderConfig(width=384, heads=6), GeometryHeadConfig(768, 64, (48, 96, 192, 384))
+        ),
+        "Apache-2.0",
     ),
-    768: DepthAnythingConfig(),
+    "DA3-BASE": Released(DepthAnythingConfig(), "Apache-2.0"),
+    "DA3-LARGE-1.1": Released(
+        DepthAnythingConfig(
+            EncoderConfig(
+                width=1024,
+                depth=24,
+                heads=16,
+                alternate_from=8,
+                qk_norm_from=8,
+                rotary_from=8,
+                taps=(11, 15, 19, 23),
+            ),
+            GeometryHeadConfig(2048, 256, (256, 512, 1024, 1024)),
+        ),
+        "CC BY-NC 4.0, not for commercial use",
+    ),
 }
 # Where the published file may lie in a folder, and the prefix of its keys.
 PUBLISHED_FILE = "model.safetensors"
@@ -59,7 +92,7 @@ def find_weights(folder: Path | str) -> Path:
         if (folder / name).is_file():
             return folder / name
     raise CheckpointError(
-        f"{folder}: no {PUBLISHED_FILE} of DA3-SMALL or DA3-BASE and no {GEOVERSE_FILE} in it; "
+        f"{folder}: no {PUBLISHED_FILE} of DA3-SMALL, -BASE or -LARGE and no {GEOVERSE_FILE}; "
         "download model.safetensors of depth-anything/DA3-BASE (Apache-2.0, 0.5 GB) into a folder "
         "and name that"
     )
@@ -71,7 +104,7 @@ def load_depth_anything(
     """The network, strictly loaded, frozen, in evaluation mode.
 
     Args:
-        folder: with ``model.safetensors`` of DA3-SMALL or DA3-BASE, or a GeoVerse folder.
+        folder: with ``model.safetensors`` of DA3-SMALL, -BASE or -LARGE, or a GeoVerse folder.
         device: of the weights.
 
     Raises:
@@ -92,12 +125,13 @@ def load_depth_anything(
         share_tied(tensors, tied_norms("head."), where=path)
         token = tensors.get("backbone.pretrained.cls_token")
         width = 0 if token is None else token.shape[-1]
-        if width not in RELEASED:
+        by_width = {model.config.encoder.width: model.config for model in RELEASED.values()}
+        if width not in by_width:
             raise CheckpointError(
-                f"{path}: tokens of {width} channels; expected Depth Anything 3 Small (384) or "
-                "Base (768)"
+                f"{path}: tokens of {width} channels; expected Depth Anything 3 Small (384), Base "
+                "(768) or Large (1024)"
             )
-        config = RELEASED[width]
+        config = by_width[width]
     with torch.device("meta"):
         network = DepthAnything3(config)
     bad = not_finite(tensors)
