@@ -41,13 +41,14 @@ PROBE = 16
 def level_cases(
     folder: Path, count: int, *, seed: int = 0, size: int = SIZE, views: int = 8
 ) -> Iterator[Case]:
-    """Cases of hand-made levels, map by map; a case's name begins with that of its map.
+    """Cases of hand-made levels, named by their maps.
 
-    Context and faults are drawn as for procedural scenes. Maps without a free path give none.
+    Context and faults are drawn as for procedural scenes. A map gives one case at most, so that
+    cases are independent; one without a free path gives none.
 
     Args:
         folder: with the packages' archives below it, see ``Archives``.
-        count: of cases.
+        count: of maps, spread evenly over all; no more than there are.
         seed: of paths, context and faults.
         size: of the square pictures, px.
         views: of a path, context and targets.
@@ -58,26 +59,18 @@ def level_cases(
     archives = Archives(folder)
     pictures = Pictures(archives)
     choice = ContextChoice()
-    share, more = divmod(count, len(archives.maps))
-    # Maps are spread over all of them where there are fewer cases than maps.
-    chosen = np.linspace(0, len(archives.maps) - 1, more or 1).round().astype(int).tolist()
-    index = 0
-    for number, name in enumerate(archives.maps):
-        wanted = share + (more > 0 and number in chosen)
-        if not wanted:
-            continue
+    chosen = np.linspace(0, len(archives.maps) - 1, min(count, len(archives.maps)))
+    for number in chosen.round().astype(int).tolist():
+        name = archives.maps[number]
         level = read_level(archives.read(name), name)
         scene = LevelScene(level, pictures.of(level.materials))
-        for turn in range(wanted):
-            rng = np.random.default_rng([seed, number, turn])
-            clip = walk(scene, rng, size=size, views=views)
-            if clip is None:
-                continue
-            strength = drawn(rng, CorruptionOptions())
-            context = choice.chosen(rng, views, choice.count([seed, number], index))
-            given = Given(clip, context, strength, rng)
-            yield case_of(given, f"{Path(name).stem}, path {turn + 1}")
-            index += 1
+        rng = np.random.default_rng([seed, number])
+        clip = walk(scene, rng, size=size, views=views)
+        if clip is None:
+            continue
+        strength = drawn(rng, CorruptionOptions())
+        context = choice.chosen(rng, views, int(rng.integers(1, choice.most + 1)))
+        yield case_of(Given(clip, context, strength, rng), Path(name).stem)
 
 
 def walk(
