@@ -93,8 +93,11 @@ class Verdict:
         return len(self.won) >= ENOUGH
 
     def __str__(self) -> str:
-        count = f"{len(self.won)} of {len(self.won) + len(self.lost)} domains"
+        judged = len(self.won) + len(self.lost)
+        count = f"{len(self.won)} of {judged} domains"
         called = "better" if self.better else "NOT better"
+        if judged < ENOUGH:
+            called = f"unsettled (it takes {ENOUGH} domains) whether better"
         text = f"{self.model}: {called} than {', '.join(self.rivals)} a view: above all on {count}"
         text += f" ({', '.join(self.won)})" if self.won else ""
         missed = "; ".join(f"on {domain} not above {why}" for domain, why in self.lost.items())

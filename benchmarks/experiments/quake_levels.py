@@ -192,7 +192,8 @@ def _patch(control: Float32) -> tuple[Float32, NDArray[np.int64]]:
     height, width, channels = control.shape
     t = np.linspace(0, 1, SPANS + 1)
     basis = np.stack([(1 - t) ** 2, 2 * t * (1 - t), t**2], axis=1)
-    points, triangles = [], []
+    points: list[Float32] = []
+    triangles: list[NDArray[np.int64]] = []
     row, column = np.divmod(np.arange(SPANS * SPANS), SPANS)
     corner = row * (SPANS + 1) + column
     below = corner + SPANS + 1

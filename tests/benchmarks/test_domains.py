@@ -174,6 +174,7 @@ def test_a_model_is_better_only_where_it_is_on_three_domains_and_on_all_their_se
     few = verdict([*sets[:2], *sets[3:]], SHIPPED, ("fill", "bad"))
     assert not few.better and few.won == (ROOMS, LEVELS)
     assert "NOT better" in str(few)
+    assert "unsettled" in str(verdict(sets[:2], SHIPPED, ("fill", "bad")))
 
 
 @pytest.mark.slow
