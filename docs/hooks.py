@@ -48,7 +48,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def _copied(source: Path) -> str:
     def link(match: re.Match[str]) -> str:
-        return f"]({RENAMED_LINKS.get(match[1], match[1])})"
+        target = match[1].removeprefix("../docs/")
+        return f"]({RENAMED_LINKS.get(target, target)})"
 
     return re.sub(r"\]\(([^)#\s]+)\)", link, source.read_text(encoding="utf-8"))
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.completers.base import ContextView
 from gvtools.guidance import Guidance
+
+if TYPE_CHECKING:
+    from gvtools.training.dataset import Given
 
 Float32 = NDArray[np.float32]
 # Of the pictures, px: the shipped model's own.
@@ -58,19 +62,28 @@ def held_out_cases(
         views: of a scene, context and targets.
     """
     from gvtools.training.dataset import ProceduralViews
-    from gvtools.training.hints import observed, projected
 
     data = ProceduralViews(seed=seed, split="held-out", views=views, size=(size, size))
     for index in range(count):
-        given = data.given(index)
-        targets = [view for view in range(views) if view not in given.context]
-        observation = observed(given.clip, given.context, given.strength, rng=given.rng)
-        guidance = projected(observation, given.clip.cameras[targets])
-        truth = given.clip
-        yield Case(
-            f"held-out {index}",
-            observation.views,
-            guidance,
-            (truth.rgb[targets] / np.float32(255)).astype(np.float32),
-            truth.depth[targets],
-        )
+        yield case_of(data.given(index), f"held-out {index}")
+
+
+def case_of(given: Given, name: str) -> Case:
+    """Views that are not given are the targets; the context gets its faults.
+
+    Args:
+        given: true views, and which of them are given; its generator is used up.
+        name: of the case.
+    """
+    from gvtools.training.hints import observed, projected
+
+    truth = given.clip
+    targets = [view for view in range(len(truth)) if view not in given.context]
+    observation = observed(truth, given.context, given.strength, rng=given.rng)
+    return Case(
+        name,
+        observation.views,
+        projected(observation, truth.cameras[targets]),
+        (truth.rgb[targets] / np.float32(255)).astype(np.float32),
+        truth.depth[targets],
+    )

@@ -24,6 +24,7 @@ EXPERIMENTS = {
     "poses": "cameras from the ray head",
     "ablations": "short trainings, alike in all but one part",
     "long-sequences": "three rounds with the memory and without",
+    "domains": "rooms, hand-made levels and recorded scenes: where is the core better",
     "real-frames": "a recorded scan, with and without fine-tuning on its context",
 }
 
@@ -53,6 +54,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--training", metavar="CONFIG", help="settings of its trainings, by name or file (tiny)"
     )
     parser.add_argument("--project", type=Path, metavar="DIR", help="of real-frames: a scan")
+    parser.add_argument(
+        "--projects", type=Path, nargs="+", metavar="DIR", help="of domains: recorded scenes"
+    )
+    parser.add_argument(
+        "--levels", type=Path, metavar="DIR", help="of domains: unpacked packages of OpenArena"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there")
 
@@ -76,6 +83,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
         "steps",
         "out",
         "project",
+        "projects",
+        "levels",
         "pictures",
         "training",
     )

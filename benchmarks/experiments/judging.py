@@ -127,7 +127,7 @@ def table(
     for name, entry in judged.items():
         found = entry.row()
         row: list[Any] = [name, *(found[key] for key in COLUMNS), found["seconds"]]
-        row += [_shown(entry, judged[(against or {})[f]], f) for f in compared]
+        row += [difference_text(entry, judged[(against or {})[f]], f) for f in compared]
         rows.append(tuple(row))
     return Table(tuple(columns), tuple(rows), caption, notes)
 
@@ -149,7 +149,7 @@ def comparisons(
     shown = (Column(f"{c.title}, {c.unit.split(', ')[-1]}") for c in COLUMNS.values())
     columns = (Column("method"), Column("against"), *shown)
     rows = tuple(
-        (name, said, *(_shown(judged[name], judged[peers[f]], f) for f in COLUMNS))
+        (name, said, *(difference_text(judged[name], judged[peers[f]], f) for f in COLUMNS))
         for name, said, peers in pairs
         if name in judged and set(peers.values()) <= set(judged)
     )
@@ -197,7 +197,8 @@ def best(judged: Mapping[str, Judged], names: Iterable[str], figure: str) -> str
     return min(known, key=lambda name: sign * known[name])
 
 
-def _shown(entry: Judged, other: Judged, figure: str) -> str:
+def difference_text(entry: Judged, other: Judged, figure: str) -> str:
+    """A figure's difference from another method's with its interval; "-" where there is none."""
     if entry is other or entry.row()[figure] is None or other.row()[figure] is None:
         return "-"
     digits = COLUMNS[figure].digits

@@ -28,6 +28,10 @@ class ExperimentOptions(Settings):
     """Folder of what a training within the experiment leaves."""
     project: Path | None = None
     """A recorded scene."""
+    projects: tuple[Path, ...] = ()
+    """Recorded scenes, of depth or of photographs."""
+    levels: Path | None = None
+    """Folder with the unpacked archives of hand-made levels."""
     pictures: Path | None = None
     """Folder for pictures side by side."""
     training: str = "tiny"

@@ -1,4 +1,4 @@
-"""Context, hint, completion and truth side by side, one PNG a scene."""
+"""Pictures side by side: a scene's context, hint, completion and truth; methods on random views."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from gvtools.training.sheets import write_png
 # Scenes that pictures are written of.
 SHOWN = 12
 GAP = 4
+# Of a sheet that compares methods, px: a picture, and the line of titles.
+TILE, TITLE = 112, 16
 
 
 def write_pictures(
@@ -46,3 +48,36 @@ def _band(pictures: list[np.ndarray], columns: int) -> np.ndarray:
     padded = np.pad(np.stack(tiles), ((0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=1)
     joined = np.concatenate(list(padded), axis=1)
     return np.rint(np.clip(joined, 0, 1) * 255).astype(np.uint8)
+
+
+def comparison_sheet(titles: Sequence[str], rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
+    """Pictures of one row beside each other, the middle squares at one size, under their titles.
+
+    Args:
+        titles: of the columns.
+        rows: (H, W, 3) pictures in [0, 1], one a column.
+
+    Returns:
+        (H, W, 3) uint8.
+    """
+    from PIL import Image, ImageDraw
+
+    band = np.full((TITLE, len(titles) * (TILE + GAP), 3), 255, np.uint8)
+    heading = Image.fromarray(band)
+    draw = ImageDraw.Draw(heading)
+    for column, title in enumerate(titles):
+        draw.text((column * (TILE + GAP) + 2, 2), title, fill=(0, 0, 0))
+    shown = [_band([_tile(picture) for picture in row], len(titles)) for row in rows]
+    return np.concatenate([np.asarray(heading), *shown])
+
+
+def _tile(picture: np.ndarray) -> np.ndarray:
+    """(TILE, TILE, 3) in [0, 1], of the picture's middle square."""
+    from PIL import Image
+
+    height, width = picture.shape[:2]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    square = np.clip(picture[top : top + side, left : left + side], 0, 1)
+    image = Image.fromarray(np.rint(255 * square).astype(np.uint8))
+    return np.asarray(image.resize((TILE, TILE), Image.Resampling.BOX)) / 255
