@@ -40,9 +40,9 @@ def compile_steps() -> None:
 def kernel_sets() -> tuple[KernelSet, ...]:
     """What fitting needs."""
     from gvtools.appearance import kernels
-    from gvtools.appearance.splat import project_kernels
+    from gvtools.appearance.splat import median_depth
 
     return (
-        KernelSet("splatting", compile_splatting, project_kernels.backward_gaussians),
+        KernelSet("splatting", compile_splatting, median_depth.median_tiles),
         KernelSet("fitting", compile_steps, kernels.adam_rows),
     )

@@ -326,7 +326,7 @@ class Fit:
         if number in self._reduced:
             return self._reduced[number]
         view = reduced(self.views[number], factor)
-        if len(self.views) * view.target.nbytes < KEPT_BYTES:
+        if len(self.views) * view.nbytes < KEPT_BYTES:
             self._reduced[number] = view
         return view
 

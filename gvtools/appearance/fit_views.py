@@ -57,6 +57,12 @@ class ReducedView:
         """Width and height."""
         return self.target.shape[2], self.target.shape[1]
 
+    @property
+    def nbytes(self) -> int:
+        """Of all arrays."""
+        arrays = (self.target, self.weight, self.depth, self.estimate)
+        return sum(array.nbytes for array in arrays if array is not None)
+
 
 def reduced(view: FitView, factor: int) -> ReducedView:
     """A view at one over ``factor`` of its size; colours are means, depth is picked.
@@ -89,6 +95,8 @@ def reduced(view: FitView, factor: int) -> ReducedView:
 def _picked(depth: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
     """The pixels of (H, W) depth that are nearest to those of a smaller picture."""
     height, width = depth.shape
+    if (rows, columns) == (height, width):
+        return depth
     y = ((np.arange(rows) + 0.5) * height / rows).astype(int)
     x = ((np.arange(columns) + 0.5) * width / columns).astype(int)
     return np.ascontiguousarray(depth[y][:, x])

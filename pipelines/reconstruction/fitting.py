@@ -167,7 +167,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     if earlier is None or _converged(plan, earlier):
         fit = _new_fit(plan, console, earlier)
     else:
-        fit = _continued_fit(plan, earlier)
+        fit = _continued_fit(plan, earlier, console)
     if fit is None:
         return None
     if fit.splatter is GsplatSplat:
@@ -206,7 +206,7 @@ def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None
             )
         frame = earlier.appearance.gaussians.frame
         options, seed = options.replaced(poses=False), seed + len(earlier.appearance.fits)
-    views = _views(plan, frame)
+    views = _views(plan, frame, console)
     try:
         start = _start(plan, views, frame)
     except GvError as error:
@@ -220,10 +220,11 @@ def _converged(plan: Plan, earlier: Fitted) -> bool:
     return earlier.steps >= converged_steps(len(plan.context), recorded=_recorded(plan))
 
 
-def _continued_fit(plan: Plan, earlier: Fitted) -> Fit:
+def _continued_fit(plan: Plan, earlier: Fitted, console: Console) -> Fit:
     start = earlier.appearance.gaussians
+    views, seed = _views(plan, start.frame, console), plan.config.seed
     fit = Fit(
-        start, _views(plan, start.frame), options=plan.config.refine, seed=plan.config.seed,
+        start, views, options=plan.config.refine, seed=seed,
         begin=CONTINUED, splatter=splatter_on(plan.config.device),
     )  # fmt: skip
     fit.cameras.spread = earlier.spread
@@ -304,7 +305,7 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
     return replace(found, poses=poses, spread=cameras.spread)
 
 
-def _views(plan: Plan, frame: LocalFrame) -> list[FitView]:
+def _views(plan: Plan, frame: LocalFrame, console: Console) -> list[FitView]:
     views = [plan.scene[name] for name in plan.context]
     poses = frame.cam_from_local(plan.scene.subset(plan.context).cameras.cam_from_world)
     frames = prefetch(lambda view: view.load(), views)
@@ -312,13 +313,15 @@ def _views(plan: Plan, frame: LocalFrame) -> list[FitView]:
         FitView(
             loaded.rgb, view.camera.K[0], pose, loaded.mask,
             loaded.depth if is_recorded(plan.source, view) else None,
-            _estimate(plan, view, loaded),
+            _estimate(plan, view, loaded, console=console),
         )
         for view, pose, loaded in zip(views, poses, frames, strict=True)
     ]  # fmt: skip
 
 
-def _estimate(plan: Plan, view: View, frame: Frame) -> NDArray[np.float32] | None:
+def _estimate(
+    plan: Plan, view: View, frame: Frame, *, console: Console
+) -> NDArray[np.float32] | None:
     """Depth that a network estimates, where the run takes a network's.
 
     A plane sweep's depth guides no fit: it knows no more than the photographs do, and where they
@@ -328,12 +331,15 @@ def _estimate(plan: Plan, view: View, frame: Frame) -> NDArray[np.float32] | Non
         return None
     try:
         return plan.source.depth(plan.scene, view, frame).depth
-    except DegenerateError:
+    except DegenerateError as error:
+        console.warn(f"{view.name} is fitted without an estimate of its depth: {error}")
         return None
 
 
 def _start(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians:
-    """Gaussians at recorded depth, else at sparse points, else at a rough plane sweep's depth.
+    """Gaussians at recorded depth, at sparse points, at a network's depth or a rough plane sweep's.
+
+    The first of these that there is.
 
     Raises:
         GvError: a camera that cannot be splatted into, or nothing tells where surfaces are.
@@ -347,6 +353,9 @@ def _start(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians
     if points is not None and len(points.positions) >= FEWEST_POINTS:
         positions = frame.from_world(points.positions)
         return from_points(positions, points.colors, frame=frame, most=most)
+    estimated = [replace(v, depth=v.estimate) for v in views if v.estimate is not None]
+    if estimated:
+        return from_depth(estimated, frame=frame, seed=seed, most=most)
     source, rough = rough_source(plan.scene, plan.source), []
     for name, view in evenly_spread(list(zip(plan.context, views, strict=True)), ROUGH_VIEWS):
         found = source.depth(plan.scene, plan.scene[name], Frame(view.rgb, None, view.mask))

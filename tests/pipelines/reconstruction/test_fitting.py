@@ -297,7 +297,9 @@ def test_a_run_with_judges_keeps_the_blend_that_they_chose(tmp_path):
     assert Fitted.load(out / FITTED).appearance.blend == chosen.appearance.blend
 
 
-def test_a_networks_depth_guides_the_fit_and_its_failures_do_not_stop_it(tmp_path, monkeypatch):
+def test_a_networks_depth_guides_the_fit_and_its_failures_do_not_stop_it(
+    tmp_path, monkeypatch, capsys
+):
     scan = write_colmap_scan(tmp_path / "scan", views=10)
     (tmp_path / "model.safetensors").write_bytes(b"only looked for")
     plan = planned(scan, "depth=da3", f"da3.weights={tmp_path}")
@@ -311,8 +313,13 @@ def test_a_networks_depth_guides_the_fit_and_its_failures_do_not_stop_it(tmp_pat
 
     monkeypatch.setattr(FoundationDepth, "depth", depth)
     frame = fitting.grid_frame(plan.scene, plan.context)
-    first, second, *_ = fitting._views(plan, frame)
+    first, second, *_ = fitting._views(plan, frame, Console())
     assert first.depth is None and first.estimate is not None and (first.estimate == 3).all()
     assert second.estimate is None
-    plain = fitting._views(planned(scan), frame)
+    assert "is fitted without an estimate of its depth: no scale" in capsys.readouterr().err
+    plain = fitting._views(planned(scan), frame, Console(quiet=True))
     assert all(view.depth is None and view.estimate is None for view in plain)
+    # Without sparse points the fit begins there, too.
+    scene = replace(plan.scene, points=None)
+    start = fitting._start(replace(plan, scene=scene), [first, second], frame)
+    assert len(start) > 50
