@@ -32,6 +32,11 @@ FIRST = (
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--runslow", action="store_true", help="run the tests marked slow as well")
+    parser.addoption(
+        "--posed-cuda",
+        action="store_true",
+        help="run the tests marked gpu on CPU tensors that pose as CUDA's (posed_cuda.py)",
+    )
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -44,7 +49,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST)
     )
     gpu_items = [item for item in items if "gpu" in item.keywords]
-    if gpu_items and not _cuda():
+    if gpu_items and not _cuda() and not config.getoption("--posed-cuda"):
         gpu = pytest.mark.skip(reason="needs a CUDA device; torch sees none")
         for item in gpu_items:
             item.add_marker(gpu)
@@ -54,6 +59,17 @@ def _cuda() -> bool:
     import torch
 
     return torch.cuda.is_available()
+
+
+@pytest.fixture(autouse=True)
+def _posed_where_asked_for(request: pytest.FixtureRequest) -> Iterator[None]:
+    if not (request.config.getoption("--posed-cuda") and "gpu" in request.keywords):
+        yield
+        return
+    from posed_cuda import posed_cuda
+
+    with posed_cuda():
+        yield
 
 
 @pytest.fixture(scope="session")
