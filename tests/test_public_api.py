@@ -28,6 +28,7 @@ DOCTESTED = (
     "gvtools.completers.complete",
     "gvtools.evaluation.trajectories",
     "gvtools.settings.base",
+    "gvtools.training.tune_options",
     "gvtools.trajectory_files",
 )
 

@@ -25,7 +25,7 @@ EXPERIMENTS = {
     "ablations": "short trainings, alike in all but one part",
     "long-sequences": "three rounds with the memory and without",
     "domains": "rooms, hand-made levels and recorded scenes: where is the core better",
-    "real-frames": "a recorded scan, with and without fine-tuning on its context",
+    "real-frames": "a recorded scan, by the model as it is and tuned to its context",
 }
 
 
@@ -39,6 +39,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", type=Path, metavar="DIR", help="default: those that ship")
     parser.add_argument(
         "--teacher", type=Path, metavar="DIR", help="the undistilled model, for its rows"
+    )
+    parser.add_argument(
+        "--tuned", type=Path, metavar="DIR", help="of real-frames: weights of gvtools train tune"
+    )
+    parser.add_argument(
+        "--context", metavar="SPEC", help="of real-frames: the given views (every:20)"
+    )
+    parser.add_argument(
+        "--targets", metavar="SPEC", help="of real-frames: the judged views (every:20+10)"
     )
     parser.add_argument("--scenes", type=int, metavar="N", help="(64)")
     parser.add_argument(
@@ -76,6 +85,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
     names = (
         "weights",
+        "tuned",
+        "context",
+        "targets",
         "teacher",
         "scenes",
         "size",

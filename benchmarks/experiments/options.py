@@ -14,6 +14,12 @@ class ExperimentOptions(Settings):
 
     weights: Path | None = None
     """Of the student, or what a training starts from; none takes those that ship."""
+    tuned: Path | None = None
+    """Weights of ``gvtools train tune``; none leaves their rows out."""
+    context: str = "every:20"
+    """Views of a recorded scene that are given."""
+    targets: str = "every:20+10"
+    """Those that are judged."""
     teacher: Path | None = None
     """The undistilled model's; none leaves its rows out."""
     scenes: int = Field(64, ge=1)

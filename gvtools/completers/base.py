@@ -148,6 +148,11 @@ class Completer(ABC):
         """Warnings for the user, shown before a run starts."""
         return ()
 
+    @property
+    def weights(self) -> Path | None:
+        """Folder of a GeoVerse model that can be tuned to a scene (option ``weights``), or None."""
+        return None
+
     @abstractmethod
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0

@@ -63,6 +63,11 @@ class SmallHolesInpainted(Completer):
         """The costly one's."""
         return self.costly_one.notes
 
+    @property
+    def weights(self) -> Path | None:
+        """The costly one's."""
+        return self.costly_one.weights
+
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:

@@ -125,6 +125,12 @@ class RunDirectory:
         except (OSError, ValueError):
             return None
 
+    def add_to_record(self, key: str, value: Any) -> None:
+        """Say in run.json what was found on the way, beside what decides the result."""
+        record = self._record()
+        if isinstance(record, dict) and record.get(key) != json.loads(json.dumps(value)):
+            write_json(self.path / RECORD, {**record, key: value})
+
     def _results(self) -> list[Path]:
         """What the folder holds beside the run's record and what a kill left half-written."""
         return [

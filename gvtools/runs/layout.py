@@ -2,7 +2,7 @@
 
     run.json  rounds.jsonl  memory.npz  metrics.json
     round_000/report.json  round_000/context_depth_VIEW.npz  round_000/appearance.npz
-    round_000/poses.npz
+    round_000/poses.npz  tuned/{config.json,geoverse.safetensors,tuning.json}
     round_001/report.json  round_001/{guidance,valid,generated,after,depth}_TARGET.*
 
 Other modules of this package read and write these files; nothing outside knows their names.
@@ -19,6 +19,8 @@ from gvtools.errors import OptionError, ProjectError
 
 RECORD, REPORT, ROUNDS, METRICS = "run.json", "report.json", "rounds.jsonl", "metrics.json"
 MEMORY, APPEARANCE, POSES = "memory.npz", "appearance.npz", "poses.npz"
+# Weights of the generative core that were tuned to the run's context.
+TUNED = "tuned"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 # Pictures that a round leaves of each target.
 GUIDANCE, VALID, COMPLETION, AFTER = "guidance", "valid", "generated", "after"

@@ -64,6 +64,10 @@ class Observation:
     views: tuple[ContextView, ...]
     lifted: tuple[Cameras, ...]
 
+    def with_more(self, other: Observation) -> Observation:
+        """These views and others."""
+        return Observation(self.views + other.views, self.lifted + other.lifted)
+
 
 def observed(
     clip: Clip, context: Sequence[int], strength: CorruptionOptions, *, rng: np.random.Generator

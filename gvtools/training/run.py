@@ -254,7 +254,7 @@ class StageRun:
             # The samples depend on which photographs are installed.
             "photographs": list(photograph_names("train")),
             "options": self.options.to_dict(),
-            "start": None if self._source is None else _fingerprint(self._source),
+            "start": None if self._source is None else fingerprint(self._source),
             "data": data,
         }
 
@@ -314,7 +314,7 @@ def _last_record(folder: Path) -> dict[str, float]:
     return records[-1] if records else {}
 
 
-def _fingerprint(folder: Path) -> str:
+def fingerprint(folder: Path) -> str:
     """16 hex digits of SHA-256 over each file's relative path, size and both ends.
 
     The video prior is left out: no stage trains it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -32,8 +33,13 @@ PROBE = 24  # points along a side of a picture that overlap is measured with
 
 
 @dataclass(frozen=True, eq=False)
-class _Reduced:
-    """One view, cropped and reduced: as it is observed, and at the model's size."""
+class ReducedView:
+    """One view, cropped and reduced.
+
+    Attributes:
+        observed: as memory is made of it, at up to ``DETAIL`` times the model's size.
+        truth: at the model's size.
+    """
 
     observed: Clip
     truth: Clip
@@ -118,12 +124,12 @@ class SceneViews:
             rows = [start + step * i for i in range(self.views)]
             if rng.random() < 0.5:
                 rows.reverse()
-            frames = [_reduced(self._usable[number][row], self.size) for row in rows]
-            truth = _joined([frame.truth for frame in frames])
+            frames = [_kept(self._usable[number][row], self.size) for row in rows]
+            truth = joined([frame.truth for frame in frames])
             found = min(overlaps(truth))
             best = max(best, found)
             if found >= self.overlap:
-                return _joined([frame.observed for frame in frames]), truth
+                return joined([frame.observed for frame in frames]), truth
         raise DegenerateError(
             f"no window of {self.views} views in {ATTEMPTS} attempts of which neighbours share "
             f"{self.overlap:.0%} of their depth (best {best:.0%}); lower the overlap"
@@ -144,33 +150,46 @@ class SceneViews:
 
 def overlaps(clip: Clip) -> list[float]:
     """Share of each view's known depth that the next view shows likewise; 0 without any."""
+    return [float(shown(clip, i, [i + 1])[0]) for i in range(len(clip) - 1)]
+
+
+def shown(clip: Clip, index: int, others: Sequence[int]) -> NDArray[np.float64]:
+    """(len(others),) share of one view's known depth that each of others shows likewise.
+
+    Args:
+        clip: the views.
+        index: of the view whose depth is looked for; without any, the shares are 0.
+        others: of the views that may show it.
+    """
     height, width = clip.depth.shape[1:]
     rows = np.linspace(0, height - 1, PROBE).astype(int)[:, None]
     columns = np.linspace(0, width - 1, PROBE).astype(int)[None]
-    out = []
-    for i in range(len(clip) - 1):
-        depth = clip.depth[i][rows, columns]
-        known = depth > 0
-        if not known.any():
-            out.append(0.0)
-            continue
-        camera = clip.cameras[i]
-        local = (camera.rays()[rows, columns] * depth[..., None])[known]
-        world = camera.world_from_cam[0]
-        xy, z = clip.cameras[i + 1].project(local @ world[:3, :3].T + world[:3, 3])
+    depth = clip.depth[index][rows, columns]
+    known = depth > 0
+    if not known.any() or not len(others):
+        return np.zeros(len(others))
+    camera = clip.cameras[index]
+    local = (camera.rays()[rows, columns] * depth[..., None])[known]
+    world = camera.world_from_cam[0]
+    points, z = clip.cameras[list(others)].project(local @ world[:3, :3].T + world[:3, 3])
+    shares = np.empty(len(others))
+    for place, other in enumerate(others):
         with np.errstate(invalid="ignore"):
-            x, y = np.floor(xy[0]).T
-            inside = (z[0] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        there = clip.depth[i + 1][y[inside].astype(int), x[inside].astype(int)]
-        # Where the next view has no depth it cannot disagree.
-        agree = (there == 0) | (np.abs(there / z[0][inside] - 1) < SAME_SURFACE)
-        out.append(float(agree.sum() / known.sum()))
-    return out
+            x, y = np.floor(points[place]).T
+            inside = (z[place] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        there = clip.depth[other][y[inside].astype(int), x[inside].astype(int)]
+        # Where the other view has no depth it cannot disagree.
+        agree = (there == 0) | (np.abs(there / z[place][inside] - 1) < SAME_SURFACE)
+        shares[place] = agree.sum() / known.sum()
+    return shares
 
 
-@lru_cache(KEPT_FRAMES)
-def _reduced(view: View, size: tuple[int, int]) -> _Reduced:
-    """A view at ``DETAIL`` times the model's size (or less, if it is smaller) and at that size."""
+def reduced_view(view: View, size: tuple[int, int]) -> ReducedView:
+    """A view cropped about its centre to the aspect of ``size`` (H, W), and reduced.
+
+    It is observed at ``DETAIL`` times that size, or less, if it is smaller. What its mask leaves
+    out has no depth.
+    """
     frame = view.load()
     height, width = frame.rgb.shape[:2]
     aspect = size[0] / size[1]
@@ -188,7 +207,10 @@ def _reduced(view: View, size: tuple[int, int]) -> _Reduced:
         _resized(frame.rgb[window], depth[window], camera, size=(size[0] * times, size[1] * times))
         for times in (factor, 1)
     ]
-    return _Reduced(*parts)
+    return ReducedView(*parts)
+
+
+_kept = lru_cache(KEPT_FRAMES)(reduced_view)
 
 
 def _resized(
@@ -204,7 +226,7 @@ def _resized(
     )
 
 
-def _joined(clips: list[Clip]) -> Clip:
+def joined(clips: Sequence[Clip]) -> Clip:
     """Views of one size as one clip."""
     return Clip(
         np.concatenate([clip.rgb for clip in clips]),

@@ -60,6 +60,7 @@ def make_sample(
     rng: np.random.Generator,
     strength: CorruptionOptions = NOTHING,
     fill: str = "none",
+    more: Clip | None = None,
 ) -> Sample:
     """A sample from views in the order of their path, the same on any number of threads.
 
@@ -70,13 +71,17 @@ def make_sample(
         rng: draws the faults.
         strength: of this sample's faults.
         fill: of the model's configuration, ``hints.fill``.
+        more: further views that memory is made of, and that the model is not shown; of any size.
     """
     targets = [index for index in range(len(clip)) if index not in context]
     observation = observed(clip, context, strength, rng=rng)
-    guidance = projected(observation, clip.cameras[targets])
+    known = observation
+    if more is not None:
+        known = observation.with_more(observed(more, range(len(more)), strength, rng=rng))
+    guidance = projected(known, clip.cameras[targets])
     size = truth.depth.shape[1], truth.depth.shape[2]
     with _one_thread():
-        over = surface_fill(observation.views, guidance) if fill == "surfaces" else None
+        over = surface_fill(known.views, guidance) if fill == "surfaces" else None
         views, cameras = view_batch(observation.views, guidance, size, fill=over)
     order = [*context, *targets]
     true_depth = torch.from_numpy(truth.depth[order])[:, None]

@@ -60,6 +60,13 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
         help="fit Gaussians to the photographs so long; 0: not at all (default: about as long as "
         "the rest takes)",
     )
+    parser.add_argument(
+        "--tune",
+        type=float,
+        metavar="MINUTES",
+        help="train the generative core (--completer geoverse) so long to predict the context from "
+        "itself, before the first targets (default 0: not at all)",
+    )
     parser.add_argument("--voxel", metavar="EDGE", help="auto, or scene units")
     parser.add_argument(
         "--device", metavar="NAME", help="cpu, cuda (the torch back end), or auto: cpu"
@@ -143,6 +150,8 @@ def config_from(args: argparse.Namespace) -> RunSettings:
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     if args.refine is not None:
         given["refine.seconds"] = args.refine
+    if args.tune is not None:
+        given["tune.minutes"] = args.tune
     if args.allow_overlap:
         given["allow_overlap"] = True
     return with_texts(with_values(config, given), texts)

@@ -13,16 +13,18 @@ from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
 from pipelines.commands.help_settings import HelpSettings
+from pipelines.commands.tune import NAME, add_tune_arguments, refuse_tune_arguments, run_tune
 
 if TYPE_CHECKING:
     from gvtools.settings import Settings
     from pipelines.console import Console
 
-SUMMARY = "train the generative core: encoder, denoisers, distillation"
+SUMMARY = "train the generative core: encoder, denoisers, distillation; or tune it to a scene"
 EXAMPLES = (
     "gvtools train tiny --stage all --out training/tiny",
     "gvtools train my_training.json --stage denoiser --out training/mine --resume",
     "gvtools train base --init weights/base --out training/base",
+    "gvtools train tune --scene scan/ --context every:2 --minutes 10 --out tuned/scan",
 )
 
 
@@ -31,7 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from gvtools.training.records import STAGES
 
     parser.add_argument(
-        "config", metavar="CONFIG", help="a training that ships (tiny, base, micro), or a JSON file"
+        "config",
+        metavar="CONFIG",
+        help="a training that ships (tiny, base, micro), a JSON file, or tune: see below",
     )
     parser.add_argument(
         "--stage",
@@ -69,6 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sheets", type=int, default=250, metavar="N", help="sample sheets every N steps; 0: none"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the last figures there")
+    add_tune_arguments(parser)
 
 
 def _settings(args: argparse.Namespace) -> list[Settings]:
@@ -93,6 +98,10 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.training.records import STAGES
     from gvtools.training.run import StageRun
 
+    if args.config == NAME:
+        run_tune(args, console)
+        return
+    refuse_tune_arguments(args)
     config, folder = shipped_or_read(args.config)
     config = with_texts(config, args.set)
     if args.until is not None and args.until < 1:

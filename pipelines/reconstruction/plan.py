@@ -101,6 +101,7 @@ def make_plan(
     from gvtools.scenes.selection import select
     from pipelines.reconstruction import poses
     from pipelines.reconstruction.targets import resolve_targets
+    from pipelines.reconstruction.tuning import check_tuning
 
     errors = [finding.message for finding in scene.findings if finding.level == "error"]
     if errors:
@@ -113,6 +114,8 @@ def make_plan(
     completer = config.effort.applied(create(config.completer, **config.completer_options))
     # By name: a project may list its views in any order, and merging depends on theirs.
     context = tuple(sorted(select(scene.names, config.context)))
+    if config.tune.wanted:
+        check_tuning(completer, context)
     targets = resolve_targets(
         scene,
         context,
@@ -289,9 +292,10 @@ def describe(plan: Plan, console: Console) -> None:
         f"{len(plan.context)}, targets {len(targets.cameras)} ({targets.kind}, "
         f"{', '.join(f'{w}x{h}' for w, h in sizes)})"
     )
+    tuning = f" (tuned for {config.tune.length})" if config.tune.wanted else ""
     console.line(
         f"depth {plan.source.name} ({plan.source_reason}), voxel {config.voxel:g}, completer "
-        f"{config.completer}, "
+        f"{config.completer}{tuning}, "
         f"{len(plan.schedule)} rounds of at most {config.views_per_round} targets, seed "
         f"{config.seed}"
     )

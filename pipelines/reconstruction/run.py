@@ -155,6 +155,7 @@ def _run_rounds(
     from pipelines.reconstruction.round_targets import RoundTargets
     from pipelines.reconstruction.rounds import load_context
     from pipelines.reconstruction.run_round import run_round
+    from pipelines.reconstruction.tuning import tuned
 
     context: list[ContextView] | None = None
     with RoundTargets(plan, memory, None if fitted is None else fitted.appearance) as targets:
@@ -163,6 +164,8 @@ def _run_rounds(
                 scene = plan.evidence or plan.scene
                 cache = DepthCache(scene, plan.context, plan.source, folder=directory.round_path(0))
                 context = load_context(scene, plan.context, cache)
+                if plan.config.tune.wanted:
+                    plan = tuned(plan, cache, directory, console=console)
             with directory.writing_round(number) as folder:
                 report = run_round(
                     plan, targets, number, context=context or [], folder=folder, console=console

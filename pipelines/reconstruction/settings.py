@@ -16,6 +16,7 @@ from gvtools.memory.spatial_memory import MemoryOptions
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.scenes.reduced import SMALLEST
 from gvtools.settings import Settings
+from gvtools.training.tune_options import TuneOptions
 
 
 class FusionOptions(Settings):
@@ -164,3 +165,4 @@ class RunSettings(Settings):
     savings: SavingsOptions = SavingsOptions()
     effort: EffortPolicy = EffortPolicy()
     refine: FitOptions = FitOptions()
+    tune: TuneOptions = TuneOptions()

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from gvtools.depth.source import RecordedDepth
+from gvtools.training.tune_options import FEWEST_VIEWS
 from pipelines.tradeoff.trial import applied
 
 if TYPE_CHECKING:
@@ -65,6 +66,9 @@ def _values(plan: Plan) -> dict[str, tuple[Any, ...]]:
             "completer.image_size": (252,),
             "effort.inpaint_below": (0.1, 0.02, 0.0),
         }
+    tunable = plan.completer.weights is not None and len(plan.context) >= FEWEST_VIEWS
+    if tunable and config.tune.steps is None:
+        values["tune.minutes"] = (0.0, 1.0, 4.0)
     if plan.source.name != RecordedDepth.name:
         values["savings.depth_from_memory"] = (0.8, 0.9, None)
     if plan.source.name == "plane-sweep":

@@ -39,9 +39,11 @@ def sweep(
     left_out = []
     for label, settings in planned.items():
         trial = runs.kept(label, settings)
-        # A trial is expected to take as long as the start, or the time that its fit is given.
+        # A trial is expected to take as long as the start and its tuning, or the time of its fit.
         fit = settings.get("refine.seconds") or 0.0
-        if trial is None and trials and clock() + max(trials[0].seconds, fit) > end:
+        tuning = 60 * settings.get("tune.minutes", 0.0)
+        expected = max(trials[0].seconds + tuning, fit) if trials else 0.0
+        if trial is None and trials and clock() + expected > end:
             left_out.append(label)
             continue
         try:

@@ -18,6 +18,7 @@ from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import METRICS
 from gvtools.scenes.scene import Scene
 from gvtools.settings import with_values
+from gvtools.training.tune_options import TuneOptions
 from pipelines.console import Console
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
@@ -55,7 +56,8 @@ class Trial:
 def applied(config: RunSettings, settings: Mapping[str, Any]) -> RunSettings:
     """A run's settings with a trial's; one that names another completer says all of its options."""
     if settings.get("completer", config.completer) != config.completer:
-        config = config.replaced(completer_options={})
+        # Another completer need not have weights to tune.
+        config = config.replaced(completer_options={}, tune=TuneOptions())
     return with_values(config, settings)
 
 

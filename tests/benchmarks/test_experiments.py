@@ -218,15 +218,17 @@ def test_ablations_train_their_variants_and_test_them(weights, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_scan_is_judged_with_and_without_fine_tuning(weights, shared, tmp_path):
-    """A real scan's few context views are enough to draw samples from."""
+def test_a_scan_is_judged_by_tuned_weights_too(weights, shared, tmp_path):
+    """A real scan's few context views are enough to tune to."""
+    scan, tuned = str(shared / "data" / "sevenscenes_reg"), str(tmp_path / "tuned")
+    tune = ["train", "tune", "--scene", scan, "--context", "every:20", "--steps", "2", "--quiet"]
+    assert run_command([*tune, "--init", str(weights / "reflow" / "weights"), "--out", tuned]) == 0
     found = experiment(
-        "real-frames", weights, tmp_path, "--project", str(shared / "data" / "sevenscenes_reg"),
-        "--training", "micro", "--out", str(tmp_path / "tuned"), "--steps", "2",
-        "--pictures", str(tmp_path / "pictures"),
+        "real-frames", weights, tmp_path, "--project", scan,
+        "--tuned", tuned, "--pictures", str(tmp_path / "pictures"),
     )  # fmt: skip
     rows = [row["method"] for row in found["against_best_filler"]]
-    assert "fine-tuned 3+1" in rows and "biharmonic" not in rows
+    assert "tuned 3+1" in rows and "biharmonic" not in rows
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 5
 
 

@@ -106,6 +106,11 @@ class GeoVerseCompleter(Completer):
         """Everything in the weights folder."""
         return tuple(sorted(path for path in self.folder.rglob("*") if path.is_file()))
 
+    @property
+    def weights(self) -> Path | None:
+        """The weights folder."""
+        return self.folder
+
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from gvtools.completers.base import create
 from gvtools.errors import GvError, OptionError
 from gvtools.settings import with_texts, with_values
 from pipelines.commands.tradeoff import parse_seconds
@@ -130,7 +131,12 @@ def test_a_time_that_is_none_is_refused(text):
 
 def planned_of(source: str, config: RunSettings, **profiles: Any) -> dict[str, Any]:
     """The trials of a run whose depth comes from ``source``."""
-    plan = SimpleNamespace(config=config.replaced(voxel=0.01), source=SimpleNamespace(name=source))
+    plan = SimpleNamespace(
+        config=config.replaced(voxel=0.01),
+        source=SimpleNamespace(name=source),
+        completer=create(config.completer, **config.completer_options),
+        context=("a", "b", "c", "d"),
+    )
     return planned_trials(cast(Plan, plan), profiles)
 
 
@@ -160,3 +166,30 @@ def test_the_starts_own_values_are_no_trials():
     assert {"completer none", "completer inpaint", "completer.steps 1"} <= set(planned)
     assert not {"completer geoverse", "effort.inpaint_below 0.02"} & set(planned)
     assert not any(name.startswith("completer.") for name in planned_of("recorded", RunSettings()))
+
+
+def test_only_what_has_weights_is_tuned_in_a_trial():
+    core = with_texts(RunSettings(), ["completer=geoverse"])
+    planned = planned_of("recorded", core)
+    assert planned["tune.minutes 4"] == {"tune.minutes": 4.0} and "tune.minutes 0" not in planned
+    assert not any("tune" in name for name in planned_of("recorded", RunSettings()))
+    # A start that is tuned is tried without, and its trial by another completer is not tuned.
+    tuned = with_values(core, {"tune.minutes": 2.0})
+    planned = planned_of("recorded", tuned)
+    assert "tune.minutes 0" in planned
+    assert not applied(tuned, planned["completer inpaint"]).tune.wanted
+    # With a number of steps, minutes are not looked at.
+    stepped = planned_of("recorded", with_values(core, {"tune.steps": 5}))
+    assert not any("tune" in name for name in stepped)
+
+
+def test_a_tuning_needs_its_time(capsys):
+    planned: dict[str, Any] = {
+        START: {},
+        "tune.minutes 4": {"tune.minutes": 4.0},
+        "edge 4": {"edge": 4},
+    }
+    runs: Any = Runs()
+    made = sweep(planned, runs, limit=200, console=Console(), clock=lambda: runs.now)
+    assert [trial.label for trial in made] == [START, "edge 4"]
+    assert "tune.minutes 4" in capsys.readouterr().err

@@ -1,0 +1,349 @@
+"""A model tuned to one scene: it learns to predict context views from each other, and is judged.
+
+Weights that predict the judging views no better than before are not taken.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gvtools.completers.base import Completer
+from gvtools.completers.geoverse.completer import GeoVerseCompleter
+from gvtools.completers.geoverse.config import GeoVerseConfig
+from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.weights.folder import (
+    check_headers,
+    config_of,
+    from_pretrained,
+    save_pretrained,
+)
+from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
+from gvtools.errors import CheckpointError, ProjectError
+from gvtools.files import folder_replaced_when_written, make_folder, write_json
+from gvtools.runs.identity import array_digest
+from gvtools.scenes.scene import Scene
+from gvtools.training.denoiser_stage import DenoiserStage
+from gvtools.training.distributed import Processes, Replicated
+from gvtools.training.hold_outs import Prediction, SplitContext, split_context
+from gvtools.training.loader import batches
+from gvtools.training.loop import Trainer
+from gvtools.training.options import (
+    SHIPPED,
+    DenoiserStageOptions,
+    OptimizerOptions,
+    TrainingSettings,
+    shipped_or_read,
+)
+from gvtools.training.run import fingerprint
+from gvtools.training.tune_options import TuneOptions
+
+Say = Callable[[str], None]
+
+# What is written beside the weights.
+RECORD = "tuning.json"
+BATCH = 4
+# Of the learning rate that the model's own training had.
+RATE_SHARE = 0.2
+WARM_STEPS = 10
+EMA = 0.99
+# The judging views are predicted so often while the model learns; the best weights are taken.
+JUDGEMENTS = 4
+# Of a training by the clock, whose number of steps is not known: enough for any time.
+ENDLESS = 10**7
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What a tuning came to.
+
+    Attributes:
+        kept: whether the weights are the tuned ones; otherwise they are as they were.
+        psnr_before: of generated pixels of the judging views, dB, by the untuned weights.
+        psnr_after: likewise by the best of the tuned ones.
+        steps: optimiser steps made.
+        best_step: the step whose weights were best.
+        seconds: all of it.
+        views: context views that were learnt from.
+        judges: names of the views that judged.
+    """
+
+    kept: bool
+    psnr_before: float
+    psnr_after: float
+    steps: int
+    best_step: int
+    seconds: float
+    views: int
+    judges: list[str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a JSON file."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        said = f"{self.psnr_before:.2f} dB untuned, {self.psnr_after:.2f} dB tuned"
+        what = (
+            f"the tuned weights (step {self.best_step}) are taken"
+            if self.kept
+            else "the weights stay as they were"
+        )
+        return (
+            f"{what}: generated pixels of {len(self.judges)} judging view(s) {said}; "
+            f"{self.steps} steps, {self.seconds:.0f} s"
+        )
+
+
+def check_tunable(weights: Path) -> GeoVerseConfig:
+    """The configuration of weights that can be tuned.
+
+    Raises:
+        CheckpointError: no weights, or untrained ones.
+    """
+    config = config_of(weights)
+    if not config.trained:
+        raise CheckpointError(
+            f"{weights}: its denoisers are untrained, so that there is nothing to tune; expected "
+            "the weights of a finished training (gvtools train)"
+        )
+    return config
+
+
+def tune(
+    scene: Scene,
+    weights: Path,
+    out: Path,
+    *,
+    options: TuneOptions,
+    completer: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    say: Say = print,
+) -> Tuning:
+    """Tune a model to a scene, and write the better weights, tuned or not, into a folder.
+
+    Args:
+        scene: context views alone; no other picture is read.
+        weights: to start from.
+        out: absent or empty, or of an earlier tuning, which is replaced when this one is done.
+        options: how long; the time holds for all of it but for what one step takes.
+        completer: further options of the completer that predicts the judging views.
+        seed: of everything random.
+        say: is told how far it is.
+
+    Raises:
+        GvError: weights that cannot be tuned, or too few views with depth.
+    """
+    begun = time.monotonic()
+    config = check_tunable(weights)
+    split = split_context(scene, config, seed=seed)
+    if split.dropped:
+        say(f"tune: {split.dropped} of {len(scene)} context views are left out")
+    chosen = {**(completer or {}), "weights": str(weights)}
+    judge = _Judge(split.predictions(), GeoVerseCompleter(**chosen))
+    with torch.random.fork_rng(devices=[]):
+        learnt = _Learner(split, config, judge, options=options, seed=seed, begun=begun)
+        say(
+            f"tune: learns from {len(split.learnt.usable)} context views; {len(split.judges)} "
+            f"others judge: {judge.before:.2f} dB untuned"
+        )
+        tuning = learnt.run(say)
+    make_folder(out)
+    with folder_replaced_when_written(out) as folder:
+        save_pretrained(learnt.best(tuning), folder)
+        _link_video(config, weights, folder)
+        inputs = inputs_of(split, weights, options=options, seed=seed)
+        record = {**tuning.to_dict(), "options": options.to_dict(), "inputs": inputs}
+        write_json(folder / RECORD, record)
+    say(f"tune: {tuning}")
+    return tuning
+
+
+def tuned_before(
+    scene: Scene, weights: Path, out: Path, *, options: TuneOptions, seed: int = 0
+) -> dict[str, Any] | None:
+    """The record of a tuning that ``tune`` would make again with these arguments; None without one.
+
+    None, too, where its weights are damaged.
+    """
+    with suppress(OSError, ValueError, CheckpointError):
+        record: dict[str, Any] = json.loads((out / RECORD).read_text(encoding="utf-8"))
+        split = split_context(scene, check_headers(out), seed=seed)
+        if record["inputs"] == inputs_of(split, weights, options=options, seed=seed):
+            return record
+    return None
+
+
+def inputs_of(split: SplitContext, weights: Path, *, options: TuneOptions, seed: int) -> str:
+    """A digest of what decides a tuning: views, depth, cameras, weights, time and seed."""
+    arrays: list[Any] = []
+    for view in split.views:
+        camera = view.observed.cameras
+        arrays += [view.observed.depth, camera.K, camera.cam_from_world]
+    said = json.dumps([split.judged.describe(), options.to_dict(), fingerprint(weights), seed])
+    return array_digest([*arrays, np.frombuffer(said.encode(), np.uint8)])
+
+
+class _Judge:
+    """Predicts the judging views by one model, as it is at the time."""
+
+    def __init__(self, predictions: list[Prediction], completer: GeoVerseCompleter) -> None:
+        self.predictions, self.completer = predictions, completer
+        self.seconds = 0.0
+        self.before = self.psnr()
+
+    def psnr(self) -> float:
+        """Of generated pixels, dB; ``seconds`` is how long it took."""
+        began = time.monotonic()
+        found = generated_psnr(self.completer, self.predictions)
+        self.seconds = time.monotonic() - began
+        return found
+
+
+def generated_psnr(completer: Completer, predictions: list[Prediction]) -> float:
+    """PSNR in dB over the generated pixels of all predictions together, at most 100.
+
+    Raises:
+        ProjectError: there are none.
+    """
+    squared, pixels = 0.0, 0
+    for number, case in enumerate(predictions):
+        holes = ~case.guidance.valid
+        pixels += int(holes.sum())
+        if holes.any():
+            made = completer.complete(case.context, case.guidance, seed=number)
+            error = np.clip(made.rgb, 0, 1).astype(np.float64)[holes] - case.rgb[holes]
+            squared += float(np.square(error).mean(-1).sum())
+    if not pixels:
+        raise ProjectError(
+            "the context views show each other whole: no pixel is left to generate, and so none to "
+            "tune by; leave tuning out"
+        )
+    return float(-10 * np.log10(max(squared / pixels, 1e-10)))
+
+
+class _Learner:
+    """Trains a copy of the model, and keeps the weights that the judge likes best."""
+
+    def __init__(
+        self,
+        split: SplitContext,
+        config: GeoVerseConfig,
+        judge: _Judge,
+        *,
+        options: TuneOptions,
+        seed: int,
+        begun: float,
+    ) -> None:
+        self.split, self.judge, self.options, self.begun = split, judge, options, begun
+        self.folder = judge.completer.folder
+        self.model = judge.completer.model
+        device = next(self.model.parameters()).device
+        recipe = stage_options(config, device, options.steps)
+        self.trainer = Trainer(
+            Replicated(DenoiserStage(self.model, recipe), Processes(0, 1, device)),
+            recipe.optimizer,
+            lambda parts: batches(split.learnt, parts, workers=0),
+            folder=Path(),
+            seed=seed,
+            identity={},
+        )
+        self._best: dict[str, Tensor] = {}
+        self._psnr, self._best_step = -np.inf, 0
+
+    def run(self, say: Say) -> Tuning:
+        """Make steps until the time is over; judge now and then, and at the end."""
+        trainer, marks = self.trainer, 0
+        parts = itertools.chain.from_iterable(map(trainer.parts, itertools.count()))
+        with closing(trainer.batches(parts)) as stream:
+            over = False
+            while not over:
+                began = time.monotonic()
+                values = trainer.step(stream)
+                share = self._share(time.monotonic() - began)
+                over = share >= 1
+                if over or share * JUDGEMENTS >= marks + 1:
+                    marks = int(share * JUDGEMENTS)
+                    found = self._judge()
+                    loss = f", loss {values['loss']:.4g}" if "loss" in values else ""
+                    say(f"tune: step {trainer.progress.step}{loss}: {found:.2f} dB")
+        return Tuning(
+            kept=self._psnr > self.judge.before,
+            psnr_before=self.judge.before,
+            psnr_after=float(self._psnr),
+            steps=trainer.progress.step,
+            best_step=self._best_step,
+            seconds=time.monotonic() - self.begun,
+            views=len(self.split.learnt.usable),
+            judges=self.split.judges,
+        )
+
+    def best(self, tuning: Tuning) -> GeoVerse:
+        """The model with the weights that are to be written."""
+        if not tuning.kept:
+            return from_pretrained(self.folder, video=False)
+        with torch.no_grad():
+            for name, parameter in self.trainer.parameters:
+                parameter.copy_(self._best[name])
+        return self.model
+
+    def _share(self, step: float) -> float:
+        """How much of the steps or the time is over; 1 where another ``step`` [s] is too late."""
+        if self.options.steps is not None:
+            return self.trainer.progress.step / self.options.steps
+        limit = 60 * self.options.minutes
+        spent = time.monotonic() - self.begun
+        # The last judgement needs its time as well.
+        return 1.0 if spent + step + self.judge.seconds > limit else spent / limit
+
+    def _judge(self) -> float:
+        with self.trainer.ema.swapped_in():
+            found = self.judge.psnr()
+        if found > self._psnr:
+            self._psnr, self._best_step = found, self.trainer.progress.step
+            self._best = {name: value.clone() for name, value in self.trainer.ema.shadow.items()}
+        return found
+
+
+def stage_options(
+    config: GeoVerseConfig, device: torch.device, steps: int | None
+) -> DenoiserStageOptions:
+    """The losses that the model was trained by, at a low constant rate.
+
+    Products are in float32 on CPUs, of which many emulate bfloat16 at a fraction of its speed.
+
+    Args:
+        config: of the model; a training that ships under its name gives the losses.
+        device: that it learns on.
+        steps: None for a training by the clock.
+    """
+    shipped = (SHIPPED / f"{config.name}.json").is_file()
+    own = (shipped_or_read(config.name)[0] if shipped else TrainingSettings()).denoiser
+    total = ENDLESS if steps is None else steps
+    optimizer = OptimizerOptions(
+        steps=total,
+        batch=BATCH,
+        accumulate=min(BATCH, own.optimizer.accumulate),
+        rate=RATE_SHARE * own.optimizer.rate,
+        warmup=min(1.0, WARM_STEPS / total),
+        schedule="constant",
+        weight_decay=own.optimizer.weight_decay,
+        ema=EMA,
+        precision="float32" if device.type == "cpu" else "bfloat16",
+    )
+    return own.replaced(optimizer=optimizer)
+
+
+def _link_video(config: GeoVerseConfig, weights: Path, folder: Path) -> None:
+    """The video prior is not tuned, so it is not copied."""
+    if config.video is not None:
+        (folder / VIDEO_FOLDER).symlink_to((weights / VIDEO_FOLDER).resolve())
