@@ -64,14 +64,14 @@ class BlendCompleter(Completer):
     """A sum of fills' differences from the mean known colour, weighted by distance.
 
     Attributes:
-        weights: (fills, distances), see ``fit_blend``.
+        shares: (fills, distances), see ``fit_blend``.
     """
 
     name = "blend of fills"
 
-    def __init__(self, weights: Float64) -> None:
+    def __init__(self, shares: Float64) -> None:
         super().__init__()
-        self.weights = weights
+        self.shares = shares
         self._inpaint = create("inpaint")
 
     def complete(
@@ -89,7 +89,7 @@ class BlendCompleter(Completer):
                 rgb[index] = mean
                 continue
             terms = _terms(made.rgb[index], valid, mean)
-            rgb[index][holes] = np.clip(mean + np.tensordot(self.weights.ravel(), terms, 1), 0, 1)
+            rgb[index][holes] = np.clip(mean + np.tensordot(self.shares.ravel(), terms, 1), 0, 1)
         return replace(made, rgb=rgb)
 
 

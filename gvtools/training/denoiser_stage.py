@@ -40,7 +40,7 @@ class DenoiserStage(Stage):
         clean0, clean1 = model.clean_latents(batch.true_views)
         device = clean1.device
         drop = draws.uniform("cameras", 1)[:, 0] < options.cameras
-        if bool(drop.any()):
+        if options.cameras and bool(drop.any()):
             prepared = model.without_cameras(prepared, drop.to(device))
 
         t1 = self.time(draws, "t1").to(device)

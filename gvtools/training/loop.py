@@ -11,7 +11,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,6 +21,7 @@ import torch
 from torch import nn
 
 from gvtools.errors import OptionError
+from gvtools.networks.precision import autocast, training_type
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.distributed import Replicated
 from gvtools.training.draws import Draws
@@ -94,6 +95,8 @@ class Trainer:
         )
         self.ema = AveragedWeights(self.parameters, options.ema)
         self.progress = Progress()
+        # Processes of one training have to agree, as a stage that runs has seen to (run.py).
+        self.dtype = training_type(options.precision, self.processes.device)
 
     @property
     def finished(self) -> bool:
@@ -225,7 +228,7 @@ class Trainer:
         for part in parts:
             batch = next(stream).to(self.processes.device)
             draws = Draws(self.seed, self.stage.name, number, tuple(part))
-            with self._precision():
+            with autocast(self.processes.device, self.dtype):
                 loss, terms = self.stage(batch, draws)
             value = float(loss.detach())
             good &= math.isfinite(value) and value <= options.largest_loss
@@ -248,11 +251,6 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         self.progress.step += 1
         return _averaged(values)
-
-    def _precision(self):  # type: ignore[no-untyped-def]
-        if self.options.precision == "float32":
-            return nullcontext()
-        return torch.autocast(self.processes.device.type, dtype=torch.bfloat16)
 
 
 def _parts(samples: range, count: int) -> list[range]:

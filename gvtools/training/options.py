@@ -12,6 +12,7 @@ from gvtools.completers.geoverse.config import GeoVerseConfig, named, read
 from gvtools.completers.geoverse.flow import check_bounds
 from gvtools.completers.geoverse.objective.objective import LossWeights
 from gvtools.errors import OptionError
+from gvtools.networks.precision import TrainingPrecision
 from gvtools.settings import Settings, with_file
 from gvtools.training.corruption import GENTLE, CorruptionOptions
 
@@ -54,8 +55,14 @@ class OptimizerOptions(Settings):
     """Largest norm of the gradient."""
     ema: Decay = 0.9995
     """Decay of the averaged weights."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Of products; bfloat16 by autocast."""
+    precision: TrainingPrecision = "float32"
+    """Of products; bfloat16 by autocast. ``auto``: bfloat16 on a GPU of compute capability 8.0 and
+    later, and on a CPU that is measured to be faster in it; float32 elsewhere. What was chosen is
+    said, and kept when the training is continued. float16 is not trained in: its gradients vanish
+    without a loss scale."""
+    recompute: bool = False
+    """Layers are computed again in the backward pass instead of being kept: the same gradients and
+    a fraction of the memory for about a quarter more time."""
     largest_loss: float = Field(1000.0, gt=0)
     """A batch with a larger loss, or one that is not finite, is skipped and counted."""
 

@@ -53,7 +53,7 @@ class ReflowStage(Stage):
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
         model, options = self.model, self.options
-        teacher = self._teacher[0].to(batch.images.device)
+        teacher = self._teacher[0]
         seeds = draws.seeds("video", batch.images.shape[1])
         prepared = model.prepare(batch.views, seed=seeds)
         _, clean = model.clean_latents(batch.true_views)

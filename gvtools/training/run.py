@@ -19,6 +19,7 @@ from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER, WHOLE_FI
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text
 from gvtools.networks.config_json import to_json
+from gvtools.networks.precision import name_of, training_type
 from gvtools.procedural.photographs import photograph_names
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.denoiser_stage import DenoiserStage
@@ -32,7 +33,7 @@ from gvtools.training.reflow_stage import ReflowStage
 from gvtools.training.samples import TrainingSamples
 from gvtools.training.sheets import completion_sheet, encoder_sheet, write_png
 from gvtools.training.stage import Stage
-from gvtools.training.state import FILE
+from gvtools.training.state import FILE, saved_identity
 
 WEIGHTS = "weights"
 # Settings of all stages, written into the folder of each stage when it is started or resumed.
@@ -104,6 +105,7 @@ class StageRun:
                 f"{self.folder}: a training is there already; continue it with --resume, or "
                 "choose another --out"
             )
+        self._settle_precision(resume, say)
         model = self._start(say)
         distributed = self._distributed(STAGE_OF[self.stage](model, self.options), model.video)
         if distributed.about:
@@ -139,6 +141,21 @@ class StageRun:
             self._write_weights(model, trainer, samples)
             say(f"{self.stage}: weights in {self.folder / WEIGHTS}")
         return _last_record(self.folder)
+
+    def _settle_precision(self, resume: bool, say: Callable[[str], None]) -> None:
+        """Put what ``auto`` means here into the options; a continued stage stays with its own."""
+        optimizer = self.options.optimizer
+        if optimizer.precision != "auto":
+            return
+        before = saved_identity(self.folder) if resume else {}
+        name = before.get("options", {}).get("optimizer", {}).get("precision", "auto")
+        if name == "auto":
+            found = training_type("auto", self.processes.device)
+            # Times differ between processes; the first one's count.
+            rounded = self.processes.any(self.processes.first and found == torch.bfloat16)
+            name = name_of(torch.bfloat16 if rounded else torch.float32)
+        self.options = self.options.replaced(optimizer=optimizer.replaced(precision=name))
+        say(f"{self.stage}: products in {name}")
 
     def _recorder(self, step: int, say: Callable[[str], None]) -> Record | None:
         """Writes and says a record; None in all processes but the first."""
@@ -247,13 +264,16 @@ class StageRun:
         for name in ("alignment", "color_alignment"):
             model.pop(name)
         model["flow"].pop("temperature")
+        options = self.options.to_dict()
+        # Memory for time: the same gradients.
+        options["optimizer"].pop("recompute")
         return {
             "stage": self.stage,
             "seed": self.config.seed,
             "model": model,
             # The samples depend on which photographs are installed.
             "photographs": list(photograph_names("train")),
-            "options": self.options.to_dict(),
+            "options": options,
             "start": None if self._source is None else fingerprint(self._source),
             "data": data,
         }

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from gvtools.completers.geoverse.flow import training_times
 from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.networks.recompute import set_recompute
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 
@@ -28,6 +29,7 @@ class Stage(nn.Module):
         super().__init__()
         self.model, self.options = model, options
         model.requires_grad_(False)
+        set_recompute(model, options.optimizer.recompute)
         for part in self.learning_parts():
             if part is not None:
                 part.requires_grad_(True)

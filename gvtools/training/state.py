@@ -89,6 +89,15 @@ def load_state(
     return state
 
 
+def saved_identity(folder: Path) -> dict[str, Any]:
+    """Of the saved state; empty where there is none that can be read, which is said later."""
+    try:
+        content = torch.load(folder / FILE, map_location="cpu", weights_only=True, mmap=True)
+        return dict(content["identity"])
+    except Exception:
+        return {}
+
+
 def _difference(before: Any, now: Any, where: str = "") -> tuple[str, Any, Any] | None:
     """The first entry of ``now`` that ``before`` has otherwise: its dotted name and both values."""
     if isinstance(before, dict) and isinstance(now, dict):

@@ -338,7 +338,7 @@ def stage_options(
         schedule="constant",
         weight_decay=own.optimizer.weight_decay,
         ema=EMA,
-        precision="float32" if device.type == "cpu" else "bfloat16",
+        precision="float32" if device.type == "cpu" else "auto",
     )
     return own.replaced(optimizer=optimizer)
 

@@ -12,6 +12,7 @@ from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.stages import DECODE
 from gvtools.completers.geoverse.weights.folder import from_pretrained
+from gvtools.networks.precision import name_of
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
 from pipelines.bench.stage_clock import PEAK, forget_peak, peak_bytes, total, within
@@ -32,7 +33,7 @@ def complete_figures(options: CompleteOptions) -> dict[str, Any]:
         batch,
         bounds=interval_bounds(options.steps, shift=config.flow.shift),
         cascade_bounds=interval_bounds(options.cascade_steps, shift=config.flow.shift),
-        rounded=options.rounded,
+        dtype=options.compute_type,
         video=None if options.runs_video(config) else random_features(config, batch),
     )
     counts = timed.flops()
@@ -67,7 +68,7 @@ def _conditions(options: CompleteOptions, config: GeoVerseConfig) -> dict[str, A
         "cascade_steps": options.cascade_steps,
         "device": options.place.type,
         "device_name": torch.cuda.get_device_name(options.place) if gpu else None,
-        "precision": "bfloat16" if options.rounded else "float32",
+        "precision": name_of(options.compute_type),
         "video": options.runs_video(config),
         "video_stand_in": config.video is not None and not options.runs_video(config),
         "compiled": options.compile,
@@ -83,8 +84,10 @@ def _model(options: CompleteOptions, config: GeoVerseConfig) -> GeoVerse:
     """The model on its device, with its video prior where that is asked for."""
     device, video = options.place, options.runs_video(config)
     if options.weights is not None:
-        return from_pretrained(options.weights, device=device, video=video)
+        dtype = options.compute_type
+        return from_pretrained(options.weights, device=device, dtype=dtype, video=video)
     model = random_model(config, device)
+    model.hold_in(options.compute_type)
     if video and config.video is not None:
         model.attach_video(random_video(config.video, device))
     return model

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from gvtools.completers.geoverse.config import GeoVerseConfig, named
 from gvtools.completers.geoverse.weights.folder import config_of
 from gvtools.errors import OptionError
+from gvtools.networks.precision import inference_type, named_type
 from gvtools.settings import Settings
 
 Count = Annotated[int, Field(ge=1)]
@@ -37,14 +38,19 @@ class CompleteOptions(Settings):
     """Of level 0."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the model runs; "auto" takes a GPU where there is one."""
-    precision: Literal["float32", "bfloat16"] | None = None
-    """None for bfloat16 on a GPU and float32 on a CPU."""
+    precision: Literal["float32", "bfloat16", "float16"] | None = None
+    """None for what the device computes in: float32 on a CPU, bfloat16 on a GPU, float16 on one
+    before compute capability 8.0; for ``memory`` bfloat16."""
     video: bool | None = None
     """Run the video prior; none: where the configuration has one, but not on a CPU."""
     repeat: Count = 9
     """Timed passes."""
     compile: bool = False
     """Compile the denoisers and the RGB head first."""
+    memory: bool = False
+    """Foretell the peak memory of a pass and of a training step instead of timing anything."""
+    card: float | None = Field(None, gt=0)
+    """Memory of a card that ``memory`` compares its figures with. [GB]"""
 
     @model_validator(mode="after")
     def _check(self) -> CompleteOptions:
@@ -52,6 +58,10 @@ class CompleteOptions(Settings):
             raise OptionError(
                 "bench complete: both --config and --weights; a weights folder has its own config"
             )
+        if self.card is not None and not self.memory:
+            raise OptionError("bench complete: --card is of --memory; give both")
+        if self.memory and self.compile:
+            raise OptionError("bench complete: --compile, and --memory runs nothing")
         if self.device == "cuda" and not torch.cuda.is_available():
             raise OptionError("bench complete: --device cuda, and torch sees no CUDA device here")
         config = self.network()
@@ -80,11 +90,17 @@ class CompleteOptions(Settings):
         return torch.device(auto if self.device == "auto" else self.device)
 
     @property
-    def rounded(self) -> bool:
-        """Products in bfloat16."""
-        if self.precision is None:
-            return self.place.type == "cuda"
-        return self.precision == "bfloat16"
+    def compute_type(self) -> torch.dtype:
+        """Of products."""
+        if self.memory:
+            return named_type(self.precision or "bfloat16")
+        return inference_type(self.precision or "auto", self.place)
+
+    @property
+    def trained_type(self) -> torch.dtype:
+        """Of products in training, which knows no float16."""
+        found = self.compute_type
+        return torch.float32 if found == torch.float16 else found
 
     def runs_video(self, config: GeoVerseConfig) -> bool:
         """The video prior is part of the pass."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import statistics
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.stages import LEVEL0, LEVEL1, no_clock
 from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
+from gvtools.networks.precision import autocast
 from pipelines.bench.stage_clock import StageClock, seconds, total
 
 PASS = "pass"
@@ -45,7 +46,7 @@ class TimedPass:
         batch: likewise.
         bounds: of the level-1 steps.
         cascade_bounds: of the cascade's.
-        rounded: products in bfloat16.
+        dtype: of products.
         video: features that stand in for the video prior's.
     """
 
@@ -56,12 +57,12 @@ class TimedPass:
         *,
         bounds: Sequence[float],
         cascade_bounds: Sequence[float],
-        rounded: bool = False,
+        dtype: torch.dtype = torch.float32,
         video: VideoFeatures | None = None,
     ) -> None:
         self.model, self.batch, self.video = model, batch, video
         self.bounds, self.cascade_bounds = tuple(bounds), tuple(cascade_bounds)
-        self.rounded = rounded
+        self.dtype = dtype
         self.device = batch.images.device
         self.now = seconds(self.device)
         # How often the stages with numbered steps are stepped through.
@@ -69,9 +70,7 @@ class TimedPass:
 
     def precision(self) -> AbstractContextManager[Any]:
         """Autocast where products are rounded."""
-        if not self.rounded:
-            return nullcontext()
-        return torch.autocast(self.device.type, dtype=torch.bfloat16)
+        return autocast(self.device, self.dtype)
 
     def run(self, clock: StageClock | None = None) -> float:
         """One pass; the seconds it took."""

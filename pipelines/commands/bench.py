@@ -22,6 +22,7 @@ SUMMARY = (
 EXAMPLES = (
     "gvtools bench splat --repeat 15 --json splat.json",
     "gvtools bench complete --config base",
+    "gvtools bench complete --config base --memory --card 24",
 )
 
 FEWEST_POINTS = 1000
@@ -38,6 +39,8 @@ COMPLETE = (
     "precision",
     "video",
     "compile",
+    "memory",
+    "card",
 )
 
 
@@ -75,8 +78,8 @@ def _add_complete(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--device", choices=("auto", "cpu", "cuda"), help="(auto)")
     group.add_argument(
         "--precision",
-        choices=("float32", "bfloat16"),
-        help="of products (bfloat16 on a GPU, float32 on a CPU)",
+        choices=("float32", "bfloat16", "float16"),
+        help="of products (float32 on a CPU, bfloat16 on a GPU, float16 on an old one)",
     )
     group.add_argument(
         "--video",
@@ -88,6 +91,15 @@ def _add_complete(group: argparse._ArgumentGroup) -> None:
         action="store_true",
         default=None,
         help="torch.compile first: needs a C++ compiler and most of a minute, pays in long runs",
+    )
+    group.add_argument(
+        "--memory",
+        action="store_true",
+        default=None,
+        help="foretell the peak memory of a pass and of a training step, by stage; runs nothing",
+    )
+    group.add_argument(
+        "--card", type=float, metavar="GB", help="with --memory: say what fits a card of so many GB"
     )
 
 
@@ -132,14 +144,24 @@ def _run_complete(args: argparse.Namespace, given: set[str], console: Console) -
     options = {name: getattr(args, name) for name in given}
     if "size" in options:
         options["size"] = parsed_size(options["size"])
-    figures = complete_figures(CompleteOptions(repeat=args.repeat, **options))
+    chosen = CompleteOptions(repeat=args.repeat, **options)
+    if chosen.memory:
+        from pipelines.bench.memory import memory_figures
+        from pipelines.bench.memory_tables import show_memory
+
+        figures = memory_figures(chosen)
+        rows = len(figures["inference"]) + len(figures["training"])
+        tables = show_memory
+    else:
+        figures = complete_figures(chosen)
+        rows, tables = len(figures["results"]), show
     if args.json is None:
-        show(figures, console)
+        tables(figures, console)
         return
     from gvtools.files import write_json
 
     write_json(args.json, figures)
-    console.line(f"{len(figures['results'])} rows written to {args.json}")
+    console.line(f"{rows} rows written to {args.json}")
 
 
 def report(

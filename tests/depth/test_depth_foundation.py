@@ -98,7 +98,7 @@ def da3(scene: Scene, weights: str, **options) -> FoundationDepth:
 
 def stand_in(monkeypatch, scene: Scene, **options) -> Oracle:
     oracle = Oracle(scene, **options)
-    monkeypatch.setattr(module, "load_depth_anything", lambda path, device: oracle)
+    monkeypatch.setattr(module, "load_depth_anything", lambda path, **_: oracle)
     return oracle
 
 
@@ -190,7 +190,7 @@ def in_another_unit(scene: Scene, factor: float) -> Scene:
 @pytest.mark.parametrize("factor", [0.01, 100.0])
 def test_the_scenes_unit_changes_the_depths_unit_alone(tmp_path, monkeypatch, weights, factor):
     network = Recorder()
-    monkeypatch.setattr(module, "load_depth_anything", lambda path, device: network)
+    monkeypatch.setattr(module, "load_depth_anything", lambda path, **_: network)
     scene = read_sevenscenes(write_scan(tmp_path / "scan"))
     depths = []
     for other in (scene, in_another_unit(scene, factor)):

@@ -211,6 +211,6 @@ def test_the_training_of_base_is_the_papers():
         options = stage.optimizer
         assert (options.steps, options.rate, options.batch) == (steps, rate, 32)
         assert (options.betas, options.clip, options.ema) == ((0.9, 0.95), 1.0, 0.9995)
-        assert options.precision == "bfloat16"
+        assert options.precision == "auto" and options.recompute
         assert stage.context_weight == 0.25
     assert config.reflow.bounds is None and config.network().flow.level1[0::3] == (1.0, 0.0)

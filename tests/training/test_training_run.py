@@ -332,3 +332,25 @@ def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
     assert "no finished denoiser" in capsys.readouterr().err
     assert main(["weights", "pack", str(trained), str(trained / "inside")]) == 2
     assert "choose another folder" in capsys.readouterr().err
+
+
+def test_auto_is_settled_once_said_and_kept(tmp_path, capsys, monkeypatch):
+    from gvtools.networks import precision
+
+    auto = ("--set", "encoder.optimizer.precision=auto", "--set", "encoder.optimizer.steps=4")
+    start = ["train", "micro", "--stage", "encoder", "--out", str(tmp_path), "--device", "cpu"]
+    faster = [True]
+    monkeypatch.setattr(precision, "bfloat16_is_faster", lambda: faster[0])
+    assert main([*start, "--sheets", "0", *SAMPLES, *auto, "--until", "2"]) == 0
+    assert "encoder: products in bfloat16" in capsys.readouterr().out
+    state = torch.load(tmp_path / "encoder" / "state.pt", weights_only=True)
+    assert state["identity"]["options"]["optimizer"]["precision"] == "bfloat16"
+    # The next start measures otherwise; the training stays what it was.
+    faster[0] = False
+    more = ("--set", "encoder.optimizer.recompute=true", "--resume")
+    assert main([*start, "--sheets", "0", *SAMPLES, *auto, *more]) == 0
+    said = capsys.readouterr().out
+    assert "encoder: products in bfloat16" in said and "goes on after step 2" in said
+    assert (tmp_path / "encoder" / "weights").is_dir()
+    assert main([*start, "--sheets", "0", *SAMPLES, *auto, "--out", str(tmp_path / "new")]) == 0
+    assert "encoder: products in float32" in capsys.readouterr().out

@@ -242,3 +242,12 @@ def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
         same_gradients(tmp_path / "two" / stage, tmp_path / "one" / stage, most)
         assert (tmp_path / "two" / stage / "weights" / "video" / "vae").is_dir()
         assert from_pretrained(tmp_path / "two" / stage / "weights").video is not None
+
+
+def test_layers_that_are_computed_again_are_put_together_again(start, tmp_path):
+    more = ["--init", str(start), "--sheets", "0", "--until", "1"]
+    more += ["--set", "denoiser.optimizer.batch=8", "--set", "denoiser.optimizer.accumulate=2"]
+    assert main(arguments("micro", "denoiser", tmp_path / "one", *more, "--quiet")) == 0
+    again = ("--set", "denoiser.optimizer.recompute=true")
+    on_two("micro", "denoiser", tmp_path / "two", *more, *SHARDED, *again)
+    same_gradients(tmp_path / "two" / "denoiser", tmp_path / "one" / "denoiser", 1e-4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -37,6 +37,7 @@ from gvtools.completers.push_pull import Filled
 from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
+from gvtools.networks.precision import autocast, inference_type
 
 # The model that ships: see MODEL_CARD.md there.
 SHIPPED = Path(__file__).parent / "pretrained" / "tiny"
@@ -92,7 +93,12 @@ class GeoVerseCompleter(Completer):
     @cached_property
     def model(self) -> GeoVerse:
         """The model, on its device; read when it is first needed."""
-        return from_pretrained(str(self.folder.resolve()), device=str(self._device))
+        return from_pretrained(
+            str(self.folder.resolve()),
+            device=str(self._device),
+            dtype=self._compute_type,
+            offload=self.settings.offload,
+        )
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -229,11 +235,13 @@ class GeoVerseCompleter(Completer):
             return torch.device("cuda" if torch.cuda.is_available() else "cpu")
         return torch.device(self.settings.device)
 
+    @property
+    def _compute_type(self) -> torch.dtype:
+        return inference_type(self.settings.precision, self._device)
+
     def _precision(self) -> AbstractContextManager[Any]:
-        """Autocast to bfloat16 if the settings ask for it, or by default on CUDA."""
-        kind, precision = self._device.type, self.settings.precision
-        use_bfloat16 = precision == "bfloat16" or (precision == "auto" and kind == "cuda")
-        return torch.autocast(kind, dtype=torch.bfloat16) if use_bfloat16 else nullcontext()
+        """Autocast to half precision if the settings ask for it, or by default on CUDA."""
+        return autocast(self._device, self._compute_type)
 
 
 class _Canvas:

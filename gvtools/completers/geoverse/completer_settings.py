@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from gvtools.completers.settings import CompleterSettings
+from gvtools.networks.precision import Precision
 
 
 class GeoVerseSettings(CompleterSettings):
@@ -48,7 +49,10 @@ class GeoVerseSettings(CompleterSettings):
     image_size: int | None = Field(None, ge=1)
     """Longer side of the pictures in a pass, pixels, rounded to whole patches; the model's own is
     also the most."""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """``auto`` is bfloat16 on a GPU and float32 on a CPU."""
+    precision: Precision = "auto"
+    """``auto`` is float32 on a CPU and bfloat16 on a GPU, float16 before compute capability 8.0."""
+    offload: Literal["auto", "always", "never"] = "auto"
+    """Whether the video prior's weights leave the GPU between passes; ``auto`` where they would
+    leave too little memory for the rest of a pass."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """``auto`` takes a GPU where there is one."""

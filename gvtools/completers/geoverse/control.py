@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
+from gvtools.networks.recompute import Recomputing
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class FeatureAdapter(nn.Module):
         return x.flatten(2).transpose(1, 2).unflatten(0, batch_views)
 
 
-class ControlBranch(nn.Module):
+class ControlBranch(Recomputing):
     """See the module.
 
     Args:
@@ -100,6 +101,7 @@ class ControlBranch(nn.Module):
         c = F.silu(denoiser.time(t, noisy.shape[1]).to(stream.dtype))
         residuals = {}
         for index, layer in enumerate(self.config.layers):
-            stream = self.blocks[index](stream + adapted[index], c, positions.encoder)
+            entering = stream + adapted[index]
+            stream = self.layer(self.blocks[index], entering, c, positions.encoder)
             residuals[layer] = self.outputs[index](stream)
         return residuals

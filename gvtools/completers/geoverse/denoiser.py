@@ -28,6 +28,7 @@ from gvtools.completers.geoverse.plucker import CameraCondition
 from gvtools.completers.geoverse.projective import HEAD_MULTIPLE, Projective
 from gvtools.completers.geoverse.shared_attention import VideoKeys
 from gvtools.errors import OptionError, ShapeError
+from gvtools.networks.recompute import Recomputing
 
 CAMERA_CHANNELS = 7
 DEPTH_CHANNELS = 2
@@ -124,7 +125,7 @@ class Positions:
         )
 
 
-class Denoiser(nn.Module):
+class Denoiser(Recomputing):
     """See the module.
 
     ``forward`` returns the velocity of the linear path, or clean latents where the model's
@@ -227,12 +228,12 @@ class Denoiser(nn.Module):
         c = nn.functional.silu(time)
         for index in range(self.config.depth):
             extra = None if video is None else video.get(index)
-            s = self.blocks[index](s, c, positions.encoder, extra)
+            s = self.layer(self.blocks[index], s, c, positions.encoder, extra)
             if residuals is not None and index in residuals:
                 s = s + residuals[index]
         s = self.s_projector(nn.functional.silu(time + s))
         for index in range(self.config.depth, len(self.blocks)):
-            x = self.blocks[index](x, s, positions.head)
+            x = self.layer(self.blocks[index], x, s, positions.head)
         return self.final_layer(x, s).transpose(2, 3).unflatten(3, grid)
 
     def _split(self, stream: str, x: Tensor, context: int) -> Tensor:

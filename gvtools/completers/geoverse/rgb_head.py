@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from gvtools.networks.attention import attend
 from gvtools.networks.depth_anything.encoder import IMAGENET_MEAN, IMAGENET_STD
+from gvtools.networks.recompute import Recomputing
 
 SINE_BASE = 10000.0
 
@@ -44,7 +45,7 @@ class RGBHeadConfig:
     eps: float = 1e-12
 
 
-class RGBHead(nn.Module):
+class RGBHead(Recomputing):
     """The decoder; ``forward`` gives pictures, ``logits`` what they are made of."""
 
     decoder_pos_embed: Tensor
@@ -107,7 +108,7 @@ class RGBHead(nn.Module):
         x = torch.cat((self.trainable_cls_token.to(x.dtype).expand(len(x), -1, -1), x), dim=1)
         x = x + position.to(x.dtype)
         for layer in self.decoder_layers:
-            x = layer(x)
+            x = self.layer(layer, x)
         return self.decoder_pred(self.decoder_norm(x)[:, 1:])
 
 

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from gvtools.networks.precision import Precision
 from gvtools.settings import Settings
 
 
@@ -26,5 +27,8 @@ class FoundationOptions(Settings):
     each needs its own support for a scale."""
     min_confidence: float = Field(0.2, ge=0, lt=1)
     """Pixels below this, of 1 - 1 / (the head's confidence), are left empty."""
+    precision: Precision = "auto"
+    """``auto`` is float32 on a CPU and bfloat16 on a GPU, float16 before compute capability 8.0.
+    The geometry head is float32 everywhere."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the network runs; "auto" takes CUDA where there is one."""

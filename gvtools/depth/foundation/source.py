@@ -25,6 +25,7 @@ from gvtools.networks.depth_anything.geometry_head import Geometry
 from gvtools.networks.depth_anything.network import DepthAnything3, relative_cameras
 from gvtools.networks.depth_anything.rays import camera_centres
 from gvtools.networks.depth_anything.weights import find_weights, load_depth_anything
+from gvtools.networks.precision import autocast, inference_type
 from gvtools.scenes.scene import Frame, Scene, View
 
 
@@ -121,8 +122,11 @@ class FoundationDepth:
         device = self.options.device
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
-        network = load_depth_anything(self._weights, device=device)
-        passes = [self._pass(network, group, device) for group in self._groups(network)]
+        place = torch.device(device)
+        dtype = inference_type(self.options.precision, place)
+        network = load_depth_anything(self._weights, device=place, dtype=dtype)
+        with autocast(place, dtype):
+            passes = [self._pass(network, group, place) for group in self._groups(network)]
         for made in passes:
             self._passes |= dict.fromkeys(made.names, made)
         sharing = [passes] if self.options.cameras else [[made] for made in passes]
@@ -154,7 +158,10 @@ class FoundationDepth:
 
     @torch.no_grad()
     def _pass(
-        self, network: DepthAnything3, group: tuple[tuple[str, ...], tuple[int, int]], device: str
+        self,
+        network: DepthAnything3,
+        group: tuple[tuple[str, ...], tuple[int, int]],
+        device: torch.device,
     ) -> Pass:
         """One forward pass over some views."""
         names, size = group

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from gvtools.errors import ShapeError
 from gvtools.networks.depth_anything.vit import Block, RotaryTable
+from gvtools.networks.recompute import Recomputing
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -80,7 +81,7 @@ class PatchEmbed(nn.Module):
         return self.proj(images).flatten(2).transpose(1, 2)
 
 
-class Backbone(nn.Module):
+class Backbone(Recomputing):
     """The vision transformer. Images are (B, V, 3, H, W), normalised as ImageNet's.
 
     The first view is the reference view: its frame is the frame of the predicted rays.
@@ -198,9 +199,11 @@ class Backbone(nn.Module):
                 x = torch.cat((self._camera_tokens(x, camera_token), x[:, :, 1:]), dim=2)
             rotary = index >= config.rotary_from
             if index >= config.alternate_from and index % 2 == 1:
-                x = block(x.flatten(1, 2), across if rotary else None).unflatten(1, (views, -1))
+                table = across if rotary else None
+                x = self.layer(block, x.flatten(1, 2), table).unflatten(1, (views, -1))
             else:
-                x = block(x.flatten(0, 1), within if rotary else None).unflatten(0, (batch, views))
+                table = within if rotary else None
+                x = self.layer(block, x.flatten(0, 1), table).unflatten(0, (batch, views))
                 local = x
             if index in taps:
                 found.append(torch.cat((local, x), dim=-1))

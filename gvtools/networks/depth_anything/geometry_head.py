@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from gvtools.networks.recompute import Recomputing
+
 
 @dataclass(frozen=True)
 class GeometryHeadConfig:
@@ -134,7 +136,7 @@ class ChannelsFirst(nn.Module):
         return x.permute(0, 3, 1, 2)
 
 
-class GeometryHead(nn.Module):
+class GeometryHead(Recomputing):
     """See the module. Runs outside autocast, in the precision of its own weights."""
 
     def __init__(self, config: GeometryHeadConfig) -> None:
@@ -210,8 +212,8 @@ class GeometryHead(nn.Module):
             flat = [level.to(dtype).flatten(0, 1) for level in levels]
             for start in range(0, batch * views, views_at_once):
                 chunk = [level[start : start + views_at_once] for level in flat]
-                pyramid = self._pyramid(chunk, grid, image)
-                parts.append([chain(pyramid, image) for chain in chains])
+                pyramid = self.layer(self._pyramid, chunk, grid, image)
+                parts.append([self.layer(chain, pyramid, image) for chain in chains])
         return [torch.cat(part).unflatten(0, (batch, views)) for part in zip(*parts, strict=True)]
 
     def _pyramid(

@@ -23,6 +23,7 @@ from gvtools.networks.depth_anything.geometry_head import (
     GeometryHead,
     GeometryHeadConfig,
 )
+from gvtools.networks.precision import hold_in
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,10 @@ class DepthAnything3(nn.Module):
             layer_scale=config.camera_layer_scale,
         )
         self.cam_dec = CameraDecoder(config.encoder.channels)
+
+    def hold_in(self, dtype: torch.dtype) -> None:
+        """Keep products' weights in autocast's type, see ``precision``; the head is float32."""
+        hold_in(dtype, self.backbone, self.cam_enc, self.cam_dec)
 
     @property
     def encoder(self) -> Backbone:

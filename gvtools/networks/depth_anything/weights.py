@@ -99,13 +99,17 @@ def find_weights(folder: Path | str) -> Path:
 
 
 def load_depth_anything(
-    folder: Path | str, *, device: torch.device | str = "cpu"
+    folder: Path | str,
+    *,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
 ) -> DepthAnything3:
     """The network, strictly loaded, frozen, in evaluation mode.
 
     Args:
         folder: with ``model.safetensors`` of DA3-SMALL, -BASE or -LARGE, or a GeoVerse folder.
         device: of the weights.
+        dtype: of the autocast that it is run in, see ``DepthAnything3.hold_in``.
 
     Raises:
         CheckpointError: nothing there, or a tensor that does not fit.
@@ -138,6 +142,7 @@ def load_depth_anything(
     if bad is not None:
         raise CheckpointError(f"{path}: {bad} holds values that are not finite")
     load(network, tensors, where=path)
+    network.hold_in(dtype)
     return network.requires_grad_(False).eval().to(device)
 
 

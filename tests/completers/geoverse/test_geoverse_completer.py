@@ -359,7 +359,7 @@ def test_a_folder_that_is_not_there_is_refused_in_one_line_at_creation(
         ({"views": 1}, "completer.views 1; expected at least 2"),
         ({"context_views": 0}, "expected at least 1"),
         ({"cfg_scale": -1.0}, "expected at least 0"),
-        ({"precision": "float64"}, "expected 'auto', 'float32' or 'bfloat16'"),
+        ({"precision": "float64"}, "expected 'auto', 'float32', 'bfloat16' or 'float16'"),
         ({"device": "tpu"}, "expected 'auto', 'cpu' or 'cuda'"),
         ({"alignment": "best"}, "expected 'centres', 'hint' or 'field'"),
         ({"step": 3}, "did you mean 'completer.steps'"),

@@ -28,8 +28,13 @@ from gvtools.completers.geoverse.video_prior.views import resized, seed_rows
 from gvtools.completers.geoverse.video_prior.wan_folder import load_network, read_empty_prompt
 from gvtools.completers.geoverse.video_prior.wan_networks import STRIDE, WanNetworks
 from gvtools.errors import CheckpointError
+from gvtools.networks.precision import half_type
 
 __all__ = ["VideoFeatures", "VideoPrior", "VideoPriorConfig"]
+
+# Bytes that a pass of base needs beside all weights: 2.5 GB (benchmarks/complete.md), and what the
+# driver takes and an allocator loses.
+ROOM = 3.5e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +96,8 @@ class VideoPrior:
             prompt=None if zeros else prompt,
             prompt_rows=self.config.prompt_rows,
         )
+        # Where features are computed while the weights are kept elsewhere.
+        self._guest: torch.device | None = None
         self._zero_latents: dict[tuple[int, ...], Tensor] = {}
         found = (self.networks.channels, self.networks.blocks)
         if found[0] != self.config.channels or found[1] <= self.config.taps[-1]:
@@ -110,6 +117,7 @@ class VideoPrior:
         *,
         config: VideoPriorConfig | None = None,
         device: torch.device | str = "cpu",
+        offload: str = "never",
     ) -> VideoPrior:
         """From a folder that ``wan_checkpoint.truncate`` made, strictly.
 
@@ -117,16 +125,23 @@ class VideoPrior:
             folder: see ``wan_folder``.
             config: how features are taken.
             device: of the weights; "meta" compares everything and reads no weights.
+            offload: the weights stay in the CPU's memory and go to a CUDA device for the time of a
+                pass's one forward: "always", "never", or, "auto", where less than
+                ``ROOM`` would be free beside them.
 
         Raises:
             CheckpointError: diffusers, a file or a tensor is absent or does not fit.
         """
         config = config or VideoPriorConfig()
         prompt = read_empty_prompt(Path(folder)) if config.prompt == "empty" else None
-        dtype = getattr(torch, config.dtype) if config.dtype else None
+        dtype = None if config.dtype is None else half_type(config.dtype, torch.device(device))
+        guest = torch.device(device) if _leaves(Path(folder), device, offload) else None
+        device = device if guest is None else "cpu"
         transformer = load_network(Path(folder), "transformer", dtype=dtype, device=str(device))
         vae = load_network(Path(folder), "vae", device=str(device))
-        return cls(transformer, vae, prompt, config=config)
+        prior = cls(transformer, vae, prompt, config=config)
+        prior._guest = guest
+        return prior
 
     @property
     def summary(self) -> str:
@@ -160,6 +175,13 @@ class VideoPrior:
                 depends on its own alone.
         """
         seeds = seed_rows(seed, *images.shape[:2])
+        with self.networks.lent(self._guest):
+            return self._features(images, valid, context, seeds=seeds)
+
+    def _features(
+        self, images: Tensor, valid: Tensor, context: int, *, seeds: list[list[int]]
+    ) -> VideoFeatures:
+        """The same, with the weights in place."""
         layout = view_layout(self.config.layout, images.shape[1])
         device = self.networks.device
         with torch.autocast(device.type, enabled=False):
@@ -217,3 +239,11 @@ class VideoPrior:
         rows = [[view_seed(value, "video", draw) for value in row] for row in seeds]
         device = self.networks.device
         return seeded_noise((len(rows), len(rows[0]), *shape), rows, device=device)
+
+
+def _leaves(folder: Path, device: torch.device | str, offload: str) -> bool:
+    """Whether the weights in a folder stay off the device but for a pass's one forward."""
+    if torch.device(device).type != "cuda" or offload != "auto":
+        return torch.device(device).type == "cuda" and offload == "always"
+    stored = sum(path.stat().st_size for path in folder.rglob("*.safetensors"))
+    return torch.cuda.mem_get_info(device)[0] < stored + ROOM

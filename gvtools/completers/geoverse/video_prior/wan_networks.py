@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -80,6 +81,30 @@ class WanNetworks:
         """Move the weights; their dtype stays, since some are float32 on purpose."""
         self.transformer.to(device)
         self.vae.to(device)
+
+    @contextmanager
+    def lent(self, device: torch.device | None) -> Iterator[None]:
+        """On another device within the block, where only copies go: nothing is brought back.
+
+        Args:
+            device: None for where the weights are.
+        """
+        if device is None or device == self.device:
+            yield
+            return
+        tensors = [
+            tensor
+            for network in (self.transformer, self.vae)
+            for tensor in (*network.parameters(), *network.buffers())
+        ]
+        home = [tensor.data for tensor in tensors]
+        try:
+            for tensor in tensors:
+                tensor.data = tensor.data.to(device)
+            yield
+        finally:
+            for tensor, data in zip(tensors, home, strict=True):
+                tensor.data = data
 
     def encode(self, clips: Tensor) -> Tensor:
         """The mode of the VAE's latents, normalised by its published mean and deviation.

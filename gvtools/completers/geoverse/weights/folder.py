@@ -254,7 +254,9 @@ def from_pretrained(
     *,
     config: GeoVerseConfig | None = None,
     device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
     video: bool = True,
+    offload: str = "auto",
 ) -> GeoVerse:
     """The model of a weights folder, strictly loaded, in evaluation mode.
 
@@ -265,7 +267,9 @@ def from_pretrained(
         config: instead of the folder's ``config.json``; ``base`` where a folder of published files
             has none.
         device: of the weights.
+        dtype: of the autocast that the model is run in, see ``GeoVerse.hold_in``.
         video: load the video prior, where the configuration has one; see ``needs_video``.
+        offload: whether its weights leave the device between passes, see ``VideoPrior``.
 
     Raises:
         CheckpointError: a file or a tensor is missing, unexpected, of another shape or not finite.
@@ -280,12 +284,14 @@ def from_pretrained(
     tensors = _tensors(folder, model)
     if not WHOLE.find(folder):
         tensors |= fresh_extension(model, tensors)
-    load(model, tensors, where=folder, device=device)
+    # Rounded before they are moved: the device never holds both.
+    load(model, tensors, where=folder, device=device if dtype == torch.float32 else "cpu")
     model.freeze()
-    model.eval()
+    model.hold_in(dtype)
+    model.to(device).eval()
     if video:
         prior = VideoPrior.from_pretrained(
-            folder / VIDEO_FOLDER, config=config.video, device=device
+            folder / VIDEO_FOLDER, config=config.video, device=device, offload=offload
         )
         model.attach_video(prior)
     model.without_video = wanted and not video

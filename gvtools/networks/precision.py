@@ -1,0 +1,141 @@
+"""The number type that networks compute in: one choice for completion, depth, training, benchmarks.
+
+bfloat16 on CUDA cards of compute capability 8.0 and later, float16 on older ones, whose bfloat16 is
+emulated and has no fused attention, float32 on CPUs. Half precision is torch's autocast: products
+and convolutions are rounded, while what has to be exact (statistics, norms and softmax sums, time
+frequencies, camera matrices, the geometry head) stays in float32.
+
+Training does not use float16, whose gradients vanish without a loss scale: older cards train in
+float32. On a CPU it takes bfloat16 where the processor multiplies it faster, which is measured.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache
+from typing import Any, Literal
+
+import torch
+from torch import nn
+
+Precision = Literal["auto", "float32", "bfloat16", "float16"]
+TrainingPrecision = Literal["auto", "float32", "bfloat16"]
+
+# From this compute capability on, CUDA cards multiply bfloat16 themselves.
+BFLOAT16_CAPABILITY = (8, 0)
+# The measured layer: tokens, inputs, outputs; a millisecond in float32, on one thread, whose times
+# other programs disturb least.
+PROBE = (128, 256, 512)
+PROBE_ROUNDS = 5
+# bfloat16 has to take at most this share of float32's time. A training step gains less than the
+# layer (0.73 of the time where the layer takes 0.40), and a narrow choice could fall differently at
+# the next start.
+WORTH = 0.8
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether a CUDA card multiplies bfloat16 itself."""
+    return torch.cuda.get_device_capability(device) >= BFLOAT16_CAPABILITY
+
+
+def inference_type(precision: str, device: torch.device) -> torch.dtype:
+    """What networks compute in when nothing is trained.
+
+    Args:
+        precision: see ``Precision``.
+        device: of the networks.
+    """
+    if precision != "auto":
+        return named_type(precision)
+    if device.type != "cuda":
+        return torch.float32
+    return torch.bfloat16 if has_bfloat16(device) else torch.float16
+
+
+def training_type(precision: str, device: torch.device) -> torch.dtype:
+    """What networks are trained in; see the module.
+
+    Args:
+        precision: see ``TrainingPrecision``.
+        device: of the networks.
+    """
+    if precision != "auto":
+        return named_type(precision)
+    faster = has_bfloat16(device) if device.type == "cuda" else bfloat16_is_faster()
+    return torch.bfloat16 if faster else torch.float32
+
+
+def named_type(precision: str) -> torch.dtype:
+    """Torch's type of the name "float32", "bfloat16" or "float16"."""
+    found: torch.dtype = getattr(torch, precision)
+    return found
+
+
+def half_type(precision: str, device: torch.device) -> torch.dtype:
+    """``named_type``, with float16 for bfloat16 on a CUDA card that does not multiply that."""
+    dtype = named_type(precision)
+    emulated = dtype == torch.bfloat16 and device.type == "cuda" and not has_bfloat16(device)
+    return torch.float16 if emulated else dtype
+
+
+def name_of(dtype: torch.dtype) -> str:
+    """The reverse of ``named_type``."""
+    return str(dtype).removeprefix("torch.")
+
+
+def autocast(device: torch.device, dtype: torch.dtype) -> AbstractContextManager[Any]:
+    """Products of ``dtype`` within the block; nothing changes for float32."""
+    if dtype == torch.float32:
+        return nullcontext()
+    return torch.autocast(device.type, dtype=dtype)
+
+
+def hold_in(dtype: torch.dtype, *modules: nn.Module | None) -> None:
+    """Keep the weights of products in the type that autocast would round them to, in place.
+
+    The results under autocast are the same to the last bit, without a rounded copy beside every
+    float32 weight. Everything else (norms, tokens, tables, frequencies, statistics) keeps its type.
+
+    Args:
+        dtype: that of autocast; float32 changes nothing.
+        modules: for inference: frozen, and not to be run outside autocast. None is passed over.
+    """
+    if dtype == torch.float32:
+        return
+    for module in modules:
+        for layer in () if module is None else module.modules():
+            if isinstance(layer, (nn.Linear, nn.Conv2d)):
+                for name, weight in list(layer.named_parameters(recurse=False)):
+                    held = weight.detach().to(dtype)
+                    setattr(layer, name, nn.Parameter(held, requires_grad=False))
+
+
+@cache
+def bfloat16_is_faster() -> bool:
+    """Whether this processor takes clearly less time for a layer in bfloat16, both ways."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _least_seconds(torch.bfloat16) <= WORTH * _least_seconds(torch.float32)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _least_seconds(dtype: torch.dtype) -> float:
+    """Of a linear layer's forward and backward pass, after one that does not count."""
+    tokens, inputs, outputs = PROBE
+    # The caller's random numbers and gradient mode are left alone.
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
+    x = torch.ones(tokens, inputs, requires_grad=True)
+    seconds = []
+    with torch.enable_grad():
+        for parameter in layer.parameters():
+            nn.init.constant_(parameter, 0.01)
+        for _ in range(1 + PROBE_ROUNDS):
+            start = time.perf_counter()
+            with autocast(x.device, dtype):
+                y = layer(x)
+            y.float().sum().backward()
+            seconds.append(time.perf_counter() - start)
+    return min(seconds[1:])
