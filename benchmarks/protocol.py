@@ -24,20 +24,20 @@ UNALIGNED = (*DECODED, "completer.alignment", "completer.color_alignment")
 WHOLE = (*UNALIGNED, "completer.output", "effort.inpaint_below")
 # Of the first part each row adds to the one above it.
 GROUPS = {
-    "as gvtools does, without a fit": (),
+    "as gvtools does, without fitting Gaussians": (),
     "decoded pictures, not corrections of filled projections": DECODED,
     "and scale by camera centres, colours not aligned with the memory's": UNALIGNED,
     "and whole views as output, also of views with small holes": WHOLE,
     "and all of their pixels fused": (*WHOLE, "fusion.pixels"),
     "and fused like observed ones": (*WHOLE, "fusion.pixels", "fusion.generated_as_observed"),
-    "by itself: nothing saved in memory and projection": (
+    "only this, from the first row: all shortcuts that save time or memory off": (
         "fusion.max_psnr_drop_db",
         "savings.reuse",
         "savings.pixel_binning",
         "savings.depth_from_memory",
         "memory.voxels_per_footprint",
     ),
-    "by itself: trackers' poses as given": ("refine.poses",),
+    "only this, from the first row: recorded poses as given": ("refine.poses",),
     "all of --protocol paper": tuple(key for key in PAPER if key not in ALWAYS_SET),
 }
 
@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--weights", type=Path)
     args = parser.parse_args()
-    print("| the paper's way | PSNR | SSIM | PSNR, generated | seconds |")
+    print("| variant | PSNR | SSIM | PSNR, generated | seconds |")
     print("|---|---|---|---|---|")
     for number, (name, keys) in enumerate(GROUPS.items()):
         run = args.out / str(number)

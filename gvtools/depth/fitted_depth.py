@@ -10,7 +10,7 @@ from gvtools.scenes.scene import Frame, Scene, View
 
 # A pixel has depth where the Gaussians stop this share of the light.
 OPAQUE = 0.8
-# Difference from the photograph, of colours 0 to 1, at which confidence is down to 37 %.
+# Mean difference of colours (0 to 1) from the photograph at which confidence is 1 / e.
 TOLERANCE = 0.12
 LEAST_CONFIDENCE = 0.05
 

@@ -24,8 +24,8 @@ TrainingPrecision = Literal["auto", "float32", "bfloat16"]
 
 # From this compute capability on, CUDA cards multiply bfloat16 themselves.
 BFLOAT16_CAPABILITY = (8, 0)
-# The measured layer: tokens, inputs, outputs; a millisecond in float32, on one thread, whose times
-# other programs disturb least.
+# The measured layer: tokens, inputs, outputs. It takes a millisecond in float32, and runs on one
+# thread, because such times are least disturbed by other programs.
 PROBE = (128, 256, 512)
 PROBE_ROUNDS = 5
 # bfloat16 has to take at most this share of float32's time. A training step gains less than the
@@ -99,7 +99,7 @@ def hold_in(dtype: torch.dtype, *modules: nn.Module | None) -> None:
 
     Args:
         dtype: that of autocast; float32 changes nothing.
-        modules: for inference: frozen, and not to be run outside autocast. None is passed over.
+        modules: frozen, and run under autocast alone; entries that are None are skipped.
     """
     if dtype == torch.float32:
         return

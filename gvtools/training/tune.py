@@ -59,7 +59,7 @@ WARM_STEPS = 10
 EMA = 0.99
 # The judging views are predicted so often while the model learns; the best weights are taken.
 JUDGEMENTS = 4
-# Of a training by the clock, whose number of steps is not known: enough for any time.
+# Step limit of a training that ends by time: more than any run reaches.
 ENDLESS = 10**7
 
 
@@ -135,7 +135,7 @@ def tune(
         scene: context views alone; no other picture is read.
         weights: to start from.
         out: absent or empty, or of an earlier tuning, which is replaced when this one is done.
-        options: how long; the time holds for all of it but for what one step takes.
+        options: how long; the limit covers everything, judging included, and may be exceeded by one step.
         completer: further options of the completer that predicts the judging views.
         seed: of everything random.
         say: is told how far it is.

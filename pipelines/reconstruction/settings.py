@@ -42,9 +42,9 @@ class FusionOptions(Settings):
     voxel_scale: float = Field(1.0, gt=0)
     """How many such footprints the edge is."""
     max_psnr_drop_db: float | None = Field(0.05, ge=0)
-    """Of edges from half to four times the footprints', how much worse context views, predicted
-    from their neighbours, may be than with the best edge for a coarser one to be taken; none keeps
-    the footprints'. Only views with recorded depth are tried. [dB]"""
+    """Voxel edges of half to four times the footprint are tried: context views with recorded depth
+    are predicted from their neighbours. The coarsest edge whose PSNR is within this of the best is
+    taken; ``none`` tries nothing and takes the footprint's edge. [dB]"""
 
 
 class SavingsOptions(Settings):
@@ -58,8 +58,8 @@ class SavingsOptions(Settings):
     section = "savings"
 
     reuse: bool = True
-    """What observed views show of a target is not projected again after completions were fused;
-    the pictures are the same."""
+    """The projection of observed points into a target is kept after completions were fused; the
+    pictures are the same."""
     pixel_binning: float = Field(1.0, ge=0)
     """2 x 2 pixels become one point, their mean, where they are together at most this many voxel
     edges wide, unless the surface is steep; 0 lifts each by itself. [voxel edges]"""
@@ -78,8 +78,8 @@ ACCURATE: Mapping[str, Any] = {
 }
 
 
-# The paper's: GeoVerse alone, whole decoded views, all of their pixels fused with the similarity's
-# scale, nothing saved.
+# The paper's: GeoVerse alone, whole decoded views, all of their pixels fused at the scale that maps
+# generated camera centres onto the given ones, no shortcuts.
 PAPER: Mapping[str, Any] = {
     "completer": "geoverse",
     "completer.output": "views",
@@ -118,7 +118,7 @@ class RunSettings(Settings):
             # The defaults.
             "balanced": {},
             "accurate": {**ACCURATE, "refine.seconds": 300.0},
-            # Fits end long before that, when another one gains nothing.
+            # Fitting ends long before that: when a further fit no longer improves the pictures.
             "finest": {**ACCURATE, "refine.seconds": 3600.0},
         },
         "protocol": {"gvtools": {}, "paper": PAPER},

@@ -23,16 +23,17 @@ from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.appearance.splat.tile_kernels import MOST_ALPHA, TILE
 from gvtools.kernels import compiled, in_threads
 
-# A surface is where so much of the light is left.
+# The surface is the first Gaussian after which less than this share of the light is left.
 HALF = 0.5
 
 
 def median_depth(values: NDArray[Any], lens: Lens) -> NDArray[np.float32]:
     """(H, W) depth of the Gaussian at which half of a pixel's light is stopped; 0 where none is.
 
-    The weighted mean of depths, which is smooth and which fits are guided by, is too near: thin fog
-    before a surface counts, what is behind it does not. On photographs of an object it was 1.6 %
-    nearer than a plane sweep's depth, the median 0.3 %.
+    The weighted mean of depths, which fits compare with recorded depth, is too near: faint Gaussians
+    before a surface pull it forward, and nothing behind the surface balances them. On photographs
+    of an object it was 1.6 % nearer than a plane sweep's depth, the median 0.3 %. The median is
+    less smooth: each Gaussian has one depth.
 
     Args:
         values: (N, VALUES) float32, see ``Splat``.
@@ -74,6 +75,7 @@ def median_tiles(first, last, tiles, tiles_x, offsets, lists, projected, depth):
                     q = 0.5 * (row[CONIC_XX] * dx * dx + row[CONIC_YY] * dy * dy)
                     q += row[CONIC_XY] * dx * dy
                     if q < row[END]:
+                        # As in blend_tiles: falls to zero twice as fast near LEAST_ALPHA.
                         alpha = row[OPACITY] * math.exp(-q)
                         alpha = min(alpha, 2 * alpha - 2 * LEAST_ALPHA, MOST_ALPHA)
                         light *= 1 - max(alpha, 0)

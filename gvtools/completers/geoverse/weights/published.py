@@ -47,8 +47,8 @@ class Part:
         names: keys other than these are no tensors of the module and are ignored.
         tied: names that are one tensor in the publisher's network; a file may hold any of them.
         optional: the model can do without it.
-        lenient: unexpected names are left aside, and missing tensors stay another part's, as its
-            publisher's code has it; a line says which.
+        lenient: loaded as its publisher's code does: unknown names are ignored, and missing
+            tensors keep the values of the part that was loaded before; a message lists them.
         stated_bytes: the file's size as published, where it holds other networks, too.
         note: what else a user should know.
     """
@@ -228,7 +228,7 @@ def read_part(
 def _check_statistics(
     content: Mapping[str, Any], found: Mapping[str, Tensor], path: Path, *, part: Part
 ) -> None:
-    """Refuse the statistics of another level, where the file names one, and no variances."""
+    """Refuse a file that names another level, or whose ``var`` has negative values."""
     expected = int(part.name.removeprefix("statistics"))
     level = content.get("level")
     # Of the four levels the last may be called -1.
