@@ -36,6 +36,8 @@ GROUPS = {
         "savings.pixel_binning",
         "savings.depth_from_memory",
         "memory.voxels_per_footprint",
+        "memory.merge_angle_deg",
+        "memory.observations_per_voxel",
     ),
     "only this, from the first row: recorded poses as given": ("refine.poses",),
     "all of --protocol paper": tuple(key for key in PAPER if key not in ALWAYS_SET),

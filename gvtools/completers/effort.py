@@ -100,5 +100,6 @@ def _merged(guidance: Guidance, parts: Sequence[tuple[Sequence[int], Completion]
         for row, alignment in zip(at, part.scale_alignment or [None] * len(at), strict=True):
             alignments[row] = alignment
     unaligned = all(alignment is None for alignment in alignments)
-    whole = any(part.whole for _, part in parts)
+    # A view that kept what the memory shows is not whole, so the others may not be taken so either.
+    whole = all(part.whole for _, part in parts)
     return Completion(rgb, depth, confidence, rays, None if unaligned else tuple(alignments), whole)

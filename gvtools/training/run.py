@@ -224,7 +224,14 @@ class StageRun:
                 )
             if self.stage == "heads":
                 self.model_config = _with_sampling_of(self.model_config, found.flow)
-        return from_pretrained(source, config=self.model_config)
+        model = from_pretrained(source, config=self.model_config)
+        if model.without_video:
+            raise CheckpointError(
+                f"{source}: no {VIDEO_FOLDER}/; training {self.model_config.name} needs the video "
+                "prior; make it with gvtools weights truncate-wan, or train a model with injection "
+                "= 'none'"
+            )
+        return model
 
     def _refuse_unfinished(self, before: Sequence[str]) -> None:
         """A stage that was begun and not finished must not be passed over for one before it.

@@ -135,7 +135,8 @@ def tune(
         scene: context views alone; no other picture is read.
         weights: to start from.
         out: absent or empty, or of an earlier tuning, which is replaced when this one is done.
-        options: how long; the limit covers everything, judging included, and may be exceeded by one step.
+        options: how long; the limit covers everything, judging included, and may be exceeded by
+            one step.
         completer: further options of the completer that predicts the judging views.
         seed: of everything random.
         say: is told how far it is.
@@ -148,7 +149,8 @@ def tune(
     split = split_context(scene, config, seed=seed)
     if split.dropped:
         say(f"tune: {split.dropped} of {len(scene)} context views are left out")
-    chosen = {**(completer or {}), "weights": str(weights)}
+    # Weights held in half precision could not be trained.
+    chosen = {**(completer or {}), "weights": str(weights), "precision": "float32"}
     judge = _Judge(split.predictions(), GeoVerseCompleter(**chosen))
     with torch.random.fork_rng(devices=[]):
         learnt = _Learner(split, config, judge, options=options, seed=seed, begun=begun)
@@ -345,5 +347,5 @@ def stage_options(
 
 def _link_video(config: GeoVerseConfig, weights: Path, folder: Path) -> None:
     """The video prior is not tuned, so it is not copied."""
-    if config.video is not None:
+    if config.video is not None and (weights / VIDEO_FOLDER).is_dir():
         (folder / VIDEO_FOLDER).symlink_to((weights / VIDEO_FOLDER).resolve())

@@ -95,7 +95,7 @@ def make_plan(
     from gvtools.completers.base import create
     from gvtools.depth.choice import choose_source
     from gvtools.depth.source import RecordedDepth
-    from gvtools.errors import ProjectError
+    from gvtools.errors import OptionError, ProjectError
     from gvtools.runs.poses import with_poses
     from gvtools.scenes.reduced import reduced
     from gvtools.scenes.selection import select
@@ -110,6 +110,10 @@ def make_plan(
             + (f" (and {len(errors) - 1} more; see 'gvtools check')" if len(errors) > 1 else "")
         )
     config = _on_device(settings)
+    if config.protocol == "paper" and config.completer != "geoverse":
+        raise OptionError(
+            f"protocol paper with completer {config.completer!r}; expected geoverse; leave one out"
+        )
     scene = reduced(scene, config.max_side)
     completer = config.effort.applied(create(config.completer, **config.completer_options))
     # By name: a project may list its views in any order, and merging depends on theirs.

@@ -56,6 +56,9 @@ class RoundTargets:
         """Begin to project what observed views show of round ``number``, if there is one."""
         if number > len(self.plan.schedule) or not parallel_kernels_may_overlap():
             return
+        if self.plan.config.fusion.generated_as_observed:
+            # A snapshot holds while generated points alone are fused.
+            return
         targets = self._projections(number)
         snapshot = self.memory.snapshot()
         # One by one, so that a run that is stopped need not wait for all.

@@ -99,6 +99,9 @@ PAPER: Mapping[str, Any] = {
     "savings.pixel_binning": 0.0,
     "savings.depth_from_memory": None,
     "memory.voxels_per_footprint": 0.0,
+    "memory.merge_angle_deg": 0.0,
+    "memory.observations_per_voxel": 64,
+    "refine.seconds": None,
     "refine.steps": 0,
     "refine.poses": False,
 }

@@ -30,10 +30,10 @@ HALF = 0.5
 def median_depth(values: NDArray[Any], lens: Lens) -> NDArray[np.float32]:
     """(H, W) depth of the Gaussian at which half of a pixel's light is stopped; 0 where none is.
 
-    The weighted mean of depths, which fits compare with recorded depth, is too near: faint Gaussians
-    before a surface pull it forward, and nothing behind the surface balances them. On photographs
-    of an object it was 1.6 % nearer than a plane sweep's depth, the median 0.3 %. The median is
-    less smooth: each Gaussian has one depth.
+    The weighted mean of depths, which fits compare with recorded depth, is too near: faint
+    Gaussians before a surface pull it forward, and nothing behind the surface balances them. On
+    photographs of an object it was 1.6 % nearer than a plane sweep's depth, the median 0.3 %. The
+    median is less smooth: each Gaussian has one depth.
 
     Args:
         values: (N, VALUES) float32, see ``Splat``.

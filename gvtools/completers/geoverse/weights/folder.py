@@ -236,7 +236,7 @@ def needs_video(folder: Path, config: GeoVerseConfig) -> bool:
     """
     if config.video is None:
         return False
-    there = (folder / VIDEO_FOLDER).exists()
+    there = (folder / VIDEO_FOLDER).is_dir()
     return there or config.injection != "control" or WHOLE.find(folder) is not None
 
 
@@ -264,8 +264,7 @@ def from_pretrained(
 
     Args:
         folder: with ``geoverse.safetensors``, or with published files (``gvtools weights list``).
-        config: instead of the folder's ``config.json``; ``base`` where a folder of published files
-            has none.
+        config: instead of the folder's own, see ``config_of``.
         device: of the weights.
         dtype: of the autocast that the model is run in, see ``GeoVerse.hold_in``.
         video: load the video prior, where the configuration has one; see ``needs_video``.
