@@ -52,6 +52,7 @@ def test_failing_tests_are_named(tmp_path):
     assert gpu.tests(sizes)["passed"].startswith("1 passed")
 
 
+@pytest.mark.slow
 def test_every_part_runs_on_a_posed_device(monkeypatch, tmp_path, capsys):
     # The tests run in a process of their own, which sees no device.
     parts = {name: part for name, part in gpu.PARTS.items() if name != "tests"}

@@ -9,7 +9,7 @@ from typing import Any
 
 import geoverse_models as micro
 import pytest
-from geoverse_folders import CONTROL, PLAIN, load, refused, report
+from geoverse_folders import CONTROL, PLAIN, SHARED, load, refused, report
 
 from gvtools.completers.geoverse.weights.folder import check_folder, from_pretrained
 from gvtools.completers.geoverse.weights.published import WHOLE_FILE
@@ -81,11 +81,11 @@ def test_a_configuration_of_another_size_does_not_fit(own: Path) -> None:
 
 def test_an_absent_video_folder_is_named(folder: Path) -> None:
     with pytest.raises(CheckpointError, match=r"video: absent; .*truncate-wan"):
-        from_pretrained(folder, config=CONTROL)
-    found = report(folder, "video", CONTROL)
+        from_pretrained(folder, config=SHARED)
+    found = report(folder, "video", SHARED)
     assert not found.ok
     assert "truncate-wan" in found.summary
-    assert load(folder, CONTROL).video is None
+    assert load(folder, SHARED).video is None
 
 
 def test_the_video_folder_is_checked_as_it_is_loaded(folder: Path) -> None:

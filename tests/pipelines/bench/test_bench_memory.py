@@ -83,6 +83,7 @@ def test_peaks_by_stage():
 # What is foretold is what is counted where the same code runs with numbers.
 
 
+@pytest.mark.slow
 def test_what_is_foretold_is_what_is_counted_with_numbers():
     found = {case: alone(foretold_peak, case, "tiny", 48) for case in CASES}
     for case, before in found.items():
@@ -99,6 +100,7 @@ def run(*words: object) -> None:
     bench.run(parser.parse_args(["complete", *map(str, words)]), Console())
 
 
+@pytest.mark.slow
 def test_the_tables_and_the_figures(tmp_path):
     weights = micro.weights_folder(tmp_path / "weights")
     command = [sys.executable, "-m", "pipelines.cli", "bench", "complete", "--memory"]

@@ -293,7 +293,7 @@ def from_pretrained(
             folder / VIDEO_FOLDER, config=config.video, device=device, offload=offload
         )
         model.attach_video(prior)
-    model.without_video = wanted and not video
+    model.without_video = wanted and config.video is not None and not video
     return model
 
 
