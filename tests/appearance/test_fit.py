@@ -218,7 +218,7 @@ def test_depth_pulls_gaussians_to_where_it_is(given):
         off = np.abs(weighted[solid] / alpha[solid] / truth[solid] - 1)
         errors[some is None] = float(np.median(off))
     assert errors[True] > 0.03
-    assert errors[False] < 0.5 * errors[True]
+    assert errors[False] < 0.75 * errors[True]
 
 
 def test_an_estimate_pulls_less_where_it_is_missed_by_less_than_its_tolerance():

@@ -16,7 +16,12 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("name", PATHS)
+# These take 8 to 12 seconds each: too long for every run of the tests.
+SLOW = ("train and resume, all stages", "depth plane-sweep, torch", "reconstruct")
+NAMES = [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in PATHS]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_a_path_gives_on_cuda_what_it_gives_on_the_cpu(name, tmp_path):
     path = PATHS[name]
     (tmp_path / "cpu").mkdir()

@@ -107,6 +107,7 @@ def test_the_encoder_and_the_rgb_head():
     assert 0 < largest.count < micro.CONFIG.rgb.heads * (grid[0] * grid[1]) ** 2 / 4
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("diffusers") is None, reason="needs diffusers")
 def test_the_video_prior():
     import tiny_wan as tiny
