@@ -179,6 +179,22 @@ def test_worse_weights_are_not_kept(scan, weights, tmp_path, monkeypatch, capsys
     assert json.loads((out / "tuning.json").read_text())["kept"] is False
 
 
+def test_weights_are_trained_in_full_precision_whatever_the_run_completes_in(
+    scan, weights, tmp_path
+):
+    kept = {}
+    for precision in ("float32", "bfloat16"):
+        out = tmp_path / precision
+        options = tuning.TuneOptions(steps=2)
+        tuning.tune(
+            open_project(scan), weights, out, options=options, say=lambda text: None,
+            completer={"precision": precision, "device": "cpu"},
+        )  # fmt: skip
+        kept[precision] = tensors(out)
+        assert {value.dtype for value in kept[precision].values()} == {torch.float32}
+    assert same(kept["float32"], kept["bfloat16"])
+
+
 def test_the_clock_ends_it(scan, weights, tmp_path):
     figures = tmp_path / "figures.json"
     out = tmp_path / "out"
