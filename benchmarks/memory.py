@@ -1,4 +1,4 @@
-"""The foretold peak memory of a model beside what it takes on this CPU: counted, and resident.
+"""The predicted peak memory of a model beside what it takes on this CPU: counted, and resident.
 
     python benchmarks/memory.py [--config tiny] [--size 96] [--case pass]
 
@@ -19,7 +19,7 @@ from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.options import OptimizerOptions
-from pipelines.bench.live_bytes import alone, foretold
+from pipelines.bench.live_bytes import alone, predicted
 from pipelines.bench.memory import pass_peaks, step_peaks
 from pipelines.bench.random_model import random_views
 
@@ -39,9 +39,9 @@ def peak(case: str, config: str, size: int) -> int:
     return max(rows.values())
 
 
-def foretold_peak(case: str, config: str, size: int) -> int:
+def predicted_peak(case: str, config: str, size: int) -> int:
     """The same, without numbers."""
-    with foretold():
+    with predicted():
         return peak(case, config, size)
 
 
@@ -70,10 +70,10 @@ def main() -> None:
     parser.add_argument("--case", choices=CASES, help="this alone")
     args: Any = parser.parse_args()
     weights = sum(t.numel() * 4 for t in GeoVerse(named(args.config)).parameters())
-    print("MB beside weights   foretold   counted   resident")
+    print("MB beside weights   predicted   counted   resident")
     for case in CASES if args.case is None else (args.case,):
         told = (case, args.config, args.size)
-        before = alone(foretold_peak, *told)
+        before = alone(predicted_peak, *told)
         counted, grown = alone(measured, *told)
         # The process makes its weights, too.
         print(f"{case:20}{before / MB:8.1f}{counted / MB:10.1f}{(grown - weights) / MB:11.1f}")

@@ -1,7 +1,7 @@
-"""Bytes that tensors hold while code runs: on a CPU, or foretold without the numbers.
+"""Bytes that tensors hold while code runs: on a CPU, or predicted without the numbers.
 
 ``LiveBytes`` sees every tensor that torch creates and forgets it when its memory is given back.
-Within ``foretold()`` tensors have shapes, types and lifetimes and no memory (torch's fake tensors),
+Within ``predicted()`` tensors have shapes, types and lifetimes, but no memory (torch's fake ones),
 so that the same code runs for a model of any size.
 """
 
@@ -117,7 +117,7 @@ class LiveBytes(TorchDispatchMode):
 
 
 @contextmanager
-def foretold() -> Iterator[None]:
+def predicted() -> Iterator[None]:
     """Within the block tensors have no numbers; models and views have to be made in it.
 
     For a process that does nothing else (``alone``): torch 2.13 has crashed where a process went on

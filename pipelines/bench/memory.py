@@ -1,4 +1,4 @@
-"""``gvtools bench complete --memory``: the peak memory of a pass and of a training step, foretold.
+"""``gvtools bench complete --memory``: the peak memory of a pass and of a training step, predicted.
 
 The library's own code runs on tensors without numbers, whose bytes are counted (``live_bytes``).
 Figures are of one device that holds everything; what its driver takes, and what an allocator loses
@@ -31,7 +31,7 @@ from gvtools.training.loop import Trainer
 from gvtools.training.options import DenoiserStageOptions, OptimizerOptions, ReflowStageOptions
 from gvtools.training.reflow_stage import ReflowStage
 from gvtools.training.stage import Stage
-from pipelines.bench.live_bytes import LiveBytes, alone, foretold
+from pipelines.bench.live_bytes import LiveBytes, alone, predicted
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_video, random_views
 from pipelines.bench.stage_clock import INSIDE
@@ -150,7 +150,7 @@ class _InPlace(Replicated):
 
 
 def memory_figures(options: CompleteOptions) -> dict[str, Any]:
-    """The foretold bytes as a JSON object: rows under ``inference`` and ``training``."""
+    """The predicted bytes as a JSON object: rows under ``inference`` and ``training``."""
     config = options.network()
     configs = {WITHOUT: replace(config, video=None, injection="none")}
     if config.video is not None and options.video is not False:
@@ -181,7 +181,7 @@ def memory_figures(options: CompleteOptions) -> dict[str, Any]:
 def _inference(options: CompleteOptions, config: GeoVerseConfig) -> list[dict[str, Any]]:
     """A row for each stage of a pass."""
     dtype = options.compute_type
-    with foretold():
+    with predicted():
         model = _model(config)
         model.hold_in(dtype)
         steps = (options.steps, options.cascade_steps)
@@ -207,7 +207,7 @@ def _training(
 ) -> dict[str, Any]:
     """A step of one sample; the video prior stays on the card."""
     dtype = options.trained_type
-    with foretold():
+    with predicted():
         model = _model(config)
         views = _views(options, config)
         batch = TrainingBatch(views, torch.rand_like(views.images), 1 + views.depth)

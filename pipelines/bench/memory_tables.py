@@ -1,4 +1,4 @@
-"""The foretold memory as tables, and what of it fits a card."""
+"""The predicted memory as tables, and what of it fits a card."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class CompleteOptions(Settings):
     compile: bool = False
     """Compile the denoisers and the RGB head first."""
     memory: bool = False
-    """Foretell the peak memory of a pass and of a training step instead of timing anything."""
+    """Predict the peak memory of a pass and of a training step instead of timing anything."""
     card: float | None = Field(None, gt=0)
     """Memory of a card that ``memory`` compares its figures with. [GB]"""
 

@@ -96,7 +96,7 @@ def _add_complete(group: argparse._ArgumentGroup) -> None:
         "--memory",
         action="store_true",
         default=None,
-        help="foretell the peak memory of a pass and of a training step, by stage; runs nothing",
+        help="predict the peak memory of a pass and of a training step, by stage; runs nothing",
     )
     group.add_argument(
         "--card", type=float, metavar="GB", help="with --memory: say what fits a card of so many GB"

@@ -11,9 +11,9 @@ import geoverse_models as micro
 import pytest
 import torch
 
-from benchmarks.memory import CASES, foretold_peak, peak
+from benchmarks.memory import CASES, peak, predicted_peak
 from gvtools.errors import OptionError
-from pipelines.bench.live_bytes import LiveBytes, alone, foretold
+from pipelines.bench.live_bytes import LiveBytes, alone, predicted
 from pipelines.bench.memory import StagePeaks
 from pipelines.bench.memory_tables import card_line
 from pipelines.commands import bench
@@ -57,8 +57,8 @@ def test_weights_are_counted_elsewhere():
         assert live.live == (10 * 30 + 30) * 4  # the gradients
 
 
-def test_nothing_is_allocated_for_what_is_foretold():
-    with foretold(), LiveBytes() as live:
+def test_nothing_is_allocated_for_what_is_predicted():
+    with predicted(), LiveBytes() as live:
         made = torch.zeros(2**40)
         made = made * 2
         assert live.live == 4 * 2**40
@@ -80,12 +80,12 @@ def test_peaks_by_stage():
     assert peaks.rows == {"hint encoding": 400, "decoding": 1200, "decoding: RGB head": 1200}
 
 
-# What is foretold is what is counted where the same code runs with numbers.
+# What is predicted is what is counted where the same code runs with numbers.
 
 
 @pytest.mark.slow
-def test_what_is_foretold_is_what_is_counted_with_numbers():
-    found = {case: alone(foretold_peak, case, "tiny", 48) for case in CASES}
+def test_what_is_predicted_is_what_is_counted_with_numbers():
+    found = {case: alone(predicted_peak, case, "tiny", 48) for case in CASES}
     for case, before in found.items():
         assert before == pytest.approx(alone(peak, case, "tiny", 48), rel=0.01)
     assert all(found.values())
