@@ -49,7 +49,7 @@ class Peer:
         built = Path(gettempdir()) / f"libgs_{sha1(source.read_bytes()).hexdigest()[:10]}.so"
         if not built.exists():
             raise SystemExit(f"no {built}; run {source.with_name('train.py')} once, which makes it")
-        self.library = ctypes.CDLL(str(built))
+        self.compiled = ctypes.CDLL(str(built))
         parts = np.split(values, [3, 6, 10, 11], axis=1)
         self.values = [np.ascontiguousarray(part) for part in parts]
         moments = [np.zeros_like(part) for part in self.values for _ in range(2)]
@@ -63,7 +63,7 @@ class Peer:
         picture = np.ascontiguousarray((view.rgb / np.float32(255)).transpose(2, 0, 1))
         mean, square = np.empty_like(picture), np.empty_like(picture)
         height, width = picture.shape[1:]
-        self.library.ssim_pre(*map(_pointer, (picture, mean, square)), width, height)
+        self.compiled.ssim_pre(*map(_pointer, (picture, mean, square)), width, height)
         pose, K = view.cam_from_local, view.K
         lens = [*pose[:3, :3].ravel(), *pose[:3, 3], K[0, 0], K[1, 1], K[0, 2], K[1, 2], near]
         return picture, mean, square, np.array(lens, np.float32)
@@ -73,7 +73,7 @@ class Peer:
         picture, mean, square, lens = self.views[self.steps % len(self.views)]
         self.steps += 1
         height, width = picture.shape[1:]
-        self.library.step(
+        self.compiled.step(
             ctypes.c_long(len(self.values[0])), 9, 2, *map(_pointer, self.values),
             self.moments[1], _pointer(lens), width, height, _pointer(picture), _pointer(mean),
             _pointer(square), ctypes.c_float(0.2), _pointer(self.rates),

@@ -7,6 +7,7 @@ far each of several fills is to be trusted at each distance.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -38,10 +39,8 @@ FEWEST = 64
 LEAST_ERROR = 1e-4
 
 
-class ShrunkInpaint(Completer):
-    """``inpaint``, its colours drawn towards the mean known colour with distance from the rim."""
-
-    name = "shrunk inpaint"
+class ChangedInpaint(Completer, ABC):
+    """``inpaint``, the colours of its holes changed view by view; its depth stays."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,13 +53,34 @@ class ShrunkInpaint(Completer):
         made = self._inpaint.complete(context, guidance, seed=seed)
         rgb = made.rgb.copy()
         for index, valid in enumerate(guidance.valid):
-            mean = _mean_color(guidance.rgb[index], valid, context)
-            kept = np.exp(-_rim_share(valid)[~valid] / SHRINK_LENGTH)[:, None]
-            rgb[index][~valid] = mean + kept * (rgb[index][~valid] - mean)
+            if not valid.all():
+                mean = _mean_color(guidance.rgb[index], valid, context)
+                rgb[index][~valid] = self.changed(rgb[index], valid, mean)
         return replace(made, rgb=rgb)
 
+    @abstractmethod
+    def changed(self, rgb: Float32, valid: NDArray[np.bool_], mean: Float32) -> Float32:
+        """(holes, 3) colours of a view's holes.
 
-class BlendCompleter(Completer):
+        Args:
+            rgb: (H, W, 3) what ``inpaint`` made, 0 to 1.
+            valid: (H, W) what is known.
+            mean: (3,) mean of the known colours.
+        """
+
+
+class ShrunkInpaint(ChangedInpaint):
+    """``inpaint``, its colours drawn towards the mean known colour with distance from the rim."""
+
+    name = "shrunk inpaint"
+
+    def changed(self, rgb: Float32, valid: NDArray[np.bool_], mean: Float32) -> Float32:
+        """See ``ChangedInpaint``."""
+        kept = np.exp(-_rim_share(valid)[~valid] / SHRINK_LENGTH)[:, None]
+        return mean + kept * (rgb[~valid] - mean)
+
+
+class BlendCompleter(ChangedInpaint):
     """A sum of fills' differences from the mean known colour, weighted by distance.
 
     Attributes:
@@ -72,25 +92,13 @@ class BlendCompleter(Completer):
     def __init__(self, shares: Float64) -> None:
         super().__init__()
         self.shares = shares
-        self._inpaint = create("inpaint")
 
-    def complete(
-        self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
-    ) -> Completion:
-        """Fill all views; see ``Completer.complete``. Nothing here is random."""
-        made = self._inpaint.complete(context, guidance, seed=seed)
-        rgb = made.rgb.copy()
-        for index, valid in enumerate(guidance.valid):
-            if valid.all():
-                continue
-            holes = ~valid
-            mean = _mean_color(guidance.rgb[index], valid, context)
-            if not valid.any():
-                rgb[index] = mean
-                continue
-            terms = _terms(made.rgb[index], valid, mean)
-            rgb[index][holes] = np.clip(mean + np.tensordot(self.shares.ravel(), terms, 1), 0, 1)
-        return replace(made, rgb=rgb)
+    def changed(self, rgb: Float32, valid: NDArray[np.bool_], mean: Float32) -> Float32:
+        """See ``ChangedInpaint``."""
+        if not valid.any():
+            return np.broadcast_to(mean, rgb.shape)[~valid]
+        terms = _terms(rgb, valid, mean)
+        return np.clip(mean + np.tensordot(self.shares.ravel(), terms, 1), 0, 1)
 
 
 def fit_blend(cases: Iterable[Case]) -> Float64:

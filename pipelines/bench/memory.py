@@ -219,7 +219,7 @@ def _training(
         "stage": stage,
         "recompute": recompute,
         "weights_bytes": weights,
-        "held_bytes": held,
+        "lasting_bytes": held,
         **{f"{part}_bytes": weights + peak for part, peak in peaks.items()},
         "total_bytes": weights + max(peaks.values()),
     }

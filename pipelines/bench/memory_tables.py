@@ -24,14 +24,14 @@ def show_memory(figures: dict[str, Any], console: Console) -> None:
         _show_pass(model, [r for r in figures["inference"] if r["model"] == model], console)
     console.line(f"a training step of one sample, {figures['training_precision']}: peak memory, GB")
     console.table(
-        ("stage", "video prior", "recompute", "weights", "held", *PARTS, "peak"),
+        ("stage", "video prior", "recompute", "weights", "lasting", *PARTS, "peak"),
         [
             (
                 row["stage"],
                 "yes" if row["model"] == WITH else "no",
                 "yes" if row["recompute"] else "no",
                 row["weights_bytes"] / GB,
-                row["held_bytes"] / GB,
+                row["lasting_bytes"] / GB,
                 *(row[f"{part}_bytes"] / GB for part in PARTS),
                 row["total_bytes"] / GB,
             )

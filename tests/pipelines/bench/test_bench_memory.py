@@ -121,7 +121,7 @@ def test_the_tables_and_the_figures(tmp_path):
     assert figures["precision"] == "float16" and figures["card_gb"] == 24
     assert len(figures["training"]) == 4
     for row in figures["training"]:
-        assert row["total_bytes"] >= row["held_bytes"] > row["weights_bytes"] > 0
+        assert row["total_bytes"] >= row["lasting_bytes"] > row["weights_bytes"] > 0
 
 
 def test_what_fits_a_card():
