@@ -99,10 +99,13 @@ class Appearance:
         return [Picture.of(self.splatter(fit.values, lens), gain=gain) for fit in self.fits]
 
     def depth(self, camera: Cameras) -> NDArray[np.float32]:
-        """(H, W) z-depth that a camera sees, a batch of one; 0 where no fit has a surface.
+        """(H, W) z-depth that a camera sees, scene units; 0 where no fit has a surface.
 
         With several fits it is the median of those that have one; with an even number the nearer of
         the middle two, since their mean may be where neither has a surface.
+
+        Args:
+            camera: a batch of one, in the world's frame.
         """
         lens = self._pose_and_lens(camera)[1]
         depths = np.array([median_depth(fit.values, lens) for fit in self.fits])

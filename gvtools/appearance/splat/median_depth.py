@@ -28,7 +28,7 @@ HALF = 0.5
 
 
 def median_depth(values: NDArray[Any], lens: Lens) -> NDArray[np.float32]:
-    """(H, W) depth of the Gaussian at which half of a pixel's light is stopped; 0 where none is.
+    """(H, W) z-depth, scene units, of the Gaussian at which half of the light is stopped; else 0.
 
     The weighted mean of depths, which fits compare with recorded depth, is too near: faint
     Gaussians before a surface pull it forward, and nothing behind the surface balances them. On
@@ -36,8 +36,8 @@ def median_depth(values: NDArray[Any], lens: Lens) -> NDArray[np.float32]:
     median is less smooth: each Gaussian has one depth.
 
     Args:
-        values: (N, VALUES) float32, see ``Splat``.
-        lens: of the camera.
+        values: (N, VALUES) float32 in the Gaussians' frame, see ``Splat``.
+        lens: of the camera, its pose in the same frame.
     """
     shown = Splat(values, lens)
     out = np.zeros((lens.height, lens.width), np.float32)
