@@ -27,8 +27,8 @@ def compile_steps() -> None:
     from gvtools.appearance.splat.project_kernels import VALUES
 
     picture = np.zeros((3, 16, 16), np.float32)
-    weight, losses = np.ones((16, 16), np.float32), np.zeros(3)
-    kernels.picture_loss(0, 3, picture, picture, weight, 0.2, np.zeros_like(picture), losses)
+    weight = np.ones((16, 16), np.float32)
+    kernels.loss_gradient(0, 3, picture, picture, weight, 0.2, np.zeros_like(picture))
     image = np.ones((5, 16, 16), np.float32)
     add_bending(image, picture, np.zeros_like(image), weight=1.0)
     rows, gradients = np.zeros(1, np.int64), np.zeros((1, VALUES + 2), np.float32)

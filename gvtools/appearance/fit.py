@@ -339,10 +339,7 @@ class Fit:
         masked = self.views[number].mask is not None
         target = np.where(view.weight > 0, view.target, shown) if masked else view.target
         gradient = np.zeros_like(picture.image)
-        losses = np.empty(3)
-        in_threads(
-            kernels.picture_loss, 3, shown, target, view.weight, options.ssim, gradient, losses
-        )
+        in_threads(kernels.loss_gradient, 3, shown, target, view.weight, options.ssim, gradient)
         gradient *= pixels
         self._errors.append(float(((shown - target) ** 2 * view.weight).mean()))
         self.cameras.step_gain(number, (gradient[:3] * shown).sum(axis=(1, 2)) / pixels)

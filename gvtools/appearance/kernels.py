@@ -1,4 +1,8 @@
-"""Kernels of fitting: the loss between two pictures with its gradient, and Adam on some rows."""
+"""Kernels of fitting: the gradient of the loss between two pictures, and Adam on some rows.
+
+The gradient is rounded as it is written, without ``FAST``: with it, a kernel's last digits depended
+on where arrays lay in memory, and a fit of a number of steps was not always the same.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +31,7 @@ def _add_four(line, lines, k):
         line[x] += w0 * a[x] + w1 * b[x] + w2 * c[x] + w3 * d[x]
 
 
-@compiled(fastmath=FAST)
+@compiled()
 def blur(picture, out, work):
     """Blur one channel (H, W) by the window.
 
@@ -59,9 +63,9 @@ def blur(picture, out, work):
             _add_four(result, shifted, k)
 
 
-@compiled(fastmath=FAST)
-def picture_loss(first, last, picture, target, weight, share, d_picture, losses):
-    """(1 - share) mean |picture - target| + share (1 - SSIM), and its gradient, by channels.
+@compiled()
+def loss_gradient(first, last, picture, target, weight, share, d_picture):
+    """Gradient of (1 - share) mean |picture - target| + share (1 - SSIM), by channels.
 
     Args:
         first: channels to do.
@@ -70,8 +74,7 @@ def picture_loss(first, last, picture, target, weight, share, d_picture, losses)
         target: (C, H, W) float32, what it should be.
         weight: (H, W) of the pixels, 0 to 1.
         share: of SSIM.
-        d_picture: (C, H, W) gradient, written.
-        losses: (C,) the channels' shares of the loss, written.
+        d_picture: (C, H, W), written.
     """
     one, two = np.float32(1), np.float32(2)
     c1, c2 = np.float32(C1), np.float32(C2)
@@ -97,9 +100,7 @@ def picture_loss(first, last, picture, target, weight, share, d_picture, losses)
             for j in range(width):
                 product[i, j] = y[i, j] * y[i, j]
         blur(product, square, work)
-        total = np.float64(0)
         for i in range(height):
-            line = np.float32(0)
             for j in range(width):
                 u, v = m[i, j], mean[i, j]
                 a1 = two * u * v + c1
@@ -109,28 +110,22 @@ def picture_loss(first, last, picture, target, weight, share, d_picture, losses)
                 inverse = one / (b1 * b2)
                 ssim = a1 * a2 * inverse
                 w = weight[i, j]
-                line += w * (one - ssim)
                 by_square, by_product = -w * ssim / b2, w * two * a1 * inverse
                 m[i, j] = (
                     w * two * (v * a2 * inverse - u * ssim / b1)
                     - two * u * by_square - v * by_product
                 )  # fmt: skip
                 xx[i, j], xy[i, j] = by_square, by_product
-            total += share * line
         blur(m, product, work)
         blur(xx, m, work)
         blur(xy, xx, work)
         for i in range(height):
-            line = np.float32(0)
             for j in range(width):
                 difference = x[i, j] - y[i, j]
                 w = weight[i, j]
-                line += w * abs(difference)
                 sign = w if difference > 0 else (-w if difference < 0 else np.float32(0))
                 smooth = product[i, j] + two * x[i, j] * m[i, j] + y[i, j] * xx[i, j]
                 d_picture[c, i, j] = k1 * sign + k2 * smooth
-            total += (1 - share) * line
-        losses[c] = total * scale
 
 
 @compiled(fastmath=FAST)

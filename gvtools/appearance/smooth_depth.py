@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.kernels import FAST, compiled
+from gvtools.kernels import compiled
 
 # Inverse depth, in shares of its median, may bend by so much before the loss grows more slowly:
 # from there on linearly, before as its square.
@@ -47,7 +47,7 @@ def add_bending(
                          gradient)  # fmt: skip
 
 
-@compiled(error_model="numpy", fastmath=FAST)
+@compiled()
 def bending_gradient(image, target, median, weight, inverse, pull, gradient):
     """See ``add_bending``.
 
