@@ -1,0 +1,85 @@
+"""The native layouts of data sets: which scenes a download holds, and how one is read.
+
+A layout is one module of this package that defines a ``Layout`` named LAYOUT, and a line in
+LAYOUTS. Several data sets may share one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.data_sets.spec import DataSetSpec, load_spec
+from gvtools.scenes.scene import Scene
+
+# Name of a layout, as specs have it: its module in this package.
+LAYOUTS: dict[str, str] = {
+    "sevenscenes": "sevenscenes",
+}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a data set lies on disk, as its authors publish it.
+
+    Attributes:
+        looks_like: what the root of a download holds, for messages.
+        scenes: the names of the scenes that are there at least in part, in natural order; a name
+            is a relative path with "/". A partial download is no error.
+        read: one of them as a scene. What is missing or damaged is left out and reported in
+            ``Scene.findings``; ProjectError if nothing is left.
+    """
+
+    looks_like: str
+    scenes: Callable[[Path], tuple[str, ...]]
+    read: Callable[[Path, str, DataSetSpec], Scene]
+
+
+def layout_of(spec: DataSetSpec) -> Layout:
+    """The layout that a spec names."""
+    return import_module(f"gvtools.scenes.data_sets.{LAYOUTS[spec.layout]}").LAYOUT
+
+
+def scenes_of(name: str, root: Path) -> tuple[str, ...]:
+    """The scenes of a data set that a folder holds.
+
+    Raises:
+        OptionError: no such data set.
+        ProjectError: the folder is absent or holds no scene of it.
+    """
+    spec = load_spec(name)
+    layout = layout_of(spec)
+    if not Path(root).is_dir():
+        raise ProjectError(f"{root}: no such folder; expected {layout.looks_like}")
+    found = layout.scenes(Path(root))
+    if not found:
+        raise ProjectError(f"{root}: no scene of {spec.name}; expected {layout.looks_like}")
+    return found
+
+
+def open_data_set(name: str, scene: str, root: Path) -> Scene:
+    """One scene of a data set as it was downloaded.
+
+    Args:
+        name: of the data set, see ``spec.load_spec``.
+        scene: as ``scenes_of`` names it; may be empty where the folder holds one alone.
+        root: the folder of the download.
+
+    Raises:
+        OptionError: no such data set.
+        ProjectError: no such scene there, or nothing of it can be read.
+    """
+    import difflib
+
+    spec = load_spec(name)
+    known = scenes_of(name, root)
+    if not scene and len(known) == 1:
+        scene = known[0]
+    if scene not in known:
+        near = difflib.get_close_matches(scene, known, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"first of {len(known)}: {known[0]!r}"
+        raise ProjectError(f"{root}: {spec.name} has no scene {scene!r} there; {hint}")
+    return layout_of(spec).read(Path(root), scene, spec)

@@ -1,0 +1,190 @@
+"""What is known of a public data set, as ``data_specs/data_sets`` records it, one YAML each.
+
+Every fact names its source; what could not be verified stands under ``not_verified``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from functools import cache
+from importlib import resources
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from gvtools.errors import OptionError
+
+Texts = Annotated[tuple[str, ...], Field(strict=False)]
+
+
+class _Record(BaseModel):
+    """Part of a spec: exactly these keys, of exactly these types."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+    )
+
+
+class Counts(_Record):
+    """How large a data set is, and who says so."""
+
+    scenes: int | None = Field(None, ge=1)
+    """Scenes, sequences or trajectories, as the source counts them."""
+    images: int | None = Field(None, ge=1)
+    """Colour images."""
+    source: str
+    """Where the counts are published."""
+
+
+class Camera(_Record):
+    """The convention in which cameras are stored."""
+
+    axes: str
+    """Directions of x, y and z of a camera, such as "x right, y down, z forward"."""
+    pose: Literal["world_from_cam", "cam_from_world", "none"]
+    """Which way a stored pose maps; "none" where poses are not published."""
+    unit_m: float | None = Field(None, gt=0)
+    """Metres in a unit of translation; None where the scale is not known."""
+    pixel_centre: Literal["integer", "half", "not stated"]
+    """Where the centre of the first pixel lies: at (0, 0) or at (0.5, 0.5)."""
+    distortion: str = "none"
+    """The lens model of the published images."""
+
+
+class Depth(_Record):
+    """How depth is stored; a data set without depth has none of this."""
+
+    encoding: str
+    """File type and number type, such as "16-bit PNG"."""
+    measures: Literal["z", "distance", "inverse", "disparity"]
+    """Depth along z, distance from the camera's centre, 1 / z, or disparity in pixels."""
+    unit_m: float | None = Field(None, gt=0)
+    """Metres in a stored unit; None where the scale is not known or does not apply."""
+    invalid: Texts = ()
+    """Stored values that mean "no depth", in words or numbers."""
+    complete: bool
+    """Whether every pixel has depth (drawn scenes), so that nothing has to be estimated."""
+
+
+class Licence(_Record):
+    """On what terms the data can be had, and from where."""
+
+    terms: str
+    """Name of the licence, or the terms in short."""
+    obtain: str
+    """Where to ask or to download."""
+    redistribution: bool | None = None
+    """Whether copies may be passed on; None where that could not be verified."""
+
+
+class Geometry(_Record):
+    """Where the poses and depth of training samples come from (the paper's appendix)."""
+
+    source: Literal["own", "estimated", "mixed"]
+    """Own: the data set's. Estimated: by a network alone. Mixed: drawn at ``own_share``."""
+    own_share: float = Field(ge=0, le=1)
+    """Probability of the data set's own geometry: 2/3 where own and estimated mix 2:1."""
+    fallback: str
+    """What stands in where depth is missing or incomplete."""
+
+
+class DataSetSpec(_Record):
+    """A data set: what it holds, how it is stored, on what terms, and how it is sampled."""
+
+    name: str
+    """As printed."""
+    kind: str
+    """Such as "real / RGB-D" or "synthetic / indoor", in the paper's words where it has them."""
+    roles: Annotated[tuple[Literal["training", "benchmark"], ...], Field(strict=False)]
+    """What the paper, or the field, uses it for."""
+    cited_as: str
+    """Authors and year, or the key of the citation."""
+    home: str
+    """The data set's own page."""
+    counts: Counts
+    """Of the paper's table where that lists the data set."""
+    layout: str
+    """The native layout: a name in ``gvtools.scenes.data_sets.layouts.LAYOUTS``."""
+    files: dict[str, str]
+    """What each kind of file is called, relative to the root; {scene} stands for a scene's name."""
+    camera: Camera
+    """Conventions of the cameras."""
+    depth: Depth | None = None
+    """Of stored depth; None where the data set has none."""
+    licence: Licence
+    """Terms and address."""
+    splits: dict[str, str] = {}
+    """Official splits: name, and which file or rule defines it."""
+    geometry: Geometry | None = None
+    """Of training; None for data sets that serve as benchmarks alone."""
+    sources: Texts
+    """Where each of these facts was read."""
+    not_verified: Texts = ()
+    """Which facts could not be verified, and why."""
+    traps: Texts = ()
+    """What readers of this data set get wrong."""
+
+    @property
+    def weight(self) -> float:
+        """Sampling weight in a mixture: the root of the number of images, 0 if that is unknown."""
+        return math.sqrt(self.counts.images or 0)
+
+
+def spec_names() -> tuple[str, ...]:
+    """The data sets there are, as ``load_spec`` takes them."""
+    return tuple(_texts())
+
+
+@cache
+def load_spec(name: str) -> DataSetSpec:
+    """A data set by its file's name or its printed one, however it is written.
+
+    >>> load_spec("7-Scenes").depth.unit_m
+    0.001
+
+    Raises:
+        OptionError: there is no such data set.
+    """
+    texts, key = _texts(), name_key(name)
+    if key not in texts:
+        near = difflib.get_close_matches(key, list(texts), n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(texts)}"
+        raise OptionError(f"data set {name!r} is unknown; {hint}")
+    return parse_spec(texts[key], where=f"{key}.yaml")
+
+
+def parse_spec(text: str, *, where: str = "spec") -> DataSetSpec:
+    """A data set from its YAML.
+
+    Raises:
+        OptionError: a key that is unknown or absent, or a value of another type.
+    """
+    import yaml
+
+    try:
+        return DataSetSpec.model_validate(yaml.safe_load(text))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise OptionError(f"{where}, {place}: {first['msg']}") from None
+
+
+def name_key(text: str) -> str:
+    """Letters and digits alone, so that ScanNet++ v2 is scannetppv2.
+
+    >>> name_key("ScanNet++ v2")
+    'scannetppv2'
+    """
+    return "".join(sign for sign in text.casefold().replace("+", "p") if sign.isalnum())
+
+
+def _texts() -> dict[str, str]:
+    """The specs' texts by their files' names."""
+    entries = resources.files("data_specs").joinpath("data_sets").iterdir()
+    found = {x.name[:-5]: x.read_text(encoding="utf-8") for x in entries if x.name[-5:] == ".yaml"}
+    return dict(sorted(found.items()))
