@@ -28,6 +28,7 @@ COMMANDS = {
     "weights": "pipelines.commands.weights",
     "train": "pipelines.commands.train",
     "export": "pipelines.commands.export",
+    "film": "pipelines.commands.film",
     "view": "pipelines.commands.view",
     "bench": "pipelines.commands.bench",
 }

@@ -1,0 +1,140 @@
+"""``gvtools film``: a path through a memory as MP4, GIF or WebP."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from gvtools.cameras import Cameras
+    from pipelines.console import Console
+
+SUMMARY = "write a film of a path through a memory"
+EXAMPLES = (
+    "gvtools film runs/kitchen --path spiral:240 --out kitchen.mp4",
+    "gvtools film runs/kitchen --path orbit:120 --compare observed,completed --out both.mp4",
+    "gvtools film runs/kitchen --path interpolate:60 --growth --width 480 --out growth.gif",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("memory", type=Path, metavar="RUN_OR_MEMORY", help="a run or a memory.npz")
+    parser.add_argument(
+        "--path",
+        default="interpolate",
+        metavar="PATH",
+        help="orbit:N, spiral:N, interpolate:N (N frames, 120 by default), cameras (the captured "
+        "views), a TUM or KITTI file, or a project (PATH@SELECTION)",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="FILE.mp4, FILE.gif or FILE.webp"
+    )
+    parser.add_argument("--fps", type=float, default=24.0, metavar="N", help="frames a second (24)")
+    parser.add_argument(
+        "--width", type=int, metavar="PIXELS", help="of a panel; the height follows (the cameras')"
+    )
+    parser.add_argument("--round", type=int, metavar="R", help="the memory as it was after round R")
+    shown = parser.add_mutually_exclusive_group()
+    shown.add_argument(
+        "--complete", action="store_true", help="fill what the memory leaves open (inpaint)"
+    )
+    shown.add_argument("--depth", action="store_true", help="depth in colours, near is red")
+    shown.add_argument(
+        "--compare",
+        metavar="A,B",
+        help="panels side by side, of memory, observed, completed, depth",
+    )
+    parser.add_argument(
+        "--growth", action="store_true", help="the path once for each round, as memory was then"
+    )
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Draw and write the film.
+
+    Raises:
+        GvError: the memory, the path or an option is wrong, or the file cannot be written.
+    """
+    from gvtools.runs.memory_file import load_memory
+    from pipelines.film.path import film_cameras
+    from pipelines.film.writer import check_suffix, write_film
+
+    check_suffix(args.out)
+    if not 0 < args.fps <= 240:
+        raise OptionError(f"--fps {args.fps:g}; expected more than 0 and at most 240")
+    if args.growth and args.round is not None:
+        raise OptionError("--growth shows every round; leave --round out")
+    panels = _panels(args)
+    memory = load_memory(args.memory, up_to=args.round)
+    if not len(memory):
+        raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
+    cameras = film_cameras(memory, args.path, width=args.width)
+    rounds = memory.rounds if args.growth else (args.round,)
+    del memory
+    start = time.perf_counter()
+    spent = [0.0]
+    frames = _frames(args, cameras, rounds, panels=panels, console=console, spent=spent)
+    write_film(args.out, frames, fps=args.fps)
+    count = len(cameras) * len(rounds)
+    each = (time.perf_counter() - start) / count
+    console.line(
+        f"{args.out}: {count} frames of {len(panels) * int(cameras.width[0])}x"
+        f"{int(cameras.height[0])}, {count / args.fps:.1f} s; {each:.3f} s a frame, of which "
+        f"projecting {spent[0] / count:.3f}"
+    )
+
+
+def _panels(args: argparse.Namespace) -> tuple[str, ...]:
+    from pipelines.film.panels import PANELS
+
+    if args.complete:
+        return ("completed",)
+    if args.depth:
+        return ("depth",)
+    if args.compare is None:
+        return ("memory",)
+    panels = tuple(args.compare.split(","))
+    unknown = [panel for panel in panels if panel not in PANELS]
+    if unknown or len(panels) < 2:
+        raise OptionError(
+            f"--compare {args.compare!r}; expected two or more of {', '.join(PANELS)}, by commas"
+        )
+    return panels
+
+
+def _frames(
+    args: argparse.Namespace,
+    cameras: Cameras,
+    rounds: tuple[int | None, ...],
+    *,
+    panels: tuple[str, ...],
+    console: Console,
+    spent: list[float],
+) -> Iterator[NDArray[np.uint8]]:
+    """All frames in order; ``spent`` receives the seconds of projecting."""
+    import numpy as np
+
+    from pipelines.film.panels import FilmRenderer, captioned
+
+    for number in rounds:
+        renderer = FilmRenderer(args.memory, cameras, up_to=number)
+        label = "drawing frames" if not args.growth else f"drawing frames of round {number}"
+        for index in console.track(range(len(cameras)), label):
+            frame = renderer.frame(index, panels)
+            if len(panels) > 1:
+                parts = np.split(frame, len(panels), axis=1)
+                pairs = zip(parts, panels, strict=True)
+                frame = np.concatenate([captioned(part, panel) for part, panel in pairs], axis=1)
+            if args.growth:
+                frame = captioned(frame, f"round {number}") if len(panels) == 1 else frame
+            yield frame
+        spent[0] += renderer.projecting

@@ -1,0 +1,1 @@
+"""Films of a memory: a path of cameras, what each frame shows, and the file."""

@@ -1,0 +1,98 @@
+"""The cameras of a film, from a path's name, a trajectory file or a project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gvtools import trajectories
+from gvtools.cameras import Cameras
+from gvtools.errors import DegenerateError, OptionError
+
+if TYPE_CHECKING:
+    from gvtools.memory.spatial_memory import SpatialMemory
+
+PATHS = ("orbit", "spiral", "interpolate")
+CAPTURED = "cameras"
+FRAMES = 120
+FORMS = (
+    f"{', '.join(f'{name}:N' for name in PATHS)}, {CAPTURED} (the captured views in order), a "
+    "trajectory file (TUM or KITTI), or a project as PATH or PATH@SELECTION"
+)
+
+
+def film_cameras(memory: SpatialMemory, path: str, *, width: int | None = None) -> Cameras:
+    """The cameras of a film's frames, all of one even size, as video coders need it.
+
+    Args:
+        memory: its observed views are what ``orbit`` and the like go by; the first of them gives
+            intrinsics and size to all frames but those of a project.
+        path: one of FORMS.
+        width: of the frames, pixels; None keeps the cameras' own.
+
+    Raises:
+        OptionError: another form, no observed views, or a width below 16.
+        DegenerateError: no such path leads through these views.
+    """
+    captured = [view.camera for view in memory.views if not view.generated]
+    if not captured:
+        raise OptionError("a memory without observed views; give a run or its memory.npz")
+    from gvtools.cameras import concatenate
+
+    cameras = _cameras(memory, concatenate(captured), path)
+    first = cameras[0]
+    columns, rows = int(first.width[0]), int(first.height[0])
+    if (cameras.width != columns).any() or (cameras.height != rows).any():
+        # Views of several sizes: the first one's lens for all of them.
+        count = len(cameras)
+        cameras = Cameras(
+            np.repeat(first.K, count, axis=0), cameras.cam_from_world,
+            np.full(count, columns), np.full(count, rows), cameras.names,
+        )  # fmt: skip
+    if width is not None:
+        if width < 16:
+            raise OptionError(f"--width {width}; expected 16 or more")
+        columns, rows = width, max(16, round(rows * width / columns))
+        cameras = cameras.resized(columns, rows)
+    return cameras.cropped(0, 0, width=columns // 2 * 2, height=rows // 2 * 2)
+
+
+def _cameras(memory: SpatialMemory, captured: Cameras, path: str) -> Cameras:
+    name, _, count = path.partition(":")
+    if name in PATHS:
+        if count and not (count.isdecimal() and int(count) >= 1):
+            raise OptionError(f"--path {path!r}; expected {name}:N with N >= 1")
+        return _named_path(memory, captured, name, count=int(count or FRAMES))
+    if path == CAPTURED:
+        return captured
+    place, at, selection = path.partition("@")
+    if not Path(place).exists():
+        raise OptionError(f"--path {path!r}; expected {FORMS}")
+    if Path(place).is_dir() or Path(place).suffix.lower() == ".json":
+        from gvtools.scenes.project import open_project
+        from gvtools.scenes.selection import select
+
+        scene = open_project(Path(place))
+        return scene.subset(select(scene.names, selection if at else "all")).cameras
+    from gvtools.trajectory_files import read_trajectory
+
+    return read_trajectory(Path(place), captured[0])
+
+
+def _named_path(memory: SpatialMemory, captured: Cameras, name: str, *, count: int) -> Cameras:
+    make = getattr(trajectories, name)
+    try:
+        return make(captured, count)
+    except DegenerateError:
+        # Parallel views have no common focus; what they look at lies at their median depth.
+        if name != "orbit":
+            raise
+        middle = captured[len(captured) // 2]
+        guidance = memory.project(middle)
+        if not guidance.valid.any():
+            raise
+        depth = float(np.median(guidance.depth[guidance.valid]))
+        ahead = middle.world_from_cam[0, :3, 2] * depth
+        return make(captured, count, center=captured.centers.mean(axis=0) + ahead)
