@@ -11,7 +11,7 @@ from functools import cache
 from importlib import resources
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from gvtools.errors import OptionError
 
@@ -39,6 +39,8 @@ class Counts(_Record):
     """Colour images."""
     source: str
     """Where the counts are published."""
+    whole: str | None = None
+    """What the data set's authors count, where the source counts a part or in another way."""
 
 
 class Camera(_Record):
@@ -54,6 +56,8 @@ class Camera(_Record):
     """Where the centre of the first pixel lies: at (0, 0) or at (0.5, 0.5)."""
     distortion: str = "none"
     """The lens model of the published images."""
+    intrinsics: str | None = None
+    """Where intrinsics are stored, and in which unit."""
 
 
 class Depth(_Record):
@@ -61,10 +65,13 @@ class Depth(_Record):
 
     encoding: str
     """File type and number type, such as "16-bit PNG"."""
-    measures: Literal["z", "distance", "inverse", "disparity"]
-    """Depth along z, distance from the camera's centre, 1 / z, or disparity in pixels."""
+    measures: Literal["z", "distance", "inverse", "disparity", "buffer"]
+    """Depth along z, distance from the camera's centre, 1 / z, disparity in pixels, or what a
+    renderer's depth buffer holds."""
     unit_m: float | None = Field(None, gt=0)
     """Metres in a stored unit; None where the scale is not known or does not apply."""
+    formula: str | None = None
+    """How z follows from a stored value, where the unit alone does not say it."""
     invalid: Texts = ()
     """Stored values that mean "no depth", in words or numbers."""
     complete: bool
@@ -91,6 +98,18 @@ class Geometry(_Record):
     """Probability of the data set's own geometry: 2/3 where own and estimated mix 2:1."""
     fallback: str
     """What stands in where depth is missing or incomplete."""
+
+    @model_validator(mode="after")
+    def _share_fits(self) -> Geometry:
+        """Own geometry alone has a share of 1, an estimate alone one of 0."""
+        fits = {
+            "own": self.own_share == 1,
+            "estimated": self.own_share == 0,
+            "mixed": 0 < self.own_share < 1,
+        }
+        if not fits[self.source]:
+            raise ValueError(f"own_share is {self.own_share}, which is not {self.source} geometry")
+        return self
 
 
 class DataSetSpec(_Record):
@@ -128,6 +147,13 @@ class DataSetSpec(_Record):
     """Which facts could not be verified, and why."""
     traps: Texts = ()
     """What readers of this data set get wrong."""
+
+    @model_validator(mode="after")
+    def _trains_from_something(self) -> DataSetSpec:
+        """A data set to train on has images to weigh it by, and says where its geometry is from."""
+        if "training" in self.roles and (self.geometry is None or self.counts.images is None):
+            raise ValueError("a training data set needs geometry and counts.images")
+        return self
 
     @property
     def weight(self) -> float:
