@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import ROTATION_ROUNDING, Cameras
 from gvtools.errors import ProjectError
 from gvtools.scenes.images import (
+    ImageHeader,
     check_size,
     fit_depth,
     read_header,
@@ -53,6 +54,7 @@ class Photograph:
         depth: the depth map; None when there is none.
         read_depth: how ``depth`` is read, to (h, w) float32 z-depth in scene units, 0 = none.
         registration: the depth camera, when it is another one than the picture's.
+        read: how ``image`` is read; it may be a file that holds many pictures.
     """
 
     name: str
@@ -63,6 +65,7 @@ class Photograph:
     depth: Path | None = None
     read_depth: Callable[[Path], Depth] | None = None
     registration: Registration | None = None
+    read: Callable[[Path], Frame] = read_image
 
     def view(self) -> View:
         """The photograph as a view that loads lazily."""
@@ -74,7 +77,8 @@ class Photograph:
             np.array([height]),
             (self.name,),
         )
-        files = tuple(path for path in (self.image, self.mask, self.depth) if path is not None)
+        paths = (path for path in (self.image, self.mask, self.depth) if path is not None)
+        files = tuple(dict.fromkeys(paths))
         return View(self.name, camera, self.load, self.depth is not None, files)
 
     def load(self) -> Frame:
@@ -83,7 +87,7 @@ class Photograph:
         Raises:
             ProjectError: a file is unreadable or of another size than the camera says.
         """
-        picture = read_image(self.image)
+        picture = self.read(self.image)
         check_size(picture.rgb.shape[1::-1], self.lens.source_size, path=self.image)
         masks = [] if picture.mask is None else [self.lens.nearest(picture.mask)]
         if self.mask is not None:
@@ -148,7 +152,7 @@ def header_findings(pictures: Sequence[tuple[Path, tuple[int, int]]]) -> list[Fi
         An error for each unreadable file or wrong size, and one line for each kind of conversion.
     """
     findings: list[Finding] = []
-    kinds: Counter[str] = Counter()
+    headers: list[ImageHeader] = []
     for path, expected in pictures:
         try:
             header = read_header(path)
@@ -158,6 +162,14 @@ def header_findings(pictures: Sequence[tuple[Path, tuple[int, int]]]) -> list[Fi
         except ProjectError as error:
             findings.append(Finding("error", str(error)))
             continue
+        headers.append(header)
+    return findings + conversion_findings(headers)
+
+
+def conversion_findings(headers: Sequence[ImageHeader]) -> list[Finding]:
+    """One line for each kind of conversion that pictures with these headers will need."""
+    kinds: Counter[str] = Counter()
+    for header in headers:
         if header.mode.startswith("I;16"):
             kinds["16-bit grey: the upper eight bits are used"] += 1
         elif header.mode in ("L", "1", "LA"):
@@ -166,8 +178,7 @@ def header_findings(pictures: Sequence[tuple[Path, tuple[int, int]]]) -> list[Fi
             kinds["with an alpha channel: read as a mask"] += 1
         if header.orientation != 1:
             kinds["with an EXIF orientation: not applied, cameras are of the stored pixels"] += 1
-    findings += [Finding("info", f"{count} pictures {kind}") for kind, count in kinds.items()]
-    return findings
+    return [Finding("info", f"{count} pictures {kind}") for kind, count in kinds.items()]
 
 
 def depth_findings(

@@ -83,7 +83,7 @@ class Scene:
 
     Attributes:
         root: the project's folder.
-        kind: "colmap", "rgbd" or "transforms".
+        kind: "colmap", "rgbd", "transforms" or "data set" (a data set's native layout).
         views: in natural name order.
         points: sparse points, where the project has them.
         findings: everything dropped, converted, repaired or noteworthy.
