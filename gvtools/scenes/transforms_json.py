@@ -61,7 +61,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     """
     path = Path(path)
     path = path / FILE if path.is_dir() else path
-    data = _load(path)
+    data = load_frames(path)
     frames = data["frames"]
     findings: list[Finding] = []
     files = [_picture(path.parent, frame, f"{path}, frame {i}") for i, frame in enumerate(frames)]
@@ -182,7 +182,12 @@ def _relative(file: str | Path, folder: Path) -> str:
     return Path(os.path.relpath(file, folder.resolve())).as_posix()
 
 
-def _load(path: Path) -> dict[str, Any]:
+def load_frames(path: Path) -> dict[str, Any]:
+    """The content of a ``transforms.json``, with at least one frame.
+
+    Raises:
+        ProjectError: no such file, or not of that form.
+    """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

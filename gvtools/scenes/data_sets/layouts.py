@@ -18,6 +18,20 @@ from gvtools.scenes.scene import Scene
 # Name of a layout, as specs have it: its module in this package.
 LAYOUTS: dict[str, str] = {
     "sevenscenes": "sevenscenes",
+    "aria_digital_twin": "aria_digital_twin",
+    "arkitscenes": "arkitscenes",
+    "dl3dv": "dl3dv",
+    "dtu": "dtu",
+    "eth3d": "eth3d",
+    "hypersim": "hypersim",
+    "llff": "llff",
+    "mapfree": "mapfree",
+    "mipnerf360": "mipnerf360",
+    "realestate10k": "realestate10k",
+    "scannet": "scannet",
+    "scannetpp": "scannetpp",
+    "tanks_and_temples": "tanks_and_temples",
+    "waymo": "waymo",
 }
 
 
@@ -31,11 +45,14 @@ class Layout:
             is a relative path with "/". A partial download is no error.
         read: one of them as a scene. What is missing or damaged is left out and reported in
             ``Scene.findings``; ProjectError if nothing is left.
+        variants: names under which ``read`` gives the same scenes from other pictures, such as
+            SCENE/images_4; they are read on request alone.
     """
 
     looks_like: str
     scenes: Callable[[Path], tuple[str, ...]]
     read: Callable[[Path, str, DataSetSpec], Scene]
+    variants: Callable[[Path], tuple[str, ...]] = lambda _: ()
 
 
 def layout_of(spec: DataSetSpec) -> Layout:
@@ -65,7 +82,7 @@ def open_data_set(name: str, scene: str, root: Path) -> Scene:
 
     Args:
         name: of the data set, see ``spec.load_spec``.
-        scene: as ``scenes_of`` names it; may be empty where the folder holds one alone.
+        scene: as ``scenes_of`` names it, or a variant; may be empty where the folder holds one.
         root: the folder of the download.
 
     Raises:
@@ -78,8 +95,9 @@ def open_data_set(name: str, scene: str, root: Path) -> Scene:
     known = scenes_of(name, root)
     if not scene and len(known) == 1:
         scene = known[0]
-    if scene not in known:
+    layout = layout_of(spec)
+    if scene not in known and scene not in layout.variants(Path(root)):
         near = difflib.get_close_matches(scene, known, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"first of {len(known)}: {known[0]!r}"
         raise ProjectError(f"{root}: {spec.name} has no scene {scene!r} there; {hint}")
-    return layout_of(spec).read(Path(root), scene, spec)
+    return layout.read(Path(root), scene, spec)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import invert_rigid, rigid_transform
 from gvtools.errors import GvError, ProjectError
@@ -106,6 +106,21 @@ def scaled_lens(lens: LensParameters, size: tuple[int, int]) -> LensParameters:
     camera.rescale(int(width), int(height))
     values = tuple(float(value) for value in camera.params)
     return LensParameters(lens.model, values, (int(width), int(height)))
+
+
+def quaternion_pose(wxyz: ArrayLike, translation: ArrayLike) -> Float64:
+    """(4, 4) float64 of a quaternion, scalar first, and a translation.
+
+    >>> quaternion_pose([1, 0, 0, 0], [1, 2, 3])[:3, 3]
+    array([1., 2., 3.])
+    """
+    from scipy.spatial.transform import Rotation
+
+    pose = np.eye(4)
+    w, x, y, z = np.asarray(wxyz, np.float64)
+    pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    pose[:3, 3] = translation
+    return pose
 
 
 def natural(names: Iterable[str]) -> tuple[str, ...]:

@@ -1,0 +1,102 @@
+"""Single frames of a video file, through PyAV."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.scene import Frame
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+
+@dataclass(frozen=True)
+class VideoHeader:
+    """What a video's head says.
+
+    Attributes:
+        size: width and height, pixels.
+        seconds: its length; infinity where the file does not say.
+        frame_seconds: from one frame to the next, on average.
+    """
+
+    size: tuple[int, int]
+    seconds: float
+    frame_seconds: float
+
+
+def video_header(path: Path) -> VideoHeader:
+    """Size and length of a video; nothing is decoded.
+
+    Raises:
+        ProjectError: absent, or no video.
+        OptionError: PyAV is not installed.
+    """
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        seconds = np.inf
+        if stream.duration is not None:
+            seconds = float(stream.duration * stream.time_base)
+        elif container.duration is not None:
+            seconds = container.duration / 1e6
+        rate = stream.average_rate or stream.guessed_rate or 30
+        return VideoHeader((stream.width, stream.height), seconds, float(1 / rate))
+
+
+def read_frame(path: Path, *, seconds: float) -> Frame:
+    """The frame of a video whose time stamp is nearest.
+
+    Args:
+        path: the video.
+        seconds: from its beginning.
+
+    Raises:
+        ProjectError: absent, damaged, or without any frame.
+        OptionError: PyAV is not installed.
+    """
+    best, best_off = None, np.inf
+    try:
+        with _opened(path) as container:
+            stream = container.streams.video[0]
+            begin = (stream.start_time or 0) * stream.time_base
+            target = round((seconds + float(begin)) / float(stream.time_base))
+            container.seek(max(target, 0), stream=stream, backward=True)
+            for frame in container.decode(stream):
+                if frame.pts is None:
+                    continue
+                off = abs(frame.pts - target)
+                if off >= best_off:
+                    break
+                best, best_off = frame, off
+            if best is not None:
+                return Frame(np.ascontiguousarray(best.to_ndarray(format="rgb24")))
+    except (_av().error.FFmpegError, IndexError) as error:
+        raise ProjectError(f"{path}: unreadable at {seconds:.3f} s ({error})") from None
+    raise ProjectError(f"{path}: no frame at {seconds:.3f} s; copy the video again")
+
+
+def _opened(path: Path) -> Any:
+    av = _av()
+    try:
+        container = av.open(str(path))
+    except (av.error.FFmpegError, OSError) as error:
+        raise ProjectError(f"{path}: no readable video ({error}); copy it again") from None
+    if not container.streams.video:
+        container.close()
+        raise ProjectError(f"{path}: a file without video stream; expected a video")
+    return container
+
+
+def _av() -> ModuleType:
+    try:
+        import av
+    except ImportError:
+        raise OptionError(
+            "reading a video needs PyAV; pip install av, or give frames as pictures"
+        ) from None
+    return av
