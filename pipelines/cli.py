@@ -26,6 +26,7 @@ COMMANDS = {
     "report": "pipelines.commands.report",
     "plot": "pipelines.commands.plot",
     "weights": "pipelines.commands.weights",
+    "data": "pipelines.commands.data",
     "train": "pipelines.commands.train",
     "export": "pipelines.commands.export",
     "film": "pipelines.commands.film",

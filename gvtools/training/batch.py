@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -18,11 +19,13 @@ class TrainingBatch:
         views: as the model gets them: context pictures and depth, then the targets' projections.
         images: (B, V, 3, H, W) true pictures in [0, 1].
         depth: (B, V, 1, H, W) true z-depth; 0 = unknown.
+        notes: how often what happened when its samples were drawn.
     """
 
     views: ViewBatch
     images: Tensor
     depth: Tensor
+    notes: Mapping[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -64,9 +67,10 @@ class TrainingBatch:
         return -(rotation.mT @ translation)[..., 0].to(self.images.dtype)
 
     def samples(self, index: Tensor) -> TrainingBatch:
-        """Some samples of the batch."""
+        """Some samples of the batch, without its notes."""
         return TrainingBatch(self.views.samples(index), self.images[index], self.depth[index])
 
     def to(self, device: torch.device | str) -> TrainingBatch:
         """On another device."""
-        return TrainingBatch(self.views.to(device), self.images.to(device), self.depth.to(device))
+        images, depth = self.images.to(device), self.depth.to(device)
+        return TrainingBatch(self.views.to(device), images, depth, self.notes)

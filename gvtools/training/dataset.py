@@ -22,7 +22,7 @@ from gvtools.training.hints import Clip
 from gvtools.training.view_sample import Sample, make_sample
 
 # Streams of random numbers of one sample.
-SCENE, PATH, FAULTS, SOURCE = range(4)
+SCENE, PATH, FAULTS = range(3)
 # The same streams of procedural and recorded samples do not meet.
 PROCEDURAL, RECORDED, MIXED = range(3)
 
@@ -81,8 +81,8 @@ class ProceduralViews:
     def __post_init__(self) -> None:
         check_split(self.split)
 
-    def sample(self, index: int) -> Sample:
-        """The sample of a number, 0 or more."""
+    def sample(self, index: int, attempt: int = 0) -> Sample:
+        """The sample of a number, 0 or more; it is drawn at the first attempt and any later one."""
         given = self.given(index)
         return make_sample(
             given.clip,
@@ -125,7 +125,7 @@ class ProceduralViews:
 
     @property
     def _seed(self) -> list[int]:
-        return [self.seed, PROCEDURAL, check_split(self.split)]
+        return context_seed(self.seed, self.split)
 
     def _rng(self, index: int, stream: int) -> np.random.Generator:
         if index < 0:
@@ -133,37 +133,13 @@ class ProceduralViews:
         return np.random.default_rng([*self._seed, index, stream])
 
 
+def context_seed(seed: int, split: str = "train") -> list[int]:
+    """What numbers of context views are drawn with: one for all sources that batches mix."""
+    return [seed, PROCEDURAL, check_split(split)]
+
+
 def described(views: Any) -> dict[str, Any]:
     """The settings that procedural and recorded views share, as plain data."""
     plain = {name: getattr(views, name) for name in ("seed", "views", "size", "fill")}
     faults = None if views.faults is None else views.faults.to_dict()
     return {**plain, "context": asdict(views.context), "faults": faults}
-
-
-@dataclass(frozen=True)
-class MixedViews:
-    """Two data sets in one, group by group.
-
-    Attributes:
-        first: most samples come from it.
-        second: the others.
-        share: of groups that come from ``second``.
-        group: samples in a row that come from the same one.
-        seed: decides which.
-    """
-
-    first: Samples
-    second: Samples
-    share: float
-    group: int = 8
-    seed: int = 0
-
-    def sample(self, index: int) -> Sample:
-        """The sample of a number, 0 or more."""
-        rng = np.random.default_rng([self.seed, MIXED, index // self.group, SOURCE])
-        return (self.second if rng.random() < self.share else self.first).sample(index)
-
-    def describe(self) -> dict[str, Any]:
-        """Everything that decides the samples, as plain data."""
-        parts = {"first": self.first.describe(), "second": self.second.describe()}
-        return {"share": self.share, "group": self.group, "seed": self.seed, **parts}

@@ -9,7 +9,8 @@ from __future__ import annotations
 import importlib
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -88,6 +89,17 @@ class Processes:
         packed = packed.to(self.device if dist.get_backend() == "nccl" else "cpu")
         dist.all_reduce(packed)
         return dict(zip(names, (packed / self.count).tolist(), strict=True))
+
+    def total(self, counts: Mapping[str, int]) -> Counter[str]:
+        """Sums of counts over all processes, which need not have the same names."""
+        if self.count == 1:
+            return Counter(counts)
+        found: list[Any] = [None] * self.count
+        dist.all_gather_object(found, dict(counts))
+        total: Counter[str] = Counter()
+        for each in found:
+            total.update(each)
+        return total
 
     def any(self, flag: bool) -> bool:
         """Whether it is so in any process."""

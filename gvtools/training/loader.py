@@ -9,7 +9,6 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Generator, Iterable
-from dataclasses import fields
 from typing import Any
 
 import numba
@@ -19,10 +18,10 @@ from numpy.typing import NDArray
 from gvtools.errors import GvError
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.dataset import Samples
-from gvtools.training.view_sample import Sample, collated
+from gvtools.training.view_sample import TENSORS, Sample, collated
 
-# A sample on its way: its context views, its tensors as arrays; or why there is none.
-_Made = tuple[int, dict[str, NDArray[Any]]] | GvError
+# A sample on its way: its context views and notes, its tensors as arrays; or why there is none.
+_Made = tuple[int, tuple[str, ...], dict[str, NDArray[Any]]] | GvError
 
 
 def batches(
@@ -72,16 +71,16 @@ class _Arrays:
         except GvError as error:
             # Raised in this process it would reach the user as a traceback.
             return error
-        names = [entry.name for entry in fields(Sample) if entry.name != "context"]
-        return sample.context, {name: getattr(sample, name).numpy() for name in names}
+        arrays = {name: getattr(sample, name).numpy() for name in TENSORS}
+        return sample.context, sample.notes, arrays
 
 
 def _restored(made: _Made) -> Sample:
     if isinstance(made, GvError):
         raise made
-    context, values = made
+    context, notes, values = made
     tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in values.items()}
-    return Sample(**tensors, context=context)
+    return Sample(**tensors, context=context, notes=notes)
 
 
 def _unchanged(item: Any) -> Any:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from gvtools.training.batch import TrainingBatch
 from gvtools.training.distributed import Replicated
 from gvtools.training.draws import Draws
 from gvtools.training.ema import AveragedWeights
+from gvtools.training.mixture import RESAMPLED
 from gvtools.training.options import OptimizerOptions
 from gvtools.training.state import Progress, StageState, load_state, save_state
 
@@ -95,6 +97,8 @@ class Trainer:
         )
         self.ema = AveragedWeights(self.parameters, options.ema)
         self.progress = Progress()
+        # Of this process's samples since they were merged last.
+        self._notes: Counter[str] = Counter()
         # Processes of one training have to agree, as a stage that runs has seen to (run.py).
         self.dtype = training_type(options.precision, self.processes.device)
 
@@ -134,6 +138,7 @@ class Trainer:
 
     def save(self) -> None:
         """Write the state, from the first process; called by all of them."""
+        self._merged_notes()
         model, optimizer, ema = (
             self.distributed.gathered(part)
             for part in (
@@ -144,6 +149,21 @@ class Trainer:
         )
         if self.processes.first:
             save_state(StageState(self.identity, self.progress, model, optimizer, ema), self.folder)
+
+    def _merged_notes(self) -> dict[str, float]:
+        """How often what happened when samples were drawn, in all processes since the start.
+
+        Called by all processes.
+        """
+        drawn = Counter(self.progress.drawn)
+        drawn.update(self.processes.total(self._notes))
+        self._notes.clear()
+        self.progress.drawn = dict(sorted(drawn.items()))
+        found = {name: float(count) for name, count in self.progress.drawn.items()}
+        if found:
+            invalid = sum(n for name, n in drawn.items() if name.startswith(f"{RESAMPLED}/"))
+            found[RESAMPLED] = float(invalid)
+        return found
 
     def train(self, reporting: Reporting, *, until: int | None = None) -> None:
         """Make steps up to ``until`` (all of them by default) and save at the end."""
@@ -169,6 +189,7 @@ class Trainer:
                     "rate": self.options.rate_at(step - 1),
                     "skipped": float(self.progress.skipped),
                     "seconds": self.progress.seconds,
+                    **self._merged_notes(),
                 }
                 if reporting.record is not None:
                     reporting.record(step, values)
@@ -227,6 +248,7 @@ class Trainer:
         count = sum(map(len, parts))
         for part in parts:
             batch = next(stream).to(self.processes.device)
+            self._notes.update(batch.notes)
             draws = Draws(self.seed, self.stage.name, number, tuple(part))
             with autocast(self.processes.device, self.dtype):
                 loss, terms = self.stage(batch, draws)

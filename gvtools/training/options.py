@@ -193,6 +193,23 @@ class HeadsStageOptions(FeatureOptions):
         return self
 
 
+class SceneSource(Settings):
+    """Recorded scenes that samples are drawn from, with what a path alone does not tell."""
+
+    section = "data.scenes"
+
+    project: str
+    """A project, a folder of shards, "spec:NAME" for a data set or "spec:NAME:SCENE"."""
+    root: str | None = None
+    """Folder of the data set's download, with spec: alone."""
+    weight: float | None = Field(None, ge=0)
+    """Against those of other entries; none for the root of the number of images, of the whole data
+    set where a spec tells it."""
+    estimated: str | None = None
+    """A project or shards of the same scenes with estimated poses and depth, for the samples that
+    are not to have the data set's own."""
+
+
 class DataOptions(Settings):
     """Where samples come from."""
 
@@ -214,10 +231,11 @@ class DataOptions(Settings):
     """Of procedural observations."""
     scene_faults: CorruptionOptions = GENTLE
     """Of those from ``scenes``, on top of what recorded depth has anyway."""
-    scenes: tuple[str, ...] = ()
-    """Paths of projects that gvtools reads, mixed in by ``scene_share``."""
+    scenes: tuple[str | SceneSource, ...] = ()
+    """Recorded scenes, mixed in by ``scene_share``: paths of projects or shards, "spec:NAME" or
+    objects of ``project``, ``root``, ``weight``, ``estimated``, see the page on training data."""
     scene_share: Share = 0.0
-    """Share of samples from ``scenes``."""
+    """Share of samples from ``scenes``; the others are procedural rooms."""
     scene_select: str = "all"
     """Which of their views are used, a selection such as "every:20"."""
     scene_overlap: Decay = 0.4
@@ -227,6 +245,11 @@ class DataOptions(Settings):
     def _check(self) -> DataOptions:
         if self.cache is not None and not self.pool:
             raise OptionError("data.cache needs data.pool, the number of samples to keep")
+        if bool(self.scenes) != (self.scene_share > 0):
+            raise OptionError(
+                f"data.scene_share {self.scene_share:g} with {len(self.scenes)} data.scenes; "
+                "expected both or none of them"
+            )
         return self
 
 

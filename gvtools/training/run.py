@@ -24,6 +24,7 @@ from gvtools.procedural.photographs import photograph_names
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.distributed import Processes, Replicated, models_of
+from gvtools.training.drawn import NOTE_PREFIXES, drawn_lines
 from gvtools.training.encoder_stage import EncoderStage, measure_statistics
 from gvtools.training.heads_stage import HeadsStage
 from gvtools.training.loop import Record, Reporting, Trainer
@@ -111,13 +112,16 @@ class StageRun:
         if distributed.about:
             say(f"{self.stage}: {distributed.about}")
         samples = TrainingSamples(self.config, self.model_config)
+        identity = self._identity()
+        if samples.sources is not None:
+            identity["sources"] = samples.sources
         trainer = Trainer(
             distributed,
             self.options.optimizer,
             samples.batches,
             folder=self.folder,
             seed=self.config.seed,
-            identity=self._identity(),
+            identity=identity,
         )
         if resume and trainer.resume():
             if trainer.finished and (self.folder / WEIGHTS / WHOLE_FILE).is_file():
@@ -137,6 +141,8 @@ class StageRun:
             sheet=self._sheet_writer(model, distributed, samples) if sheet_every else None,
         )
         trainer.train(reporting, until=until)
+        for line in drawn_lines(trainer.progress.drawn):
+            say(f"{self.stage}: {line}")
         if trainer.finished:
             self._write_weights(model, trainer, samples)
             say(f"{self.stage}: weights in {self.folder / WEIGHTS}")
@@ -166,7 +172,9 @@ class StageRun:
         def record(step: int, values: dict[str, float]) -> None:
             log.write(step, values)
             shown = ", ".join(
-                f"{k} {v:.4g}" for k, v in values.items() if not k.endswith(COUNT_SUFFIXES)
+                f"{k} {v:.4g}"
+                for k, v in values.items()
+                if not (k.endswith(COUNT_SUFFIXES) or k.startswith(NOTE_PREFIXES))
             )
             say(f"{self.stage} step {step} of {self.options.optimizer.steps}: {shown}")
 

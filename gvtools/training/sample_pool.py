@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import gvtools
 from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written
 from gvtools.training.dataset import Samples
-from gvtools.training.view_sample import Sample
+from gvtools.training.view_sample import TENSORS, Sample
 
 COLORS, DEPTHS = ("images", "hint"), ("depth", "hint_depth")
 GREATEST = float(np.finfo(np.float16).max)
@@ -85,31 +85,32 @@ def _code() -> bytes:
 
 
 def _packed(sample: Sample) -> dict[str, NDArray[Any]]:
-    packed: dict[str, NDArray[Any]] = {"context": np.array(sample.context)}
-    for entry in fields(Sample):
-        if entry.name == "context":
-            continue
-        values = getattr(sample, entry.name).numpy()
-        if entry.name in COLORS:
+    packed: dict[str, NDArray[Any]] = {
+        "context": np.array(sample.context),
+        "notes": np.array(sample.notes, str),
+    }
+    for name in TENSORS:
+        values = getattr(sample, name).numpy()
+        if name in COLORS:
             values = np.rint(values * 255).astype(np.uint8)
-        elif entry.name in DEPTHS:
+        elif name in DEPTHS:
             values = np.clip(values, 0, GREATEST).astype(np.float16)
-        packed[entry.name] = values
+        packed[name] = values
     return packed
 
 
 def _sample(packed: dict[str, NDArray[Any]]) -> Sample:
     tensors: dict[str, Any] = {}
-    for name, values in packed.items():
-        if name == "context":
-            continue
+    for name in TENSORS:
+        values = packed[name]
         if name in COLORS:
             tensors[name] = torch.from_numpy(values).float() / 255
         elif name in DEPTHS:
             tensors[name] = torch.from_numpy(values.astype(np.float32))
         else:
             tensors[name] = torch.from_numpy(values)
-    return Sample(**tensors, context=int(packed["context"]))
+    notes = tuple(packed["notes"].tolist())
+    return Sample(**tensors, context=int(packed["context"]), notes=notes)
 
 
 def _read(path: Path) -> dict[str, NDArray[Any]] | None:

@@ -5,16 +5,23 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable
 from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
+from gvtools.scenes.collection import digest_of
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.context_choice import ContextChoice
-from gvtools.training.dataset import MixedViews, ProceduralViews
+from gvtools.training.dataset import ProceduralViews
 from gvtools.training.dataset import Samples as DataSet
 from gvtools.training.loader import batches
+from gvtools.training.mixture import ROOMS, Mixture, Source
 from gvtools.training.options import TrainingSettings
 from gvtools.training.sample_pool import PooledViews
 from gvtools.training.view_sample import collated
+
+if TYPE_CHECKING:
+    from gvtools.scenes.collection import SceneCollection
+    from gvtools.training.scene_views import SceneViews
 
 # Numbers of samples that no training step sees: for statistics.
 ASIDE = 10**9
@@ -33,12 +40,29 @@ class TrainingSamples:
         most = min(model.context, config.data.views - 1)
         self._context = ContextChoice(most=most)
         self._fill = model.hints.fill
-        self._data = self._pooled(self._data_set("train"))
+        self._train = self._data_set("train")
+        self._data = self._pooled(self._train)
 
     @property
     def group(self) -> int:
         """So many samples in a row, from a multiple of it, have context views of one number."""
         return self._context.group
+
+    @property
+    def sources(self) -> dict[str, Any] | None:
+        """What a mixture draws from, by source, to be compared when a training is continued.
+
+        None where rooms are the only source, which follow from the settings.
+        """
+        if not isinstance(self._train, Mixture):
+            return None
+        return {
+            source.name: {
+                "share": float(share),
+                "digest": digest_of(source.samples.describe()),
+            }
+            for source, share in zip(self._train.sources, self._train.shares, strict=True)
+        }
 
     def batches(self, parts: Iterable[range]) -> Generator[TrainingBatch, None, None]:
         """The batches of the samples with these numbers, made ahead."""
@@ -54,7 +78,7 @@ class TrainingSamples:
         """Training scenes that no step sees."""
         group = self._context.group
         first = ASIDE // group * group + index * group
-        data = self._data_set("train")
+        data = self._train
         return collated([data.sample(first + n) for n in range(min(count, group))])
 
     def held_out(self, count: int) -> TrainingBatch:
@@ -86,13 +110,20 @@ class TrainingSamples:
             faults=data.faults,
             fill=self._fill,
         )
-        if not data.scenes or data.scene_share == 0 or split != "train":
+        if not data.scenes or split != "train":
             return rooms
-        from gvtools.scenes.project import open_project
+        from gvtools.training.sources import recorded_sources
+
+        seed, share = self.config.seed, data.scene_share
+        recorded = recorded_sources(data.scenes, self._recorded, share=share, seed=seed)
+        return Mixture((Source(ROOMS, 1 - share, rooms), *recorded), seed)
+
+    def _recorded(self, scenes: SceneCollection) -> SceneViews:
         from gvtools.training.scene_views import SceneViews
 
-        recorded = SceneViews(
-            scenes=tuple(open_project(Path(path)) for path in data.scenes),
+        data = self.config.data
+        return SceneViews(
+            scenes=scenes,
             select=data.scene_select,
             overlap=data.scene_overlap,
             seed=self.config.seed,
@@ -102,4 +133,3 @@ class TrainingSamples:
             faults=data.scene_faults,
             fill=self._fill,
         )
-        return MixedViews(rooms, recorded, data.scene_share, group=self._context.group)

@@ -22,11 +22,13 @@ class Progress:
         step: optimiser steps made; the next sample is ``step`` x batch.
         skipped: batches that were left out, not finite or too large.
         seconds: spent so far.
+        drawn: how often what happened when samples of a mixture were drawn, by note.
     """
 
     step: int = 0
     skipped: int = 0
     seconds: float = 0.0
+    drawn: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -39,6 +40,7 @@ class Sample:
         K: (V, 3, 3), pixels, pixel centres at + 0.5.
         place: (V,) int64, where each view stands along the path.
         context: number of context views.
+        notes: what happened when it was drawn, to be counted, see ``mixture``.
     """
 
     images: Tensor
@@ -50,6 +52,11 @@ class Sample:
     K: Tensor
     place: Tensor
     context: int
+    notes: tuple[str, ...] = ()
+
+
+# The parts of a sample that are tensors.
+TENSORS = tuple(part.name for part in fields(Sample) if part.name not in ("context", "notes"))
 
 
 def make_sample(
@@ -152,11 +159,8 @@ def collated(samples: Sequence[Sample]) -> TrainingBatch:
             f"a batch of samples with {sorted(kinds)} as shapes and context counts; expected one; "
             "take the samples of a batch from one group"
         )
-    stacked = {
-        entry.name: torch.stack([getattr(sample, entry.name) for sample in samples])
-        for entry in fields(Sample)
-        if entry.name != "context"
-    }
+    stacked = {name: torch.stack([getattr(sample, name) for sample in samples]) for name in TENSORS}
+    notes = Counter(note for sample in samples for note in sample.notes)
     views = ViewBatch(
         images=stacked["hint"],
         depth=stacked["hint_depth"],
@@ -165,4 +169,4 @@ def collated(samples: Sequence[Sample]) -> TrainingBatch:
         K=stacked["K"],
         context=samples[0].context,
     )
-    return TrainingBatch(views, stacked["images"], stacked["depth"])
+    return TrainingBatch(views, stacked["images"], stacked["depth"], notes)

@@ -14,6 +14,7 @@ from gvtools.errors import DegenerateError, ProjectError
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.render import developed, radiance
+from gvtools.scenes.collection import of_scenes
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.training.context_choice import ContextChoice
@@ -54,7 +55,8 @@ def _scene(seed: int = 0, *, count: int = 20, masked: bool = False) -> Scene:
 
 
 def _views(**changes) -> SceneViews:
-    return SceneViews(**{"scenes": (_scene(),), "faults": None, "size": (48, 48), **changes})
+    plain = {"scenes": (_scene(),), "faults": None, "size": (48, 48), **changes}
+    return SceneViews(**{**plain, "scenes": of_scenes(plain["scenes"])})
 
 
 def test_samples_are_windows_of_neighbouring_views() -> None:
@@ -127,7 +129,7 @@ def test_a_colmap_project_with_depth_maps_gives_samples(tmp_path):
         depth = render(world_from_cam(index))[1].astype(np.float32)
         np.save(folder / f"{view.name}.npy", depth)
     data = SceneViews(
-        scenes=(open_project(home),), faults=None, views=4, size=(32, 32), overlap=0.0,
+        scenes=of_scenes([open_project(home)]), faults=None, views=4, size=(32, 32), overlap=0.0,
         context=ContextChoice(most=2),
     )  # fmt: skip
     sample = data.sample(0)
@@ -141,7 +143,8 @@ def test_a_colmap_project_with_depth_maps_gives_samples(tmp_path):
 
 @pytest.mark.data
 def test_real_frames(shared: Path) -> None:
-    data = SceneViews(scenes=(open_project(shared / "data" / "sevenscenes_reg"),), faults=None)
+    place = open_project(shared / "data" / "sevenscenes_reg")
+    data = SceneViews(scenes=of_scenes([place]), faults=None)
     sample = data.sample(0)
     k, valid = sample.context, sample.valid[sample.context :]
     assert sample.images.shape == (8, 3, 96, 96) and 0.1 < float(valid.float().mean()) < 0.99
@@ -153,11 +156,13 @@ def test_real_frames(shared: Path) -> None:
 def test_a_selection_limits_the_views(tmp_path):
     place = _scene(count=20)
     data = SceneViews(
-        scenes=(place,), select="every:4", views=4, size=(32, 32), overlap=0.0,
+        scenes=of_scenes([place]), select="every:4", views=4, size=(32, 32), overlap=0.0,
         context=ContextChoice(most=2),
     )  # fmt: skip
-    listed = data.describe()["scenes"][0]["views"]
-    assert listed == [view.name for view in place][::4]
+    listed = {int(name[:3]) for index in range(20) for name in data.clips(index)[0].cameras.names}
+    assert listed == set(range(0, 20, 4))
     assert data.sample(3).images.shape == (4, 3, 32, 32)
     with pytest.raises(ProjectError, match="'every:10'"):
-        SceneViews(scenes=(place,), select="every:10", views=4, context=ContextChoice(most=2))
+        SceneViews(
+            scenes=of_scenes([place]), select="every:10", views=4, context=ContextChoice(most=2)
+        )

@@ -1,0 +1,98 @@
+"""Many scenes by name, each opened when it is needed: a data set, a folder of shards, a project."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCollection:
+    """Scenes by name; picklable where its reader is.
+
+    Attributes:
+        title: what messages and logs call it.
+        names: the scenes, in order.
+        read: opens the scene of a name; ProjectError where nothing of it can be read.
+        counts: views with depth of each scene; None where only opening a scene tells.
+        digest: changes when what is in it does, as far as that is known without opening scenes.
+        data_set: which data set it is of, as ``load_spec`` takes it; "" for none.
+    """
+
+    title: str
+    names: tuple[str, ...]
+    read: Callable[[str], Scene]
+    counts: tuple[int, ...] | None = None
+    digest: str = ""
+    data_set: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.names:
+            raise ProjectError(f"{self.title}: no scene; expected at least one")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def subset(self, names: Sequence[str]) -> SceneCollection:
+        """Some of the scenes, in the order of the collection.
+
+        Raises:
+            ProjectError: no such scene.
+        """
+        for name in names:
+            if name not in self.names:
+                near = difflib.get_close_matches(name, self.names, n=1)
+                hint = f"did you mean {near[0]!r}?" if near else f"first: {self.names[0]!r}"
+                raise ProjectError(
+                    f"{self.title}: no scene {name!r} among {len(self.names)}; {hint}"
+                )
+        rows = [row for row, name in enumerate(self.names) if name in set(names)]
+        counts = None if self.counts is None else tuple(self.counts[row] for row in rows)
+        chosen = tuple(self.names[row] for row in rows)
+        return replace(
+            self, names=chosen, counts=counts, digest=digest_of([self.digest, list(chosen)])
+        )
+
+    @property
+    def opened(self) -> bool:
+        """Whether its scenes are open already, so that reading one costs nothing."""
+        return isinstance(self.read, _Opened)
+
+
+class _Opened:
+    """Reads scenes that are open already."""
+
+    def __init__(self, scenes: dict[str, Scene]) -> None:
+        self.scenes = scenes
+
+    def __call__(self, name: str) -> Scene:
+        return self.scenes[name]
+
+
+def of_scenes(scenes: Sequence[Scene], *, title: str = "") -> SceneCollection:
+    """Scenes that are open already, as a collection; they are named after their folders.
+
+    Raises:
+        ProjectError: there is none, or two of them have the same root.
+    """
+    opened = {scene.root.name: scene for scene in scenes}
+    if len(opened) != len(scenes):
+        opened = {str(scene.root): scene for scene in scenes}
+    if len(opened) != len(scenes):
+        raise ProjectError("two scenes have the same folder; give each of them once")
+    title = title or next(iter(opened), "scenes")
+    counts = tuple(sum(view.has_depth for view in scene) for scene in scenes)
+    digest = digest_of([[name, list(scene.names)] for name, scene in opened.items()])
+    return SceneCollection(title, tuple(opened), _Opened(opened), counts, digest)
+
+
+def digest_of(content: object) -> str:
+    """16 hex digits of SHA-256 over plain data."""
+    text = json.dumps(content, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

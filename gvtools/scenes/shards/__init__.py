@@ -1,0 +1,1 @@
+"""Scenes in WebDataset shards: tar files of views, with an index that finds each view at once."""

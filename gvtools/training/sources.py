@@ -1,0 +1,95 @@
+"""The recorded sources of a training, from the addresses that its settings name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gvtools.errors import OptionError
+from gvtools.scenes.addresses import open_collection
+from gvtools.scenes.collection import SceneCollection
+from gvtools.training.mixture import ROOMS, OwnOrEstimated, Redrawable, Source
+from gvtools.training.options import SceneSource
+
+Draw = Callable[[SceneCollection], Redrawable]
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """A source with what its spec says of it."""
+
+    collection: SceneCollection
+    weight: float
+    own_share: float
+    fallback: str
+
+
+def recorded_sources(
+    entries: Sequence[str | SceneSource], draw: Draw, *, share: float, seed: int
+) -> tuple[Source, ...]:
+    """The sources of recorded scenes.
+
+    Args:
+        entries: of the settings.
+        draw: makes the samples of scenes.
+        share: of all samples, to be divided among them by weight.
+        seed: 0 or more.
+
+    Raises:
+        GvError: an address that leads nowhere, or a source without geometry.
+    """
+    whole = [SceneSource(project=entry) if isinstance(entry, str) else entry for entry in entries]
+    opened = [_opened(entry) for entry in whole]
+    total = sum(each.weight for each in opened)
+    sources: list[Source] = []
+    for entry, each in zip(whole, opened, strict=True):
+        samples = draw(each.collection)
+        estimated = None
+        if entry.estimated is not None:
+            estimated = draw(open_collection(entry.estimated))
+        if each.own_share < 1 or estimated is not None:
+            samples = OwnOrEstimated(samples, estimated, each.own_share, seed)
+        name = _unique(each.collection.title, [source.name for source in sources])
+        sources.append(Source(name, share * each.weight / total, samples))
+    return tuple(sources)
+
+
+def _opened(entry: SceneSource) -> _Opened:
+    root = None if entry.root is None else Path(entry.root)
+    collection = open_collection(entry.project, root)
+    counts, weight, own_share, fallback = collection.counts, 0.0, 1.0, ""
+    if collection.data_set:
+        from gvtools.scenes.data_sets.spec import load_spec
+
+        spec = load_spec(collection.data_set)
+        # One scene of a data set has no claim to the weight of all.
+        weight = spec.weight if len(collection) > 1 else 0.0
+        if spec.geometry is not None:
+            own_share, fallback = spec.geometry.own_share, spec.geometry.fallback
+    if own_share == 0 and entry.estimated is None:
+        raise OptionError(
+            f"{entry.project}: samples of {collection.title} take estimated geometry alone "
+            f"({fallback}); name a project or shards with estimates as 'estimated', or leave it out"
+        )
+    if entry.weight is not None:
+        weight = entry.weight
+    elif not weight and counts is not None:
+        weight = math.sqrt(sum(counts))
+    if not weight:
+        raise OptionError(
+            f"{entry.project}: how many images {collection.title} has is not known; give its "
+            "'weight'"
+        )
+    return _Opened(collection, weight, own_share, fallback)
+
+
+def _unique(name: str, others: Sequence[str]) -> str:
+    """A name that no other source has; "/" divides the parts of notes."""
+    name = name.replace("/", " ")
+    number, found = 1, name
+    while found in (*others, ROOMS):
+        number += 1
+        found = f"{name} ({number})"
+    return found

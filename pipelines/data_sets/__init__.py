@@ -1,0 +1,1 @@
+"""What ``gvtools data`` does with data sets."""

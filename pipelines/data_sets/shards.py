@@ -1,0 +1,108 @@
+"""``gvtools data shards`` and ``gvtools data verify``: scenes as WebDataset shards."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import ProjectError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from gvtools.scenes.shards.index import Skipped
+    from gvtools.scenes.shards.writer import Progress
+    from pipelines.console import Console
+
+# Of what could not be converted, so many are named; all are in index.json.
+NAMED = 5
+
+
+def shards_options(option: Callable[..., object]) -> None:
+    """The options of ``gvtools data shards``."""
+    option(
+        "scenes_of",
+        metavar="NAME|PROJECT",
+        help="a data set's name with --root, spec:NAME:SCENE with --root, or a project's folder",
+    )
+    option("--root", type=Path, metavar="DIR", help="the folder of the data set's download")
+    option("--out", type=Path, required=True, metavar="DIR", help="the folder of the shards")
+    option("--scenes", nargs="+", metavar="SCENE", help="of the data set, by name (all)")
+    option("--size", type=float, default=256, metavar="MB", help="of a shard (%(default)s)")
+    option(
+        "--max-side",
+        type=int,
+        metavar="PX",
+        help="reduce pictures to this length of their longer side (as they are)",
+    )
+
+
+def verify_options(option: Callable[..., object]) -> None:
+    """The options of ``gvtools data verify``."""
+    option("folder", type=Path, metavar="DIR", help="a folder of shards")
+
+
+def shards(args: argparse.Namespace, console: Console) -> None:
+    """Convert scenes to shards, or go on where a conversion stopped.
+
+    Raises:
+        GvError: nothing there, an unknown scene, another conversion in the folder.
+    """
+    from gvtools.scenes.addresses import SPEC, open_collection
+    from gvtools.scenes.shards.writer import MEGABYTE, ShardOptions, write_shards
+
+    address = args.scenes_of
+    if args.root is not None and not address.startswith(SPEC):
+        address = SPEC + address
+    collection = open_collection(address, args.root)
+    if args.scenes:
+        collection = collection.subset(args.scenes)
+
+    def said(done: Progress) -> None:
+        shard = done.shard
+        at = shard.views[-1].scene + 1
+        console.line(
+            f"{shard.file}: {len(shard.views)} views, {shard.bytes / MEGABYTE:.1f} MB, up to scene "
+            f"{at} of {done.scenes}{' (complete before)' if done.kept else ''}"
+        )
+
+    options = ShardOptions(args.size, args.max_side)
+    index = write_shards(collection, args.out, options=options, progress=said)
+    views = sum(scene.views for scene in index.scenes)
+    depth = sum(scene.with_depth for scene in index.scenes)
+    _warn(index.skipped, console)
+    console.line(
+        f"{args.out}: {len(index.shards)} shards of {len(index.scenes)} scenes, {views} views, "
+        f"{depth} with depth; train from them with data.scenes"
+    )
+
+
+def _warn(skipped: tuple[Skipped, ...], console: Console) -> None:
+    for item in skipped[:NAMED]:
+        console.warn(f"left out: {item.reason}")
+    if len(skipped) > NAMED:
+        console.warn(f"left out: {len(skipped) - NAMED} more, listed in index.json")
+
+
+def verify(args: argparse.Namespace, console: Console) -> None:
+    """Compare shards with their checksums.
+
+    Raises:
+        ProjectError: one of them is damaged; each has a line.
+    """
+    from gvtools.scenes.shards.index import read_index
+    from gvtools.scenes.shards.reader import verify as problems_of
+
+    problems = problems_of(args.folder)
+    count = len(read_index(args.folder).shards)
+    if len(problems) > 1:
+        for problem in problems:
+            console.warn(problem)
+    if problems:
+        raise ProjectError(problems[0] if len(problems) == 1 else _several(problems, count))
+    console.line(f"{args.folder}: {count} shards, all as their checksums say")
+
+
+def _several(problems: list[str], count: int) -> str:
+    return f"{len(problems)} of {count} shards are damaged, first {problems[0]}"
