@@ -21,6 +21,7 @@ from gvtools.scenes.shards.index import (
     Position,
     ShardRecord,
     ShardsIndex,
+    read_index,
     read_record,
     sha256_of,
     shard_name,
@@ -86,13 +87,14 @@ def write_shards(
     options = options or ShardOptions()
     make_folder(out)
     _settle_description(collection, out, options)
+    before = _listed_before(out)
     shards: list[ShardRecord] = []
     walk = Walk(collection, max_side=options.max_side)
     while True:
-        kept = _kept(out, len(shards), walk.position)
+        tar = out / shard_name(len(shards))
+        kept = _kept(tar, walk.position, before.get(tar.name))
         if kept is not None:
             walk.go_to(kept.next)
-        tar = out / shard_name(len(shards))
         shard = kept or write_shard(walk, tar, limit=options.megabytes * MEGABYTE)
         if shard is None:
             break
@@ -153,12 +155,21 @@ def _settle_description(collection: SceneCollection, out: Path, options: ShardOp
             )
 
 
-def _kept(out: Path, number: int, start: Position) -> ShardRecord | None:
-    """A shard that is complete and begins where it should."""
-    tar = out / shard_name(number)
+def _listed_before(out: Path) -> dict[str, ListedShard]:
+    """The shards that a complete conversion listed, by file."""
     try:
-        shard = read_record(tar.with_suffix(".json"), ShardRecord)
+        return {listed.file: listed for listed in read_index(out).shards}
+    except ProjectError:
+        return {}
+
+
+def _kept(tar: Path, start: Position, listed: ListedShard | None) -> ShardRecord | None:
+    """A shard that is complete, undamaged, and begins where it should."""
+    path = tar.with_suffix(".json")
+    try:
+        shard = read_record(path, ShardRecord)
         fits = shard.first == start and tar.stat().st_size == shard.bytes
+        fits = fits and (listed is None or sha256_of(path) == listed.index_sha256)
         return shard if fits and sha256_of(tar) == shard.sha256 else None
     except (ProjectError, OSError):
         return None
