@@ -43,13 +43,15 @@ def reconstruct(
     completer: str | None = None,
     profile: str = "balanced",
     settings: Mapping[str, Any] | None = None,
+    root: Path | str | None = None,
     resume: bool = False,
     quiet: bool = True,
 ) -> Run:
     """Grow a memory from a posed project, round by round, as ``gvtools reconstruct`` does.
 
     Args:
-        project: a COLMAP workspace, a posed RGB-D folder or a ``transforms.json``.
+        project: a COLMAP workspace, a posed RGB-D folder, a ``transforms.json``, or
+            ``spec:NAME:SCENE`` for a scene of a data set.
         out: the run's folder; new, unless ``resume``.
         context: which views are given, such as ``"every:2"``; None takes all.
         targets: which cameras to complete, such as ``"every:2+1"`` or ``"orbit:24"``; None takes
@@ -57,6 +59,7 @@ def reconstruct(
         completer: by registered name; None takes ``inpaint``.
         profile: fast, balanced, accurate or finest.
         settings: any setting by its dotted name, such as ``{"voxel": 0.01, "rounds": 2}``.
+        root: the folder of the data set's download, where ``project`` is a scene of one.
         resume: continue after the last whole round.
         quiet: False prints progress and figures.
 
@@ -67,7 +70,7 @@ def reconstruct(
         GvError: wrong input or settings; nothing of an earlier run is lost.
     """
     from gvtools.runs.run import load_run
-    from gvtools.scenes.project import open_project
+    from gvtools.scenes.reading import open_as
     from gvtools.settings import with_values
     from pipelines.console import Console
     from pipelines.reconstruction.run import reconstruct as run_reconstruct
@@ -78,12 +81,14 @@ def reconstruct(
     named = {"context": context, "targets": targets, "completer": completer}
     chosen = {key: value for key, value in named.items() if value is not None}
     config = with_values(config, {**chosen, **(settings or {})})
+    reading = {} if root is None else {"root": str(Path(root).resolve())}
     folder = run_reconstruct(
-        open_project(Path(project)),
+        open_as(Path(project), reading),
         config,
         Path(out),
         console=Console(quiet=quiet),
         resume=resume,
+        reading=reading,
         draw=draw_run,
     )
     return load_run(folder)

@@ -122,17 +122,22 @@ class Run:
         Raises:
             GvError: it cannot be read any more.
         """
+        from gvtools.scenes.data_sets.address import is_address
         from gvtools.scenes.project import open_project
-        from gvtools.scenes.reading import open_as
+        from gvtools.scenes.reading import open_recorded
         from gvtools.scenes.reduced import reduced
 
         max_side = self.settings.get("max_side")
-        root = self.project or Path(self.record["project"])
-        scene = reduced(open_as(root, self.record["reading"]), max_side)
+        project, reading = self.record["project"], self.record["reading"]
+        scene = reduced(open_recorded(project, reading, moved=self.project), max_side)
         other = self.record["targets_project"]
         truths = scene if self.record["targets_kind"] == "hold-out" else None
         if other is not None:
-            truths = reduced(open_project(Path(other)), max_side)
+            # Another scene of the data set lies in the same download.
+            root = None if scene.origin is None else scene.origin.root
+            truths = reduced(
+                open_project(other, root=root if is_address(other) else None), max_side
+            )
         poses = refined_poses_of(self.path)
         if poses is None:
             return scene, truths

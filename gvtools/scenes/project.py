@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.colmap_files import find_model
+from gvtools.scenes.data_sets.address import FORM, is_address, open_address
 from gvtools.scenes.photographs import named
 from gvtools.scenes.redwood import REDWOOD
 from gvtools.scenes.rgbd_recording import RgbdOptions
@@ -27,25 +28,39 @@ LOOKED_FOR = (
 
 
 def open_project(
-    path: Path,
+    path: Path | str,
     *,
     images: Path | None = None,
     masks: Path | None = None,
     rgbd: RgbdOptions | None = None,
+    root: Path | None = None,
 ) -> Scene:
     """The scene of a COLMAP workspace or model, a posed RGB-D folder or a ``transforms.json``.
 
     Args:
-        path: the folder, or a ``transforms.json``.
+        path: the folder, a ``transforms.json``, or ``spec:NAME:SCENE`` for a scene of a data set.
         images: the image folder, where the project does not say it (COLMAP, transforms).
         masks: the mask folder (COLMAP, transforms).
         rgbd: what a posed RGB-D folder does not tell by itself.
+        root: the folder of the data set's download.
 
     Raises:
         ProjectError: nothing there that can be read, or what is there is damaged.
         OptionError: an option of another kind of project.
         ShapeError: a pose with NaN, a scale or a mirror.
     """
+    if is_address(path):
+        if images is not None or masks is not None or rgbd is not None:
+            raise OptionError(
+                f"{path}: the data set's spec says how it is read; expected neither images, masks "
+                "nor RGB-D options"
+            )
+        return open_address(path, root)
+    if root is not None:
+        raise OptionError(
+            f"{path}: root {root} is given for a project that is none of a data set; expected "
+            f"{FORM}; leave one out"
+        )
     path = Path(path)
     if not path.exists():
         raise ProjectError(f"{path}: no such folder{_nearest(path)}")

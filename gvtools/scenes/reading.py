@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.data_sets.address import is_address
 from gvtools.scenes.project import open_project
 from gvtools.scenes.rgbd_recording import RgbdOptions, load_matrix
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 # Options of a project by name, with the name that RgbdOptions has for those of RGB-D folders.
 READING = {
+    "root": None,
     "images": None,
     "masks": None,
     "depth_unit": "depth_unit",
@@ -38,9 +40,28 @@ def open_as(path: Path, reading: Mapping[str, Any]) -> Scene:
     """
     folders = {
         name: None if reading.get(name) is None else Path(reading[name])
-        for name in ("images", "masks")
+        for name in ("images", "masks", "root")
     }
     return open_project(path, **folders, rgbd=rgbd_options(reading))
+
+
+def open_recorded(project: str, reading: Mapping[str, Any], *, moved: Path | None = None) -> Scene:
+    """A project as a run recorded it.
+
+    Args:
+        project: of a run's record.
+        reading: of the record.
+        moved: where the project lies now, or where the download of its data set does; None: where
+            it lay.
+
+    Raises:
+        GvError: as of ``open_as``; the project is gone or cannot be read any more.
+    """
+    if moved is None:
+        return open_as(Path(project), reading)
+    if is_address(project) and not is_address(moved):
+        return open_as(Path(project), {**reading, "root": str(moved)})
+    return open_as(moved, reading)
 
 
 def rgbd_options(reading: Mapping[str, Any]) -> RgbdOptions | None:

@@ -77,6 +77,19 @@ class Finding:
     message: str
 
 
+@dataclass(frozen=True)
+class Origin:
+    """What opens a scene of a data set again.
+
+    Attributes:
+        address: "spec:NAME:SCENE", the same for every way in which a user may write it.
+        root: the folder of the data set's download.
+    """
+
+    address: str
+    root: Path
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Views in natural order of their names, what is known beside them, and what was met reading.
@@ -88,6 +101,7 @@ class Scene:
         points: sparse points, where the project has them.
         findings: everything dropped, converted, repaired or noteworthy.
         metric: True when scene units are metres.
+        origin: of a scene that was opened as part of a data set; None: its folder opens it.
     """
 
     root: Path
@@ -96,6 +110,7 @@ class Scene:
     points: SparsePoints | None = None
     findings: tuple[Finding, ...] = ()
     metric: bool = False
+    origin: Origin | None = None
     _index: dict[str, int] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -124,6 +139,11 @@ class Scene:
     def cameras(self) -> Cameras:
         """All cameras, in the views' order."""
         return concatenate([view.camera for view in self.views])
+
+    @property
+    def address(self) -> str:
+        """What ``open_project`` takes to open it again, as runs record it."""
+        return str(self.root.resolve()) if self.origin is None else self.origin.address
 
     def subset(self, names: Iterable[str]) -> Scene:
         """The same scene with the named views alone (sparse points are left out)."""

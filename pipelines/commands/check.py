@@ -21,7 +21,12 @@ LEVELS = ("error", "warning", "info")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("project", type=Path, metavar="PROJECT", help="a folder or transforms.json")
+    parser.add_argument(
+        "project",
+        type=Path,
+        metavar="PROJECT",
+        help="a folder, a transforms.json or spec:NAME:SCENE",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there")
     add_scene_arguments(parser)
 

@@ -23,7 +23,9 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``reconstruct``."""
-    parser.add_argument("project", type=Path, help="COLMAP, posed RGB-D or transforms.json")
+    parser.add_argument(
+        "project", type=Path, help="COLMAP, posed RGB-D, transforms.json or spec:NAME:SCENE"
+    )
     add_run_arguments(parser, out_required=True)
     parser.add_argument(
         "--live", action="store_true", help="open the web viewer and follow the run"

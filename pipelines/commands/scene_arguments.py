@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from gvtools.errors import OptionError
+from gvtools.scenes.data_sets.address import FORM, is_address
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
@@ -14,6 +18,7 @@ if TYPE_CHECKING:
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that say where pictures and masks are, and what RGB-D folders leave open."""
     group = parser.add_argument_group("project")
+    add_root_argument(group)
     group.add_argument(
         "--images", type=Path, metavar="DIR", help="the pictures, where they are not beside a model"
     )
@@ -50,6 +55,26 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="between picture, depth and pose of one TUM frame (0.02)",
     )
+
+
+def add_root_argument(parser: argparse._ActionsContainer) -> None:
+    """The option that says where a data set lies, for projects given as spec:NAME:SCENE."""
+    parser.add_argument(
+        "--root",
+        type=Path,
+        metavar="DIR",
+        help="the data set's download, for a project given as spec:NAME:SCENE (gvtools data list)",
+    )
+
+
+def refuse_root(root: Path | None, paths: Iterable[Path | None]) -> None:
+    """Refuse --root where none of the given paths is a scene of a data set.
+
+    Raises:
+        OptionError: see above.
+    """
+    if root is not None and not any(path is not None and is_address(path) for path in paths):
+        raise OptionError(f"--root {root}: belongs to {FORM}; expected that, or no --root")
 
 
 def open_scene(path: Path, args: argparse.Namespace) -> Scene:

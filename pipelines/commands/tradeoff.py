@@ -28,7 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     from pipelines.commands.scene_arguments import add_scene_arguments
 
-    parser.add_argument("project", type=Path, help="COLMAP, posed RGB-D or transforms.json")
+    parser.add_argument(
+        "project", type=Path, help="COLMAP, posed RGB-D, transforms.json or spec:NAME:SCENE"
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the results")
     parser.add_argument(
         "--budget",

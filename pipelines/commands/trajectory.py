@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError
+from pipelines.commands.scene_arguments import add_root_argument, refuse_root
 
 if TYPE_CHECKING:
     from gvtools.evaluation.trajectories import PoseErrors
@@ -31,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar=name.upper(),
             help="a TUM, KITTI or EuRoC file, a COLMAP model, a project, or a run",
         )
+    add_root_argument(parser)
     parser.add_argument(
         "--align",
         choices=("none", "se3", "sim3"),
@@ -81,8 +83,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
         raise OptionError(f"--layout {args.layout!r}; expected one of {', '.join(LAYOUTS)}")
     if not args.max_difference >= 0:
         raise OptionError(f"--max-difference {args.max_difference}; expected 0 or more seconds")
-    reference = open_trajectory(args.reference, layout=args.layout)
-    estimate = open_trajectory(args.estimate, layout=args.layout)
+    refuse_root(args.root, (args.reference, args.estimate))
+    reference = open_trajectory(args.reference, layout=args.layout, root=args.root)
+    estimate = open_trajectory(args.estimate, layout=args.layout, root=args.root)
     first, second, how = associate(
         reference,
         estimate,

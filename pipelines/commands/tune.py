@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError
+from pipelines.commands.scene_arguments import add_root_argument
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
@@ -30,6 +31,7 @@ def add_tune_arguments(parser: argparse.ArgumentParser) -> None:
         "--set completer.weights=DIR",
     )
     group.add_argument("--scene", type=Path, metavar="PROJECT", help="as reconstruct takes it")
+    add_root_argument(group)
     group.add_argument(
         "--context", metavar="SPEC", help="views that may be looked at (default all)"
     )
@@ -49,7 +51,7 @@ def refuse_tune_arguments(args: argparse.Namespace) -> None:
     Raises:
         OptionError: one is given.
     """
-    for name in ("scene", "context", "depth", "minutes", "steps", "seed"):
+    for name in ("scene", "root", "context", "depth", "minutes", "steps", "seed"):
         if getattr(args, name) is not None:
             raise OptionError(f"--{name} belongs to 'gvtools train tune'; leave it out")
 
@@ -73,7 +75,8 @@ def run_tune(args: argparse.Namespace, console: Console) -> None:
     if args.out.exists() and not (args.out.is_dir() and not any(args.out.iterdir())):
         raise OptionError(f"--out {args.out}: holds something already; give a new folder")
     with tempfile.TemporaryDirectory() as folder:
-        scene = context_of(open_project(args.scene), config, Path(folder), console=console)
+        project = open_project(args.scene, root=args.root)
+        scene = context_of(project, config, Path(folder), console=console)
         tuning = tune(
             scene,
             weights,

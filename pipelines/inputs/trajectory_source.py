@@ -18,21 +18,26 @@ LAYOUTS = ("auto", "tum", "kitti", "euroc")
 ASSOCIATIONS = ("auto", "time", "name", "index")
 
 
-def open_trajectory(path: Path, *, layout: str = "auto") -> Trajectory:
+def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = None) -> Trajectory:
     """Camera-to-world poses.
 
     Args:
         path: a TUM, KITTI or EuRoC file; a COLMAP model or workspace (its pictures need not be
-            there); a transforms.json or posed RGB-D folder; or a run, whose poses are those of the
-            views in its memory.
+            there); a transforms.json or posed RGB-D folder; spec:NAME:SCENE; or a run, whose poses
+            are those of the views in its memory.
         layout: of a file, see gvtools.trajectory_files.read_poses.
+        root: of the download, for spec:NAME:SCENE; not looked at for anything else.
 
     Raises:
         GvError: nothing there, or nothing that holds poses.
     """
     from gvtools.scenes.colmap_files import find_model
+    from gvtools.scenes.data_sets.address import is_address, open_address
     from gvtools.trajectory_files import Trajectory, read_poses
 
+    if is_address(path):
+        cameras = open_address(path, root).cameras
+        return Trajectory(cameras.world_from_cam, cameras.names)
     if not path.exists():
         raise ProjectError(f"{path}: no such file or folder; expected a trajectory")
     if path.is_file() and path.suffix.lower() not in (".json", ".npz"):

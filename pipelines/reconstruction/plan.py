@@ -256,7 +256,7 @@ def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
     cameras = (scene.subset(plan.context).cameras, targets.cameras)
     points = scene.points
     return {
-        "project": str(scene.root.resolve()),
+        "project": scene.address,
         "reading": dict(reading),
         "fingerprint": fingerprint([*files, *targets.files]),
         "cameras": array_digest(
@@ -273,7 +273,7 @@ def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
         "context": list(plan.context),
         "targets": list(targets.cameras.names),
         "targets_kind": targets.kind,
-        "targets_project": None if targets.project is None else str(targets.project),
+        "targets_project": targets.project,
         "schedule": [list(rows) for rows in plan.schedule],
     }
 

@@ -14,7 +14,8 @@ from gvtools.runs.folder import RunDirectory, changed_keys
 from gvtools.runs.folder_lock import folder_lock
 from gvtools.runs.layout import APPEARANCE, METRICS, round_folder
 from gvtools.runs.run import Run, load_run
-from gvtools.scenes.reading import open_as
+from gvtools.scenes.data_sets.address import is_address
+from gvtools.scenes.reading import open_recorded
 from gvtools.settings import dotted, with_values
 from pipelines.reconstruction.compile_kernels import compile_kernels
 from pipelines.reconstruction.fitting import Fitted, fit_appearance
@@ -23,6 +24,7 @@ from pipelines.reconstruction.run import Draw, complete_run, say_results
 from pipelines.reconstruction.settings import RunSettings
 
 if TYPE_CHECKING:
+    from gvtools.scenes.scene import Scene
     from pipelines.console import Console
 
 # In run.json: what each call was given, the first one first.
@@ -102,11 +104,8 @@ def _reopened(run: Run, console: Console) -> tuple[Plan, Mapping[str, Any]]:
         raise ProjectError(
             f"{run.path}: settings of another version ({error}); run reconstruct again"
         ) from None
-    root = Path(record["project"]) if run.project is None else run.project
-    if not root.exists():
-        raise ProjectError(f"{run.path}: its project {root} is gone; say by --project where it is")
     begun = round_folder(run.path, 0) if run.rounds else None
-    scene = open_as(root, record["reading"])
+    scene = _project_of(run)
     plan = make_plan(scene, settings, say=console.line, round_0=begun)
     identity = run_identity(plan, record["reading"])
     changed = changed_keys(identity, record)
@@ -114,10 +113,26 @@ def _reopened(run: Run, console: Console) -> tuple[Plan, Mapping[str, Any]]:
         changed.remove("project")
     if changed:
         raise ProjectError(
-            f"{run.path}: its project {root} is not as it was when the run was made "
+            f"{run.path}: its project {scene.root} is not as it was when the run was made "
             f"({', '.join(changed)} differ); expected it unchanged; run reconstruct again"
         )
     return plan, identity
+
+
+def _project_of(run: Run) -> Scene:
+    """The project of a run.
+
+    Raises:
+        ProjectError: it is gone.
+        GvError: it cannot be read any more.
+    """
+    project, reading = run.record["project"], run.record["reading"]
+    place = Path(reading["root"] if is_address(project) else project)
+    if not (run.project or place).exists():
+        raise ProjectError(
+            f"{run.path}: its project {run.project or place} is gone; say by --project where it is"
+        )
+    return open_recorded(project, reading, moved=run.project)
 
 
 def _earlier(run: Run, console: Console) -> Fitted | None:

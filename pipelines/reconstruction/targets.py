@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError
+from gvtools.scenes.data_sets.address import is_address
+from gvtools.scenes.reduced import reduced
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import check_disjoint, select
 
@@ -20,7 +22,7 @@ SAME_DIRECTION = 0.05
 PATHS = ("interpolate", "orbit", "spiral")
 FORMS = (
     "a selection of the project's views, interpolate:N, orbit:N, spiral:N, a trajectory file "
-    "(TUM or KITTI), or another project as PATH or PATH@SELECTION"
+    "(TUM or KITTI), or another project as PATH, spec:NAME:SCENE or either with @SELECTION"
 )
 
 
@@ -33,14 +35,14 @@ class Targets:
         truth: per camera the view that shows the truth, None where there is none.
         kind: "hold-out", the path's name, "trajectory" or "project".
         files: what was read beside the project.
-        project: the other project that ``truth`` is of; None when it is the run's own.
+        project: what opens the other project that ``truth`` is of; None when it is the run's own.
     """
 
     cameras: Cameras
     truth: tuple[View | None, ...]
     kind: str
     files: tuple[Path, ...] = ()
-    project: Path | None = None
+    project: str | None = None
 
 
 def resolve_targets(
@@ -70,9 +72,9 @@ def resolve_targets(
             raise OptionError(f"targets {spec!r}; expected {name}:N with N >= 1")
         return _path(scene, context, name, count=int(count))
     path, at, selection = spec.partition("@")
-    if path and _exists(path) and spec not in scene.names:
-        if Path(path).is_dir() or Path(path).suffix == ".json":
-            targets = _project(Path(path), selection if at else "all", max_side)
+    if path and (is_address(path) or _exists(path)) and spec not in scene.names:
+        if is_address(path) or Path(path).is_dir() or Path(path).suffix == ".json":
+            targets = _project(path, selection if at else "all", scene, max_side=max_side)
             if not allow_overlap:
                 _check_pictures(scene, context, targets)
             return targets
@@ -130,15 +132,25 @@ def _file(path: Path, context_cameras: Cameras) -> Targets:
     return Targets(cameras, (None,) * len(cameras), "trajectory", (path,))
 
 
-def _project(path: Path, selection: str, max_side: int | None) -> Targets:
+def _project(path: str, selection: str, scene: Scene, *, max_side: int | None) -> Targets:
+    """Views of another project; one of a data set lies in the same download as the run's own."""
     from gvtools.scenes.project import open_project
-    from gvtools.scenes.reduced import reduced
 
-    other = reduced(open_project(path), max_side)
+    if not is_address(path):
+        other, address = open_project(path), str(Path(path).resolve())
+    elif scene.origin is None:
+        raise OptionError(
+            f"targets {path}: the run's project is none of a data set, so that no --root says "
+            "where this one lies; give the folder of the scene instead"
+        )
+    else:
+        other = open_project(path, root=scene.origin.root)
+        address = other.address
+    other = reduced(other, max_side)
     chosen = tuple(sorted(select(other.names, selection)))
     views = tuple(other[name] for name in chosen)
     files = tuple(file for view in views for file in view.files)
-    return Targets(other.subset(chosen).cameras, views, "project", files, path.resolve())
+    return Targets(other.subset(chosen).cameras, views, "project", files, address)
 
 
 def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) -> None:

@@ -7,13 +7,14 @@ LAYOUTS. Several data sets may share one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.data_sets.spec import DataSetSpec, load_spec
-from gvtools.scenes.scene import Scene
+from gvtools.scenes.data_sets.address import FORM, SPEC
+from gvtools.scenes.data_sets.spec import DataSetSpec, load_spec, name_key
+from gvtools.scenes.scene import Origin, Scene
 
 # Name of a layout, as specs have it: its module in this package.
 LAYOUTS: dict[str, str] = {
@@ -95,9 +96,24 @@ def open_data_set(name: str, scene: str, root: Path) -> Scene:
     known = scenes_of(name, root)
     if not scene and len(known) == 1:
         scene = known[0]
-    layout = layout_of(spec)
-    if scene not in known and scene not in layout.variants(Path(root)):
+    if not scene:
+        raise ProjectError(
+            f"{root}: holds {len(known)} scenes of {spec.name}, first {known[0]!r}; say which, as "
+            f"{FORM}"
+        )
+    if scene not in known and scene not in layout_of(spec).variants(Path(root)):
         near = difflib.get_close_matches(scene, known, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"first of {len(known)}: {known[0]!r}"
         raise ProjectError(f"{root}: {spec.name} has no scene {scene!r} there; {hint}")
-    return layout.read(Path(root), scene, spec)
+    return read_scene(spec, scene, Path(root))
+
+
+def read_scene(spec: DataSetSpec, scene: str, root: Path) -> Scene:
+    """A scene that ``scenes_of`` names, without looking for the others.
+
+    Raises:
+        ProjectError: nothing of it can be read.
+    """
+    opened = layout_of(spec).read(root, scene, spec)
+    origin = Origin(f"{SPEC}{name_key(spec.name)}:{scene}", root.resolve())
+    return replace(opened, origin=origin)
