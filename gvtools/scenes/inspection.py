@@ -148,8 +148,7 @@ def reprojection_errors(scene: Scene) -> np.ndarray:
         return np.zeros(0)
     cameras = scene.cameras
     errors = np.full(len(points.point_index), np.nan)
-    for view in range(len(scene)):
-        rows = np.flatnonzero(points.view_index == view)
+    for view, rows in enumerate(points.rows_of_views(len(scene))):
         xy, _ = cameras[view].project(points.positions[points.point_index[rows]])
         errors[rows] = np.linalg.norm(xy[0] - points.xy[rows], axis=1)
     return errors

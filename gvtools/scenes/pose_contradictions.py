@@ -15,6 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
+from math import hypot
 from typing import NamedTuple
 
 import cv2
@@ -43,6 +45,10 @@ COMPARABLE, DISAGREEING = 0.3, 0.15
 # and less than this share of them is of both. On three real scenes it is at least 0.5.
 POINTS, SHARED = 30, 0.05
 LISTED = 3  # pairs that the finding names
+# Places of the shifted window in the padded picture, unshifted first.
+_SHIFTS = sorted(
+    product(range(2 * SHIFT + 1), repeat=2), key=lambda at: hypot(at[0] - SHIFT, at[1] - SHIFT)
+)
 
 
 class Thumbnail(NamedTuple):
@@ -79,6 +85,46 @@ class Contradiction:
         else:
             evidence = f"{self.shared_points} of {self.points} sparse points shared"
         return f"{self.names[0]} and {self.names[1]} ({evidence})"
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """Sparse points by the views that detected them.
+
+    Attributes:
+        points: all.
+        of_view: for each view the points of its track elements, repeats included.
+    """
+
+    points: SparsePoints
+    of_view: list[NDArray[np.int32]]
+
+    @staticmethod
+    def of(points: SparsePoints, views: int) -> _Tracks:
+        return _Tracks(points, [points.point_index[rows] for rows in points.rows_of_views(views)])
+
+    def depths(self, cameras: Cameras) -> dict[int, float]:
+        """Median z-depth of the points of each view that has any, scene units."""
+        axes = cameras.cam_from_world[:, 2]
+        return {
+            view: float(np.median(self.points.positions[rows] @ axis[:3] + axis[3]))
+            for view, (rows, axis) in enumerate(zip(self.of_view, axes, strict=True))
+            if len(rows)
+        }
+
+    def shared(self, cameras: Cameras, views: tuple[int, int]) -> tuple[int, int] | None:
+        """How many points both views have, and of how many; None where too few can tell."""
+        own = [np.unique(self.of_view[view]) for view in views]
+        inside = []
+        for rows, other in zip(own, reversed(views), strict=True):
+            xy, z = cameras[other].project(self.points.positions[rows])
+            size = [cameras.width[other], cameras.height[other]]
+            with np.errstate(invalid="ignore"):
+                seen = (z[0] > 0) & (xy[0] >= 0).all(-1) & (xy[0] < size).all(-1)
+            inside.append(int(seen.sum()))
+        if min(inside) < POINTS:
+            return None
+        return len(np.intersect1d(own[0], own[1])), min(inside)
 
 
 def thumbnail(frame: Frame) -> Thumbnail:
@@ -128,13 +174,16 @@ def contradictions(
     if len(scene) < 2:
         return []
     cameras = scene.cameras
+    tracks = None if scene.points is None else _Tracks.of(scene.points, len(scene))
     found = []
-    for a, b, distance, degrees in _near_pairs(cameras, _reach(scene, depths)):
-        points = None if scene.points is None else _shared_points(scene.points, cameras, (a, b))
+    for a, b, distance, degrees in _near_pairs(cameras, _reach(scene, depths, tracks)):
+        points = None if tracks is None else tracks.shared(cameras, (a, b))
+        unshared = points is not None and points[0] < SHARED * points[1]
         differs = None
         if a in thumbnails and b in thumbnails:
-            differs = disagreement(thumbnails[a], thumbnails[b], cameras[[a, b]])
-        unshared = points is not None and points[0] < SHARED * points[1]
+            pair = thumbnails[a], thumbnails[b]
+            enough = 0.0 if unshared else DISAGREEING
+            differs = _disagreement(*pair, _homography(pair, cameras, (a, b)), enough)
         if unshared or (differs is not None and differs > DISAGREEING):
             names = scene.views[a].name, scene.views[b].name
             shared, of = points or (None, None)
@@ -153,28 +202,41 @@ def disagreement(a: Thumbnail, b: Thumbnail, cameras: Cameras) -> float | None:
     Returns:
         None where less than ``COMPARABLE`` of the picture lies in both and has contrast in both.
     """
+    return _disagreement(a, b, _homography((a, b), cameras, (0, 1)), enough=0.0)
+
+
+def _disagreement(a: Thumbnail, b: Thumbnail, H: Float64, enough: float) -> float | None:
+    """As ``disagreement``; the search among shifts ends once the share is at most ``enough``.
+
+    Each shift can lower the share alone, so that ending early never turns a pair into a
+    contradiction or back. Most pairs agree at once, unshifted.
+    """
     x = a.grey - a.grey.mean()
-    y, valid = _carried(b, cameras, a.grey.shape)
+    y, valid = _carried(b, H, a.grey.shape)
     mask = (valid & a.valid).astype(np.float32)
     weight = np.maximum(_window(mask), 1e-6)
     mean_y = _window(mask * y) / weight
     var_y = np.maximum(_window(mask * y * y) / weight - mean_y**2, 0)
     best = np.full(x.shape, -1.0, np.float32)
     contrast = np.zeros(x.shape, np.bool_)
+    share = 1.0
     padded = cv2.copyMakeBorder(x, *(SHIFT,) * 4, cv2.BORDER_REPLICATE)
-    for dy in range(2 * SHIFT + 1):
-        for dx in range(2 * SHIFT + 1):
-            moved = padded[dy : dy + x.shape[0], dx : dx + x.shape[1]]
-            sums = _window(cv2.merge([mask * moved, mask * moved * moved, mask * moved * y]))
-            mean_x, square, product = np.moveaxis(sums / weight[..., None], -1, 0)
-            var_x = np.maximum(square - mean_x**2, 0)
-            correlation = (product - mean_x * mean_y) / np.sqrt(var_x * var_y + 1e-3)
-            np.maximum(best, correlation, out=best)
-            if dx == dy == SHIFT:
-                contrast = (np.minimum(var_x, var_y) > CONTRAST**2) & (weight > 0.4)
-    if contrast.mean() < COMPARABLE:
-        return None
-    return float((best[contrast] < AGREE).mean())
+    for dy, dx in _SHIFTS:
+        moved = padded[dy : dy + x.shape[0], dx : dx + x.shape[1]]
+        weighted = mask * moved
+        mean_x = _window(weighted) / weight
+        var_x = np.maximum(_window(weighted * moved) / weight - mean_x**2, 0)
+        both = _window(weighted * y) / weight
+        correlation = (both - mean_x * mean_y) / np.sqrt(var_x * var_y + 1e-3)
+        np.maximum(best, correlation, out=best)
+        if dx == dy == SHIFT:
+            contrast = (np.minimum(var_x, var_y) > CONTRAST**2) & (weight > 0.4)
+            if contrast.mean() < COMPARABLE:
+                return None
+        share = float((best[contrast] < AGREE).mean())
+        if share <= enough:
+            break
+    return share
 
 
 def _window(values: Float32) -> Float32:
@@ -182,15 +244,23 @@ def _window(values: Float32) -> Float32:
     return np.asarray(cv2.blur(values, (WINDOW, WINDOW), borderType=cv2.BORDER_CONSTANT))
 
 
-def _carried(
-    b: Thumbnail, cameras: Cameras, shape: tuple[int, ...]
-) -> tuple[Float32, NDArray[np.bool_]]:
-    """The second picture seen from the first's orientation, and where it is known."""
-    first = cameras[0].resized(shape[1], shape[0])
-    second = cameras[1].resized(b.grey.shape[1], b.grey.shape[0])
-    rotation = second.cam_from_world[0, :3, :3] @ first.cam_from_world[0, :3, :3].T
+def _homography(
+    pair: tuple[Thumbnail, Thumbnail], cameras: Cameras, views: tuple[int, int]
+) -> Float64:
+    """(3, 3) from pixels of the first picture to those of the second, as OpenCV counts them."""
+    Ks = []
+    for picture, view in zip(pair, views, strict=True):
+        height, width = picture.grey.shape
+        scale = np.array([width / cameras.width[view], height / cameras.height[view], 1])
+        Ks.append(scale[:, None] * cameras.K[view])
+    poses = cameras.cam_from_world
+    rotation = poses[views[1], :3, :3] @ poses[views[0], :3, :3].T
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centres
-    H = np.linalg.inv(half) @ second.K[0] @ rotation @ np.linalg.inv(first.K[0]) @ half
+    return np.asarray(np.linalg.inv(half) @ Ks[1] @ rotation @ np.linalg.inv(Ks[0]) @ half)
+
+
+def _carried(b: Thumbnail, H: Float64, shape: tuple[int, ...]) -> tuple[Float32, NDArray[np.bool_]]:
+    """The second picture seen from the first's orientation, and where it is known."""
     size = shape[1], shape[0]
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     grey = cv2.warpPerspective(b.grey - b.grey.mean(), H, size, flags=flags)
@@ -198,7 +268,7 @@ def _carried(
     return np.asarray(grey, np.float32), valid > 0.99
 
 
-def _reach(scene: Scene, depths: Mapping[int, float]) -> Float64:
+def _reach(scene: Scene, depths: Mapping[int, float], tracks: _Tracks | None) -> Float64:
     """(V,) how far another camera may stand from each, scene units.
 
     A share of the view's depth, from its sparse points or its depth map. A scene that has neither
@@ -208,12 +278,8 @@ def _reach(scene: Scene, depths: Mapping[int, float]) -> Float64:
     cameras = scene.cameras
     centers = cameras.centers
     known = dict(depths)
-    if scene.points is not None:
-        for view in range(len(scene)):
-            rows = scene.points.point_index[scene.points.view_index == view]
-            if len(rows):
-                axis = cameras.cam_from_world[view, 2]
-                known[view] = float(np.median(scene.points.positions[rows] @ axis[:3] + axis[3]))
+    if tracks is not None:
+        known |= tracks.depths(cameras)
     if known:
         middle = float(np.median(list(known.values())))
         return NEAR * np.array([known.get(view, middle) for view in range(len(scene))])
@@ -243,20 +309,3 @@ def _near_pairs(cameras: Cameras, reach: Float64) -> list[tuple[int, int, float,
         if a != b and distance < min(reach[a], reach[b]) and degrees < NEAR_DEGREES:
             near.append((a, b, distance, degrees))
     return near
-
-
-def _shared_points(
-    points: SparsePoints, cameras: Cameras, views: tuple[int, int]
-) -> tuple[int, int] | None:
-    """How many points both views have, and of how many; None where there are too few to tell."""
-    own = [np.unique(points.point_index[points.view_index == view]) for view in views]
-    inside = []
-    for rows, other in zip(own, reversed(views), strict=True):
-        xy, z = cameras[other].project(points.positions[rows])
-        size = [cameras.width[other], cameras.height[other]]
-        with np.errstate(invalid="ignore"):
-            seen = (z[0] > 0) & (xy[0] >= 0).all(-1) & (xy[0] < size).all(-1)
-        inside.append(int(seen.sum()))
-    if min(inside) < POINTS:
-        return None
-    return len(np.intersect1d(own[0], own[1])), min(inside)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,12 @@ class SparsePoints:
     point_index: NDArray[np.int32]
     view_index: NDArray[np.int32]
     xy: NDArray[np.float64]
+
+    def rows_of_views(self, count: int) -> list[NDArray[np.int64]]:
+        """For each of ``count`` views its track elements, as indices in their order."""
+        order = np.argsort(self.view_index, kind="stable")
+        starts = np.searchsorted(self.view_index[order], np.arange(count + 1))
+        return [order[low:high] for low, high in pairwise(starts)]
 
 
 @dataclass(frozen=True)
