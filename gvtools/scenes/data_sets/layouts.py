@@ -18,6 +18,9 @@ from gvtools.scenes.scene import Origin, Scene
 
 # Name of a layout, as specs have it: its module in this package.
 LAYOUTS: dict[str, str] = {
+    "gta_sfm": "gta_sfm",
+    "mvs_synth": "mvs_synth",
+    "omniworld": "omniworld",
     "sevenscenes": "sevenscenes",
     "aria_digital_twin": "aria_digital_twin",
     "arkitscenes": "arkitscenes",
@@ -33,6 +36,10 @@ LAYOUTS: dict[str, str] = {
     "scannetpp": "scannetpp",
     "tanks_and_temples": "tanks_and_temples",
     "waymo": "waymo",
+    "spring": "spring",
+    "tartanair": "tartanair",
+    "tartanair_v2": "tartanair_v2",
+    "virtual_kitti": "virtual_kitti",
 }
 
 

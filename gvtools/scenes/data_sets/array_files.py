@@ -1,0 +1,94 @@
+"""HDF5 and OpenEXR files of data sets; their packages come with ``gvtools[data]``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import ProjectError
+
+if TYPE_CHECKING:
+    import h5py
+
+
+@contextmanager
+def hdf5_file(path: Path) -> Iterator[h5py.File]:
+    """The HDF5 file at ``path``, open for reading.
+
+    Raises:
+        ProjectError: absent, damaged, without what is asked of it in the block, or h5py is not
+            installed.
+    """
+    try:
+        import h5py
+    except ImportError:
+        raise ProjectError(
+            f"{path}: HDF5 is read with h5py, which is absent; pip install 'gvtools[data]'"
+        ) from None
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, KeyError, RuntimeError, ValueError) as error:
+        raise _unreadable(path, error) from None
+
+
+def hdf5_array(path: Path, key: str) -> NDArray[Any]:
+    """One array of an HDF5 file.
+
+    Args:
+        path: the file.
+        key: the array's name in it.
+
+    Raises:
+        ProjectError: as of ``hdf5_file``, or no such array.
+    """
+    with hdf5_file(path) as file:
+        if key not in file:
+            raise KeyError(f"holds {', '.join(list(file)[:5]) or 'nothing'}; expected {key!r}")
+        return np.asarray(file[key][()])
+
+
+def exr_channel(path: Path, channels: tuple[str, ...]) -> NDArray[np.float32]:
+    """(H, W) float32, one channel of an OpenEXR file.
+
+    Args:
+        path: the file.
+        channels: names in order of preference; the first that is there is read.
+
+    Raises:
+        ProjectError: absent, damaged, without these channels, or OpenEXR is not installed.
+    """
+    try:
+        import OpenEXR
+    except ImportError:
+        raise ProjectError(
+            f"{path}: EXR is read with OpenEXR, which is absent; pip install 'gvtools[data]'"
+        ) from None
+    if not path.is_file():
+        raise ProjectError(f"{path}: no such file")
+    try:
+        # Else R, G and B come as one array.
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            found = file.channels()
+            for name in channels:
+                if name in found:
+                    return np.array(found[name].pixels, np.float32)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise _unreadable(path, error) from None
+    raise ProjectError(
+        f"{path}: holds the channels {', '.join(sorted(found))}; expected {' or '.join(channels)}"
+    )
+
+
+def _unreadable(path: Path, error: Exception) -> ProjectError:
+    if isinstance(error, FileNotFoundError):
+        return ProjectError(f"{path}: no such file")
+    reason = str(error.args[0] if error.args else error).splitlines()[0].replace(str(path), "")
+    return ProjectError(
+        f"{path}: unreadable ({reason}); expected a complete file; download it again"
+    )
