@@ -74,7 +74,7 @@ def exr_channel(path: Path, channels: tuple[str, ...]) -> NDArray[np.float32]:
     try:
         # Else R, G and B come as one array.
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            found = file.channels()
+            found = dict(file.channels())
             for name in channels:
                 if name in found:
                     return np.array(found[name].pixels, np.float32)

@@ -1,10 +1,10 @@
 """MVS-Synth as published: ``GTAV_720/0000`` with ``images``, ``depths`` and ``poses``.
 
 Files are ``images/0000.png``, ``depths/0000.exr`` and ``poses/0000.json``. Depth is the channel Y
-of an OpenEXR file, z-depth, infinity for the sky. A pose file holds ``extrinsic``, 4x4 cam_from_world
-with OpenCV axes in the camera, and ``f_x, f_y, c_x, c_y`` in pixels. The world is left-handed, so
-that the matrix has the determinant -1; here the world's y axis is turned round. The unit is the
-game's and is not published, so the scene is not taken to be metric.
+of an OpenEXR file, z-depth, infinity for the sky. A pose file holds ``extrinsic``, 4x4
+cam_from_world with OpenCV axes in the camera, and ``f_x, f_y, c_x, c_y`` in pixels. The world is
+left-handed, so that the matrix has the determinant -1; here the world's y axis is turned round. The
+unit is the game's and is not published, so the scene is not taken to be metric.
 """
 
 from __future__ import annotations

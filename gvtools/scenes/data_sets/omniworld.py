@@ -3,8 +3,9 @@
 Recordings are cut into splits, each with cameras of its own, so that a split is a scene here.
 ``split_info.json`` lists the frames of each split; ``camera/split_0.json`` holds for them ``quats``
 (w, x, y, z) and ``trans`` of cam_from_world with OpenCV axes, ``focals``, ``cx`` and ``cy`` in
-pixels whose first centre is (0.5, 0.5). Depth is a 16-bit PNG of a depth buffer between a near plane at 1
-and a far one at 1000, times 250; the unit is not published. Masks of what moves are not applied.
+pixels whose first centre is (0.5, 0.5). Depth is a 16-bit PNG of a depth buffer between a near
+plane at 1 and a far one at 1000, times 250; the unit is not published. Masks of what moves are not
+applied.
 """
 
 from __future__ import annotations

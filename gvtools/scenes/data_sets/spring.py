@@ -32,7 +32,7 @@ from gvtools.scenes.images import read_mask
 from gvtools.scenes.scene import Finding, Scene
 
 BASELINE = 0.065  # metres
-SAME_SURFACE = 0.02  # relative disparity between neighbours of one surface
+SAME_SURFACE = 0.05  # relative disparity between neighbours of one surface
 
 IMAGE, DISPARITY = "frame_left_{:04d}.png", "disp1_left_{:04d}.dsp5"
 SKY = "skymap_left_{:04d}.png"

@@ -15,7 +15,6 @@ from pathlib import Path
 from gvtools.scenes.data_sets.drawn import (
     NO_LENS,
     drawn_lens,
-    folders_with,
     number_table,
     numbers_in,
     picture_size,
@@ -38,9 +37,13 @@ def _part(root: Path, part: str) -> Path:
 
 
 def _scenes(root: Path) -> tuple[str, ...]:
-    drawn = folders_with(_part(root, "rgb"), ["Scene*/*/frames"])
-    posed = folders_with(_part(root, "textgt"), ["Scene*/*/extrinsic.txt"])
-    return natural(f"{folder}/{camera}" for folder in (*drawn, *posed) for camera in CAMERAS)
+    drawn = (
+        path.relative_to(_part(root, part)).parts
+        for part in ("rgb", "depth")
+        for camera in CAMERAS
+        for path in _part(root, part).glob(f"Scene*/*/frames/{part}/{camera}")
+    )
+    return natural(f"{scene}/{variation}/{camera}" for scene, variation, *_, camera in drawn)
 
 
 def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:

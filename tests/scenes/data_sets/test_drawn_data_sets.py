@@ -1,0 +1,400 @@
+"""What readers of drawn data sets get wrong: axes, codes for the sky, half pixels, resolutions."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import sys
+import types
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from data_sets import (
+    mini_gta_sfm,
+    mini_mvs_synth,
+    mini_omniworld,
+    mini_spring,
+    mini_tartanair,
+    mini_virtual_kitti,
+)
+from data_sets.drawn_frames import drawn_frames
+from data_sets.miniature import Expected, layout_named, read_miniature
+from PIL import Image
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.data_sets import array_files
+from gvtools.scenes.data_sets.drawn import number_table, numbers_in, picture_size
+from gvtools.scenes.data_sets.omniworld import buffer_depth
+from gvtools.scenes.data_sets.spring import halved
+from gvtools.scenes.data_sets.tartanair import SKY_FROM, ned_poses
+from gvtools.scenes.data_sets.tartanair_v2 import CAMERAS, packed_depth
+from gvtools.scenes.scene import Scene
+
+WRITERS = {
+    "gta_sfm": mini_gta_sfm.write,
+    "mvs_synth": mini_mvs_synth.write,
+    "omniworld": mini_omniworld.write,
+    "spring": mini_spring.write,
+    "tartanair": mini_tartanair.write_first,
+    "tartanair_v2": mini_tartanair.write_second,
+    "virtual_kitti": mini_virtual_kitti.write,
+}
+
+
+@dataclass(frozen=True)
+class Written:
+    """A miniature on disk."""
+
+    layout: str
+    root: Path
+    expected: Expected
+
+    def read(self) -> Scene:
+        return read_miniature(self.layout, self.root, self.expected.scene)
+
+
+@pytest.fixture
+def written(request: pytest.FixtureRequest, tmp_path: Path) -> Written:
+    """The miniature of the layout that a test names; it may be changed."""
+    return Written(request.param, tmp_path, WRITERS[request.param](tmp_path))
+
+
+def of(*layouts: str) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("written", layouts, indirect=True)
+
+
+def warnings(scene: Scene) -> str:
+    return "; ".join(item.message for item in scene.findings if item.level == "warning")
+
+
+# Depth and poses that a partial download lacks.
+
+
+@of("mvs_synth", "omniworld", "spring", "tartanair", "tartanair_v2", "virtual_kitti")
+def test_depth_that_is_not_there_is_counted_and_its_frames_stay(written: Written) -> None:
+    suffixes = (".exr", ".npy", ".dsp5", ".png")
+    maps = sorted(
+        file
+        for file in written.root.rglob("*")
+        if file.suffix in suffixes
+        and any(n in file.parent.relative_to(written.root).as_posix() for n in ("depth", "disp1"))
+    )
+    maps[2].unlink()
+    scene = written.read()
+    assert len(scene) == 4
+    assert [view.has_depth for view in scene] == [True, True, False, True]
+    assert "1 of 4 frames have no depth map" in warnings(scene)
+    assert scene.views[2].load().depth is None
+
+
+@of("spring", "tartanair", "tartanair_v2", "virtual_kitti")
+def test_rows_of_poses_that_are_missing_drop_their_frames(written: Written) -> None:
+    names = ("pose_left.txt", "pose_lcam_front.txt", "extrinsic.txt", "extrinsics.txt")
+    (path,) = (file for file in written.root.rglob("*.txt") if file.name in names)
+    lines = path.read_text().splitlines()
+    rows = len(lines) // 4 * 3 + len(lines) % 4
+    path.write_text("\n".join(lines[:rows]) + "\n")
+    scene = written.read()
+    assert scene.names == written.expected.cameras.names[:3]
+    assert "1 of 4 frames have no pose: dropped" in warnings(scene)
+    path.write_text(lines[0] + " 7\n")
+    with pytest.raises(ProjectError, match=rf"{path.name}.* numbers|none of 4 frames"):
+        written.read()
+
+
+@of("mvs_synth")
+def test_a_damaged_pose_file_is_reported_and_drops_its_frame(written: Written) -> None:
+    paths = sorted(written.root.rglob("*.json"))
+    paths[0].write_text("{")
+    paths[1].unlink()
+    scene = written.read()
+    assert scene.names == ("0002.png", "0003.png")
+    assert "2 of 4 frames have no pose" in warnings(scene)
+    assert "0000.json: JSONDecodeError" in warnings(scene)
+
+
+@of("gta_sfm")
+def test_arrays_that_an_hdf5_file_lacks_drop_their_frames(written: Written) -> None:
+    import h5py
+
+    (path,) = written.root.rglob("*.hdf5")
+    with h5py.File(path, "a") as file:
+        del file["image_0"], file["pose_1"], file["depth_2"]
+    scene = written.read()
+    assert scene.names == ("image_2", "image_3")
+    assert [view.has_depth for view in scene] == [False, True]
+    assert "1 of 4 frames have no picture" in warnings(scene)
+    assert "1 of 4 frames have no pose" in warnings(scene)
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(ProjectError, match="unreadable"):
+        written.read()
+
+
+@of("omniworld")
+def test_a_camera_file_of_another_split_is_refused(written: Written) -> None:
+    path = written.root / "b04f88d1f85a" / "camera" / "split_1.json"
+    path.rename(path.with_name("split_0.json"))
+    assert layout_named("omniworld").scenes(written.root) == ("b04f88d1f85a/split_0",)
+    with pytest.raises(ProjectError, match="does not fit split_info"):
+        read_miniature("omniworld", written.root, "b04f88d1f85a/split_0")
+
+
+# Traps of each layout.
+
+
+@of("tartanair")
+def test_tartanair_looks_along_x_of_a_north_east_down_frame(written: Written) -> None:
+    """A camera at the origin that flies north and level sees what lies east on its right."""
+    (path,) = written.root.rglob("pose_left.txt")
+    path.write_text("1 2 3 0 0 0 1\n" + "0 0 0 0 0 0.7071067811865476 0.7071067811865476\n" * 3)
+    scene = written.read()
+    xy, z = scene.cameras.project([[11.0, 7.0, 1.0]])  # 10 m north, 5 m east, 2 m above camera 0
+    assert z[0, 0] == pytest.approx(10.0)
+    np.testing.assert_allclose(xy[0, 0], [32 + 32 * 5 / 10, 24 - 32 * 2 / 10], atol=1e-9)
+    # Turned by 90 degrees about down, it looks east.
+    assert z[1, 0] == pytest.approx(7.0)
+
+
+@of("tartanair")
+def test_tartanair_is_found_where_its_archives_repeat_the_environment(written: Written) -> None:
+    env = written.root / "abandonedfactory"
+    env.rename(written.root / "moved")
+    env.mkdir()
+    (written.root / "moved").rename(env / "abandonedfactory")
+    name = f"abandonedfactory/{written.expected.scene}"
+    assert layout_named("tartanair").scenes(written.root) == (name,)
+    assert len(read_miniature("tartanair", written.root, name)) == 4
+    assert layout_named("tartanair").scenes(env) == (written.expected.scene,)
+
+
+@of("tartanair_v2")
+def test_bytes_of_tartanair_v2s_depth_are_in_opencvs_order(written: Written) -> None:
+    """As the documentation decodes them: cv2.imread(...).view("<f4")."""
+    for path in sorted(written.root.rglob("*_depth.png")):
+        official = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).view("<f4")[..., 0]
+        np.testing.assert_array_equal(
+            packed_depth(path), np.where(official > SKY_FROM, 0, official)
+        )
+    Image.open(path).convert("RGB").save(path)
+    with pytest.raises(ProjectError, match="depth as RGB"):
+        packed_depth(path)
+
+
+@of("tartanair_v2")
+def test_each_camera_of_tartanair_v2_is_a_scene_and_fisheyes_are_none(written: Written) -> None:
+    folder = written.root / "AbandonedCable" / "Data_easy" / "P000"
+    for name in ("image_rcam_top", "image_lcam_fish", "image_lcam_equirect", "depth_rcam_back"):
+        (folder / name).mkdir()
+    names = layout_named("tartanair_v2").scenes(written.root)
+    stem = "AbandonedCable/Data_easy/P000"
+    assert names == (f"{stem}/lcam_front", f"{stem}/rcam_top")
+    assert len(CAMERAS) == 12
+
+
+@of("virtual_kitti")
+def test_virtual_kitti_counts_pixel_centres_as_integers(written: Written) -> None:
+    """The stored principal point is (31.5, 23.5) of 64x48, the middle if the first pixel is 0."""
+    (path,) = written.root.rglob("intrinsic.txt")
+    assert path.read_text().splitlines()[1].split()[4:] == ["31.5", "23.5"]
+    np.testing.assert_array_equal(written.read().cameras.K[0, :2, 2], [32, 24])
+    # A principal point that is no middle is left where it is.
+    path.write_text(path.read_text().replace("31.5 23.5", "30 20"))
+    np.testing.assert_array_equal(written.read().cameras.K[0, :2, 2], [30, 20])
+
+
+@of("virtual_kitti")
+def test_virtual_kitti_takes_the_rows_of_the_camera_asked_for(written: Written) -> None:
+    frames = written.root / "Scene01" / "clone" / "frames"
+    for part in ("rgb", "depth"):
+        shutil.copytree(frames / part / "Camera_0", frames / part / "Camera_1")
+    names = layout_named("virtual_kitti").scenes(written.root)
+    assert names == ("Scene01/clone/Camera_0", "Scene01/clone/Camera_1")
+    left, right = (read_miniature("virtual_kitti", written.root, name) for name in names)
+    between = right.cameras.cam_from_world[:, :3, 3] - left.cameras.cam_from_world[:, :3, 3]
+    np.testing.assert_allclose(between, np.tile([-0.532725, 0, 0], (4, 1)), atol=1e-9)
+
+
+@of("mvs_synth")
+def test_a_right_handed_world_of_mvs_synth_is_left_as_it_is(written: Written) -> None:
+    """Every pose has the determinant -1 as stored, and gives a rotation."""
+    before = written.read().cameras.cam_from_world
+    for path in written.root.rglob("*.json"):
+        values = json.loads(path.read_text())
+        stored = np.array(values["extrinsic"])
+        assert np.linalg.det(stored[:3, :3]) == pytest.approx(-1)
+        values["extrinsic"] = (stored @ np.diag([1.0, -1.0, 1.0, 1.0])).tolist()
+        path.write_text(json.dumps(values))
+    np.testing.assert_allclose(np.linalg.det(before[:, :3, :3]), 1)
+    np.testing.assert_allclose(written.read().cameras.cam_from_world, before, atol=1e-12)
+
+
+@of("gta_sfm")
+def test_a_damaged_picture_in_an_hdf5_file_is_an_error_when_it_is_loaded(written: Written) -> None:
+    import h5py
+
+    (path,) = written.root.rglob("*.hdf5")
+    with h5py.File(path, "a") as file:
+        del file["image_1"]
+        file["image_1"] = np.zeros(40, np.uint8)
+    view = written.read()["image_1"]
+    with pytest.raises(ProjectError, match="image_1: no picture"):
+        view.load()
+
+
+def test_omniworlds_depth_buffer_is_not_linear(tmp_path: Path) -> None:
+    """Values of yangzhou24/OmniWorld's load_depth, worked out by hand from its formula."""
+    raw = np.array([[0, 98, 99, 32768, 62258, 65500, 65501, 65535]], np.uint16)
+    Image.fromarray(raw).save(tmp_path / "depth.png")
+    depth = buffer_depth(tmp_path / "depth.png")[0]
+    share = raw[0] / 65535
+    expected = share / (1000 - 999 * share) / 0.004
+    expected[[0, 1, 6, 7]] = 0  # less than 0.0015, more than 65500 / 65535
+    np.testing.assert_allclose(depth, expected, rtol=1e-6)
+    assert depth[3] == pytest.approx(0.24976, abs=1e-4)
+    Image.fromarray(np.zeros((2, 2), np.uint8)).save(tmp_path / "depth.png")
+    with pytest.raises(ProjectError, match="depth as L"):
+        buffer_depth(tmp_path / "depth.png")
+
+
+@of("spring")
+def test_springs_depth_is_that_of_the_frames_pixel_centres(written: Written) -> None:
+    """Disparity is in pixels of the frame at twice its resolution; every second value is off."""
+    scene = written.read()
+    fine = drawn_frames((92.0, 92.0, 64.0, 48.0), 128, 96).depth
+    errors = []
+    for i, view in enumerate(scene):
+        depth, true = view.load().depth, np.asarray(written.expected.depth)[i]
+        assert depth is not None
+        seen = true > 0
+        ours = np.abs(depth / np.where(seen, true, 1) - 1)[seen]
+        every_second = np.abs(fine[i, ::2, ::2] / np.where(seen, true, 1) - 1)[seen]
+        errors.append([np.quantile(ours, 0.7), np.median(every_second)])
+    most, every_second = np.max(errors, axis=0)
+    assert most < 1e-5
+    assert every_second > 1e-3
+
+
+def test_an_edge_through_a_block_gives_one_of_its_surfaces() -> None:
+    near, far = 10.0, 4.0
+    blocks = [
+        [near, far, near, far],
+        [near, near, far, far],
+        [near] * 3 + [far],
+        [far] * 3 + [near],
+    ]
+    image = np.concatenate([np.reshape(block, (2, 2)) for block in blocks], axis=1)
+    np.testing.assert_array_equal(halved(image), [[near, near, near, far]])
+    np.testing.assert_array_equal(halved(np.array([[0, 0], [0, near]])), [[0]])
+
+
+@of("spring")
+def test_springs_sky_is_told_by_its_map_alone(written: Written) -> None:
+    """Disparity says nothing of some of the sky; without the map, that stays far away."""
+    shutil.rmtree(written.root / "spring/train/0011/maps")
+    scene = written.read()
+    assert any("4 frames have no map of the sky" in item.message for item in scene.findings)
+    depth = scene.views[0].load().depth
+    assert depth is not None
+    assert (depth[2:4, :3] > 0).all()
+    assert (depth[:2, :3] == 0).all()
+
+
+def test_hdf5_and_exr_name_the_extra_that_reads_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    with pytest.raises(ProjectError, match=r"gvtools\[data\]"):
+        array_files.hdf5_array(tmp_path / "a.h5", "x")
+    with pytest.raises(ProjectError, match=r"gvtools\[data\]"):
+        array_files.exr_channel(tmp_path / "a.exr", ("Y",))
+
+
+def test_errors_of_array_files_say_what_is_there(tmp_path: Path) -> None:
+    import h5py
+    import OpenEXR
+
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["image_0"] = np.zeros(3)
+    with pytest.raises(ProjectError, match="holds image_0; expected 'depth'"):
+        array_files.hdf5_array(tmp_path / "a.h5", "depth")
+    with pytest.raises(ProjectError, match=r"no such file|unreadable"):
+        array_files.hdf5_array(tmp_path / "b.h5", "depth")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    for name, kind in (("half", np.float16), ("float", np.float32)):
+        image = np.array([[1.5, np.inf], [2.0, 3.0]], kind)
+        OpenEXR.File(header, {"R": image}).write(str(tmp_path / f"{name}.exr"))
+        read = array_files.exr_channel(tmp_path / f"{name}.exr", ("Y", "R"))
+        np.testing.assert_array_equal(read, image)
+        assert read.dtype == np.float32
+    with pytest.raises(ProjectError, match="channels R; expected Y or Z"):
+        array_files.exr_channel(tmp_path / "half.exr", ("Y", "Z"))
+    (tmp_path / "half.exr").write_bytes(b"none")
+    with pytest.raises(ProjectError, match="unreadable"):
+        array_files.exr_channel(tmp_path / "half.exr", ("Y",))
+    with pytest.raises(ProjectError, match="no such file"):
+        array_files.exr_channel(tmp_path / "none.exr", ("Y",))
+
+
+def test_numbers_and_tables(tmp_path: Path) -> None:
+    for name in (
+        "rgb_00003.jpg",
+        "rgb_00010.jpg",
+        "rgb_x.jpg",
+        "a_rgb_00001.jpg",
+        "rgb_00001.jpg~",
+    ):
+        (tmp_path / name).touch()
+    assert numbers_in(tmp_path, "rgb_{:05d}.jpg") == {3, 10}
+    assert numbers_in(tmp_path / "none", "rgb_{:05d}.jpg") == set()
+    assert picture_size(tmp_path.iterdir()) == (1, 1)
+    assert number_table(tmp_path / "none.txt", 3).shape == (0, 3)
+    path = tmp_path / "rows.txt"
+    path.write_text("a b\n1 2\n\n3 4\n")
+    np.testing.assert_array_equal(number_table(path, 2, header=True), [[1, 2], [3, 4]])
+    with pytest.raises(ProjectError, match="could not convert"):
+        number_table(path, 2)
+    with pytest.raises(ProjectError, match="row 1 of 3 has 2 numbers; expected 7"):
+        ned_poses(path)
+
+
+def _official_reader() -> Any:
+    """tartanair's TartanAirImageReader, without the downloads and CUDA that its package imports."""
+    spec = importlib.util.find_spec("tartanair")
+    if spec is None or not spec.submodule_search_locations:
+        pytest.skip("no package tartanair; pip install --no-deps tartanair")
+    folder = Path(spec.submodule_search_locations[0])
+    package = types.ModuleType("official_tartanair")
+    package.__path__ = [str(folder)]
+    sys.modules[package.__name__] = package
+    stub = types.ModuleType("official_tartanair.tartanair_module")
+    stub.TartanAirModule = object  # type: ignore[attr-defined]
+    sys.modules[stub.__name__] = stub
+    spec = importlib.util.spec_from_file_location("official_tartanair.reader", folder / "reader.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        del sys.modules[package.__name__], sys.modules[stub.__name__]
+    return module.TartanAirImageReader()
+
+
+@of("tartanair", "tartanair_v2")
+def test_the_official_tool_kit_reads_the_miniatures(written: Written) -> None:
+    official = _official_reader()
+    for view in written.read():
+        image, depth = view.files
+        frame = view.load()
+        np.testing.assert_array_equal(official.read_rgb(str(image)), frame.rgb)
+        read = official.read_depth(str(depth))
+        np.testing.assert_array_equal(np.where(read > SKY_FROM, 0, read), frame.depth)
+        # Its distances assume the optical centre in the middle of pixels counted from 0.5.
+        rays = np.linalg.norm(view.camera.rays(), axis=-1)
+        np.testing.assert_allclose(official.read_dist(str(depth)), rays * read, rtol=1e-5)
