@@ -27,6 +27,8 @@ DOCTESTED = (
     "gvtools.cameras",
     "gvtools.completers.complete",
     "gvtools.evaluation.trajectories",
+    "gvtools.scenes.data_sets.drawn",
+    "gvtools.scenes.data_sets.spring",
     "gvtools.settings.base",
     "gvtools.training.tune_options",
     "gvtools.trajectory_files",

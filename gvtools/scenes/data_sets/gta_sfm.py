@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
@@ -66,7 +67,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
         matches = [match for match in map(KEY.fullmatch, file) if match]
         present = {match[0] for match in matches}
         frames = sorted({int(match[2]) for match in matches})
-        size = next((_size(file[f"image_{i}"][()]) for i in frames if f"image_{i}" in file), (1, 1))
+        size = _size(file[f"image_{i}"][()] for i in frames if f"image_{i}" in present)
         for i in frames:
             image, depth, pose, K = (f"{part}_{i}" for part in ("image", "depth", "pose", "K"))
             posed = pose in present and K in present
@@ -85,10 +86,15 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
     return posed_scene(path, pictures, poses="world_from_cam", metric=False)
 
 
-def _size(data: NDArray[np.uint8]) -> tuple[int, int]:
-    """Width and height of an encoded picture, by its header."""
-    with Image.open(io.BytesIO(np.asarray(data, np.uint8).tobytes())) as image:
-        return image.size
+def _size(pictures: Iterable[NDArray[np.uint8]]) -> tuple[int, int]:
+    """Width and height of the first encoded picture with a sound header, pixels; else 1 x 1."""
+    for data in pictures:
+        try:
+            with Image.open(io.BytesIO(np.asarray(data, np.uint8).tobytes())) as image:
+                return image.size
+        except (OSError, SyntaxError, ValueError):
+            continue
+    return 1, 1
 
 
 LAYOUT = Layout(f"SEQUENCE{SUFFIX}, also below train and test", _scenes, _read)

@@ -239,11 +239,12 @@ def test_a_damaged_picture_in_an_hdf5_file_is_an_error_when_it_is_loaded(written
 
     (path,) = written.root.rglob("*.hdf5")
     with h5py.File(path, "a") as file:
-        del file["image_1"]
-        file["image_1"] = np.zeros(40, np.uint8)
-    view = written.read()["image_1"]
-    with pytest.raises(ProjectError, match="image_1: no picture"):
-        view.load()
+        del file["image_0"]
+        file["image_0"] = np.zeros(40, np.uint8)
+    scene = written.read()
+    with pytest.raises(ProjectError, match="image_0: no picture"):
+        scene["image_0"].load()
+    assert scene["image_1"].load().rgb.shape == (48, 64, 3)
 
 
 def test_omniworlds_depth_buffer_is_not_linear(tmp_path: Path) -> None:
