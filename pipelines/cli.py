@@ -16,6 +16,7 @@ from pipelines.console import Console
 # Each module has SUMMARY, EXAMPLES, add_arguments(parser) and run(args, console).
 COMMANDS = {
     "demo": "pipelines.commands.demo",
+    "capture": "pipelines.commands.capture",
     "check": "pipelines.commands.check",
     "reconstruct": "pipelines.commands.reconstruct",
     "refine": "pipelines.commands.refine",

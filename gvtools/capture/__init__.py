@@ -1,0 +1,1 @@
+"""Captures without poses: pictures chosen and checked, cameras found, a project written."""

@@ -1,0 +1,260 @@
+"""Cameras from photographs: features, matching and mapping by pycolmap.
+
+Global mapping (GLOMAP, Pan et al. 2024) solves for all cameras at once. Where it registers too few
+pictures or leaves large errors, incremental mapping is tried as well and the better model kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gvtools.capture.pairs import similar_pairs
+from gvtools.errors import ProjectError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import pycolmap
+
+# Up to so many pictures, all are matched with all.
+EXHAUSTIVE = 60
+# A picture of a video is matched with so many after it, and with those 2, 4, 8, ... further on.
+SEQUENTIAL_OVERLAP = 10
+# Features of a picture at most, and the longer side that they are found at.
+MAX_FEATURES, MAX_SIDE = 8192, 1600
+# A global model that registers less than this share, or errs by more pixels, is not taken unseen.
+ENOUGH, LARGE_ERROR = 0.9, 1.5
+# A camera that fewer points hold is taken out: global mapping keeps some that a dozen points hold,
+# which bend the whole model (demo room: errors of centres of 28 % of the extent, 2 % without them).
+LEAST_POINTS = 30
+# The principal point is refined where a camera took so many pictures; fewer do not tell it.
+REFINED_FROM = 8
+SEED = 1
+
+Say = Callable[[str], object]
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """What mapping found.
+
+    Attributes:
+        model: the largest model.
+        how: "global" or "incremental".
+        others: numbers of registered pictures of further models, largest first.
+        matching: how pairs were chosen, in words.
+        pairs: number of verified matches of each pair of pictures, by their names.
+    """
+
+    model: pycolmap.Reconstruction
+    how: str
+    others: tuple[int, ...]
+    matching: str
+    pairs: Mapping[tuple[str, str], int]
+
+
+def find_cameras(
+    images: Path,
+    cameras: Sequence[Sequence[str]],
+    *,
+    work: Path,
+    in_order: bool = False,
+    masks: Path | None = None,
+    say: Say = lambda text: None,
+) -> Mapped:
+    """Find the cameras of pictures.
+
+    Args:
+        images: the folder of the pictures.
+        cameras: names of the pictures that each camera took; they share its intrinsics.
+        work: a folder for the database.
+        in_order: the pictures follow a path in the order of their names, as frames of a video do.
+        masks: ``NAME.png`` of pictures, black where features are not to be found; None for none.
+        say: told of each step.
+
+    Raises:
+        ProjectError: no two pictures overlap, or no model comes of those that do.
+    """
+    import pycolmap
+
+    with _quiet():
+        pycolmap.set_random_seed(SEED)
+        database = work / "database.db"
+        names = [name for group in cameras for name in group]
+        say(f"finding features in {len(names)} pictures")
+        for group in cameras:
+            _extract(database, images, group, masks=masks)
+        how = _match(database, work, count=len(names), in_order=in_order, say=say)
+        pairs = _verified(database)
+        if not pairs:
+            raise ProjectError(
+                f"{images}: no two of the {len(names)} pictures show enough of the same; expected "
+                "neighbours that share at least half of what they show; take more pictures between "
+                "these, and sharp ones"
+            )
+        say(f"finding cameras from {len(pairs)} pairs that overlap")
+        found = _map(database, images, work, count=len(names), say=say)
+    if not found:
+        best = max(pairs, key=lambda pair: pairs[pair])
+        raise ProjectError(
+            f"{images}: {len(pairs)} pairs of pictures overlap (best {best[0]} and {best[1]}, "
+            f"{pairs[best]} matches), and no model comes of them; expected views from different "
+            "places; take pictures while walking, not while turning on the spot"
+        )
+    kind, models = found
+    first, *rest = sorted(models, key=lambda model: -model.num_reg_images())
+    others = tuple(model.num_reg_images() for model in rest)
+    return Mapped(first, kind, others, how, pairs)
+
+
+def _extract(database: Path, images: Path, names: Sequence[str], *, masks: Path | None) -> None:
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = MAX_SIDE
+    options.sift.max_num_features = MAX_FEATURES
+    reader = pycolmap.ImageReaderOptions()
+    if masks is not None:
+        reader.mask_path = masks
+    pycolmap.extract_features(
+        database, images, image_names=list(names), camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader, extraction_options=options, device=pycolmap.Device.auto,
+    )  # fmt: skip
+
+
+def _match(database: Path, work: Path, *, count: int, in_order: bool, say: Say) -> str:
+    """Match, and say how in words."""
+    import pycolmap
+
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    if count <= EXHAUSTIVE:
+        say(f"matching all {count * (count - 1) // 2} pairs")
+        pycolmap.match_exhaustive(database, verification_options=verification)
+        return "all pairs"
+    pairs = set(similar_pairs(database))
+    how = f"each picture with the {len(pairs) * 2 // count} most similar"
+    if in_order:
+        with pycolmap.Database.open(database) as opened:
+            names = sorted(image.name for image in opened.read_all_images())
+        steps = {*range(1, SEQUENTIAL_OVERLAP + 1), *(2**k for k in range(4, 8))}
+        pairs |= {
+            (names[i], names[i + step]) for i in range(count) for step in steps if i + step < count
+        }
+        how = f"neighbours in time, and {how}"
+    say(f"matching {len(pairs)} pairs")
+    file = work / "pairs.txt"
+    file.write_text("".join(f"{a} {b}\n" for a, b in sorted(pairs)), encoding="utf-8")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = file
+    pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+    return how
+
+
+def _verified(database: Path) -> dict[tuple[str, str], int]:
+    """Pairs of pictures that overlap, with the number of their verified matches."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        numbers, counts = opened.read_two_view_geometry_num_inliers()
+    found = {}
+    for number, count in zip(numbers, counts, strict=True):
+        if count > 0:
+            a, b = pycolmap.pair_id_to_image_pair(number)
+            found[names[a], names[b]] = int(count)
+    return found
+
+
+def _map(
+    database: Path, images: Path, work: Path, *, count: int, say: Say
+) -> tuple[str, list[pycolmap.Reconstruction]] | None:
+    """How the best models were made, and these; None where there is none."""
+    import pycolmap
+
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = SEED
+    best: tuple[str, list[pycolmap.Reconstruction]] | None = None
+    models = _models(
+        pycolmap.global_mapping, database, images, out=work / "global", options=options
+    )
+    if models:
+        best = "global", models
+        largest = max(models, key=lambda model: model.num_reg_images())
+        error = largest.compute_mean_reprojection_error()
+        if largest.num_reg_images() >= ENOUGH * count and error <= LARGE_ERROR:
+            return best
+        say(
+            f"global mapping registers {largest.num_reg_images()} of {count} pictures with errors "
+            f"of {error:.2f} pixels; trying incremental mapping"
+        )
+    else:
+        say("global mapping gives no model; trying incremental mapping")
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.random_seed = SEED
+    # A scene of few pictures is a model, too.
+    pipeline.min_model_size = 3
+    models = _models(
+        pycolmap.incremental_mapping, database, images, out=work / "incremental", options=pipeline
+    )
+    if models and (best is None or _rank(models) > _rank(best[1])):
+        best = "incremental", models
+    return best
+
+
+def _rank(models: Sequence[pycolmap.Reconstruction]) -> tuple[int, float]:
+    """More pictures are better; among equals, smaller errors."""
+    largest = max(models, key=lambda model: model.num_reg_images())
+    return largest.num_reg_images(), -largest.compute_mean_reprojection_error()
+
+
+def _models(
+    mapping: Any, database: Path, images: Path, *, out: Path, options: Any
+) -> list[pycolmap.Reconstruction]:
+    """The models with at least two pictures that a mapping makes; none if it fails."""
+    out.mkdir()
+    try:
+        found = mapping(database, images, out, options=options)
+    except (RuntimeError, ValueError):
+        return []
+    models = [model for model in found.values() if model.num_reg_images() >= 2]
+    for model in models:
+        _settle(model)
+    return [model for model in models if model.num_reg_images() >= 2]
+
+
+def _settle(model: pycolmap.Reconstruction) -> None:
+    """Take cameras out that hardly any points hold, and adjust the rest once more."""
+    import pycolmap
+
+    for image in list(model.images.values()):
+        if image.has_pose and image.num_points3D < LEAST_POINTS:
+            model.deregister_frame(image.frame_id)
+    if model.num_reg_images() < 2:
+        return
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    pycolmap.bundle_adjustment(model, options)
+    images = [image for image in model.images.values() if image.has_pose]
+    taken = [sum(image.camera_id == camera for image in images) for camera in model.cameras]
+    if min(taken) >= REFINED_FROM:
+        options.refine_principal_point = True
+        pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep COLMAP's progress from the terminal; its errors become ours."""
+    import pycolmap
+
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before

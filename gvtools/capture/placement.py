@@ -1,0 +1,134 @@
+"""Where a model lies in the world: metric and level by GPS, metric by a length, or level alone.
+
+Mapping leaves position, direction and size of a model open. World axes here are x east (or to the
+right), y north (or ahead), z up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import OptionError
+from gvtools.scenes.scene import Finding
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# GPS of a phone or a drone errs by so much; what spreads less cannot be placed by it. [metres]
+GPS_ERROR = 5.0
+LEAST_PLACED = 3
+SEED = 1
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How a model was placed.
+
+    Attributes:
+        metric: whether its units are metres.
+        by: "GPS", "distance" or "cameras".
+        origin: latitude, longitude, height of its origin, with GPS; None else.
+    """
+
+    metric: bool
+    by: str
+    origin: tuple[float, float, float] | None = None
+
+
+def place(
+    model: pycolmap.Reconstruction,
+    *,
+    locations: Mapping[str, tuple[float, float, float]],
+    distance: tuple[str, str, float] | None = None,
+) -> tuple[Placement, list[Finding]]:
+    """Move, turn and scale a model in place.
+
+    Args:
+        model: changed.
+        locations: latitude, longitude, height of pictures by name.
+        distance: two pictures and the metres between the places where they were taken.
+
+    Raises:
+        OptionError: the pictures of ``distance`` are not in the model, or were taken at one place.
+    """
+    import pycolmap
+
+    placed = {name: value for name, value in locations.items() if _found(model, name) is not None}
+    placement, findings = None, []
+    if len(placed) >= LEAST_PLACED:
+        placement, findings = _by_gps(model, placed)
+    if placement is None:
+        _level(model)
+        placement = Placement(metric=False, by="cameras")
+    if distance is not None:
+        first, second, metres = distance
+        centres = [_found(model, name) for name in (first, second)]
+        missing = [n for n, c in zip((first, second), centres, strict=True) if c is None]
+        if missing:
+            raise OptionError(
+                f"--distance: {missing[0]!r} is no registered picture; give two that are"
+            )
+        apart = float(np.linalg.norm(centres[0] - centres[1]))
+        if apart <= 1e-9:
+            raise OptionError(f"--distance: {first!r} and {second!r} were taken at one place")
+        identity = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.0, 1.0]))
+        model.transform(pycolmap.Sim3d(metres / apart, identity, np.zeros(3)))
+        placement = Placement(True, "distance", placement.origin)
+    return placement, findings
+
+
+def _found(model: pycolmap.Reconstruction, name: str) -> NDArray[np.float64] | None:
+    image = model.find_image_with_name(name)
+    return None if image is None or not image.has_pose else np.asarray(image.projection_center())
+
+
+def _by_gps(
+    model: pycolmap.Reconstruction, placed: Mapping[str, tuple[float, float, float]]
+) -> tuple[Placement | None, list[Finding]]:
+    import pycolmap
+
+    names, values = list(placed), np.array(list(placed.values()))
+    origin = values.mean(axis=0)
+    east = pycolmap.GPSTransform().ellipsoid_to_enu(values, *origin)
+    east = np.asarray(east) - np.asarray(east).mean(axis=0)
+    spread = float(np.linalg.norm(east[:, :2], axis=1).max())
+    if spread < 2 * GPS_ERROR:
+        text = (
+            f"GPS of {len(names)} pictures spreads over {spread:.1f} m alone, about what it errs "
+            "by: not used; give --distance for metres"
+        )
+        return None, [Finding("info", text)]
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed = GPS_ERROR, SEED
+    moved = pycolmap.align_reconstruction_to_locations(model, names, east, LEAST_PLACED, options)
+    if moved is None:
+        text = f"GPS of {len(names)} pictures contradicts the cameras that were found: not used"
+        return None, [Finding("warning", text)]
+    model.transform(moved)
+    at = {name: _found(model, name) for name in names}
+    errors = [float(np.linalg.norm(at[name] - row)) for name, row in zip(names, east, strict=True)]
+    error = float(np.median(errors))
+    text = f"placed by GPS of {len(names)} pictures, which it differs from by {error:.2f} m"
+    return Placement(True, "GPS", tuple(float(x) for x in origin)), [Finding("info", text)]
+
+
+def _level(model: pycolmap.Reconstruction) -> None:
+    """Turn the mean up vector of the cameras to +z, and move their mean centre to the origin."""
+    import pycolmap
+    from scipy.spatial.transform import Rotation
+
+    images = [image for image in model.images.values() if image.has_pose]
+    rotations = np.stack([image.cam_from_world().rotation.matrix() for image in images])
+    centres = np.stack([image.projection_center() for image in images])
+    # Row 1 of cam_from_world is the camera's y axis, which points down.
+    up = -rotations[:, 1].mean(axis=0)
+    if np.linalg.norm(up) < 1e-3:
+        return
+    turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up / np.linalg.norm(up)])[0]
+    shift = -turn.apply(centres.mean(axis=0))
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn.as_quat()), shift))

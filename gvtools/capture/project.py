@@ -1,0 +1,234 @@
+"""From photographs or a video to a COLMAP project that every command reads.
+
+``images/``, ``sparse/0`` (the largest model that was found) and ``capture.json``, a report. All of
+it appears at once, when it is complete.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gvtools.capture import video
+from gvtools.capture.mapping import Mapped, find_cameras
+from gvtools.capture.photographs import Photograph, copy_upright, find_photographs
+from gvtools.capture.placement import Placement, place
+from gvtools.errors import OptionError, ProjectError
+from gvtools.files import write_json
+from gvtools.scenes.photographs import named
+from gvtools.scenes.scene import Finding
+
+REPORT = "capture.json"
+IMAGES, MODEL = "images", "sparse/0"
+
+Say = Callable[[str], object]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureReport:
+    """What a capture found.
+
+    Attributes:
+        pictures: how many were tried.
+        registered: names of those with a camera, in order.
+        left_out: name and reason of each other one.
+        reprojection_px: mean error of the triangulated points, pixels.
+        points: how many.
+        track_length: mean number of pictures that a point is seen in.
+        mapping: "global" or "incremental".
+        matching: how pairs were chosen.
+        other_models: pictures of further models that do not connect to this one.
+        overlap: pairs of pictures, and their verified matches.
+        cameras: model and parameters of each camera.
+        metric: whether units are metres.
+        placed_by: "GPS", "distance" or "cameras", see ``placement``.
+        origin: latitude, longitude and height of the origin, with GPS.
+        findings: what was met.
+    """
+
+    pictures: int
+    registered: tuple[str, ...]
+    left_out: dict[str, str]
+    reprojection_px: float
+    points: int
+    track_length: float
+    mapping: str
+    matching: str
+    other_models: tuple[int, ...]
+    overlap: tuple[tuple[str, str, int], ...]
+    cameras: tuple[dict[str, Any], ...]
+    metric: bool
+    placed_by: str
+    origin: tuple[float, float, float] | None
+    findings: tuple[Finding, ...] = field(default=())
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return asdict(self)
+
+
+def capture_photographs(
+    source: Path,
+    out: Path,
+    *,
+    frames: int | None = None,
+    masks: Path | None = None,
+    distance: tuple[str, str, float] | None = None,
+    say: Say = lambda text: None,
+) -> CaptureReport:
+    """Find the cameras of a folder's photographs, or of a video's frames, and write a project.
+
+    Args:
+        source: the folder or the video.
+        out: the project's folder; must not hold anything yet.
+        frames: how many frames of a video to take; None goes by its motion.
+        masks: folder of ``NAME.png``, black where nothing is to be matched; photographs alone.
+        distance: names of two pictures and the metres between them.
+        say: told of each step.
+
+    Raises:
+        ProjectError: too few pictures, no overlap between them, no model, or no place to write.
+        OptionError: options that do not fit the source.
+    """
+    is_video = source.is_file()
+    if is_video and masks is not None:
+        raise OptionError("--masks: masks are of photographs; a video's frames have no names yet")
+    if not is_video and frames is not None:
+        raise OptionError(f"--frames: {source} is a folder of pictures; all of them are tried")
+    with replaced_folder(out) as work:
+        folder = source
+        findings: list[Finding] = []
+        if is_video:
+            folder = work / "frames"
+            picked = video.pick_frames(
+                source, folder, count=frames, progress=lambda n: say(f"{n} frames looked at")
+            )
+            text = (
+                f"{len(picked.frames)} of {picked.total} frames taken, over a motion of "
+                f"{picked.motion:.1f} widths of the picture"
+            )
+            findings.append(Finding("info", text))
+            say(text)
+        photographs, met = find_photographs(folder)
+        findings += met
+        copy_upright(photographs, work / IMAGES)
+        mapped = find_cameras(
+            work / IMAGES, _by_camera(photographs, one=is_video),
+            work=_made(work / "mapping"), in_order=is_video, masks=masks, say=say,
+        )  # fmt: skip
+        locations = {item.name: item.location for item in photographs if item.location}
+        placement, met = place(mapped.model, locations=locations, distance=distance)
+        findings += met
+        report = _report(photographs, mapped, placement, findings=findings)
+        mapped.model.write_binary(str(_made(work / MODEL)))
+        write_json(work / REPORT, report.to_dict())
+        for spare in ("mapping", "frames"):
+            shutil.rmtree(work / spare, ignore_errors=True)
+    return report
+
+
+@contextmanager
+def replaced_folder(out: Path) -> Iterator[Path]:
+    """A folder beside ``out`` to work in, which takes that name when all is done.
+
+    Raises:
+        ProjectError: ``out`` holds something, or cannot be written.
+    """
+    if out.is_file() or (out.is_dir() and any(out.iterdir())):
+        raise ProjectError(
+            f"{out}: is there already, and not empty; nothing is overwritten; give another --out"
+        )
+    work = out.with_name(f".{out.name}.part")
+    try:
+        # Left by a capture that was killed.
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        yield work
+        if out.is_dir():
+            out.rmdir()
+        work.rename(out)
+    except OSError as error:
+        raise ProjectError(
+            f"{out}: cannot be written ({error.strerror or error}); free some space or choose "
+            "another folder"
+        ) from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    return folder
+
+
+def _by_camera(photographs: Sequence[Photograph], *, one: bool) -> list[list[str]]:
+    """Names of the pictures of each camera, see ``Photograph.camera``."""
+    groups: dict[str, list[str]] = {}
+    for item in photographs:
+        groups.setdefault("" if one else item.camera, []).append(item.name)
+    return list(groups.values())
+
+
+def _report(
+    photographs: Sequence[Photograph],
+    mapped: Mapped,
+    placement: Placement,
+    *,
+    findings: Sequence[Finding],
+) -> CaptureReport:
+    model = mapped.model
+    there = {image.name for image in model.images.values() if image.has_pose}
+    registered = [item.name for item in photographs if item.name in there]
+    partners: dict[str, int] = {}
+    for pair in mapped.pairs:
+        for name in pair:
+            partners[name] = partners.get(name, 0) + 1
+    left_out = {
+        item.name: f"overlaps with {partners[item.name]} pictures, and no camera fits them"
+        if item.name in partners
+        else "overlaps with no other picture"
+        for item in photographs
+        if item.name not in there
+    }
+    met = list(findings)
+    if left_out:
+        met.append(
+            Finding(
+                "warning",
+                f"{len(left_out)} of {len(photographs)} pictures have no camera "
+                f"({named(list(left_out))}); take more pictures between these and the others",
+            )
+        )
+    if mapped.others:
+        sizes = ", ".join(str(number) for number in mapped.others)
+        text = f"further models of {sizes} pictures do not connect to the largest: not kept"
+        met.append(Finding("warning", text))
+    return CaptureReport(
+        pictures=len(photographs),
+        registered=tuple(registered),
+        left_out=left_out,
+        reprojection_px=float(model.compute_mean_reprojection_error()),
+        points=int(model.num_points3D()),
+        track_length=float(model.compute_mean_track_length()),
+        mapping=mapped.how,
+        matching=mapped.matching,
+        other_models=mapped.others,
+        overlap=tuple((a, b, count) for (a, b), count in sorted(mapped.pairs.items())),
+        cameras=tuple(
+            {
+                "model": camera.model.name,
+                "width": camera.width,
+                "height": camera.height,
+                "params": [float(value) for value in camera.params],
+            }
+            for camera in model.cameras.values()
+        ),
+        metric=placement.metric,
+        placed_by=placement.by,
+        origin=placement.origin,
+        findings=tuple(met),
+    )

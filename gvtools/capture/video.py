@@ -1,0 +1,144 @@
+"""Frames of a video that structure from motion can use: sharp ones, a fair step apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.capture.photographs import sharpness
+from gvtools.errors import OptionError, ProjectError
+
+SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")
+# Frames are compared at this width. [pixels]
+WIDTH = 320
+# Motion, as a share of the picture's width, after which a frame is taken where no number is given:
+# neighbours then share nine tenths of what they show.
+STEP = 0.07
+MOST = 300
+# A whole video with less motion than this share of the width shows the scene from one place.
+STANDS_STILL = 0.05
+JPEG_QUALITY = 97
+# Corners that are followed from frame to frame.
+CORNERS = 200
+
+
+@dataclass(frozen=True)
+class Picked:
+    """What was taken from a video.
+
+    Attributes:
+        frames: numbers of the frames taken, from 0.
+        total: how many frames it has.
+        motion: of the whole video, in widths of the picture.
+    """
+
+    frames: tuple[int, ...]
+    total: int
+    motion: float
+
+
+def pick_frames(
+    path: Path, folder: Path, *, count: int | None = None, progress: Callable[[int], object]
+) -> Picked:
+    """Write the chosen frames of a video to ``folder`` as ``frame_NNNNNN.jpg``.
+
+    The path of the picture is cut into pieces of equal motion, and the sharpest frame of each is
+    taken.
+
+    Args:
+        path: of the video.
+        folder: is made.
+        count: how many frames to take; None takes one a STEP of motion, MOST at most.
+        progress: called with the number of frames read, now and then.
+
+    Raises:
+        ProjectError: no video, or one without motion.
+        OptionError: fewer than two frames asked for.
+    """
+    if count is not None and count < 2:
+        raise OptionError(f"--frames {count}; expected 2 or more")
+    moved, sharp = _measure(path, progress)
+    total = float(moved[-1])
+    if len(moved) < 2 or total < STANDS_STILL:
+        raise ProjectError(
+            f"{path}: its {len(moved)} frames move by {total:.1%} of the picture's width in all; "
+            "expected a camera that moves; film the scene while walking"
+        )
+    pieces = count or int(np.clip(round(total / STEP), 8, MOST))
+    pieces = min(pieces, len(moved))
+    piece = np.minimum((moved / total * pieces).astype(int), pieces - 1)
+    chosen = []
+    for number in np.unique(piece):
+        rows = np.flatnonzero(piece == number)
+        chosen.append(int(rows[np.argmax(sharp[rows])]))
+    _write(path, folder, chosen)
+    return Picked(tuple(chosen), len(moved), total)
+
+
+def _measure(
+    path: Path, progress: Callable[[int], object]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N,) motion up to each frame, in widths, and (N,) sharpness of each."""
+    import cv2
+
+    video = cv2.VideoCapture(str(path))
+    if not video.isOpened():
+        raise ProjectError(f"{path}: no video that OpenCV reads; convert it to H.264 in MP4")
+    moved, sharp = [0.0], []
+    before: NDArray[np.uint8] | None = None
+    while True:
+        there, frame = video.read()
+        if not there:
+            break
+        height = max(1, round(frame.shape[0] * WIDTH / frame.shape[1]))
+        grey = cv2.cvtColor(
+            cv2.resize(frame, (WIDTH, height), interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY
+        )
+        sharp.append(sharpness(grey))
+        if before is not None:
+            moved.append(moved[-1] + _motion(before, grey))
+        before = grey
+        if len(sharp) % 100 == 0:
+            progress(len(sharp))
+    video.release()
+    if not sharp:
+        raise ProjectError(f"{path}: a video without a frame that can be read")
+    return np.array(moved), np.array(sharp)
+
+
+def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
+    """Median motion of corners between two frames, in widths of the picture."""
+    import cv2
+
+    corners = cv2.goodFeaturesToTrack(before, CORNERS, 0.01, 5)
+    if corners is None or len(corners) < 8:
+        return 0.0
+    found, there, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None)
+    kept = there[:, 0] == 1
+    if kept.sum() < 8:
+        # Nothing of the one is found in the other: as far apart as can be measured.
+        return STEP
+    return float(np.median(np.linalg.norm((found - corners)[kept, 0], axis=1))) / before.shape[1]
+
+
+def _write(path: Path, folder: Path, chosen: list[int]) -> None:
+    import cv2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    video, wanted, number = cv2.VideoCapture(str(path)), set(chosen), 0
+    while wanted:
+        # Frames in between are decoded, not copied out.
+        if not video.grab():
+            break
+        if number in wanted:
+            _, frame = video.retrieve()
+            name = str(folder / f"frame_{number:06d}.jpg")
+            if not cv2.imwrite(name, frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
+                raise ProjectError(f"{name}: cannot be written; free some space")
+            wanted.remove(number)
+        number += 1
+    video.release()

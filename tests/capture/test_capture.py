@@ -1,0 +1,195 @@
+"""Photographs and videos without poses become projects."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from command_line import refused
+from PIL import Image
+
+from gvtools.capture.mapping import find_cameras
+from gvtools.capture.pairs import similar_pairs
+from gvtools.capture.photographs import copy_upright, find_photographs
+from gvtools.capture.placement import place
+from gvtools.capture.project import capture_photographs
+from gvtools.errors import OptionError, ProjectError
+from gvtools.procedural.room_sample import write_room
+from gvtools.scenes.project import open_project
+from pipelines.cli import main
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A room's project with true cameras: ten photographs."""
+    folder = tmp_path_factory.mktemp("capture") / "room"
+    write_room(folder, views=10, width=360, height=270)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def captured(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project made of these photographs alone."""
+    out = tmp_path_factory.mktemp("captured") / "project"
+    assert main(["capture", str(room / "images"), "--out", str(out), "--quiet"]) == 0
+    return out
+
+
+def centre_error(found: Path, truth: Path) -> float:
+    """Largest error of a centre after a similarity, as a share of the centres' extent."""
+    mine, true = open_project(found), open_project(truth)
+    a = mine.cameras.centers
+    b = np.concatenate([true[name].camera.centers for name in mine.names])
+    similarity = pycolmap.estimate_sim3d(a, b)
+    moved = np.array([similarity * row for row in a])
+    return float(np.linalg.norm(moved - b, axis=1).max() / np.ptp(b, axis=0).max())
+
+
+def test_cameras_are_found_from_the_pictures_alone(room: Path, captured: Path) -> None:
+    scene = open_project(captured)
+    # The last ones along the path show hardly anything of the others.
+    assert len(scene) >= 8
+    assert centre_error(captured, room) < 0.03
+    report = json.loads((captured / "capture.json").read_text())
+    assert report["registered"] == list(scene.names)
+    assert len(report["registered"]) + len(report["left_out"]) == 10
+    assert report["reprojection_px"] < 1
+    assert len(report["cameras"]) == 1
+    assert (captured / "capture.png").stat().st_size > 10_000
+    assert sorted(path.name for path in captured.iterdir()) == [
+        "capture.json", "capture.png", "images", "sparse",
+    ]  # fmt: skip
+    assert not list(captured.parent.glob(".*"))
+
+
+def test_the_model_is_level_and_takes_a_given_length(captured: Path) -> None:
+    model = pycolmap.Reconstruction(str(captured / "sparse/0"))
+    up = -np.mean(
+        [image.cam_from_world().rotation.matrix()[1] for image in model.images.values()], 0
+    )
+    assert up[2] > 0.9 * np.linalg.norm(up)
+    assert np.abs(up[:2]).max() < 1e-6
+    names = [image.name for image in model.images.values()]
+    placement, _ = place(model, locations={}, distance=(names[0], names[3], 2.5))
+    ends = [model.find_image_with_name(names[row]).projection_center() for row in (0, 3)]
+    assert placement.metric
+    assert np.linalg.norm(ends[0] - ends[1]) == pytest.approx(2.5)
+    with pytest.raises(OptionError, match="no registered picture"):
+        place(model, locations={}, distance=(names[0], "elsewhere.jpg", 1.0))
+
+
+def test_gps_places_a_model_in_metres(captured: Path) -> None:
+    model = pycolmap.Reconstruction(str(captured / "sparse/0"))
+    images = list(model.images.values())
+    true = np.stack([image.projection_center() for image in images]) * [40, 40, 40]
+    places = pycolmap.GPSTransform().enu_to_ellipsoid(true, 48.0, 11.0, 500.0)
+    locations = {
+        image.name: (float(row[0]), float(row[1]), float(row[2]))
+        for image, row in zip(images, places, strict=True)
+    }
+    placement, findings = place(model, locations=locations)
+    assert (placement.metric, placement.by) == (True, "GPS")
+    found = np.stack([image.projection_center() for image in model.images.values()])
+    assert np.allclose(found - found.mean(0), true - true.mean(0), atol=0.01)
+    # A spread below the receiver's error tells nothing.
+    near = {name: (48.0 + 1e-6 * i, 11.0, 500.0) for i, name in enumerate(locations)}
+    placement, findings = place(model, locations=near)
+    assert not placement.metric
+    assert "not used" in findings[0].message
+
+
+def test_damaged_copied_and_turned_pictures_are_told_apart(room: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    shutil.copytree(room / "images", folder)
+    names = sorted(path.name for path in folder.iterdir())
+    (folder / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing more")
+    shutil.copy(folder / names[0], folder / "copy.png")
+    with Image.open(folder / names[1]) as image:
+        exif = image.getexif()
+        exif[0x0112] = 6  # stored on its side: to be turned by 90 degrees
+        image.transpose(Image.Transpose.ROTATE_90).save(folder / "turned.jpg", exif=exif)
+    photographs, findings = find_photographs(folder)
+    said = " ".join(finding.message for finding in findings)
+    assert "1 of 13 pictures cannot be read" in said
+    assert "are copies of others" in said
+    assert "1 pictures were stored on their side" in said
+    copy_upright(photographs, tmp_path / "upright")
+    with (
+        Image.open(tmp_path / "upright/turned.jpg") as upright,
+        Image.open(folder / names[1]) as original,
+    ):
+        assert upright.size == original.size
+        assert int(upright.getexif().get(0x0112, 1)) == 1
+        difference = np.asarray(upright, np.int16) - np.asarray(original.convert("RGB"))
+        assert np.abs(difference).mean() < 6
+    kept = (tmp_path / "upright" / names[0]).read_bytes()
+    assert kept == (folder / names[0]).read_bytes()
+
+
+def test_a_picture_of_elsewhere_is_left_out_and_named(room: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for path in sorted((room / "images").iterdir())[:5]:
+        shutil.copy(path, folder)
+    noise = np.random.default_rng(3).integers(0, 255, (270, 360, 3), np.uint8)
+    Image.fromarray(noise).save(folder / "noise.png")
+    report = capture_photographs(folder, tmp_path / "out")
+    assert set(report.left_out) == {"noise.png"}
+    assert len(report.registered) == 5
+    assert any("noise.png" in finding.message for finding in report.findings)
+
+
+def test_pictures_that_share_nothing_give_one_line_and_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    rng = np.random.default_rng(1)
+    for index in range(3):
+        noise = rng.integers(0, 255, (120, 160, 3), np.uint8)
+        Image.fromarray(noise).save(folder / f"{index}.png")
+    assert "show enough of the same" in refused(
+        capsys, "capture", folder, "--out", tmp_path / "out"
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]
+
+
+def test_wrong_inputs_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there/file").touch()
+    (tmp_path / "text.txt").touch()
+    out = ("--out", tmp_path / "out")
+    assert "at least two photographs" in refused(capsys, "capture", tmp_path / "empty", *out)
+    assert "no such file" in refused(capsys, "capture", tmp_path / "nothing", *out)
+    assert "expected a folder of photographs" in refused(
+        capsys, "capture", tmp_path / "text.txt", *out
+    )
+    assert "nothing is overwritten" in refused(
+        capsys, "capture", tmp_path / "empty", "--out", tmp_path / "there"
+    )
+    assert "A,B,METRES" in refused(capsys, "capture", tmp_path / "empty", *out, "--distance", "a,b")
+
+
+def test_pairs_are_found_by_what_pictures_look_like(room: Path, tmp_path: Path) -> None:
+    names = sorted(path.name for path in (room / "images").iterdir())
+    with pytest.raises(ProjectError):
+        find_cameras(room / "images", [names[:1]], work=tmp_path)
+    database = tmp_path / "features.db"
+    pycolmap.extract_features(database, room / "images")
+    pairs = similar_pairs(database, nearest=3)
+    assert all(a in names and b in names and a < b for a, b in pairs)
+    cameras = open_project(room)
+    apart = {
+        (a, b): float(np.linalg.norm(cameras[a].camera.centers - cameras[b].camera.centers))
+        for a in names
+        for b in names
+        if a < b
+    }
+    chosen = np.mean([apart[pair] for pair in pairs])
+    assert len(pairs) < len(apart)
+    assert chosen < 0.8 * np.mean(list(apart.values()))
