@@ -18,9 +18,9 @@ from PIL import Image, ImageOps
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.photographs import named
+from gvtools.scenes.project import PICTURES
 from gvtools.scenes.scene import Finding, natural_key
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 # EXIF tags (Exif 2.32) and the sub-folders that hold them.
 EXIF_FOLDER, GPS_FOLDER = 0x8769, 0x8825
 ORIENTATION, MAKE, MODEL = 0x0112, 0x010F, 0x0110
@@ -66,7 +66,7 @@ def find_photographs(folder: Path) -> tuple[list[Photograph], list[Finding]]:
     paths = [
         path
         for path in folder.rglob("*")
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+        if path.suffix.lower() in PICTURES and not path.name.startswith(".") and path.is_file()
     ]
     paths.sort(key=lambda path: natural_key(path.relative_to(folder).as_posix()))
     found: list[Photograph] = []

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from gvtools.capture.photographs import sharpness
 from gvtools.errors import OptionError, ProjectError
 
-SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")
 # Frames are compared at this width. [pixels]
 WIDTH = 320
 # Motion, as a share of the picture's width, after which a frame is taken where no number is given:

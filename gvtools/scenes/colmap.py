@@ -25,18 +25,25 @@ from gvtools.scenes.scene import Finding, Scene
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 
 
-def read_colmap(root: Path, *, images: Path | None = None, masks: Path | None = None) -> Scene:
+def read_colmap(
+    root: Path,
+    *,
+    images: Path | None = None,
+    masks: Path | None = None,
+    model: int | None = None,
+) -> Scene:
     """A COLMAP project with every view in an undistorted pinhole camera.
 
-    The model is looked for in ``sparse/0``, ``sparse`` and ``root`` itself, the pictures in
-    ``images`` beside it. Masks follow COLMAP's layout (``masks/NAME.png`` for the image NAME,
-    black = ignore). Depth comes from ``stereo/depth_maps`` (geometric before photometric); it is
-    z-depth of the recorded camera, which in a dense workspace is the undistorted one already.
+    The model is looked for in ``sparse/N``, ``sparse``, ``root`` itself and ``sparse_txt``, the
+    pictures in ``images`` beside it. Masks follow COLMAP's layout (``masks/NAME.png`` for the image
+    NAME, black = ignore). Depth comes from ``stereo/depth_maps`` (geometric before photometric); it
+    is z-depth of the recorded camera, which in a dense workspace is the undistorted one already.
 
     Args:
         root: the workspace or the model folder.
         images: the image folder, where it is not beside the model.
         masks: the mask folder, where it is not beside the images.
+        model: number of the model, where there are several; None takes the largest.
 
     Returns:
         The scene, in the model's frame and scale.
@@ -46,13 +53,13 @@ def read_colmap(root: Path, *, images: Path | None = None, masks: Path | None = 
             camera. Unreadable pictures and wrong sizes are error findings, and raise when loaded.
     """
     root = Path(root)
-    folder = find_model(root)
+    folder = find_model(root, number=model)
     if folder is None:
         raise ProjectError(
             f"{root}: no COLMAP model; expected cameras.bin or cameras.txt in sparse/0, in sparse "
             "or in the folder itself"
         )
-    model = load_model(folder)
+    loaded = load_model(folder)
     homes = _homes(root, folder)
     image_folder = _image_folder(images, homes, folder)
     beside = image_folder.parent
@@ -60,16 +67,16 @@ def read_colmap(root: Path, *, images: Path | None = None, masks: Path | None = 
         _first([beside, *homes], "masks") if masks is None else given_folder(masks, "masks")
     )
     depth_folder = _first([*homes, beside], "stereo/depth_maps")
-    findings = list(model.findings)
+    findings = list(loaded.findings)
     photographs, ids = _photographs(
-        model, image_folder, mask_folder, depth_folder=depth_folder, findings=findings
+        loaded, image_folder, mask_folder, depth_folder=depth_folder, findings=findings
     )
-    points, dropped = sparse_points(model, {key: i for i, key in enumerate(ids)})
+    points, dropped = sparse_points(loaded, {key: i for i, key in enumerate(ids)})
     lenses = [photograph.lens for photograph in photographs]
     findings += dropped + lens_findings(lenses)
     findings += header_findings([(item.image, item.lens.source_size) for item in photographs])
     findings += _depth_findings(photographs)
-    findings += _registered_findings(image_folder, model)
+    findings += _registered_findings(image_folder, loaded)
     views = tuple(photograph.view() for photograph in photographs)
     return Scene(root, "colmap", views, points, tuple(findings), metric=False)
 
@@ -77,7 +84,7 @@ def read_colmap(root: Path, *, images: Path | None = None, masks: Path | None = 
 def _homes(root: Path, folder: Path) -> list[Path]:
     """Folders that may hold ``images``, ``masks`` and ``stereo``, nearest guess first."""
     homes = [root, folder, folder.parent]
-    if folder.parent.name == "sparse":
+    if folder.parent.name in ("sparse", "sparse_txt"):
         homes.append(folder.parent.parent)
     return list(dict.fromkeys(path.resolve() for path in homes))
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 REQUIRED = ("cameras", "images", "points3D")
 RIGGED = ("rigs", "frames")
-# Where a model lies inside a workspace, best first.
-PLACES = ("sparse/0", "sparse", ".", "colmap/sparse/0", "colmap/sparse")
+# Where a model lies inside a workspace, best first. A place may hold several, numbered from 0.
+PLACES = ("sparse", ".", "colmap/sparse", "sparse_txt")
 # Bytes of the smallest record of each binary file.
 LEAST_BYTES = {"cameras": 24, "images": 73, "points3D": 51, "rigs": 8, "frames": 68}
 
@@ -44,16 +44,41 @@ def has_model(folder: Path) -> bool:
     return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 
-def find_model(root: Path) -> Path | None:
-    """The model folder of a workspace, or ``root`` when it is one; None when there is none."""
+def find_model(root: Path, *, number: int | None = None) -> Path | None:
+    """The model folder of a workspace, or ``root`` when it is one; None when there is none.
+
+    Args:
+        root: the workspace.
+        number: of the model, where the workspace holds several (``sparse/0``, ``sparse/1``, ...);
+            None takes the one with most images, the first of equals.
+
+    Raises:
+        ProjectError: there is no model of that number.
+    """
     for place in PLACES:
+        numbered = _numbered(root / place)
+        if number is not None:
+            if number in numbered:
+                return numbered[number]
+            continue
+        if numbered:
+            return max(numbered.values(), key=_count_images)
         if has_model(root / place):
             return root / place
-    numbered = sorted(
-        (path for path in root.glob("sparse/*") if path.name.isdecimal() and has_model(path)),
-        key=lambda path: int(path.name),
+    if number is None:
+        return None
+    known = [str(key) for place in PLACES for key in _numbered(root / place)]
+    raise ProjectError(
+        f"{root}: no COLMAP model of number {number}; it holds {', '.join(known) or 'none'}"
     )
-    return numbered[0] if numbered else None
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    """Models in sub-folders that are numbers, by these, ascending."""
+    if folder.name not in ("sparse", "sparse_txt") or not folder.is_dir():
+        return {}
+    found = [path for path in folder.iterdir() if path.name.isdecimal() and has_model(path)]
+    return {int(path.name): path for path in sorted(found, key=lambda path: int(path.name))}
 
 
 def model_files(folder: Path) -> ModelFiles:
@@ -142,7 +167,7 @@ def _suffix(folder: Path) -> str:
 
 
 def _siblings(folder: Path) -> tuple[tuple[str, int], ...]:
-    if folder.parent.name != "sparse":
+    if folder.parent.name not in ("sparse", "sparse_txt"):
         return ()
     return tuple(
         (path.name, _count_images(path))

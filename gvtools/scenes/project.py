@@ -18,10 +18,12 @@ from gvtools.scenes.transforms_json import FILE as TRANSFORMS
 from gvtools.scenes.transforms_json import read_transforms
 from gvtools.scenes.tum import TUM
 
+PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")
 # ScanNet before Redwood: both have colour and depth folders.
 LAYOUTS = (SEVENSCENES, TUM, SCANNET, REDWOOD)
 LOOKED_FOR = (
-    "a COLMAP model (cameras.bin or .txt in sparse/0, sparse or the folder itself)",
+    "a COLMAP model (cameras.bin or .txt in sparse/N, sparse, sparse_txt or the folder itself)",
     "transforms.json",
     *(layout.looks_like for layout in LAYOUTS),
 )
@@ -34,6 +36,7 @@ def open_project(
     masks: Path | None = None,
     rgbd: RgbdOptions | None = None,
     root: Path | None = None,
+    model: int | None = None,
 ) -> Scene:
     """The scene of a COLMAP workspace or model, a posed RGB-D folder or a ``transforms.json``.
 
@@ -43,6 +46,7 @@ def open_project(
         masks: the mask folder (COLMAP, transforms).
         rgbd: what a posed RGB-D folder does not tell by itself.
         root: the folder of the data set's download.
+        model: number of the COLMAP model, where there are several; None takes the largest.
 
     Raises:
         ProjectError: nothing there that can be read, or what is there is damaged.
@@ -50,10 +54,10 @@ def open_project(
         ShapeError: a pose with NaN, a scale or a mirror.
     """
     if is_address(path):
-        if images is not None or masks is not None or rgbd is not None:
+        if any(option is not None for option in (images, masks, rgbd, model)):
             raise OptionError(
-                f"{path}: the data set's spec says how it is read; expected neither images, masks "
-                "nor RGB-D options"
+                f"{path}: the data set's spec says how it is read; expected neither images, masks, "
+                "a model's number nor RGB-D options"
             )
         return open_address(path, root)
     if root is not None:
@@ -64,15 +68,19 @@ def open_project(
     path = Path(path)
     if not path.exists():
         raise ProjectError(f"{path}: no such folder{_nearest(path)}")
-    model = find_model(path) if path.is_dir() else None
-    if model is not None or path.is_file() or (path / TRANSFORMS).is_file():
+    if path.suffix.lower() in VIDEOS and path.is_file():
+        raise ProjectError(f"{path}: a video without cameras; {_capture(path)}")
+    folder = find_model(path, number=model) if path.is_dir() else None
+    if model is not None and folder is None:
+        raise OptionError(f"{path}: a file; a model's number is of a COLMAP workspace")
+    if folder is not None or path.is_file() or (path / TRANSFORMS).is_file():
         if rgbd is not None:
             raise OptionError(f"{path}: no posed RGB-D folder; expected no RGB-D options")
-        if model is None:
+        if folder is None:
             return read_transforms(path, images=images, masks=masks)
         from gvtools.scenes.colmap import read_colmap
 
-        scene = read_colmap(path, images=images, masks=masks)
+        scene = read_colmap(path, images=images, masks=masks, model=model)
         if not (path / TRANSFORMS).is_file():
             return scene
         note = f"the COLMAP model is read, {TRANSFORMS} is not: give that file to read it instead"
@@ -88,6 +96,10 @@ def open_project(
     raise ProjectError(_unknown(path))
 
 
+def _capture(path: Path) -> str:
+    return f"find the cameras first: gvtools capture {path} --out PROJECT"
+
+
 def _nearest(path: Path) -> str:
     import difflib
 
@@ -99,6 +111,9 @@ def _nearest(path: Path) -> str:
 
 def _unknown(path: Path) -> str:
     entries = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
+    pictures = [name for name in entries if Path(name).suffix.lower() in PICTURES]
+    if len(pictures) > 1:
+        return f"{path}: {len(pictures)} pictures without cameras; {_capture(path)}"
     held = f"holds {named(entries)}" if entries else "is empty"
     inside = [
         str(folder)

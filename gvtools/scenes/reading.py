@@ -19,6 +19,7 @@ READING = {
     "root": None,
     "images": None,
     "masks": None,
+    "model": None,
     "depth_unit": "depth_unit",
     "depth_max": "depth_max",
     "color_intrinsics": "color_K",
@@ -42,7 +43,7 @@ def open_as(path: Path, reading: Mapping[str, Any]) -> Scene:
         name: None if reading.get(name) is None else Path(reading[name])
         for name in ("images", "masks", "root")
     }
-    return open_project(path, **folders, rgbd=rgbd_options(reading))
+    return open_project(path, **folders, rgbd=rgbd_options(reading), model=reading.get("model"))
 
 
 def open_recorded(project: str, reading: Mapping[str, Any], *, moved: Path | None = None) -> Scene:

@@ -49,13 +49,13 @@ def run(args: argparse.Namespace, console: Console) -> None:
         GvError: nothing that can be used, or no place to write to.
     """
     from gvtools.capture.project import capture_photographs
-    from gvtools.capture.video import SUFFIXES
+    from gvtools.scenes.project import VIDEOS
 
     if not args.input.exists():
         raise ProjectError(f"{args.input}: no such file or folder; expected photographs or a video")
-    if args.input.is_file() and args.input.suffix.lower() not in SUFFIXES:
+    if args.input.is_file() and args.input.suffix.lower() not in VIDEOS:
         raise OptionError(
-            f"{args.input}: expected a folder of photographs, or a video ({', '.join(SUFFIXES)})"
+            f"{args.input}: expected a folder of photographs, or a video ({', '.join(VIDEOS)})"
         )
     if args.masks is not None and not args.masks.is_dir():
         raise ProjectError(f"--masks {args.masks}: no such folder")

@@ -26,6 +26,9 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         "--masks", type=Path, metavar="DIR", help="masks NAME.png (black = ignore) of the pictures"
     )
     group.add_argument(
+        "--model", type=int, metavar="N", help="COLMAP's sparse/N, where it holds several (largest)"
+    )
+    group.add_argument(
         "--depth-unit", type=_positive, metavar="METRES", help="of one stored unit of RGB-D depth"
     )
     group.add_argument(

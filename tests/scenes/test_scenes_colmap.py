@@ -9,6 +9,8 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.colmap_depth import write_depth_map
 from gvtools.scenes.inspection import reprojection_errors
+from gvtools.scenes.project import open_project
+from gvtools.scenes.reading import open_as
 
 UNTOUCHED = ("SIMPLE_PINHOLE", "PINHOLE")
 
@@ -209,6 +211,27 @@ def test_further_models_are_named(tmp_path):
     reconstruction.write_binary(tmp_path / "sparse" / "1")
     messages = [finding.message for finding in read_colmap(tmp_path).findings]
     assert "model 0 is read; further models are not: 1 (4 images)" in messages
+
+
+def test_the_largest_model_is_read_and_any_other_can_be_chosen(tmp_path):
+    small = workspace(tmp_path)
+    (tmp_path / "sparse/0").rename(tmp_path / "sparse/1")
+    image = next(iter(small.images.values()))
+    small.deregister_frame(image.frame_id)
+    (tmp_path / "sparse/0").mkdir()
+    small.write_binary(tmp_path / "sparse/0")
+    largest = read_colmap(tmp_path)
+    assert len(largest) == 4
+    assert any("model 1 is read" in finding.message for finding in largest.findings)
+    assert image.name not in open_project(tmp_path, model=0).names
+    assert open_as(tmp_path, {"model": 0}).names == open_project(tmp_path, model=0).names
+    with pytest.raises(ProjectError, match="no COLMAP model of number 7; it holds 0, 1"):
+        open_project(tmp_path, model=7)
+
+
+def test_a_text_model_beside_the_pictures_is_found(tmp_path):
+    workspace(tmp_path, text=True, place="sparse_txt")
+    assert len(open_project(tmp_path)) == 4
 
 
 def test_picture_of_another_size_is_an_error_finding_and_raises_when_loaded(tmp_path):

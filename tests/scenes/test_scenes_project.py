@@ -71,3 +71,14 @@ def test_import_is_quick():
     code = f"import sys, gvtools.scenes.project; print({heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_pictures_without_cameras_are_told_from_unknown_folders(tmp_path):
+    for index in range(3):
+        save(tmp_path / f"{index}.jpg", ramp())
+    with pytest.raises(ProjectError, match=r"3 pictures without cameras; .* gvtools capture"):
+        open_project(tmp_path)
+    video = tmp_path / "walk.mp4"
+    video.touch()
+    with pytest.raises(ProjectError, match=r"a video without cameras; .* gvtools capture"):
+        open_project(video)
