@@ -1,14 +1,19 @@
 """Cameras from photographs: features, matching and mapping by pycolmap.
 
-Global mapping (GLOMAP, Pan et al. 2024) solves for all cameras at once. Where it registers too few
-pictures or leaves large errors, incremental mapping is tried as well and the better model kept.
+Global mapping (GLOMAP, Pan et al. 2024) solves for all cameras at once. It can end in a model whose
+parts have different scales, with every picture registered and small reprojection errors (fox:
+centres wrong by 35 % of their extent, errors of 0.5 pixels). What tells such a model is how many
+verified matches became points: 69 % there, 94 % in the right one. So incremental mapping is tried
+as well where that share is low, and the model that explains more is kept.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +31,8 @@ EXHAUSTIVE = 60
 SEQUENTIAL_OVERLAP = 10
 # Features of a picture at most, and the longer side that they are found at.
 MAX_FEATURES, MAX_SIDE = 8192, 1600
-# A global model that registers less than this share, or errs by more pixels, is not taken unseen.
-ENOUGH, LARGE_ERROR = 0.9, 1.5
+# A global model that explains a smaller share of the verified matches is not taken unseen.
+ENOUGH = 0.9
 # A camera that fewer points hold is taken out: global mapping keeps some that a dozen points hold,
 # which bend the whole model (demo room: errors of centres of 28 % of the extent, 2 % without them).
 LEAST_POINTS = 30
@@ -48,6 +53,7 @@ class Mapped:
         others: numbers of registered pictures of further models, largest first.
         matching: how pairs were chosen, in words.
         pairs: number of verified matches of each pair of pictures, by their names.
+        explained: share of these matches that became points of the model.
     """
 
     model: pycolmap.Reconstruction
@@ -55,6 +61,7 @@ class Mapped:
     others: tuple[int, ...]
     matching: str
     pairs: Mapping[tuple[str, str], int]
+    explained: float
 
 
 def find_cameras(
@@ -97,7 +104,7 @@ def find_cameras(
                 "these, and sharp ones"
             )
         say(f"finding cameras from {len(pairs)} pairs that overlap")
-        found = _map(database, images, work, count=len(names), say=say)
+        found = _map(database, images, work, pairs=pairs, say=say)
     if not found:
         best = max(pairs, key=lambda pair: pairs[pair])
         raise ProjectError(
@@ -105,10 +112,10 @@ def find_cameras(
             f"{pairs[best]} matches), and no model comes of them; expected views from different "
             "places; take pictures while walking, not while turning on the spot"
         )
-    kind, models = found
+    kind, models, share = found
     first, *rest = sorted(models, key=lambda model: -model.num_reg_images())
     others = tuple(model.num_reg_images() for model in rest)
-    return Mapped(first, kind, others, how, pairs)
+    return Mapped(first, kind, others, how, pairs=pairs, explained=share)
 
 
 def _extract(database: Path, images: Path, names: Sequence[str], *, masks: Path | None) -> None:
@@ -171,27 +178,26 @@ def _verified(database: Path) -> dict[tuple[str, str], int]:
 
 
 def _map(
-    database: Path, images: Path, work: Path, *, count: int, say: Say
-) -> tuple[str, list[pycolmap.Reconstruction]] | None:
-    """How the best models were made, and these; None where there is none."""
+    database: Path, images: Path, work: Path, *, pairs: Mapping[tuple[str, str], int], say: Say
+) -> tuple[str, list[pycolmap.Reconstruction], float] | None:
+    """How the best models were made, these, and the share that the largest explains.
+
+    None where there is no model.
+    """
     import pycolmap
 
-    options = pycolmap.GlobalPipelineOptions()
-    options.random_seed = SEED
-    best: tuple[str, list[pycolmap.Reconstruction]] | None = None
+    settings = pycolmap.GlobalPipelineOptions()
+    settings.random_seed = SEED
+    best = None
     models = _models(
-        pycolmap.global_mapping, database, images, out=work / "global", options=options
+        pycolmap.global_mapping, database, images, out=work / "global", options=settings
     )
     if models:
-        best = "global", models
-        largest = max(models, key=lambda model: model.num_reg_images())
-        error = largest.compute_mean_reprojection_error()
-        if largest.num_reg_images() >= ENOUGH * count and error <= LARGE_ERROR:
+        share = explained(_largest(models), pairs)
+        best = "global", models, share
+        if share >= ENOUGH:
             return best
-        say(
-            f"global mapping registers {largest.num_reg_images()} of {count} pictures with errors "
-            f"of {error:.2f} pixels; trying incremental mapping"
-        )
+        say(f"global mapping explains {share:.0%} of the matches; trying incremental mapping")
     else:
         say("global mapping gives no model; trying incremental mapping")
     pipeline = pycolmap.IncrementalPipelineOptions()
@@ -201,15 +207,33 @@ def _map(
     models = _models(
         pycolmap.incremental_mapping, database, images, out=work / "incremental", options=pipeline
     )
-    if models and (best is None or _rank(models) > _rank(best[1])):
-        best = "incremental", models
+    if models:
+        share = explained(_largest(models), pairs)
+        if best is None or share > best[2]:
+            best = "incremental", models, share
     return best
 
 
-def _rank(models: Sequence[pycolmap.Reconstruction]) -> tuple[int, float]:
-    """More pictures are better; among equals, smaller errors."""
-    largest = max(models, key=lambda model: model.num_reg_images())
-    return largest.num_reg_images(), -largest.compute_mean_reprojection_error()
+def _largest(models: Sequence[pycolmap.Reconstruction]) -> pycolmap.Reconstruction:
+    return max(models, key=lambda model: model.num_reg_images())
+
+
+def explained(model: pycolmap.Reconstruction, pairs: Mapping[tuple[str, str], int]) -> float:
+    """Share of the verified matches of all pairs that became points of the model.
+
+    Args:
+        model: with points and their tracks.
+        pairs: number of verified matches of each pair of pictures.
+    """
+    names = {image.image_id: image.name for image in model.images.values()}
+    shared: Counter[tuple[str, str]] = Counter()
+    for point in model.points3D.values():
+        seen = sorted({names[element.image_id] for element in point.track.elements})
+        shared.update(combinations(seen, 2))
+    became = 0
+    for (first, second), count in pairs.items():
+        became += min(count, shared[min(first, second), max(first, second)])
+    return became / max(1, sum(pairs.values()))
 
 
 def _models(

@@ -24,6 +24,8 @@ from gvtools.scenes.scene import Finding
 
 REPORT = "capture.json"
 IMAGES, MODEL = "images", "sparse/0"
+# A model that explains less of the matches is likely to be wrong.
+DOUBTFUL = 0.75
 
 Say = Callable[[str], object]
 
@@ -39,6 +41,7 @@ class CaptureReport:
         reprojection_px: mean error of the triangulated points, pixels.
         points: how many.
         track_length: mean number of pictures that a point is seen in.
+        explained: share of the verified matches that became points; low where a model is doubtful.
         mapping: "global" or "incremental".
         matching: how pairs were chosen.
         other_models: pictures of further models that do not connect to this one.
@@ -56,6 +59,7 @@ class CaptureReport:
     reprojection_px: float
     points: int
     track_length: float
+    explained: float
     mapping: str
     matching: str
     other_models: tuple[int, ...]
@@ -207,6 +211,12 @@ def _report(
         sizes = ", ".join(str(number) for number in mapped.others)
         text = f"further models of {sizes} pictures do not connect to the largest: not kept"
         met.append(Finding("warning", text))
+    if mapped.explained < DOUBTFUL:
+        text = (
+            f"{mapped.explained:.0%} of the matches became points: the cameras are doubtful; look "
+            "at the picture of the cameras, and take more pictures from places in between"
+        )
+        met.append(Finding("warning", text))
     return CaptureReport(
         pictures=len(photographs),
         registered=tuple(registered),
@@ -214,6 +224,7 @@ def _report(
         reprojection_px=float(model.compute_mean_reprojection_error()),
         points=int(model.num_points3D()),
         track_length=float(model.compute_mean_track_length()),
+        explained=mapped.explained,
         mapping=mapped.how,
         matching=mapped.matching,
         other_models=mapped.others,

@@ -93,6 +93,7 @@ def _print(report: CaptureReport, console: Console) -> None:
         ("points", report.points),
         ("pictures that see a point, mean", f"{report.track_length:.1f}"),
         ("pairs that overlap", len(report.overlap)),
+        ("matches that became points", f"{report.explained:.0%}"),
         ("matched", report.matching),
         ("mapping", report.mapping),
         ("cameras", ", ".join(str(camera["model"]) for camera in report.cameras)),
