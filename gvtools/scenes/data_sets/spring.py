@@ -68,8 +68,8 @@ def halved(disparity: NDArray[np.float64]) -> NDArray[np.float64]:
     The median of four is exact on planes, whose disparity is affine in the picture. Where an edge
     halves the block, it is the nearer surface's, so that no depth between two is made up.
 
-    >>> halved(np.array([[1.0, 1.01], [1.02, 1.03]])).item()
-    1.015
+    >>> halved(np.array([[1.0, 1.125], [1.125, 1.25]]) + 16).item()
+    17.125
     """
     height, width = disparity.shape[0] // 2, disparity.shape[1] // 2
     blocks = disparity.reshape(height, 2, width, 2).transpose(0, 2, 1, 3).reshape(height, width, 4)
