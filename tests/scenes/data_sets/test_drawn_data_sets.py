@@ -176,7 +176,9 @@ def test_tartanair_is_found_where_its_archives_repeat_the_environment(written: W
 def test_bytes_of_tartanair_v2s_depth_are_in_opencvs_order(written: Written) -> None:
     """As the documentation decodes them: cv2.imread(...).view("<f4")."""
     for path in sorted(written.root.rglob("*_depth.png")):
-        official = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).view("<f4")[..., 0]
+        packed = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert packed is not None
+        official = packed.view("<f4")[..., 0]
         np.testing.assert_array_equal(
             packed_depth(path), np.where(official > SKY_FROM, 0, official)
         )
