@@ -1,4 +1,4 @@
-"""Folders that hold the same pictures at several sizes: ``images``, ``images_2``, ``images_4``..."""
+"""Folders that hold the same pictures at several sizes: ``images``, ``images_2``, ``images_4``."""
 
 from __future__ import annotations
 

@@ -39,6 +39,7 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # Reasons for which a frame is left out, as findings have them.
 NO_PICTURE = "have no picture"
 NO_POSE = "have no pose"
+NO_LENS = "have no intrinsics"
 UNREADABLE = "have a damaged picture"
 OTHER_ASPECT = "have a picture of another aspect than their camera"
 BAD_POSE = "have an impossible pose"
@@ -53,7 +54,7 @@ class PosedPicture:
         name: the view's name.
         image: the picture, or the file that holds it among others.
         lens: its camera, of pictures of ``lens.size``; a picture that has the same aspect and
-            another size gets it scaled.
+            another size gets it scaled. None where the layout lacks it.
         pose: (4, 4) or (3, 4), OpenCV axes, scene units; None where the layout lacks it.
         depth: the depth map, or the file that holds it; None where the layout has none.
         read_depth: how ``depth`` is read, to (h, w) float32 z-depth in scene units, 0 = none.
@@ -65,7 +66,7 @@ class PosedPicture:
 
     name: str
     image: Path
-    lens: LensParameters
+    lens: LensParameters | None
     pose: Float64 | None
     depth: Path | None = None
     read_depth: Callable[[Path], Depth] = read_depth
@@ -240,6 +241,9 @@ def _lens(
     picture: PosedPicture, lenses: dict[LensParameters, Undistortion], sieve: _Sieve
 ) -> Undistortion | None:
     """The frame's way to a pinhole camera, or None where the frame is left out."""
+    if picture.lens is None:
+        sieve.drop(picture.name, NO_LENS)
+        return None
     size = picture.lens.size
     if picture.read is None:
         try:
