@@ -1,0 +1,178 @@
+"""Waymo Open, perception data set v2: Parquet components, one file a segment.
+
+``[SPLIT/]camera_image/SEGMENT.parquet`` holds JPEGs with the vehicle's pose at each picture's own
+time, ``camera_calibration`` a row for each of the five cameras, ``vehicle_pose`` the pose of each
+frame, which stands in where a picture lacks its own. Both are world_from_vehicle; ``extrinsic`` is
+vehicle_from_cam of a camera with x forward, y left and z up; units are metres. Lenses have OpenCV's
+k1, k2, p1, p2, k3 and are undistorted. Columns of numbers are read at opening; a picture is read
+from its row group when it is needed. Lidar is not read, and shutters roll: a picture has one pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.data_sets.layouts import Layout
+from gvtools.scenes.data_sets.posed_pictures import (
+    Float64,
+    PosedPicture,
+    natural,
+    posed_scene,
+)
+from gvtools.scenes.data_sets.spec import DataSetSpec
+from gvtools.scenes.scene import Finding, Frame, Scene
+from gvtools.scenes.transforms_frame import LensParameters
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
+TIME, CAMERA = "key.frame_timestamp_micros", "key.camera_name"
+IMAGE, IMAGE_POSE = "[CameraImageComponent].image", "[CameraImageComponent].pose.transform"
+VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
+CALIBRATION = "[CameraCalibrationComponent]."
+INTRINSICS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+# Waymo's camera axes (x forward, y left, z up) from OpenCV's.
+WAYMO_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+PICTURES_AT_ONCE = 4  # that are decoded from a row group to come to one of them
+
+
+def _scenes(root: Path) -> tuple[str, ...]:
+    files = (*root.glob("camera_image/*.parquet"), *root.glob("*/camera_image/*.parquet"))
+    found = []
+    for path in files:
+        split = path.parent.parent.relative_to(root).as_posix()
+        found.append(path.stem if split == "." else f"{split}/{path.stem}")
+    return natural(found)
+
+
+def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
+    split, _, segment = scene.rpartition("/")
+    home = root / split
+    images = home / "camera_image" / f"{segment}.parquet"
+    rig = _calibrations(home / "camera_calibration" / f"{segment}.parquet")
+    vehicle = _vehicle_poses(home / "vehicle_pose" / f"{segment}.parquet")
+    pictures, stood_in = [], 0
+    for group, row, record in _rows(images, (TIME, CAMERA, IMAGE_POSE)):
+        time, camera = int(record[TIME]), int(record[CAMERA])
+        pose = _transform(record.get(IMAGE_POSE))
+        if pose is None:
+            pose = vehicle.get(time)
+            stood_in += pose is not None
+        lens, vehicle_from_cam = rig.get(camera, (None, None))
+        if pose is not None and vehicle_from_cam is not None:
+            pose = pose @ vehicle_from_cam @ WAYMO_FROM_OPENCV
+        pictures.append(
+            PosedPicture(
+                f"{CAMERAS.get(camera, str(camera))}/{time}",
+                images,
+                lens,
+                pose,
+                read=partial(read_picture, group=group, row=row),
+            )
+        )
+    findings = []
+    if stood_in:
+        line = f"{stood_in} pictures have their frame's pose, not that of their own time"
+        findings.append(Finding("warning", line))
+    return posed_scene(images, pictures, poses="world_from_cam", metric=True, findings=findings)
+
+
+def read_picture(path: Path, *, group: int, row: int) -> Frame:
+    """One picture of a ``camera_image`` file.
+
+    Args:
+        path: the file.
+        group: its row group.
+        row: within the group.
+
+    Raises:
+        ProjectError: absent or damaged.
+        OptionError: pyarrow is not installed.
+    """
+    try:
+        with _parquet().ParquetFile(path) as file:
+            seen = 0
+            for batch in file.iter_batches(
+                batch_size=PICTURES_AT_ONCE, row_groups=[group], columns=[IMAGE]
+            ):
+                if row < seen + batch.num_rows:
+                    data = batch.column(0)[row - seen].as_py()
+                    return Frame(np.array(Image.open(BytesIO(data)).convert("RGB")))
+                seen += batch.num_rows
+    except (OSError, SyntaxError, ValueError, TypeError) as error:
+        raise ProjectError(f"{path}: unreadable picture ({error}); copy it again") from None
+    raise ProjectError(f"{path}: no row {row} in row group {group}; copy it again")
+
+
+def _rows(path: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, int, dict[str, Any]]]:
+    """Row group, row within it, and the values of the columns that a file has."""
+    try:
+        with _parquet().ParquetFile(path) as file:
+            known = set(file.schema_arrow.names)
+            wanted = [name for name in columns if name in known]
+            for group in range(file.num_row_groups):
+                row = 0
+                for batch in file.iter_batches(row_groups=[group], columns=wanted):
+                    for record in batch.to_pylist():
+                        yield group, row, record
+                        row += 1
+    except (OSError, ValueError) as error:
+        raise ProjectError(f"{path}: no readable Parquet file ({error}); copy it again") from None
+
+
+def _calibrations(path: Path) -> dict[int, tuple[LensParameters, Float64 | None]]:
+    """For each camera its lens and (4, 4) vehicle_from_cam."""
+    names = [f"{CALIBRATION}intrinsic.{name}" for name in INTRINSICS]
+    sides = [f"{CALIBRATION}{side}" for side in ("width", "height")]
+    extrinsic = f"{CALIBRATION}extrinsic.transform"
+    rig = {}
+    for _, _, record in _rows(path, (CAMERA, *names, *sides, extrinsic)):
+        try:
+            *shared, k3 = (float(record[name]) for name in names)
+            size = int(record[sides[0]]), int(record[sides[1]])
+        except (KeyError, TypeError, ValueError):
+            continue  # a camera without intrinsics: its pictures are left out and counted
+        lens = LensParameters("FULL_OPENCV", (*shared, k3, 0.0, 0.0, 0.0), size)
+        rig[int(record[CAMERA])] = lens, _transform(record.get(extrinsic))
+    return rig
+
+
+def _vehicle_poses(path: Path) -> dict[int, Float64]:
+    """For each frame's time stamp (4, 4) world_from_vehicle; empty where the file is absent."""
+    if not path.is_file():
+        return {}
+    poses = {}
+    for _, _, record in _rows(path, (TIME, VEHICLE_POSE)):
+        pose = _transform(record.get(VEHICLE_POSE))
+        if pose is not None:
+            poses[int(record[TIME])] = pose
+    return poses
+
+
+def _transform(values: Any) -> Float64 | None:
+    """(4, 4) of sixteen numbers, row by row; None where there are none."""
+    if values is None or len(values) != 16:
+        return None
+    return np.array(values, np.float64).reshape(4, 4)
+
+
+def _parquet() -> ModuleType:
+    try:
+        import pyarrow.parquet
+    except ImportError:
+        raise OptionError("reading Waymo's files needs pyarrow; pip install pyarrow") from None
+    return pyarrow.parquet
+
+
+LAYOUT = Layout(
+    "SPLIT/camera_image/SEGMENT.parquet with camera_calibration and vehicle_pose", _scenes, _read
+)
