@@ -10,19 +10,23 @@ A scene's intrinsics stand in ``metadata_camera_parameters.csv`` (of the data se
 is looked for in the root and above) as a 3x3 matrix that takes u (right) and v (up), both from -1
 to 1 across the picture, to a ray. With a tilted lens the picture's plane is not square to the view.
 Such a camera is a pinhole all the same, one that is turned: matrix and orientation are split anew,
-so that nothing is resampled, and z is along the turned axis. Without the file the published 60
-degrees are taken, which a finding tells.
+so that nothing is resampled, and z is along the turned axis. A lens that is tilted both ways skews
+the pixels besides, and rows of such pictures and maps are moved sideways to those of a pinhole.
+Without the file the published 60 degrees are taken, which a finding tells.
 """
 
 from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.data_sets.layouts import Layout
@@ -35,6 +39,7 @@ from gvtools.scenes.data_sets.posed_pictures import (
     posed_scene,
 )
 from gvtools.scenes.data_sets.spec import DataSetSpec
+from gvtools.scenes.images import read_image
 from gvtools.scenes.photographs import Depth
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
@@ -45,7 +50,7 @@ if TYPE_CHECKING:
 PARAMETERS = "metadata_camera_parameters.csv"
 SIZE = (1024, 768)
 FIELD_OF_VIEW = math.radians(60)  # horizontal, of scenes without lens shift
-SKEW = 1e-6  # of a focal length; a pinhole has none
+SKEW = 1e-6  # slopes below this are rounding
 # The tone curve: this share of pixels is below this brightness, after the display's gamma.
 PERCENTILE, BRIGHTNESS, GAMMA = 90, 0.8, 2.2
 DARK = 1e-4  # a picture whose brightness is below this stays black
@@ -67,11 +72,8 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
     parameters = _parameters(root, name)
     unit = _metres_per_unit(detail / "metadata_scene.csv", parameters)
     uv, size, findings = _projection(parameters)
-    lens, turn = turned_pinhole(uv, size, what=scene)
-    if turn is not None:
-        angle = math.degrees(math.acos(min(1.0, turn[2, 2])))
-        line = f"tilted lens: cameras are turned by {angle:.3g} degrees to pinholes"
-        findings.append(Finding("info", line))
+    turned = turned_pinhole(uv, size)
+    findings += _turn_findings(turned)
     orientations = _hdf5(detail / camera / "camera_keyframe_orientations.hdf5")
     positions = _hdf5(detail / camera / "camera_keyframe_positions.hdf5") * unit
     indices = _frame_indices(detail / camera, len(positions))
@@ -81,40 +83,59 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, position
         pose = pose @ OPENCV_FROM_OPENGL
-        if turn is not None:
-            pose[:3, :3] = pose[:3, :3] @ turn
+        pose[:3, :3] = pose[:3, :3] @ turned.stored_from_turned
         stem = f"frame.{index:04d}"
-        color, read = _color(images, camera, stem)
+        color, read = _color(images, camera, stem, turned=turned)
         frames.append(
             PosedPicture(
                 stem,
                 color,
-                lens,
+                turned.lens,
                 pose,
                 geometry / f"{stem}.depth_meters.hdf5" if geometry.is_dir() else None,
-                partial(read_distance, lens=lens),
+                partial(read_distance, camera=turned),
                 read=read,
             )
         )
     return posed_scene(root / scene, frames, poses="world_from_cam", metric=True, findings=findings)
 
 
-def turned_pinhole(
-    cam_from_uv: Float64, size: tuple[int, int], *, what: str
-) -> tuple[LensParameters, Float64 | None]:
+@dataclass(frozen=True)
+class TurnedPinhole:
     """The pinhole of a perspective camera whose picture may be tilted.
+
+    Attributes:
+        lens: of the pinhole.
+        stored_from_turned: (3, 3) rotation from the pinhole's axes to the stored camera's, OpenCV.
+        slope: by how many pixels a row of the stored picture lies farther right than the one above.
+    """
+
+    lens: LensParameters
+    stored_from_turned: Float64
+    slope: float
+
+    def straight(self, values: NDArray[Any], *, nearest: bool) -> NDArray[Any]:
+        """A stored picture or map (h, w, ...) with its rows moved to the pinhole's."""
+        import cv2
+
+        if not self.slope:
+            return values
+        height, width = values.shape[:2]
+        shift = self.slope * (0.5 - self.lens.values[3])
+        back = np.array([[1, self.slope, shift], [0, 1, 0]])
+        how = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+        return cv2.warpAffine(values, back, (width, height), flags=how | cv2.WARP_INVERSE_MAP)
+
+
+def turned_pinhole(cam_from_uv: Float64, size: tuple[int, int]) -> TurnedPinhole:
+    """The pinhole of a projection.
 
     Args:
         cam_from_uv: (3, 3), from u, v, 1 to a ray; x right, y up, z backward.
         size: width and height of the picture, pixels.
-        what: for the message.
-
-    Returns:
-        The lens, and the (3, 3) rotation from the turned camera to the stored one, OpenCV axes;
-        None where the picture is square to the view.
 
     Raises:
-        ProjectError: pixels are skewed, so that no pinhole takes such a picture.
+        ProjectError: the projection is mirrored.
     """
     width, height = size
     uv_from_pixel = np.array([[2 / width, 0, -1], [0, -2 / height, 1], [0, 0, 1]])
@@ -123,28 +144,23 @@ def turned_pinhole(
     sign = np.sign(np.diag(upper))
     rotation, upper = rotation * sign, upper * sign[:, None]
     if np.linalg.det(rotation) < 0:
-        raise ProjectError(f"{what}: a mirrored projection in {PARAMETERS}; copy the file again")
+        raise ProjectError(f"{PARAMETERS}: a mirrored projection {ray.tolist()}; copy it again")
     K = np.linalg.inv(upper / upper[2, 2])
-    if abs(K[0, 1]) > SKEW * K[0, 0]:
-        raise ProjectError(
-            f"{what}: its lens is tilted both ways, so that pixels are skewed by {K[0, 1]:.3g} "
-            "px; no pinhole takes such pictures; leave the scene out"
-        )
-    square = np.abs(rotation - np.eye(3)).max() < 1e-12
-    return pinhole_lens(K, size), None if square else rotation
+    slope = float(K[0, 1] / K[1, 1])
+    return TurnedPinhole(pinhole_lens(K, size), rotation, slope if abs(slope) > SKEW else 0.0)
 
 
-def read_distance(path: Path, *, lens: LensParameters) -> Depth:
+def read_distance(path: Path, *, camera: TurnedPinhole) -> Depth:
     """``depth_meters`` as (h, w) float32 z-depth, metres, of a pinhole; 0 for none.
 
     Raises:
         ProjectError: absent or damaged.
         OptionError: h5py is not installed.
     """
-    distance = _hdf5(path)
-    fx, fy, cx, cy = lens.values
+    distance = camera.straight(np.nan_to_num(_hdf5(path).astype(np.float32)), nearest=True)
+    fx, fy, cx, cy = camera.lens.values
     height, width = distance.shape
-    scale = lens.size[0] / width, lens.size[1] / height
+    scale = camera.lens.size[0] / width, camera.lens.size[1] / height
     x = ((np.arange(width) + 0.5) * scale[0] - cx) / fx
     y = ((np.arange(height) + 0.5) * scale[1] - cy) / fy
     z = distance / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
@@ -173,11 +189,38 @@ def read_color(path: Path) -> Frame:
     return Frame(np.rint(display * 255).astype(np.uint8))
 
 
-def _color(images: Path, camera: str, stem: str) -> tuple[Path, partial[Frame] | None]:
-    """The picture of a frame, and its reader; None for a picture file."""
+def read_straight(path: Path, *, camera: TurnedPinhole, reader: Callable[[Path], Frame]) -> Frame:
+    """A picture with its rows moved to the pinhole's; the mask tells what lies outside of it."""
+    frame = reader(path)
+    rgb = camera.straight(frame.rgb, nearest=False)
+    seen = camera.straight(np.ones(rgb.shape[:2], np.uint8), nearest=True)
+    return Frame(rgb, mask=seen > 0)
+
+
+def _color(
+    images: Path, camera: str, stem: str, *, turned: TurnedPinhole
+) -> tuple[Path, Callable[[Path], Frame] | None]:
+    """The picture of a frame, and its reader; None for a picture file as it is."""
     linear = images / f"scene_{camera}_final_hdf5" / f"{stem}.color.hdf5"
     preview = images / f"scene_{camera}_final_preview" / f"{stem}.tonemap.jpg"
-    return (linear, partial(read_color)) if linear.is_file() else (preview, None)
+    path, reader = (linear, read_color) if linear.is_file() else (preview, read_image)
+    if turned.slope:
+        return path, partial(read_straight, camera=turned, reader=reader)
+    return path, reader if reader is read_color else None
+
+
+def _turn_findings(turned: TurnedPinhole) -> list[Finding]:
+    findings = []
+    turn = turned.stored_from_turned
+    if np.abs(turn - np.eye(3)).max() > 1e-9:
+        angle = math.degrees(math.acos(min(1.0, turn[2, 2])))
+        line = f"tilted lens: cameras are turned by {angle:.3g} degrees to pinholes"
+        findings.append(Finding("info", line))
+    if turned.slope:
+        most = abs(turned.slope) * turned.lens.size[1] / 2
+        line = f"skewed pixels: rows are moved sideways by up to {most:.2g} px to those of pinholes"
+        findings.append(Finding("info", line))
+    return findings
 
 
 def _frame_indices(folder: Path, count: int) -> list[int]:
