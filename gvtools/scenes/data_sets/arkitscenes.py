@@ -28,6 +28,7 @@ from gvtools.scenes.data_sets.posed_pictures import (
     posed_scene,
 )
 from gvtools.scenes.data_sets.spec import DataSetSpec
+from gvtools.scenes.data_sets.timed_poses import pose_at
 from gvtools.scenes.images import read_depth
 from gvtools.scenes.rgbd_recording import MILLIMETRES
 from gvtools.scenes.scene import Finding, Scene
@@ -62,7 +63,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
     frames, exact = [], 0
     for name in _names(folder / pictures, depths):
         time = _stamp(name)
-        pose = pose_at(time, times, poses)
+        pose = pose_at(time, times, poses, same=SAME, longest_gap=LONGEST_GAP)
         exact += pose is not None and bool(np.abs(times - time).min() <= SAME)
         frames.append(
             PosedPicture(
@@ -148,28 +149,6 @@ def read_trajectory(path: Path) -> tuple[Float64, Float64]:
     poses[:, :3, :3] = Rotation.from_rotvec(rows[:, 1:4]).as_matrix()
     poses[:, :3, 3] = rows[:, 4:]
     return rows[:, 0], poses
-
-
-def pose_at(time: float, times: Float64, poses: Float64) -> Float64 | None:
-    """(4, 4) cam_from_world at a time: a pose, or two interpolated; None where none is near.
-
-    The camera's place and orientation in the world are interpolated, not the inverse pose.
-    """
-    from scipy.spatial.transform import Rotation, Slerp
-
-    nearest = int(np.abs(times - time).argmin())
-    if abs(times[nearest] - time) <= SAME:
-        return poses[nearest]
-    after = int(np.searchsorted(times, time))
-    if after in (0, len(times)) or times[after] - times[after - 1] > LONGEST_GAP:
-        return None
-    pair = poses[after - 1 : after + 1]
-    share = (time - times[after - 1]) / (times[after] - times[after - 1])
-    centers = -np.einsum("nji,nj->ni", pair[:, :3, :3], pair[:, :3, 3])
-    pose = np.eye(4)
-    pose[:3, :3] = Slerp([0, 1], Rotation.from_matrix(pair[:, :3, :3]))(share).as_matrix()
-    pose[:3, 3] = -pose[:3, :3] @ (centers[0] + share * (centers[1] - centers[0]))
-    return pose
 
 
 LAYOUT = Layout(

@@ -27,8 +27,9 @@ def written(
 def test_a_miniature_is_read_back(written: tuple[Miniature, Path, Expected]) -> None:
     miniature, root, expected = written
     assert layout_named(miniature.layout).scenes(root) == (expected.scene,)
-    scene = read(miniature.layout, root, expected.scene)
-    compare(scene, expected, pose_error=miniature.pose_error)
+    with miniature.within():
+        scene = read(miniature.layout, root, expected.scene)
+        compare(scene, expected, pose_error=miniature.pose_error)
     assert list(scene.names) == sorted(scene.names, key=natural_key)
     assert all(file.is_file() for view in scene for file in view.files)
 

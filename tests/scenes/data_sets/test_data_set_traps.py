@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import shutil
+import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from data_sets import (
+    mini_aria,
     mini_arkitscenes,
     mini_colmap,
     mini_hypersim,
@@ -18,17 +21,20 @@ from data_sets import (
     mini_stereo_benchmarks,
     mini_waymo,
 )
+from data_sets.aria_stand_in import projectaria_tools
 from data_sets.miniature import compare, layout_named
 from data_sets.miniature import read_miniature as read
 from data_sets.room_frames import room_frames
 from PIL import Image
 
-from gvtools.errors import ProjectError
-from gvtools.scenes.data_sets.arkitscenes import pose_at
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.data_sets.aria_vrs import FISHEYE, AriaCamera
 from gvtools.scenes.data_sets.dtu import decomposed
 from gvtools.scenes.data_sets.hypersim import read_color, turned_pinhole
+from gvtools.scenes.data_sets.timed_poses import pose_at
 from gvtools.scenes.data_sets.video import read_frame
 from gvtools.scenes.scene import Scene
+from gvtools.scenes.transforms_frame import LensParameters
 
 
 def messages(scene: Scene) -> str:
@@ -235,15 +241,20 @@ def test_arkitscenes_frames_between_poses_are_interpolated_and_others_left_out(
     )
 
 
-def test_arkitscenes_poses_far_apart_are_not_interpolated() -> None:
+def test_poses_far_apart_are_not_interpolated() -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = -1.0
-    near = pose_at(0.05, np.array([0.0, 0.1]), poses)
+    at = partial(pose_at, poses=poses, same=1e-3, longest_gap=0.2)
+    near = at(0.05, np.array([0.0, 0.1]))
     assert near is not None
     np.testing.assert_allclose(near[:3, 3], [-0.5, 0, 0], atol=1e-12)
-    assert pose_at(0.5, np.array([0.0, 1.0]), poses) is None
-    assert pose_at(0.2, np.array([0.0, 0.1]), poses) is None
-    assert pose_at(-0.1, np.array([0.0, 0.1]), poses) is None
+    assert at(0.5, np.array([0.0, 1.0])) is None
+    assert at(0.2, np.array([0.0, 0.1])) is None
+    assert at(-0.1, np.array([0.0, 0.1])) is None
+    for time, expected in ((0.0009, 0), (-0.0009, 0), (0.1009, -1)):
+        found = at(time, np.array([0.0, 0.1]))
+        assert found is not None
+        assert found[0, 3] == expected
 
 
 def test_arkitscenes_tells_where_the_sky_is(tmp_path: Path) -> None:
@@ -383,6 +394,61 @@ def test_waymo_takes_the_frames_pose_where_pictures_have_none(tmp_path: Path) ->
     shutil.rmtree(tmp_path / "training" / "vehicle_pose")
     with pytest.raises(ProjectError, match="4 of 4 frames have no pose"):
         read("waymo", tmp_path, expected.scene)
+
+
+# --- Aria Digital Twin ------------------------------------------------------------------------
+
+
+def test_aria_lens_projects_as_the_official_tools() -> None:
+    """Values that projectaria_tools 2.3.0 gives for a FISHEYE624 camera of these parameters."""
+    focal, cx, cy = 610.9, 711.2, 709.4
+    lens = LensParameters(
+        FISHEYE, (focal, focal, cx + 0.5, cy + 0.5, *mini_aria.PARAMS[3:]), (1408, 1408)
+    )
+    points = np.array([[0, 0, 1], [0.3, 0.2, 1], [-0.5, 0.4, 1], [0.9, -0.7, 1], [-1, 1, 1]])
+    official = [
+        [711.2, 709.4],
+        [894.42369727, 831.59135017],
+        [414.56037259, 946.80005992],
+        [1197.46209743, 331.38097377],
+        [205.24181961, 1215.57873122],
+    ]
+    found = AriaCamera(lens, 700.0, np.eye(4))._fisheye.img_from_cam(points)
+    np.testing.assert_allclose(found, np.array(official) + 0.5, rtol=0, atol=1e-7)
+
+
+def test_aria_first_version_has_the_scalar_of_quaternions_first(tmp_path: Path) -> None:
+    expected = mini_aria.write(tmp_path, version="1.0")
+    with projectaria_tools():
+        scene = read("aria_digital_twin", tmp_path, expected.scene)
+        compare(scene, expected)
+    assert "quaternions of version 1.0" in messages(scene)
+
+
+def test_aria_recordings_need_the_official_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = mini_aria.write(tmp_path)
+    monkeypatch.setitem(sys.modules, "projectaria_tools", None)
+    with pytest.raises(OptionError, match="pip install projectaria-tools"):
+        read("aria_digital_twin", tmp_path, expected.scene)
+    (tmp_path / expected.scene / "video.vrs").write_bytes(b"none")
+    monkeypatch.undo()
+    with projectaria_tools(), pytest.raises(ProjectError, match="no readable VRS file"):
+        read("aria_digital_twin", tmp_path, expected.scene)
+
+
+def test_aria_frames_beyond_the_trajectory_are_left_out(tmp_path: Path) -> None:
+    expected = mini_aria.write(tmp_path)
+    path = tmp_path / expected.scene / "aria_trajectory.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:2], *lines[3:4]]))  # without the second and the last pose
+    with projectaria_tools():
+        scene = read("aria_digital_twin", tmp_path, expected.scene)
+    assert scene.names == expected.cameras.names[:3]
+    assert "1 of 4 frames have no pose: dropped" in messages(scene)
+    middle = expected.cameras.centers[[0, 2]].mean(axis=0)
+    np.testing.assert_allclose(scene.cameras.centers[1], middle, atol=1e-3)
 
 
 # --- benchmarks of stereo ---------------------------------------------------------------------
