@@ -23,6 +23,7 @@ COMMANDS = {
     "render": "pipelines.commands.render",
     "tradeoff": "pipelines.commands.tradeoff",
     "evaluate": "pipelines.commands.evaluate",
+    "judge": "pipelines.commands.judge",
     "trajectory": "pipelines.commands.trajectory",
     "report": "pipelines.commands.report",
     "plot": "pipelines.commands.plot",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,7 @@ def view_figures(
     *,
     observed: NDArray[np.bool_],
     generated: NDArray[np.bool_],
+    others: Mapping[str, NDArray[np.bool_]] | None = None,
     depth: ArrayLike | None = None,
     lpips: Lpips | None = None,
 ) -> dict[str, float | None]:
@@ -41,13 +43,14 @@ def view_figures(
         truth: the true picture; its mask limits every comparison, its depth is the reference.
         observed: (H, W) bool, pixels that stand on observations.
         generated: (H, W) bool, pixels that a completer made; never observed ones.
+        others: (H, W) bool each, more regions by name; their figures end in ``_NAME``.
         depth: (H, W) z-depth of the picture, scene units, 0 = none.
         lpips: the network; None leaves LPIPS out. On a region it is the mean of the distance's
             map, which has no meaning for regions much smaller than the network's view. Pictures
             below 32 x 32 pixels have none.
 
     Returns:
-        FIGURES by name; None where there is nothing to compare.
+        FIGURES by name, and those of ``others``; None where there is nothing to compare.
 
     Raises:
         ShapeError: the pictures differ in size.
@@ -58,6 +61,7 @@ def view_figures(
     use = np.ones(shape, np.bool_) if truth.mask is None else truth.mask
     generated = generated & ~observed
     regions = {"": use, "_valid": observed & use, "_generated": generated & use}
+    regions |= {f"_{name}": mask & use for name, mask in (others or {}).items()}
     out: dict[str, float | None] = dict.fromkeys(FIGURES)
     found = image_figures(picture, truth.rgb, regions)
     for region, figures in found.items():

@@ -107,7 +107,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     lpips, no_lpips = open_lpips(args)
     options = EvaluationOptions(
         name=args.name,
-        parts=_parts(args.parts),
+        parts=parts_of(args.parts),
         matcher=args.matcher,
         control=not args.no_control,
         seed=args.seed,
@@ -125,7 +125,12 @@ def run(args: argparse.Namespace, console: Console) -> None:
         write_json(args.json, figures)
 
 
-def _parts(text: str) -> tuple[str, ...]:
+def parts_of(text: str) -> tuple[str, ...]:
+    """The parts that a list with commas names.
+
+    Raises:
+        OptionError: an unknown one, or none.
+    """
     from pipelines.evaluation.run_evaluation import PARTS
 
     parts = tuple(part.strip() for part in text.split(",") if part.strip())

@@ -1,0 +1,147 @@
+"""``gvtools judge``: pictures that any method made, with the figures of ``gvtools evaluate``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError
+from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
+from pipelines.commands.scene_arguments import add_scene_arguments
+
+if TYPE_CHECKING:
+    from pipelines.console import Console
+    from pipelines.judging.reference import Reference
+
+SUMMARY = "judge pictures of any method, several side by side, with the figures of evaluate"
+EXAMPLES = (
+    "gvtools judge runs/kitchen gsplat/results/kitchen nerfstudio/renders --against runs/kitchen "
+    "--out judged",
+    "gvtools judge renders --against scans/kitchen --context not:every:8 --targets every:8 "
+    "--out judged",
+)
+MATCHERS = ("sift", "lightglue")
+MATCHES = ("auto", "name", "order")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument(
+        "pictures",
+        type=Path,
+        nargs="+",
+        metavar="PICTURES",
+        help="of one method each: a folder of pictures, a run of gvtools, or what nerfstudio, "
+        "gsplat or NerfBaselines wrote",
+    )
+    parser.add_argument(
+        "--against",
+        type=Path,
+        required=True,
+        metavar="PROJECT",
+        help="a finished run (its targets, truths, memory and settings count), or a project",
+    )
+    parser.add_argument(
+        "--name", action="append", default=[], metavar="NAME", help="of a method, in their order"
+    )
+    parser.add_argument("--context", metavar="SPEC", help="of a project: the views that were given")
+    parser.add_argument(
+        "--targets", metavar="SPEC", help="of a project: the views that the pictures stand for"
+    )
+    parser.add_argument(
+        "--cameras",
+        type=Path,
+        metavar="FILE",
+        help="a TUM, KITTI or EuRoC trajectory with the cameras of the pictures, where they are "
+        "none of the project's; figures that need a truth are left out then",
+    )
+    parser.add_argument(
+        "--match",
+        choices=MATCHES,
+        default="auto",
+        help="pictures with views: by name, or by order where no name matches (default auto)",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="for the results")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
+    parser.add_argument(
+        "--parts",
+        default="images,consistency,poses",
+        metavar="NAMES",
+        help="what to measure (default %(default)s)",
+    )
+    parser.add_argument(
+        "--no-control", action="store_true", help="leave out the same measures on the true pictures"
+    )
+    parser.add_argument(
+        "--matcher", choices=MATCHERS, default="sift", help="of the pose probe (default sift)"
+    )
+    parser.add_argument(
+        "--sheet-views", type=int, default=12, metavar="N", help="views on contact sheets (12)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (0)")
+    add_lpips_arguments(parser)
+    add_scene_arguments(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Match, measure, print, write.
+
+    Raises:
+        GvError: pictures, run or project cannot be read, or an option is wrong.
+    """
+    from gvtools.files import make_folder, write_json
+    from pipelines.commands.evaluate import parts_of
+    from pipelines.judging.judge import JudgeOptions, judge
+    from pipelines.judging.methods import method_names
+
+    for name, value in (("seed", args.seed), ("sheet-views", args.sheet_views)):
+        if value < 0:
+            raise OptionError(f"--{name} {value}; expected at least 0")
+    names = method_names(args.pictures, args.name)
+    options = JudgeOptions(
+        parts=parts_of(args.parts),
+        matcher=args.matcher,
+        control=not args.no_control,
+        rule=args.match,
+        sheet_views=args.sheet_views,
+        seed=args.seed,
+        lpips_net=args.lpips_net,
+    )
+    lpips, no_lpips = open_lpips(args)
+    make_folder(args.out)
+    figures = judge(
+        args.pictures,
+        names,
+        _reference(args, console),
+        options=options,
+        lpips=lpips,
+        no_lpips=no_lpips,
+        out=args.out,
+        console=console,
+    )
+    if args.json is not None:
+        write_json(args.json, figures)
+
+
+def _reference(args: argparse.Namespace, console: Console) -> Reference:
+    from gvtools.runs.layout import RECORD
+    from pipelines.commands.scene_arguments import open_scene, reading_of
+    from pipelines.judging.reference import observe_context, open_reference
+
+    if (args.against / RECORD).is_file():
+        given = [name for name in ("context", "targets") if getattr(args, name) is not None]
+        if given:
+            raise OptionError(
+                f"--{given[0]}: {args.against} is a run, whose views are its own; leave it out"
+            )
+        return open_reference(args.against, cameras=args.cameras)
+    return observe_context(
+        open_scene(args.against, args),
+        args.out / "memory",
+        context=args.context,
+        targets=args.targets,
+        cameras=args.cameras,
+        reading=reading_of(args),
+        console=console,
+    )

@@ -1,0 +1,1 @@
+"""Pictures that any method made, judged with the figures of gvtools' own."""
