@@ -143,6 +143,8 @@ def observe_context(
         "completer": "none",
         "max_side": None,
         "refine.steps": 0,
+        # Where other methods were told that the cameras stand.
+        "refine.poses": False,
     }
     resume = (out / RECORD).is_file()
     RunDirectory(out).refuse_foreign()

@@ -70,6 +70,6 @@ def _rendered(file: Path, folder: Path, ending: str) -> Picture:
     stem = file.name.removesuffix(ending)
     depth = file.with_name(f"{stem}.depth.npz")
     return Picture(
-        file.relative_to(folder).with_name(stem + Path(ending).suffix).as_posix(),
+        file.relative_to(folder).with_name(stem + file.suffix).as_posix(),
         lambda: Frame(read_rgb(file), read_depth(depth) if depth.is_file() else None),
     )

@@ -1,0 +1,181 @@
+"""Pictures read from folders in the layouts that nerfstudio, gsplat and NerfBaselines write."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gvtools.errors import ProjectError
+from gvtools.evaluation.picture_sets.open_pictures import open_pictures
+
+NAMES = ("cam/2.jpg", "cam/10.jpg", "cam/30.jpg")
+
+
+def picture(seed: int, *, channels: int = 3) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (12, 16, channels), np.uint8)
+
+
+def save(path, rgb) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(rgb).save(path)
+
+
+def png(rgb) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(rgb).save(out, format="PNG")
+    return out.getvalue()
+
+
+def loaded(found):
+    return {one.name: one.load().rgb for one in found.pictures}
+
+
+def test_plain_folders_are_read_with_their_folders_and_depth(tmp_path):
+    save(tmp_path / "a/1.png", picture(0))
+    save(tmp_path / "a/2.png", picture(1))
+    save(tmp_path / ".hidden/3.png", picture(2))
+    depth = np.random.default_rng(3).random((12, 16)).astype(np.float32)
+    np.savez(tmp_path / "a/2.depth.npz", depth=depth)
+    found = open_pictures(tmp_path)
+    assert (found.layout, found.names) == ("plain folder", ("a/1.png", "a/2.png"))
+    assert np.array_equal(loaded(found)["a/1.png"], picture(0))
+    assert found.pictures[0].load().depth is None
+    assert np.array_equal(found.pictures[1].load().depth, depth)
+
+
+def test_the_pictures_of_gvtools_render_are_read_without_their_other_files(tmp_path):
+    for kind in ("rgb", "valid", "confidence"):
+        save(tmp_path / f"frame-1.color.{kind}.png", picture(0))
+    np.savez(tmp_path / "frame-1.color.depth.npz", depth=np.ones((12, 16), np.float32))
+    found = open_pictures(tmp_path)
+    assert (found.layout, found.names) == ("gvtools render", ("frame-1.color.png",))
+    assert found.pictures[0].load().depth.sum() == 12 * 16
+
+
+def test_transparent_pixels_lie_before_black(tmp_path):
+    rgba = picture(0, channels=4)
+    save(tmp_path / "1.png", rgba)
+    expected = np.rint(rgba[..., :3] * (rgba[..., 3:] / 255.0))
+    assert np.array_equal(loaded(open_pictures(tmp_path))["1.png"], expected)
+
+
+@pytest.mark.parametrize("folder", ["", "test"])
+def test_ns_render_dataset(tmp_path, folder):
+    # OUT/SPLIT/OUTPUT/NAME, NAME with the ending of the render.
+    for split in ("test", "train"):
+        for number, name in enumerate(NAMES):
+            file = name.replace(".jpg", ".png")
+            save(tmp_path / split / "rgb" / file, picture(number))
+            save(tmp_path / split / "gt-rgb" / file, picture(number + 10))
+            save(tmp_path / split / "depth" / file, picture(number + 20))
+    found = open_pictures(tmp_path / folder)
+    assert found.layout == "nerfstudio, ns-render dataset"
+    assert found.names == ("cam/2.png", "cam/10.png", "cam/30.png")
+    assert np.array_equal(found.pictures[1].load().rgb, picture(1))
+    assert np.array_equal(found.pictures[1].load_truth(), picture(11))
+    assert found.notes == (() if folder else ("split test taken; also there: train",))
+
+
+def test_ns_eval(tmp_path):
+    for number in range(2):
+        canvas = np.concatenate([picture(number), picture(number + 10)], axis=1)
+        Image.fromarray(canvas).save(tmp_path / f"{number:06d}-img.jpg", quality=100, subsampling=0)
+        save(tmp_path / f"{number:06d}-depth.jpg", picture(5))
+    found = open_pictures(tmp_path)
+    assert (found.layout, len(found.pictures)) == ("nerfstudio, ns-eval", 2)
+    # JPEG at its best quality is some levels off.
+    render, truth = found.pictures[1].load().rgb, found.pictures[1].load_truth()
+    assert np.abs(render.astype(int) - picture(11)).mean() < 5
+    assert np.abs(truth.astype(int) - picture(1)).mean() < 5
+
+
+@pytest.mark.parametrize("folder", ["", "renders"])
+def test_gsplat(tmp_path, folder):
+    for step in (6999, 29999):
+        for number in range(3):
+            canvas = np.concatenate([picture(number), picture(step + number)], axis=1)
+            save(tmp_path / f"renders/val_step{step}_{number:04d}.png", canvas)
+    save(tmp_path / "renders/compress_step29999_0000.png", picture(0))
+    (tmp_path / "stats").mkdir()
+    found = open_pictures(tmp_path / folder)
+    assert (found.layout, found.alphabetical) == ("gsplat", True)
+    assert found.names == tuple(f"val_step29999_{i:04d}.png" for i in range(3))
+    assert np.array_equal(found.pictures[2].load().rgb, picture(29999 + 2))
+    assert np.array_equal(found.pictures[2].load_truth(), picture(2))
+    assert "also there: compress_step29999, val_step6999" in found.notes[1]
+
+
+def members() -> dict[str, bytes]:
+    """What NerfBaselines writes of each picture, and once."""
+    out = {"info.json": b"{}"}
+    for number, name in enumerate(NAMES):
+        stem = name.removesuffix(".jpg")
+        out[f"color/{stem}.png"] = png(picture(number))
+        out[f"gt-color/{stem}.png"] = png(picture(number + 10))
+        out[f"depth-rgb/{stem}.png"] = png(picture(number + 20))
+        out[f"depth/{stem}.bin"] = b"\0"
+        out[f"cameras/{stem}.npz"] = b"\0"
+    return out
+
+
+def write_archive(path, entries) -> None:
+    with tarfile.open(path, "w:gz") as tar:
+        for name, content in entries.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            tar.addfile(info, io.BytesIO(content))
+
+
+@pytest.mark.parametrize("form", ["folder", "archive", "training"])
+def test_nerfbaselines(tmp_path, form):
+    path = tmp_path
+    if form == "folder":
+        for name, content in members().items():
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_bytes(content)
+    elif form == "archive":
+        path = tmp_path / "predictions.tar.gz"
+        write_archive(path, members())
+    else:
+        write_archive(tmp_path / "predictions-30000.tar.gz", members())
+        write_archive(tmp_path / "predictions-7000.tar.gz", {"color/x.png": png(picture(9))})
+        (tmp_path / "results-30000.json").write_text("{}")
+    found = open_pictures(path)
+    assert found.layout == "NerfBaselines"
+    assert found.names == ("cam/2.png", "cam/10.png", "cam/30.png")
+    assert np.array_equal(found.pictures[1].load().rgb, picture(1))
+    assert np.array_equal(found.pictures[1].load_truth(), picture(11))
+    taken = ("predictions-30000.tar.gz taken, the last of 2",)
+    assert found.notes == (taken if form == "training" else ())
+
+
+def test_what_holds_no_pictures_is_refused(tmp_path):
+    with pytest.raises(ProjectError, match="no such folder"):
+        open_pictures(tmp_path / "absent")
+    with pytest.raises(ProjectError, match="no pictures"):
+        open_pictures(tmp_path)
+    (tmp_path / "a.zip").write_bytes(b"x")
+    with pytest.raises(ProjectError, match="is a file"):
+        open_pictures(tmp_path / "a.zip")
+    (tmp_path / "predictions.tar.gz").write_bytes(b"x")
+    with pytest.raises(ProjectError, match="no readable archive"):
+        open_pictures(tmp_path / "predictions.tar.gz")
+    write_archive(tmp_path / "empty.tar.gz", {"info.json": b"{}"})
+    with pytest.raises(ProjectError, match="no pictures under color/"):
+        open_pictures(tmp_path / "empty.tar.gz")
+
+
+def test_a_canvas_that_is_no_pair_is_refused(tmp_path):
+    save(tmp_path / "val_step0_0000.png", picture(0)[:, :15])
+    with pytest.raises(ProjectError, match="15 pixels wide"):
+        open_pictures(tmp_path).pictures[0].load()
+
+
+def test_a_damaged_picture_is_named(tmp_path):
+    (tmp_path / "1.png").write_bytes(png(picture(0))[:60])
+    with pytest.raises(ProjectError, match=r"1\.png"):
+        open_pictures(tmp_path).pictures[0].load()
