@@ -87,10 +87,9 @@ def summary_table(
         name = evaluation["name"]
         images = evaluation.get("images", {"mean": {}, "rounds": [], "notes": {}})
         for figure, value in images["mean"].items():
-            by_round = [part[figure]["mean"] for part in images["rounds"]]
-            by_round += [None] * (rounds - len(by_round))
+            by_round = {part["round"]: part[figure]["mean"] for part in images["rounds"]}
             ends = value["mean"], value["low"], value["high"], value["n"]
-            rows.append((name, figure, *ends, *by_round, None))
+            rows.append((name, figure, *ends, *(by_round.get(i + 1) for i in range(rounds)), None))
         for figure, mean, low, high, n, true in scalars(evaluation):
             rows.append((name, figure, mean, low, high, n, *[None] * rounds, true))
         notes += [f"{name}: {key}: {text}" for key, text in images["notes"].items()]

@@ -101,6 +101,7 @@ def judge(
         "against": str(reference.run.path),
         "project": reference.run.record["project"],
         "context": list(reference.run.context),
+        "poses": reference.poses,
         "cameras": None if reference.cameras is None else str(reference.cameras),
         "targets": [target.picture.name for target in targets],
         "with_truth": sum(target.truth is not None for target in targets),

@@ -16,6 +16,7 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.runs.layout import RECORD
 from gvtools.runs.memory_file import load_memory
+from gvtools.runs.poses import refined_poses_of
 from gvtools.runs.run import Run, load_run
 from gvtools.runs.target_files import to_bytes
 from pipelines.evaluation.measured_target import MeasuredTarget, context_pictures, run_targets
@@ -63,6 +64,11 @@ class Reference:
             replace(target, surface=self.memory.project(target.picture.camera).depth[0])
             for target in self.targets
         ]
+
+    @property
+    def poses(self) -> str:
+        """Whose the poses of the targets and the context are."""
+        return "recorded" if refined_poses_of(self.run.path) is None else "refined by the run"
 
     def context(self) -> list[PosedPicture]:
         """The context views with the memory's depth."""
@@ -141,7 +147,6 @@ def observe_context(
         # One round: nothing is added to the memory between the targets.
         "views_per_round": max(len(scene), 1) if cameras is None else 1_000_000,
         "completer": "none",
-        "max_side": None,
         "refine.steps": 0,
         # Where other methods were told that the cameras stand.
         "refine.poses": False,

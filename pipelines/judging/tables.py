@@ -95,26 +95,27 @@ def _control(method: Figures, path: Sequence[str]) -> float | None:
 
 
 def _notes(figures: Figures) -> list[str]:
-    total = len(figures["targets"])
-    notes = []
+    """How each method was read and matched, and what its figures lack."""
+    total, notes = len(figures["targets"]), []
     for method in figures["methods"]:
-        name = method["name"]
-        text = f"{name}: {method['layout']}, matched by {method['matched_by']}"
+        parts = [f"{method['layout']}, matched by {method['matched_by']}"]
         if method["missing"]:
-            text += (
-                f"; no picture of {len(method['missing'])} of {total} views, means are over the "
+            parts.append(
+                f"no picture of {len(method['missing'])} of {total} views, means are over the "
                 "others and have no rank"
             )
         if method["left_over"]:
-            text += f"; {len(method['left_over'])} pictures of no judged view left out"
+            parts.append(f"{len(method['left_over'])} pictures of no judged view left out")
         for entry in method["resized"]:
             width, height = entry["from"]
-            text += f"; {entry['pictures']} pictures of {width}x{height} pixels resized"
-        notes.append("; ".join([text, *method["reading"]]))
-        notes += (
-            [f"{name}: {key}: {why}" for key, why in nested(method, "images", "notes").items()]
-            if "images" in method
-            else []
+            parts.append(f"{entry['pictures']} pictures of {width}x{height} pixels resized")
+        notes.append(f"{method['name']}: {'; '.join([*parts, *method['reading']])}")
+        reasons = nested(method, "images", "notes") or {}
+        notes += [f"{key}: {why}" for key, why in reasons.items() if key == "lpips"]
+    if figures["poses"] != "recorded":
+        notes.append(
+            f"poses are {figures['poses']}: pictures rendered at recorded ones look from somewhere "
+            "else, and their errors of poses and matches tell so"
         )
     return list(dict.fromkeys(notes))
 
