@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -124,8 +124,14 @@ def _opened(
 ) -> Method:
     """The method's pictures; those without depth get the memory's, where it is needed."""
     method = open_method(path, name, reference.targets, rule=options.rule)
-    if "consistency" in options.parts and any(t.picture.depth is None for t in method.targets):
-        method = open_method(path, name, reference.with_surfaces, rule=options.rule)
+    if "consistency" in options.parts:
+        method = replace(
+            method,
+            targets=[
+                reference.with_surface(target) if target.picture.depth is None else target
+                for target in method.targets
+            ],
+        )
     matching, pictures = method.matching, method.pictures
     console.line(
         f"{name}: {len(method.targets)} of {len(reference.targets)} views, matched by "

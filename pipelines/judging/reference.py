@@ -7,10 +7,13 @@ that its regions are what the context observed at recorded poses.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.posed_picture import PosedPicture
@@ -38,6 +41,7 @@ class Reference:
 
     run: Run
     cameras: Path | None = None
+    _surfaces: dict[tuple[str, int], NDArray[np.float32]] = field(default_factory=dict, repr=False)
 
     @cached_property
     def memory(self) -> SpatialMemory:
@@ -57,13 +61,12 @@ class Reference:
         """
         return run_targets(self.run) if self.cameras is None else self._projected()
 
-    @cached_property
-    def with_surfaces(self) -> list[MeasuredTarget]:
-        """The targets with the memory's depth, for pictures without depth of their own."""
-        return [
-            replace(target, surface=self.memory.project(target.picture.camera).depth[0])
-            for target in self.targets
-        ]
+    def with_surface(self, target: MeasuredTarget) -> MeasuredTarget:
+        """A target with the memory's depth, for a picture without depth of its own."""
+        key = target.picture.name, target.number
+        if key not in self._surfaces:
+            self._surfaces[key] = self.memory.project(target.picture.camera).depth[0]
+        return replace(target, surface=self._surfaces[key])
 
     @property
     def poses(self) -> str:
