@@ -125,7 +125,7 @@ def _by_name(pictures: Sequence[str], views: Sequence[str], what: str) -> list[i
     Raises:
         OptionError: two pictures for one view.
     """
-    tried = [[[] for _ in views]]
+    tried: list[list[list[int]]] = [[[] for _ in views]]
     for view_keys in (_paths(views), _last_parts(views)):
         if len(set(view_keys)) == len(view_keys):
             for picture_keys in (_paths(pictures), _last_parts(pictures)):
