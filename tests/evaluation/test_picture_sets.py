@@ -87,6 +87,7 @@ def test_ns_eval(tmp_path):
         save(tmp_path / f"{number:06d}-depth.jpg", picture(5))
     found = open_pictures(tmp_path)
     assert (found.layout, len(found.pictures)) == ("nerfstudio, ns-eval", 2)
+    assert found.alphabetical
     # JPEG at its best quality is some levels off.
     render, truth = found.pictures[1].load().rgb, found.pictures[1].load_truth()
     assert np.abs(render.astype(int) - picture(11)).mean() < 5

@@ -5,7 +5,9 @@ NAME being the photograph's path below the folder that all photographs have in c
 .jpg or .png (nerfstudio/scripts/render.py, DatasetRender). ``ns-eval`` writes ``NNNNNN-img.jpg``,
 the truth on the left and the render on the right, and ``NNNNNN-depth.jpg``,
 ``NNNNNN-accumulation.jpg`` (VanillaPipeline.get_average_image_metrics; get_image_metrics_and_images
-of nerfacto and splatfacto). Pictures of ``ns-render`` along a path (``00000.jpg``) are a plain
+of nerfacto and splatfacto). NNNNNN counts the views of the split as the data set has them: its own
+format in alphabetical order of the photographs' paths, which is taken here; COLMAP's in the order of
+the images' numbers, which the truths beside the renders tell where it differs. Pictures of ``ns-render`` along a path (``00000.jpg``) are a plain
 folder.
 """
 
@@ -63,7 +65,8 @@ def evaluation_renders(path: Path) -> PictureSet | None:
         path,
         "nerfstudio, ns-eval",
         tuple(canvas_picture(file, path) for file in in_natural_order(canvases, path)),
-        notes=("renders are the right halves of the pictures",),
+        alphabetical=True,
+        notes=("renders are the right halves of the pictures, which are JPEG",),
     )
 
 
