@@ -5,10 +5,10 @@ NAME being the photograph's path below the folder that all photographs have in c
 .jpg or .png (nerfstudio/scripts/render.py, DatasetRender). ``ns-eval`` writes ``NNNNNN-img.jpg``,
 the truth on the left and the render on the right, and ``NNNNNN-depth.jpg``,
 ``NNNNNN-accumulation.jpg`` (VanillaPipeline.get_average_image_metrics; get_image_metrics_and_images
-of nerfacto and splatfacto). NNNNNN counts the views of the split as the data set has them: its own
-format in alphabetical order of the photographs' paths, which is taken here; COLMAP's in the order of
-the images' numbers, which the truths beside the renders tell where it differs. Pictures of ``ns-render`` along a path (``00000.jpg``) are a plain
-folder.
+of nerfacto and splatfacto). NNNNNN counts the views of the split as the data set has them:
+nerfstudio's own format in alphabetical order of the photographs' paths, which is taken here,
+COLMAP's in the order of the images' numbers. The truths beside the renders tell where it differs.
+Pictures of ``ns-render`` along a path (``00000.jpg``) are a plain folder.
 """
 
 from __future__ import annotations
