@@ -7,7 +7,7 @@ same on any number of processes and workers, and a million draws are one call.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -23,12 +23,14 @@ from gvtools.training.view_sample import Sample
 Float64 = NDArray[np.float64]
 
 # Of an invalid sample, the same source is asked so often, so that sources keep their shares; then
-# so many others are drawn, until an error says that the data are not fit to train on.
-TRIES, REDRAWS = 10, 5
+# one of the others is drawn, until none is left.
+TRIES = 10
 # Streams of a mixture.
 SOURCES, GEOMETRY = range(2)
 # Numbers that Philox makes in one step of its counter.
 _BLOCK = 4
+# Numbers that are spread evenly together.
+_RUN = 1024
 # The source of procedural rooms.
 ROOMS = "rooms"
 # What notes begin with: samples by source, invalid ones by source and reason, where geometry
@@ -89,18 +91,19 @@ class Mixture:
         weights = np.array([source.weight for source in self.sources], np.float64)
         return weights / weights.sum()
 
-    def drawn(self, start: int, count: int, redraw: int = 0) -> NDArray[np.int64]:
+    def drawn(self, start: int, count: int, *, without: Collection[int] = ()) -> NDArray[np.int64]:
         """(count,) which source the numbers from ``start`` on have.
 
         Args:
             start: 0 or more.
             count: how many.
-            redraw: 0; 1 and more where the source before had no valid sample.
+            without: sources that had no valid sample; not all of those with a share.
         """
-        numbers = uniform_at(start, count, stream=[self.seed, MIXED, SOURCES, redraw])
-        ends = np.cumsum(self.shares)
+        numbers = stratified_at(start, count, stream=[self.seed, MIXED, SOURCES, len(without)])
+        shares = np.where(np.isin(np.arange(len(self.sources)), list(without)), 0, self.shares)
+        ends = np.cumsum(shares) / shares.sum()
         # Rounding must not leave a gap at the end, nor give it to a source of weight 0.
-        last = int(np.flatnonzero(self.shares)[-1])
+        last = int(np.flatnonzero(shares)[-1])
         return np.minimum(np.searchsorted(ends, numbers, side="right"), last)
 
     def sample(self, index: int) -> Sample:
@@ -113,18 +116,23 @@ class Mixture:
         if index < 0:
             raise OptionError(f"sample {index}; expected a number of 0 or more")
         notes: list[str] = []
-        for attempt in range(TRIES * REDRAWS):
-            source = self.sources[int(self.drawn(index, 1, attempt // TRIES)[0])]
-            try:
-                sample = source.samples.sample(index, attempt)
-            except InvalidSampleError as error:
-                notes.append(f"{RESAMPLED}/{source.name}/{error.reason}")
-                problem = f"{source.name}: {error}"
-                continue
-            own = [f"{kind}/{source.name}/{text}" for kind, text in map(_split, sample.notes)]
-            return replace(sample, notes=(*notes, f"{DRAWN}/{source.name}", *own))
+        failed: list[int] = []
+        problem = ""
+        while len(failed) < np.count_nonzero(self.shares):
+            number = int(self.drawn(index, 1, without=failed)[0])
+            source = self.sources[number]
+            for attempt in range(TRIES):
+                try:
+                    sample = source.samples.sample(index, attempt)
+                except InvalidSampleError as error:
+                    notes.append(f"{RESAMPLED}/{source.name}/{error.reason}")
+                    problem = f"{source.name}: {error}"
+                    continue
+                own = [f"{kind}/{source.name}/{text}" for kind, text in map(_split, sample.notes)]
+                return replace(sample, notes=(*notes, f"{DRAWN}/{source.name}", *own))
+            failed.append(number)
         raise DegenerateError(
-            f"sample {index}: {TRIES * REDRAWS} draws and none is valid, the last of {problem}"
+            f"sample {index}: {len(notes)} draws and none is valid, the last of {problem}"
         )
 
     def describe(self) -> dict[str, Any]:
@@ -166,7 +174,7 @@ class OwnOrEstimated:
     def wants_own(self, start: int, count: int, attempt: int = 0) -> NDArray[np.bool_]:
         """(count,) whether the numbers from ``start`` on are to have the own geometry."""
         stream = [self.seed, MIXED, GEOMETRY, attempt]
-        return uniform_at(start, count, stream=stream) < self.own_share
+        return stratified_at(start, count, stream=stream) < self.own_share
 
     def sample(self, index: int, attempt: int = 0) -> Sample:
         """The sample of a number, 0 or more; of each attempt another one.
@@ -192,11 +200,20 @@ class OwnOrEstimated:
         return {**own, "estimated": estimated, "seed": self.seed}
 
 
-def uniform_at(start: int, count: int, *, stream: Sequence[int]) -> Float64:
+def stratified_at(start: int, count: int, *, stream: Sequence[int]) -> Float64:
     """(count,) numbers in [0, 1) from a place of a random stream on, found without those before.
 
-    >>> whole = uniform_at(0, 10, stream=[1, 2])
-    >>> bool((uniform_at(7, 2, stream=[1, 2]) == whole[7:9]).all())
+    Each is uniform by itself. Every run of 1024, from a multiple of it, has one number in each
+    1/1024 in random order, so that what is drawn by them keeps closer to its shares than by
+    independent numbers: of fifteen sources, those miss three standard deviations with one seed in
+    thirty.
+
+    >>> whole = stratified_at(0, 10, stream=[1, 2])
+    >>> bool((stratified_at(7, 2, stream=[1, 2]) == whole[7:9]).all())
+    True
+    >>> sorted(int(1024 * number) for number in stratified_at(2048, 1024, stream=[3])) == [
+    ...     *range(1024)
+    ... ]
     True
 
     Args:
@@ -204,11 +221,13 @@ def uniform_at(start: int, count: int, *, stream: Sequence[int]) -> Float64:
         count: how many.
         stream: names it; numbers of 0 or more.
     """
+    first, last = start // _RUN, -(-(start + count) // _RUN)
     key = np.random.SeedSequence(list(stream)).generate_state(2, np.uint64)
     bits = np.random.Philox(key=key)
-    bits.advance(start // _BLOCK)
-    skip = start % _BLOCK
-    return np.random.Generator(bits).random(skip + count)[skip:]
+    bits.advance(first * 2 * _RUN // _BLOCK)
+    order, place = np.moveaxis(np.random.Generator(bits).random((last - first, 2, _RUN)), 1, 0)
+    numbers = (order.argsort(1).argsort(1) + place) / _RUN
+    return numbers.ravel()[start - first * _RUN :][:count]
 
 
 def _noted(sample: Sample, text: str) -> Sample:

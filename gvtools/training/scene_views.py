@@ -38,6 +38,10 @@ LEAST_DEPTH = 0.1
 KEPT_SCENES = 32  # scenes of large collections that a process keeps open
 
 
+class TooFewViewsError(ProjectError):
+    """A scene has fewer views with depth than a sample."""
+
+
 @dataclass(frozen=True, eq=False)
 class ReducedView:
     """One view, cropped and reduced.
@@ -123,7 +127,8 @@ class SceneViews:
         try:
             views = _usable(self, number)
         except GvError as error:
-            raise InvalidSampleError(SCENE, str(error)) from None
+            reason = DEPTH if isinstance(error, TooFewViewsError) else SCENE
+            raise InvalidSampleError(reason, str(error)) from None
         best = 0.0
         for trial in range(ATTEMPTS):
             rows = self._rows(rng, len(views), trial)
@@ -182,7 +187,7 @@ def _usable(data: SceneViews, number: int) -> tuple[View, ...]:
     chosen = [scene[view] for view in select(scene.names, data.select)]
     views = tuple(view for view in chosen if view.has_depth)
     if len(views) < data.views:
-        raise ProjectError(
+        raise TooFewViewsError(
             f"{scene.root}: {len(views)} of {len(scene)} views have depth and are among "
             f"{data.select!r}; samples need {data.views}; give a scene with recorded depth, or "
             "fewer views a sample"

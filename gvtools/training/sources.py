@@ -23,7 +23,6 @@ class _Opened:
     collection: SceneCollection
     weight: float
     own_share: float
-    fallback: str
 
 
 def recorded_sources(
@@ -45,44 +44,51 @@ def recorded_sources(
     total = sum(each.weight for each in opened)
     sources: list[Source] = []
     for entry, each in zip(whole, opened, strict=True):
-        samples = draw(each.collection)
-        estimated = None
-        if entry.estimated is not None:
-            estimated = draw(open_collection(entry.estimated))
-        if each.own_share < 1 or estimated is not None:
-            samples = OwnOrEstimated(samples, estimated, each.own_share, seed)
         name = _unique(each.collection.title, [source.name for source in sources])
+        samples = _samples(entry, each, draw, seed=seed)
         sources.append(Source(name, share * each.weight / total, samples))
     return tuple(sources)
+
+
+def _samples(entry: SceneSource, opened: _Opened, draw: Draw, *, seed: int) -> Redrawable:
+    if entry.estimated is None:
+        own = draw(opened.collection)
+        return own if opened.own_share == 1 else OwnOrEstimated(own, None, opened.own_share, seed)
+    estimated = draw(open_collection(entry.estimated))
+    if opened.own_share == 0:
+        return estimated
+    return OwnOrEstimated(draw(opened.collection), estimated, opened.own_share, seed)
 
 
 def _opened(entry: SceneSource) -> _Opened:
     root = None if entry.root is None else Path(entry.root)
     collection = open_collection(entry.project, root)
-    counts, weight, own_share, fallback = collection.counts, 0.0, 1.0, ""
+    weight, own_share = 0.0, 1.0
     if collection.data_set:
         from gvtools.scenes.data_sets.spec import load_spec
 
         spec = load_spec(collection.data_set)
         # One scene of a data set has no claim to the weight of all.
         weight = spec.weight if len(collection) > 1 else 0.0
-        if spec.geometry is not None:
-            own_share, fallback = spec.geometry.own_share, spec.geometry.fallback
-    if own_share == 0 and entry.estimated is None:
-        raise OptionError(
-            f"{entry.project}: samples of {collection.title} take estimated geometry alone "
-            f"({fallback}); name a project or shards with estimates as 'estimated', or leave it out"
-        )
+        own_share = 1.0 if spec.geometry is None else spec.geometry.own_share
+        if spec.depth is None:
+            own_share = 0.0
+        if own_share == 0 and entry.estimated is None:
+            fallback = "" if spec.geometry is None else f" ({spec.geometry.fallback})"
+            raise OptionError(
+                f"{entry.project}: {spec.name} gives samples no geometry of its own{fallback}; "
+                "name a project or shards with estimates as 'estimated', or leave it out"
+            )
+    if not weight and collection.counts is not None:
+        weight = math.sqrt(sum(collection.counts))
     if entry.weight is not None:
         weight = entry.weight
-    elif not weight and counts is not None:
-        weight = math.sqrt(sum(counts))
-    if not weight:
+    elif not weight:
         raise OptionError(
             f"{entry.project}: how many images {collection.title} has is not known; give its "
             "'weight'"
         )
-    return _Opened(collection, weight, own_share, fallback)
+    return _Opened(collection, weight, own_share)
 
 
 def _unique(name: str, others: Sequence[str]) -> str:

@@ -1,0 +1,192 @@
+"""``data.scenes``: projects, data sets and shards as sources, their weights, and going on."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_scan import write_scan
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.addresses import open_collection
+from gvtools.scenes.data_sets.spec import load_spec
+from gvtools.scenes.shards.writer import ShardOptions, write_shards
+from gvtools.settings import with_texts
+from gvtools.training.batch import TrainingBatch
+from gvtools.training.mixture import Mixture
+from gvtools.training.options import shipped_or_read
+from gvtools.training.records import read_log
+from gvtools.training.samples import TrainingSamples
+from gvtools.training.state import load_state
+from pipelines.cli import main
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+PARTS = [range(4 * i, 4 * i + 4) for i in range(4)]
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory) -> Path:
+    """A project, a download of 7-Scenes with two sequences, and shards of it."""
+    home = tmp_path_factory.mktemp("home")
+    write_scan(home / "kitchen", views=8)
+    for name in ("chess/seq-01", "fire/seq-02"):
+        write_scan(home / "7scenes" / name, views=9)
+    collection = open_collection("spec:7-Scenes", home / "7scenes")
+    write_shards(collection, home / "shards", options=ShardOptions(megabytes=0.1))
+    return home
+
+
+def settings(*entries: object, share: float = 0.5) -> list[str]:
+    return [f"data.scenes={json.dumps(entries)}", f"data.scene_share={share}"]
+
+
+def samples(*entries: object, share: float = 0.5, more: tuple[str, ...] = ()) -> TrainingSamples:
+    config, folder = shipped_or_read("micro")
+    config = with_texts(config, [*settings(*entries, share=share), "data.scene_overlap=0.1", *more])
+    return TrainingSamples(config, config.network(folder))
+
+
+def equal(a: TrainingBatch, b: TrainingBatch) -> bool:
+    names = ("images", "depth", "valid", "cam_from_world", "K")
+    same = [torch.equal(getattr(a.views, name), getattr(b.views, name)) for name in names]
+    return all(same) and torch.equal(a.depth, b.depth) and a.notes == b.notes
+
+
+def test_every_kind_of_source_gives_samples_of_its_weight(home):
+    download = str(home / "7scenes")
+    data = samples(
+        str(home / "kitchen"),
+        {"project": "spec:7-Scenes", "root": download},
+        {"project": "spec:7-Scenes:chess/seq-01", "root": download, "weight": 50},
+        str(home / "shards"),
+        share=0.8,
+    )
+    spec = load_spec("7-Scenes")
+    weights = {
+        "kitchen": math.sqrt(8),
+        "7-Scenes": spec.weight,
+        "7-Scenes chess seq-01": 50,
+        "7-Scenes (2)": spec.weight,
+    }
+    total = sum(weights.values())
+    assert data.sources is not None
+    assert {name: entry["share"] for name, entry in data.sources.items()} == pytest.approx(
+        {"rooms": 0.2} | {name: 0.8 * weight / total for name, weight in weights.items()}
+    )
+    notes: Counter[str] = Counter()
+    for part in PARTS:
+        notes.update(data.batch(part).notes)
+    drawn = {name: count for name, count in notes.items() if name.startswith("drawn/")}
+    assert sum(drawn.values()) == 16 and len(drawn) >= 3
+
+
+def test_shards_give_the_samples_of_what_they_were_made_of(home):
+    whole = {"project": "spec:7-Scenes", "root": str(home / "7scenes")}
+    direct, sharded = (samples(entry, share=1.0) for entry in (whole, str(home / "shards")))
+    for part in PARTS[:2]:
+        assert equal(direct.batch(part), sharded.batch(part))
+
+
+def test_two_workers_make_the_batches_and_counts_of_none(home):
+    entries = (str(home / "shards"), str(home / "kitchen"))
+    plain = [samples(*entries).batch(part) for part in PARTS]
+    assert len({note for batch in plain for note in batch.notes}) >= 2
+    with_workers = samples(*entries, more=("data.workers=2",)).batches(PARTS)
+    assert all(equal(made, batch) for made, batch in zip(with_workers, plain, strict=True))
+
+
+def test_a_damaged_file_costs_its_windows_alone_and_is_counted(home, tmp_path):
+    folder = write_scan(tmp_path / "flawed", views=12)
+    depth = folder / "frame-000006.depth.png"
+    depth.write_bytes(depth.read_bytes()[:60])
+    batch = samples(str(folder), share=1.0).batch(range(24, 32))
+    assert batch.notes["drawn/flawed"] == 8
+    assert batch.notes["resampled/flawed/unreadable"] > 0
+    again = samples(str(folder), share=1.0, more=("data.pool=32", f"data.cache={tmp_path / 'p'}"))
+    # A pool's files keep the notes.
+    assert again.batch(range(24, 32)).notes == again.batch(range(24, 32)).notes == batch.notes
+
+
+def test_sources_that_cannot_be_are_one_line_before_training(home, tmp_path):
+    with pytest.raises(OptionError, match=r"spec:7-Scenes: no root; give the folder"):
+        samples("spec:7-Scenes")
+    with pytest.raises(OptionError, match="expected one for spec:NAME alone"):
+        samples({"project": str(home / "kitchen"), "root": str(home)})
+    with pytest.raises(ProjectError, match="no such folder"):
+        samples(str(tmp_path / "absent"))
+    with pytest.raises(OptionError, match="expected both or none"):
+        samples(str(home / "kitchen"), share=0)
+    with pytest.raises(OptionError, match=r"data\.scenes.*weight"):
+        samples({"project": str(home / "kitchen"), "weight": -1})
+
+
+def test_the_papers_rule_is_taken_from_the_spec(home, monkeypatch):
+    spec = load_spec("7-Scenes")
+    mixed = load_spec("Hypersim").geometry
+    assert mixed is not None and mixed.own_share == pytest.approx(2 / 3)
+    texts = {"7scenes": spec.model_copy(update={"geometry": mixed})}
+    monkeypatch.setattr("gvtools.scenes.data_sets.spec.load_spec", lambda name: texts["7scenes"])
+    alone = samples(str(home / "shards"), share=1.0).batch(range(24, 32))
+    own, fallen = (
+        alone.notes.get(f"geometry/7-Scenes/{kind}", 0) for kind in ("own", "own (no estimate)")
+    )
+    assert own + fallen == 8 and own and fallen
+    twin = {"project": str(home / "shards"), "estimated": str(home / "kitchen")}
+    both = samples(twin, share=1.0).batch(range(24, 32))
+    assert both.notes["geometry/7-Scenes/own"] == own
+    assert both.notes["geometry/7-Scenes/estimated"] == fallen
+    # Without depth of its own, a data set needs estimates.
+    texts["7scenes"] = spec.model_copy(update={"geometry": mixed, "depth": None})
+    with pytest.raises(OptionError, match=r"no geometry of its own .*name a project or shards"):
+        samples(str(home / "shards"))
+    assert isinstance(samples(twin, share=1.0)._train, Mixture)
+
+
+def test_samples_travel_to_workers_small(home):
+    data = samples(str(home / "shards"))._train
+    data.sample(3)
+    assert len(pickle.dumps(data)) < 20_000
+
+
+def train(out: Path, home: Path, *more: str) -> int:
+    start = ["train", "micro", "--stage", "encoder", "--out", str(out), "--device", "cpu"]
+    words = [*settings(str(home / "shards")), "data.scene_overlap=0.1", "encoder.optimizer.steps=8"]
+    named = [word for text in words for word in ("--set", text)]
+    return main([*start, "--sheets", "0", *named, *more])
+
+
+def test_a_continued_training_sees_the_same_samples_and_counts(home, tmp_path, capsys):
+    assert train(tmp_path / "whole", home) == 0
+    said = capsys.readouterr().out
+    assert "samples (" in said and "of 7-Scenes" in said and "of rooms" in said
+    assert train(tmp_path / "parts", home, "--until", "3") == 0
+    assert train(tmp_path / "parts", home, "--resume") == 0
+    one, two = (read_log(tmp_path / name / "encoder")[-1] for name in ("whole", "parts"))
+    counted = {name: count for name, count in one.items() if "/" in name}
+    assert counted == {name: count for name, count in two.items() if "/" in name}
+    assert counted["drawn/rooms"] + counted["drawn/7-Scenes"] == 32
+    weights = [
+        torch.load(tmp_path / name / "encoder" / "state.pt", weights_only=True)["model"]
+        for name in ("whole", "parts")
+    ]
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
+
+
+def test_other_shards_are_refused_when_a_training_goes_on(home, tmp_path, capsys):
+    assert train(tmp_path / "out", home, "--until", "1", "--quiet") == 0
+    state = load_state(tmp_path / "out" / "encoder", {})
+    assert state is not None and set(state.identity["sources"]) == {"rooms", "7-Scenes"}
+    index = home / "shards" / "index.json"
+    text = index.read_text()
+    try:
+        index.write_text(text.replace('"max_side": null', '"max_side": 900'))
+        assert train(tmp_path / "out", home, "--resume") == 2
+    finally:
+        index.write_text(text)
+    assert "was trained with sources.7-Scenes.digest = '" in capsys.readouterr().err
