@@ -30,6 +30,9 @@ DOCTESTED = (
     "gvtools.scenes.data_sets.drawn",
     "gvtools.scenes.data_sets.spring",
     "gvtools.settings.base",
+    "gvtools.scenes.shards.index",
+    "gvtools.training.drawn",
+    "gvtools.training.mixture",
     "gvtools.training.tune_options",
     "gvtools.trajectory_files",
 )

@@ -27,8 +27,7 @@ def reduced(scene: Scene, max_side: int | None) -> Scene:
     Raises:
         OptionError: below 64 pixels.
     """
-    if max_side is not None and not max_side >= SMALLEST:
-        raise OptionError(f"max_side {max_side}; expected at least {SMALLEST}")
+    check_max_side(max_side)
     sizes = np.array([(view.camera.width[0], view.camera.height[0]) for view in scene.views])
     if max_side is None or not len(sizes) or sizes.max() <= max_side:
         return scene
@@ -50,6 +49,16 @@ def reduced(scene: Scene, max_side: int | None) -> Scene:
     )
     findings = (*scene.findings, Finding("info", message))
     return replace(scene, views=views, points=points, findings=findings)
+
+
+def check_max_side(max_side: int | None) -> None:
+    """Refuse a size at which nothing is left.
+
+    Raises:
+        OptionError: below 64 pixels.
+    """
+    if max_side is not None and not max_side >= SMALLEST:
+        raise OptionError(f"max_side {max_side}; expected at least {SMALLEST}")
 
 
 def _reduced_view(view: View, width: int, height: int) -> View:

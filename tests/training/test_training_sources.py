@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import pickle
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -93,6 +96,7 @@ def test_shards_give_the_samples_of_what_they_were_made_of(home):
         assert equal(direct.batch(part), sharded.batch(part))
 
 
+@pytest.mark.slow
 def test_two_workers_make_the_batches_and_counts_of_none(home):
     entries = (str(home / "shards"), str(home / "kitchen"))
     plain = [samples(*entries).batch(part) for part in PARTS]
@@ -150,27 +154,36 @@ def test_the_papers_rule_is_taken_from_the_spec(home, monkeypatch):
 
 def test_samples_travel_to_workers_small(home):
     data = samples(str(home / "shards"))._train
-    data.sample(3)
-    assert len(pickle.dumps(data)) < 20_000
+    before = [data.sample(index) for index in range(6)]
+    text = pickle.dumps(data)
+    assert len(text) < 20_000
+    again = pickle.loads(text)
+    for index, sample in enumerate(before):
+        assert torch.equal(again.sample(index).hint, sample.hint)
+        assert again.sample(index).notes == sample.notes
+
+
+def words(out: Path, home: Path) -> list[str]:
+    start = ["train", "micro", "--stage", "encoder", "--out", str(out), "--device", "cpu"]
+    texts = [*settings(str(home / "shards")), "data.scene_overlap=0.1", "encoder.statistics=1"]
+    texts += ["encoder.optimizer.steps=5", "encoder.optimizer.batch=2"]
+    return [*start, "--sheets", "0", *(word for text in texts for word in ("--set", text))]
 
 
 def train(out: Path, home: Path, *more: str) -> int:
-    start = ["train", "micro", "--stage", "encoder", "--out", str(out), "--device", "cpu"]
-    words = [*settings(str(home / "shards")), "data.scene_overlap=0.1", "encoder.optimizer.steps=8"]
-    named = [word for text in words for word in ("--set", text)]
-    return main([*start, "--sheets", "0", *named, *more])
+    return main([*words(out, home), *more])
 
 
 def test_a_continued_training_sees_the_same_samples_and_counts(home, tmp_path, capsys):
     assert train(tmp_path / "whole", home) == 0
     said = capsys.readouterr().out
     assert "samples (" in said and "of 7-Scenes" in said and "of rooms" in said
-    assert train(tmp_path / "parts", home, "--until", "3") == 0
+    assert train(tmp_path / "parts", home, "--until", "2") == 0
     assert train(tmp_path / "parts", home, "--resume") == 0
     one, two = (read_log(tmp_path / name / "encoder")[-1] for name in ("whole", "parts"))
     counted = {name: count for name, count in one.items() if "/" in name}
     assert counted == {name: count for name, count in two.items() if "/" in name}
-    assert counted["drawn/rooms"] + counted["drawn/7-Scenes"] == 32
+    assert counted["drawn/rooms"] + counted["drawn/7-Scenes"] == 10
     weights = [
         torch.load(tmp_path / name / "encoder" / "state.pt", weights_only=True)["model"]
         for name in ("whole", "parts")
@@ -190,3 +203,27 @@ def test_other_shards_are_refused_when_a_training_goes_on(home, tmp_path, capsys
     finally:
         index.write_text(text)
     assert "was trained with sources.7-Scenes.digest = '" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_two_processes_count_together(home, tmp_path, capsys):
+    """Each its own samples, with the totals of one process."""
+    more = ("--set", "data.workers=1", "--quiet")
+    assert train(tmp_path / "one", home, *more) == 0
+    command = [
+        *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
+        *("-m", "pipelines.cli", *words(tmp_path / "two", home), *more),
+    ]
+    done = subprocess.run(
+        command,
+        cwd=Path(__file__).resolve().parents[2],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    one, two = (read_log(tmp_path / name / "encoder")[-1] for name in ("one", "two"))
+    counted = {name: count for name, count in one.items() if "/" in name}
+    assert counted and counted == {name: count for name, count in two.items() if "/" in name}
+    assert two["loss"] == pytest.approx(one["loss"], rel=1e-4)

@@ -14,6 +14,7 @@ from pathlib import Path
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import make_folder, write_text
 from gvtools.scenes.collection import SceneCollection
+from gvtools.scenes.reduced import check_max_side
 from gvtools.scenes.shards.index import (
     INDEX,
     ListedScene,
@@ -47,6 +48,7 @@ class ShardOptions:
     def __post_init__(self) -> None:
         if not self.megabytes > 0:
             raise OptionError(f"shards of {self.megabytes} MB; expected more than 0")
+        check_max_side(self.max_side)
 
 
 @dataclass(frozen=True)

@@ -168,7 +168,7 @@ def test_shards_that_are_cut_off_or_absent_are_one_line(whole, tmp_path):
     with pytest.raises(ProjectError, match=f"{size - 512} bytes; index.json says {size}"):
         open_shards(out).read("one")
     tar.unlink()
-    with pytest.raises(ProjectError, match="no such file; index.json lists it"):
+    with pytest.raises(ProjectError, match=r"no such file; index\.json lists it"):
         open_shards(out).read("one")
     assert len(verify(out)) == 1
 
