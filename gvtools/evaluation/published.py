@@ -1,7 +1,7 @@
-"""Published figures of a benchmark, as ``data_specs/benchmarks`` records them.
+"""Benchmarks as ``data_specs/benchmarks`` records them: protocol, figures, rows as published.
 
-A benchmark is a YAML file: its protocol, how each figure is defined, what the source leaves open,
-and the rows as published.
+A benchmark is a YAML file: its scenes and which of their views are given and completed, how each
+figure is defined, what the source leaves open, and the published rows with their sources.
 """
 
 from __future__ import annotations
@@ -9,18 +9,22 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 from importlib import resources
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from gvtools.errors import OptionError
+from gvtools.evaluation.splits import SplitRule, SpecRecord
 
 Aspect = Literal[
-    "pixels", "lpips_net", "poses_from", "pose_unit", "reprojection", "met3r", "hardware"
-]
+    "pixels", "mask", "ssim", "lpips_net", "poses_from", "pose_unit", "reprojection", "met3r",
+    "hardware",
+]  # fmt: skip
 # What a definition may ask of a setting: its field, and how it is called in a reason.
 ASPECTS: dict[Aspect, str] = {
     "pixels": "compared pixels",
+    "mask": "object mask",
+    "ssim": "SSIM",
     "lpips_net": "LPIPS network",
     "poses_from": "poses from",
     "pose_unit": "unit of translations",
@@ -30,16 +34,10 @@ ASPECTS: dict[Aspect, str] = {
 }
 
 
-class _Record(BaseModel):
-    """Part of a specification: exactly these keys, of exactly these types."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
 Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
-class Figure(_Record):
+class Figure(SpecRecord):
     """A measure as the source has it.
 
     Attributes:
@@ -64,59 +62,124 @@ class Figure(_Record):
     unit: str = ""
 
 
-class PublishedRow(_Record):
-    """What the source reports of one system: every figure, by name."""
+class PublishedRow(SpecRecord):
+    """What a source reports of one system.
+
+    Attributes:
+        system: its name.
+        figures: by name; None for one that the source does not report.
+        views: number of context views; None where the benchmark has one number alone.
+        source: name of the publication that reports it, in ``Benchmark.sources``.
+        differs: how it departs from the protocol, so that it has no rank; empty where it does not.
+    """
 
     system: str
-    figures: dict[str, float]
+    figures: dict[str, float | None]
+    views: int | None = None
+    source: str = ""
+    differs: str = ""
 
 
-class Source(_Record):
-    """Title of the publication, and its table."""
+class Source(SpecRecord):
+    """Title of the publication, its table, and where that was read.
+
+    Attributes:
+        title: of the publication.
+        table: where in it.
+        read_in: which copy the rows were taken from; empty for the publication itself.
+    """
 
     title: str
     table: str
+    read_in: str = ""
 
 
-class DataSet(_Record):
-    """Citation, role, licence and where to get it, in words."""
+class DataSet(SpecRecord):
+    """Citation, role, licence and where to get it, in words.
+
+    Attributes:
+        cited_as: key of the citation, or authors and year.
+        role: what it serves for.
+        licence: on what terms.
+        obtain: from where.
+        spec: its name in ``data_specs/data_sets``; empty for projects of the user's own.
+    """
 
     cited_as: str
     role: str
     licence: str
     obtain: str
+    spec: str = ""
 
 
-class Benchmark(_Record):
+class Benchmark(SpecRecord):
     """A published table with its protocol.
 
     Attributes:
         name: of the data set, as printed.
-        resolution: width and height, pixels.
+        resolution: width and height, pixels; None where pictures have several sizes, which then
+            follow from the split's ``divided_by``.
+        views: the numbers of context views that it is run with.
         context: context views of a round.
-        targets: target views of a round.
+        targets: target views of a round; None for all that a scene's split holds out.
         rounds: how many rounds.
+        splits: which views are given and completed; each serves some of ``views``.
+        scenes: their names in the data set; empty for all that are there.
+        masks: where object masks may lie below the root: {scene}, and {index}, the view's number
+            from 0 on; empty where whole pictures are compared alone.
         figures: by name, in the table's order.
-        rows: one a system, in the table's order.
-        source: where it is published.
-        data_set: what was measured on.
+        rows: one a system and number of context views, in the table's order.
+        sources: where rows are published, by the rows' names for it; "" is the only one.
+        data_set: what is measured on.
         stated: what the source says of the protocol.
         not_stated: what it leaves open there.
         notes: what does not fit together in the source.
     """
 
     name: str
-    resolution: Annotated[tuple[int, int], Field(strict=False)]
+    resolution: Annotated[tuple[int, int] | None, Field(strict=False)]
+    views: Annotated[tuple[int, ...], Field(strict=False)]
     context: int
-    targets: int
+    targets: int | None
     rounds: int
+    splits: Annotated[tuple[SplitRule, ...], Field(strict=False)]
+    scenes: Texts = ()
+    masks: Texts = ()
     figures: dict[str, Figure]
     rows: Annotated[tuple[PublishedRow, ...], Field(strict=False)]
-    source: Source
+    sources: dict[str, Source]
     data_set: DataSet
     stated: Texts
     not_stated: Texts
     notes: Texts
+
+    @property
+    def source(self) -> Source:
+        """The publication, of a benchmark with one."""
+        return next(iter(self.sources.values()))
+
+    def at(self, views: int) -> Benchmark:
+        """The same with one number of context views, and with the rows of that number.
+
+        Raises:
+            OptionError: it is not run with so many.
+        """
+        if views not in self.views:
+            listed = ", ".join(map(str, self.views))
+            raise OptionError(f"{self.name} with {views} context views; expected one of {listed}")
+        rows = tuple(row for row in self.rows if row.views in (None, views))
+        return self.model_copy(update={"context": views, "views": (views,), "rows": rows})
+
+    def split_of(self, views: int) -> SplitRule:
+        """The rule that chooses views where so many are given.
+
+        Raises:
+            OptionError: there is none.
+        """
+        for rule in self.splits:
+            if views in rule.views or not rule.views:
+                return rule
+        raise OptionError(f"{self.name}: no split with {views} context views")
 
 
 def benchmark_names() -> tuple[str, ...]:
@@ -125,14 +188,15 @@ def benchmark_names() -> tuple[str, ...]:
 
 
 def load_benchmark(name: str) -> Benchmark:
-    """A benchmark by its file's name or its printed one, however it is capitalised.
+    """A benchmark by its file's name or its printed one, however it is written.
 
     Raises:
         OptionError: there is no such benchmark.
     """
     specs, key = _specs(), name_key(name)
-    if key in specs:
-        return parse_benchmark(specs[key])
+    for known, text in specs.items():
+        if key == name_key(known):
+            return parse_benchmark(text)
     raise OptionError(unknown("benchmark", name, specs))
 
 
@@ -153,15 +217,31 @@ def parse_benchmark(text: str) -> Benchmark:
 
     data = yaml.safe_load(text)
     protocol, published = data.pop("protocol"), data.pop("published")
-    names = list(data["figures"])
-    if published["columns"] != ["system", *names]:
-        raise ValueError(f"published.columns: {published['columns']}; expected system, {names}")
-    rows = [
-        {"system": system, "figures": dict(zip(names, values, strict=True))}
-        for system, *values in published["rows"]
-    ]
+    if "context" in protocol:
+        protocol["views"] = [protocol["context"]]
+    else:
+        protocol["context"] = protocol["views"][0]
+    if "source" in data:
+        data["sources"] = {"": data.pop("source")}
     figures = {name: {"name": name, **figure} for name, figure in data["figures"].items()}
-    return Benchmark.model_validate({**data, **protocol, "figures": figures, "rows": rows})
+    rows = _rows(published["columns"], published["rows"], names=list(figures))
+    benchmark = Benchmark.model_validate({**data, **protocol, "figures": figures, "rows": rows})
+    foreign = {row.source for row in benchmark.rows} - set(benchmark.sources)
+    if foreign:
+        raise ValueError(f"published.rows: sources {sorted(foreign)} are not under sources")
+    return benchmark
+
+
+def _rows(columns: list[str], rows: list[list[Any]], *, names: list[str]) -> list[dict[str, Any]]:
+    """Rows by the names of their columns: of the row itself, then the figures in their order."""
+    own = [name for name in columns if name not in names]
+    if columns != [*own, *names] or not {"system"} <= set(own) <= {*PublishedRow.model_fields}:
+        raise ValueError(f"published.columns: {columns}; expected system, {names}")
+    named = [dict(zip(columns, row, strict=True)) for row in rows]
+    return [
+        {**{name: row[name] for name in own}, "figures": {name: row[name] for name in names}}
+        for row in named
+    ]
 
 
 def unknown(what: str, given: object, known: Iterable[str]) -> str:

@@ -1,7 +1,7 @@
 """What a measurement needs to be ranked beside published figures.
 
-A measured row joins the ranking figure by figure, where its data set, its resolution, its numbers
-of views and the figure's definition are those of the source. What the source leaves open and the
+A measured row joins the ranking figure by figure, where its data set, its scenes, its resolution,
+its views and the figure's definition are those of the source. What the source leaves open and the
 value depends on (such as the network of LPIPS) agrees with nothing.
 """
 
@@ -30,7 +30,12 @@ class Setting:
         targets: target views of a round.
         rounds: how many rounds.
         scenes: how many scenes the figures are averages over.
+        failed: how many more were to be measured, and have no figures.
+        split: name of the benchmark whose rule chose the views; None is another choice.
+        divided_by: what the recorded width and height were divided by.
         pixels: which pixels were compared, "all" or a region's name.
+        mask: what object masks were of, where figures were taken within them: "object".
+        ssim: window of SSIM.
         lpips_net: "vgg" or "alex".
         poses_from: what estimated the poses of the pictures: "VGGT", "pose probe".
         pose_unit: of ATE and RPE_t: "data set", or what they are a share of.
@@ -45,7 +50,12 @@ class Setting:
     targets: int | None
     rounds: int | None = 1
     scenes: int = 1
+    failed: int = 0
+    split: str | None = None
+    divided_by: int | None = None
     pixels: str = "all"
+    mask: str | None = None
+    ssim: str | None = "Gaussian 11x11"
     lpips_net: str | None = None
     poses_from: str | None = None
     pose_unit: str | None = None
@@ -90,12 +100,28 @@ def reasons_not_to_rank(setting: Setting, benchmark: Benchmark, figure: str) -> 
         reasons = [f"data set: {own} here, {benchmark.name} published"]
     elif setting.scenes < 2:
         reasons = ["scenes: a single one here, the published figures are of a data set"]
-    compared = {
+    elif benchmark.scenes and setting.scenes != len(benchmark.scenes):
+        reasons = [f"scenes: {setting.scenes} here, {len(benchmark.scenes)} published"]
+    if setting.failed:
+        reasons.append(f"scenes: {setting.failed} without figures here")
+    divided_by = benchmark.split_of(benchmark.context).divided_by
+    compared: dict[str, tuple[object, object]] = {
         "resolution": (_size(setting.resolution), _size(benchmark.resolution)),
+        "resolution divided by": (setting.divided_by, divided_by),
         "context views a round": (setting.context, benchmark.context),
         "target views a round": (setting.targets, benchmark.targets),
         "rounds": (setting.rounds, benchmark.rounds),
     }
+    if benchmark.targets is None:
+        # The number follows from the split, which has to be the benchmark's own.
+        del compared["target views a round"], compared["rounds"]
+        own = None if setting.split is None else name_key(setting.split)
+        if own != name_key(benchmark.name):
+            reasons.append("views: another choice here than the benchmark's")
+    if benchmark.resolution is None:
+        del compared["resolution"]
+    else:
+        del compared["resolution divided by"]
     for what, (here, there) in compared.items():
         if here != there:
             reasons.append(f"{what}: {here or 'mixed'} here, {there} published")
@@ -123,7 +149,8 @@ def side_by_side(
     ranks = {}
     for name, figure in benchmark.figures.items():
         pairs = zip(rows, why, strict=True)
-        ranks[name] = _ranks([None if name in w else r.figures[name] for r, w in pairs], figure)
+        values = [None if name in w else r.figures.get(name) for r, w in pairs]
+        ranks[name] = _ranks(values, figure)
     return tuple(
         SideBySideRow(
             row.system,
@@ -145,12 +172,25 @@ def comparison_table(rows: Sequence[SideBySideRow], benchmark: Benchmark) -> Tab
         (row.system, row.origin, *(Cell(row.figures[f.name], row.ranks[f.name]) for f in figures))
         for row in rows
     ]
-    notes = [
-        f"Published: {benchmark.source.title}, {benchmark.source.table}.",
-        f"Not stated there: {'; '.join(benchmark.not_stated)}.",
-        *(f"In the source, {note}." for note in benchmark.notes),
-        "Ranks count the published rows, and the comparable ones that were measured here.",
-    ]
+    return Table(
+        tuple(columns), tuple(cells), caption=benchmark.name, notes=comparison_notes(rows, benchmark)
+    )
+
+
+def comparison_notes(rows: Sequence[SideBySideRow], benchmark: Benchmark) -> tuple[str, ...]:
+    """Where published rows are from, what their source leaves open, and why values have no rank."""
+    figures = benchmark.figures.values()
+    notes = []
+    for name, source in benchmark.sources.items():
+        of = [row.system for row in benchmark.rows if row.source == name]
+        if of:
+            systems = f" ({', '.join(dict.fromkeys(of))})" if name else ""
+            copy = f", read in {source.read_in}" if source.read_in else ""
+            notes.append(f"Published{systems}: {source.title}, {source.table}{copy}.")
+    if benchmark.not_stated and notes:
+        notes.append(f"Not stated there: {'; '.join(benchmark.not_stated)}.")
+    notes += [f"In the source, {note}." for note in benchmark.notes]
+    notes.append("Ranks count the published rows, and the comparable ones that were measured here.")
     for row in rows:
         labels: dict[str, list[str]] = {}
         for figure in figures:
@@ -159,13 +199,13 @@ def comparison_table(rows: Sequence[SideBySideRow], benchmark: Benchmark) -> Tab
         labels.pop(NO_VALUE, None)
         for reason, of in labels.items():
             notes.append(f"{row.system}, no rank in {', '.join(of)}: {reason}.")
-    return Table(tuple(columns), tuple(cells), caption=benchmark.name, notes=tuple(notes))
+    return tuple(notes)
 
 
 def _reasons(row: PublishedRow | MeasuredRow, benchmark: Benchmark) -> dict[str, tuple[str, ...]]:
     """For each figure without a rank, why."""
     if isinstance(row, PublishedRow):
-        return {}
+        return dict.fromkeys(benchmark.figures, (row.differs,)) if row.differs else {}
     out: dict[str, tuple[str, ...]] = {}
     for name in benchmark.figures:
         value = row.figures.get(name)

@@ -107,7 +107,7 @@ def markdown(table: Table) -> str:
         cells = []
         for column, value in zip(table.columns, row, strict=True):
             mark = {1: "**", 2: "*"}.get(_rank(value) or 0, "")
-            cells.append(mark + _markdown_text(_shown(column, value)) + mark)
+            cells.append(mark + _markdown_text(shown(column, value)) + mark)
         lines.append(f"| {' | '.join(cells)} |")
     above = [f"{_markdown_paragraph(table.caption)}\n"] if table.caption else []
     below = [f"\n{_markdown_paragraph(note)}" for note in table.notes]
@@ -172,8 +172,8 @@ def _numeric(table: Table, index: int) -> bool:
     return not any(isinstance(row[index], str) for row in table.rows)
 
 
-def _shown(column: Column, value: Value) -> str:
-    """For readers: a number other than 0 never reads as 0."""
+def shown(column: Column, value: Value) -> str:
+    """A value for readers, with its column's decimals; a number other than 0 never reads as 0."""
     plain = _plain(value)
     if plain is None:
         return "–"
@@ -190,14 +190,14 @@ def _shown(column: Column, value: Value) -> str:
 
 
 def _latex_value(column: Column, value: Value) -> str:
-    shown = _shown(column, value)
+    text = shown(column, value)
     if isinstance(_plain(value), str):
-        return _latex_text(shown)
-    if shown == "–":
+        return _latex_text(text)
+    if text == "–":
         return "--"
     # Only mathematics has a minus sign, infinity and powers.
-    number = re.sub(r"e\+?(-?)0*(\d+)", r"\\cdot10^{\1\2}", shown.replace("∞", r"\infty"))
-    return shown if number == shown and shown[0] != "-" else f"${number}$"
+    number = re.sub(r"e\+?(-?)0*(\d+)", r"\\cdot10^{\1\2}", text.replace("∞", r"\infty"))
+    return text if number == text and text[0] != "-" else f"${number}$"
 
 
 _MARKDOWN = re.compile(r"([\\`*_\[\]<>|~&#$])")

@@ -100,6 +100,15 @@ def _capture(path: Path) -> str:
     return f"find the cameras first: gvtools capture {path} --out PROJECT"
 
 
+def is_project(folder: Path) -> bool:
+    """Whether ``open_project`` would take the folder for a project, going by its files' names."""
+    return (
+        find_model(folder) is not None
+        or (folder / TRANSFORMS).is_file()
+        or any(layout.matches(folder) for layout in LAYOUTS)
+    )
+
+
 def _nearest(path: Path) -> str:
     import difflib
 
@@ -118,7 +127,7 @@ def _unknown(path: Path) -> str:
     inside = [
         str(folder)
         for folder in sorted([*path.glob("*/"), *path.glob("dense/*/")])
-        if find_model(folder) or any(layout.matches(folder) for layout in LAYOUTS)
+        if is_project(folder)
     ]
     advice = f"did you mean {named(inside)}?" if inside else "give the project's folder"
     return f"{path}: {held}; expected one of: {'; '.join(LOOKED_FOR)}; {advice}"

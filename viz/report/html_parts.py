@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
+from pathlib import Path
 
 from viz.report.contact_sheet import Tile
+
+STYLE = Path(__file__).with_name("report.css")
+# A page that a browser holds to asking nobody for anything.
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 # What a figure that could not be had is shown as.
 NONE = "–"
@@ -21,6 +26,19 @@ def text(value: object) -> str:
         # Narrow spaces between thousands.
         return f"{value:,}".replace(",", "\u202f")
     return escape(str(value), quote=True).replace("\n", "<br>")
+
+
+def document(title: str, body: str) -> str:
+    """A whole page under a title, which holds its style and asks the network for nothing."""
+    style = STYLE.read_text(encoding="utf-8")
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>{text(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
+        f"<h1>{text(title)}</h1>\n{body}\n</body>\n</html>\n"
+    )
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, caption: str = "") -> str:

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from viz.plots.canvas import check_rounds
 from viz.report import sections
 from viz.report.content import RunReport
-from viz.report.html_parts import bulleted, paragraph, section, text
-
-STYLE = Path(__file__).with_name("report.css")
-# A page that a browser holds to asking nobody for anything.
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+from viz.report.html_parts import bulleted, document, paragraph, section, text
 
 
 def report_html(report: RunReport) -> str:
@@ -32,15 +26,9 @@ def report_html(report: RunReport) -> str:
     shown = {name: part for name, part in parts.items() if part[1]}
     links = "".join(f'<a href="#{name}">{text(head)}</a>' for name, (head, _) in shown.items())
     body = "\n".join(section(name, head, content) for name, (head, content) in shown.items())
-    style = STYLE.read_text(encoding="utf-8")
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
-        '<link rel="icon" href="data:,">\n'
-        f"<title>{text(report.title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
-        f"<h1>{text(report.title)}</h1>\n{_facts(report)}\n<nav>{links}</nav>\n"
-        f"{_warnings(report)}\n{_key_figures(report)}\n{body}\n</body>\n</html>\n"
+    return document(
+        report.title,
+        f"{_facts(report)}\n<nav>{links}</nav>\n{_warnings(report)}\n{_key_figures(report)}\n{body}",
     )
 
 

@@ -1,0 +1,108 @@
+"""A scene with pictures of one size, and with what some of its views alone would tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.scenes.images import resize_nearest
+from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
+
+# Left, top, width and height of a picture's window, pixels.
+Window = tuple[int, int, int, int]
+
+
+def resized(scene: Scene, width: int, height: int) -> Scene:
+    """The scene with every picture ``width`` x ``height`` pixels large.
+
+    The largest central window of that shape is taken and resampled: colours are averaged where
+    pictures become smaller and interpolated where they grow; depth and masks take the nearest
+    pixel. Cameras and detections of sparse points follow.
+
+    Args:
+        scene: left as it is.
+        width: pixels.
+        height: pixels.
+    """
+    windows = [_window(view, width, height) for view in scene.views]
+    views = tuple(
+        view
+        if window == (0, 0, width, height)
+        else _resized_view(view, window, width=width, height=height)
+        for view, window in zip(scene.views, windows, strict=True)
+    )
+    points = scene.points
+    if points is not None:
+        left_top = np.array([window[:2] for window in windows], np.float64)[points.view_index]
+        size = np.array([window[2:] for window in windows], np.float64)[points.view_index]
+        xy = (points.xy - left_top) / size * (width, height)
+        inside = ((xy >= 0) & (xy <= (width, height))).all(axis=1)
+        points = _with_tracks(replace(points, xy=xy), inside, least=1)
+    return replace(scene, views=views, points=points)
+
+
+def seen_by(scene: Scene, names: Iterable[str]) -> Scene:
+    """The scene with the sparse points alone that two of the named views detected.
+
+    Their positions stay as they were solved, with the help of all views.
+
+    Args:
+        scene: left as it is; without points it comes back.
+        names: of the views, such as those of the context.
+    """
+    points = scene.points
+    if points is None:
+        return scene
+    rows = [scene.names.index(name) for name in names]
+    return replace(scene, points=_with_tracks(points, np.isin(points.view_index, rows), least=2))
+
+
+def _window(view: View, width: int, height: int) -> Window:
+    """The largest central one of the target's shape."""
+    whole = int(view.camera.width[0]), int(view.camera.height[0])
+    scale = min(whole[0] / width, whole[1] / height)
+    size = round(width * scale), round(height * scale)
+    return (whole[0] - size[0]) // 2, (whole[1] - size[1]) // 2, *size
+
+
+def _resized_view(view: View, window: Window, *, width: int, height: int) -> View:
+    def load() -> Frame:
+        return _resized_frame(view.load(), window, width=width, height=height)
+
+    cropped = view.camera.cropped(window[0], window[1], width=window[2], height=window[3])
+    return replace(view, camera=cropped.resized(width, height), load=load)
+
+
+def _resized_frame(frame: Frame, window: Window, *, width: int, height: int) -> Frame:
+    from PIL import Image
+
+    left, top = window[:2]
+    across, down = slice(left, left + window[2]), slice(top, top + window[3])
+    method = Image.Resampling.BOX if window[2] >= width else Image.Resampling.BICUBIC
+    picture = Image.fromarray(np.ascontiguousarray(frame.rgb[down, across]))
+    arrays: list[NDArray[np.generic] | None] = [
+        None if array is None else np.ascontiguousarray(
+            resize_nearest(array[down, across], width, height)
+        )
+        for array in (frame.depth, frame.mask)
+    ]  # fmt: skip
+    return Frame(np.array(picture.resize((width, height), method)), *arrays)  # type: ignore[arg-type]
+
+
+def _with_tracks(points: SparsePoints, keep: NDArray[np.bool_], *, least: int) -> SparsePoints:
+    """The points with at least ``least`` detections among those to keep."""
+    counts = np.bincount(points.point_index[keep], minlength=len(points.positions))
+    known = counts >= least
+    keep = keep & known[points.point_index]
+    number = np.cumsum(known) - 1
+    return SparsePoints(
+        points.positions[known],
+        points.colors[known],
+        points.errors[known],
+        number[points.point_index[keep]].astype(np.int32),
+        points.view_index[keep],
+        points.xy[keep],
+    )

@@ -1,0 +1,1 @@
+"""Whole benchmarks: every scene, number of views and method, resumable, and the tables of it."""

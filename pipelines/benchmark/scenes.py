@@ -1,0 +1,114 @@
+"""The scenes of a benchmark: which there are, and each with its views and picture size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import ProjectError
+
+if TYPE_CHECKING:
+    from gvtools.evaluation.published import Benchmark
+    from gvtools.evaluation.splits import SceneSplit
+    from gvtools.scenes.scene import Scene
+
+
+def scene_names(benchmark: Benchmark, root: Path) -> tuple[str, ...]:
+    """The benchmark's scenes; where it names none, all that lie below the root.
+
+    Raises:
+        ProjectError: the root is absent, or holds no scene.
+    """
+    if benchmark.scenes:
+        if not root.is_dir():
+            raise ProjectError(f"{root}: no such folder; expected the scenes of {benchmark.name}")
+        return benchmark.scenes
+    if benchmark.data_set.spec:
+        from gvtools.scenes.data_sets.layouts import scenes_of
+
+        return scenes_of(benchmark.data_set.spec, root)
+    return _projects(root)
+
+
+def _projects(root: Path) -> tuple[str, ...]:
+    from gvtools.scenes.project import is_project
+    from gvtools.scenes.scene import natural_key
+
+    if not root.is_dir():
+        raise ProjectError(f"{root}: no such folder; expected projects, one folder each")
+    found = sorted(
+        (path.name for path in root.iterdir() if path.is_dir() and is_project(path)),
+        key=natural_key,
+    )
+    if not found:
+        raise ProjectError(f"{root}: no project in its folders; expected one folder a project")
+    return tuple(found)
+
+
+def open_benchmark_scene(benchmark: Benchmark, name: str, root: Path) -> Scene:
+    """One scene of a benchmark as it is recorded.
+
+    Args:
+        benchmark: with one number of context views.
+        name: of the scene.
+        root: the folder of the data set, or of the projects.
+
+    Raises:
+        GvError: it is not there, or cannot be read.
+    """
+    from gvtools.scenes.data_sets.layouts import open_data_set
+    from gvtools.scenes.project import open_project
+
+    released = benchmark.split_of(benchmark.context).kind == "files"
+    if released or not benchmark.data_set.spec:
+        return open_project(root / name)
+    return open_data_set(benchmark.data_set.spec, name, root)
+
+
+def split_of_scene(benchmark: Benchmark, scene: Scene) -> SceneSplit:
+    """Which of its views are given and which are completed.
+
+    Args:
+        benchmark: with one number of context views.
+        scene: as recorded.
+
+    Raises:
+        GvError: it has too few views, or its split file is absent.
+    """
+    from gvtools.evaluation.splits import split_scene
+
+    return split_scene(
+        benchmark.split_of(benchmark.context),
+        scene.names,
+        views=benchmark.context,
+        targets=benchmark.targets,
+        rounds=benchmark.rounds,
+        folder=scene.root if scene.root.is_dir() else scene.root.parent,
+    )
+
+
+def prepared(benchmark: Benchmark, scene: Scene, split: SceneSplit) -> Scene:
+    """The scene at the benchmark's picture size, with the sparse points of its context alone."""
+    from gvtools.scenes.reduced import reduced
+    from gvtools.scenes.resized import resized, seen_by
+
+    divided_by = benchmark.split_of(benchmark.context).divided_by
+    if benchmark.resolution is not None:
+        scene = resized(scene, *benchmark.resolution)
+    elif divided_by is not None:
+        side = max(int(max(view.camera.width[0], view.camera.height[0])) for view in scene.views)
+        scene = reduced(scene, round(side / divided_by))
+    return seen_by(scene, split.context)
+
+
+def object_mask_path(benchmark: Benchmark, root: Path, *, scene: str, index: int) -> Path | None:
+    """Where the object mask of a view lies; None where there is none.
+
+    Args:
+        benchmark: whose ``masks`` say where to look.
+        root: the folder of the data set.
+        scene: its name.
+        index: the view's number in the scene's order, from 0 on.
+    """
+    paths = [root / pattern.format(scene=scene, index=index) for pattern in benchmark.masks]
+    return next((path for path in paths if path.is_file()), None)

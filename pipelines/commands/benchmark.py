@@ -1,0 +1,148 @@
+"""``gvtools benchmark``: a whole benchmark, every scene, number of views and method."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError
+from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
+
+if TYPE_CHECKING:
+    from gvtools.evaluation.published import Benchmark
+    from pipelines.benchmark.measure import Cell
+    from pipelines.console import Console
+
+SUMMARY = "run a whole benchmark, and stand its means beside published rows"
+EXAMPLES = (
+    "gvtools benchmark llff --root nerf_llff_data --views 3,6,9",
+    "gvtools benchmark few-view --root projects --methods default,none,mine=renders",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument(
+        "name",
+        metavar="NAME",
+        help="llff, dtu, mipnerf360-few, few-view (projects of one's own), or the paper's: "
+        "realestate10k, dl3dv, mipnerf360, scannetv2, dl3dv-steps, scannetv2-ablation",
+    )
+    parser.add_argument(
+        "--root",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="the data set as downloaded, or a folder of projects",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="of the results (runs/benchmark-NAME); goes on there"
+    )
+    parser.add_argument(
+        "--views", metavar="N,...", help="numbers of context views (default: the benchmark's)"
+    )
+    parser.add_argument("--scenes", metavar="NAME,...", help="default: all of the benchmark's")
+    parser.add_argument(
+        "--methods",
+        default="default",
+        metavar="NAME,...",
+        help="default, a profile, a completer, paper, NAME=FILE.json (settings) or NAME=DIR "
+        "(pictures of another method) (%(default)s)",
+    )
+    parser.add_argument(
+        "--seconds", type=float, metavar="S", help="of each fit of Gaussians (default: the method's)"
+    )
+    add_lpips_arguments(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Measure what is not measured yet, and write the tables.
+
+    Raises:
+        GvError: an option is wrong, or results are there of other settings.
+    """
+    from gvtools.evaluation.published import load_benchmark
+    from gvtools.runs.folder_lock import folder_lock
+    from pipelines.benchmark.cells import measure_apart, measure_cells
+    from pipelines.benchmark.results import PAGE, print_tables, write_results
+
+    benchmark = load_benchmark(args.name)
+    cells = planned_cells(args, benchmark, console)
+    out, title = cells[0].out, f"Benchmark {args.name}"
+
+    def write() -> None:
+        write_results(benchmark, cells, out, title=title)
+
+    with folder_lock(out):
+        measure_cells(cells, console=console, measure=measure_apart, after=write)
+        tables = write_results(benchmark, cells, out, title=title)
+    print_tables(tables, console)
+    console.line(f"results in {out}: {PAGE}, results.json, and tables as .csv, .md and .tex")
+
+
+def planned_cells(
+    args: argparse.Namespace, benchmark: Benchmark, console: Console
+) -> tuple[Cell, ...]:
+    """Every scene, number of views and method, scene by scene.
+
+    Raises:
+        GvError: a name that is none, or a folder without a scene.
+    """
+    from pipelines.benchmark.measure import Cell
+    from pipelines.benchmark.methods import parse_methods
+    from pipelines.benchmark.scenes import scene_names
+
+    if args.seconds is not None and not args.seconds > 0:
+        raise OptionError(f"--seconds {args.seconds:g}; expected more than 0")
+    root = args.root.resolve()
+    methods = parse_methods(args.methods)
+    for method in methods:
+        method.config(seconds=args.seconds)
+    lpips, no_lpips = open_lpips(args)
+    if lpips is None:
+        console.line(f"LPIPS is not measured: {no_lpips}")
+    chosen = None if lpips is None else (args.lpips_net, args.lpips_weights)
+    scenes = _chosen_scenes(args.scenes, scene_names(benchmark, root))
+    out = args.out or Path("runs") / f"benchmark-{args.name}"
+    return tuple(
+        Cell(
+            benchmark=args.name,
+            root=root,
+            scene=scene,
+            views=views,
+            method=method,
+            seconds=args.seconds,
+            lpips=chosen,
+            out=out.resolve(),
+        )
+        for scene in scenes
+        for views in _chosen_views(args.views, benchmark)
+        for method in methods
+    )
+
+
+def _chosen_views(text: str | None, benchmark: Benchmark) -> tuple[int, ...]:
+    if text is None:
+        return benchmark.views
+    try:
+        numbers = tuple(dict.fromkeys(int(part) for part in text.split(",")))
+    except ValueError:
+        raise OptionError(f"--views {text!r}; expected numbers with commas between them") from None
+    for number in numbers:
+        benchmark.at(number)
+    return numbers
+
+
+def _chosen_scenes(text: str | None, known: tuple[str, ...]) -> tuple[str, ...]:
+    from gvtools.evaluation.published import unknown
+
+    if text is None:
+        return known
+    names = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    for name in names:
+        if name not in known:
+            raise OptionError(unknown("scene", name, known))
+    if not names:
+        raise OptionError(f"--scenes {text!r}; expected at least one of {', '.join(known)}")
+    return names

@@ -1,0 +1,48 @@
+"""Accuracy over the number of context views, method by method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from viz.plots.canvas import figure_of
+from viz.plots.palette import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Number of context views, mean, lower and upper end of its interval.
+Point = tuple[int, float, float | None, float | None]
+STYLES = tuple(zip((BLUE, ORANGE, GREEN, RED, SKY, PINK, BLACK, GREY), "os^vDPX*", strict=True))
+
+
+def draw_by_views(lines: Mapping[str, Sequence[Point]], *, label: str = "PSNR [dB]") -> Figure:
+    """A line a method, with the interval of each mean.
+
+    Args:
+        lines: points by the method's name.
+        label: of the vertical axis.
+
+    Returns:
+        A figure with its own Agg canvas.
+    """
+
+    def panel(axes: Axes) -> None:
+        for number, (name, points) in enumerate(lines.items()):
+            color, marker = STYLES[number % len(STYLES)]
+            views, means = [p[0] for p in points], [p[1] for p in points]
+            ends = [
+                [mean - (p[2] if p[2] is not None else mean) for p, mean in zip(points, means)],
+                [(p[3] if p[3] is not None else mean) - mean for p, mean in zip(points, means)],
+            ]  # fmt: skip
+            axes.errorbar(
+                views, means, yerr=ends, color=color, marker=marker, capsize=3, label=name
+            )
+        axes.set_xticks(sorted({p[0] for points in lines.values() for p in points}))
+        axes.set_xlabel("context views")
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.3)
+        axes.legend()
+
+    return figure_of([panel])
