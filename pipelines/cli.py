@@ -99,7 +99,10 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
         print(f"gvtools: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        goes_on = "reconstruct goes on with --resume, tradeoff and benchmark by themselves; refine changed nothing"
+        goes_on = (
+            "reconstruct goes on with --resume, tradeoff and benchmark by themselves; refine "
+            "changed nothing"
+        )
         print(f"gvtools: interrupted; {goes_on}", file=sys.stderr)
         return 1
     except Exception as error:

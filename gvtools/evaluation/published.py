@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from gvtools.errors import OptionError
-from gvtools.evaluation.splits import SplitRule, SpecRecord
+from gvtools.evaluation.splits import SpecRecord, SplitRule
 
 Aspect = Literal[
     "pixels", "mask", "ssim", "lpips_net", "poses_from", "pose_unit", "reprojection", "met3r",

@@ -173,7 +173,10 @@ def comparison_table(rows: Sequence[SideBySideRow], benchmark: Benchmark) -> Tab
         for row in rows
     ]
     return Table(
-        tuple(columns), tuple(cells), caption=benchmark.name, notes=comparison_notes(rows, benchmark)
+        tuple(columns),
+        tuple(cells),
+        caption=benchmark.name,
+        notes=comparison_notes(rows, benchmark),
     )
 
 

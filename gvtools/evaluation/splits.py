@@ -131,8 +131,8 @@ def _every(count: int, step: int, views: int) -> tuple[list[int], list[int]]:
     others = [i for i in range(count) if i % step]
     if views > len(others):
         raise OptionError(
-            f"{count} views, of which {len(others)} are no targets; expected at least {views}; give "
-            "fewer --views"
+            f"{count} views, of which {len(others)} are no targets; expected at least {views}; "
+            "give fewer --views"
         )
     # Halves are rounded to even numbers, as in the code that the split is cited from.
     rows = [round(place) for place in np.linspace(0, len(others) - 1, views).tolist()]

@@ -168,9 +168,7 @@ class Run:
             yield view, files, truth
 
 
-def load_run(
-    path: Path | str, *, project: Path | None = None, opened: Scene | None = None
-) -> Run:
+def load_run(path: Path | str, *, project: Path | None = None, opened: Scene | None = None) -> Run:
     """The run in a folder, finished or not.
 
     Args:

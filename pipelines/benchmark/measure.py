@@ -94,7 +94,7 @@ def measure_cell(cell: Cell) -> dict[str, Any]:
         for name, picture in pictures.items()
     }  # fmt: skip
     figures["figures"] |= masked_figures(pictures, scene, masks, lpips=lpips)
-    write_thumbnails(cell.result, pictures, scene, split.context)
+    write_thumbnails(cell.result, pictures, scene, context=split.context)
     sizes = {picture.shape[:2] for picture in pictures.values()}
     return {
         "split": {"context": list(split.context), "rounds": [list(r) for r in split.rounds]},
@@ -146,8 +146,10 @@ def _reconstruct(cell: Cell, benchmark: Benchmark, scene: Scene, *, split: Scene
     from pipelines.report.write import draw_run
 
     config = cell.method.config(seconds=cell.seconds)
+    # The size of the pictures is the benchmark's, also of methods that would work on smaller ones.
     decided: dict[str, Any] = {
-        "context": ",".join(split.context), "targets": ",".join(split.targets), "seed": 0
+        "context": ",".join(split.context), "targets": ",".join(split.targets), "seed": 0,
+        "max_side": None,
     }  # fmt: skip
     if benchmark.targets is not None:
         decided |= {"views_per_round": benchmark.targets, "rounds": benchmark.rounds}
@@ -182,6 +184,7 @@ def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
         "poses_from": found,
         "met3r": nested(evaluation, "consistency", "generated", "met3r", "status"),
         "versions": evaluation["versions"],
+        "masked_share": evaluation["images"]["settings"]["masked_share"],
         "notes": evaluation["images"]["notes"],
     }
 

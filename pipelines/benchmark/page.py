@@ -92,4 +92,6 @@ def _tile(path: Path, label: str, where: str) -> Tile | None:
         return None
     with Image.open(path) as picture:
         width, height = picture.size
-    return Tile(label, f"{where}: {label}", data_uri(path.read_bytes(), "image/jpeg"), width, height)
+    return Tile(
+        label, f"{where}: {label}", data_uri(path.read_bytes(), "image/jpeg"), width, height
+    )

@@ -113,7 +113,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def write_thumbnails(
-    result: Path, pictures: Mapping[str, np.ndarray], scene: Scene, context: Sequence[str]
+    result: Path, pictures: Mapping[str, np.ndarray], scene: Scene, *, context: Sequence[str]
 ) -> None:
     """Small pictures of the middle target beside a cell's figures, for the page.
 

@@ -146,9 +146,9 @@ def comparison(benchmark: Benchmark, results: Sequence[MethodResult]) -> Table:
                 Column("Scenes")]  # fmt: skip
     body = [_cells(row, benchmark, by_name.get(row.system)) for row in rows]
     notes = [
-        f"{first.label} low and high: 95 % bootstrap interval of the mean over scenes. Observed: PSNR "
-        "of the pixels that stand on observations. A run: mean wall-clock seconds. Peak: the most "
-        "main memory of any run.",
+        f"{first.label} low and high: 95 % bootstrap interval of the mean over scenes. Observed: "
+        "PSNR of the pixels that stand on observations. A run: mean wall-clock seconds. Peak: the "
+        "most main memory of any run.",
         *(f"{result.row.system}, {scene}: failed: {reason}" for result in results
           for scene, reason in result.failures.items()),
         *comparison_notes(rows, benchmark),

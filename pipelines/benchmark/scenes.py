@@ -88,9 +88,13 @@ def split_of_scene(benchmark: Benchmark, scene: Scene) -> SceneSplit:
 
 
 def prepared(benchmark: Benchmark, scene: Scene, split: SceneSplit) -> Scene:
-    """The scene at the benchmark's picture size, with the sparse points of its context alone."""
+    """The scene at the benchmark's picture size, with the sparse points of its context alone.
+
+    Where the benchmark leaves the size open, it is that of a run by default.
+    """
     from gvtools.scenes.reduced import reduced
     from gvtools.scenes.resized import resized, seen_by
+    from pipelines.reconstruction.settings import RunSettings
 
     divided_by = benchmark.split_of(benchmark.context).divided_by
     if benchmark.resolution is not None:
@@ -98,6 +102,8 @@ def prepared(benchmark: Benchmark, scene: Scene, split: SceneSplit) -> Scene:
     elif divided_by is not None:
         side = max(int(max(view.camera.width[0], view.camera.height[0])) for view in scene.views)
         scene = reduced(scene, round(side / divided_by))
+    else:
+        scene = reduced(scene, RunSettings().max_side)
     return seen_by(scene, split.context)
 
 

@@ -37,7 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the data set as downloaded, or a folder of projects",
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="of the results (runs/benchmark-NAME); goes on there"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="of the results (runs/benchmark-NAME); goes on there",
     )
     parser.add_argument(
         "--views", metavar="N,...", help="numbers of context views (default: the benchmark's)"
@@ -51,7 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(pictures of another method) (%(default)s)",
     )
     parser.add_argument(
-        "--seconds", type=float, metavar="S", help="of each fit of Gaussians (default: the method's)"
+        "--seconds",
+        type=float,
+        metavar="S",
+        help="of each fit of Gaussians (default: the method's)",
     )
     add_lpips_arguments(parser)
 

@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="BENCHMARK",
         help="print its published rows beside the measured one: dl3dv, realestate10k, mipnerf360, "
-        "scannetv2 or all; the files hold all of them",
+        "scannetv2, llff, ... or all; the files hold all with the paper's protocol",
     )
     parser.add_argument(
         "--data-set",

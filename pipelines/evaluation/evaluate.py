@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def load_benchmarks(shown: Sequence[str], data_set: str | None) -> dict[str, Benchmark]:
-    """All published benchmarks by name.
+    """Published benchmarks by name: those with the paper's protocol, and those asked for.
 
     Args:
         shown: names that the user asked for.
@@ -44,8 +44,9 @@ def load_benchmarks(shown: Sequence[str], data_set: str | None) -> dict[str, Ben
     """
     if data_set is not None:
         load_benchmark(data_set)
-    names = dict.fromkeys((*benchmark_names(), *shown))
-    return {name: load_benchmark(name) for name in names}
+    known = {name: load_benchmark(name) for name in benchmark_names()}
+    papers = {name: b for name, b in known.items() if b.splits[0].kind == "protocol"}
+    return papers | {name: load_benchmark(name) for name in shown}
 
 
 def load_runs(paths: Sequence[Path], *, project: Path | None) -> list[Run]:
@@ -127,7 +128,14 @@ def write_evaluation(
     """
     setting = setting_of(options, runs, evaluations)
     row = measured_row(options.name, evaluations, setting)
-    comparisons = {name: comparison(row, benchmark) for name, benchmark in benchmarks.items()}
+    # Of several numbers of context views, that of the runs, if there are rows of it.
+    alike = {
+        name: benchmark.at(
+            setting.context if setting.context in benchmark.views else benchmark.context
+        )
+        for name, benchmark in benchmarks.items()
+    }
+    comparisons = {name: comparison(row, benchmark) for name, benchmark in alike.items()}
     figures = joined(evaluations, row.figures, options)
     over = figures["over_scenes"] if len(evaluations) > 1 else {}
     tables = {"summary": summary_table(evaluations, "Evaluation", over)}

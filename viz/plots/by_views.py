@@ -32,12 +32,11 @@ def draw_by_views(lines: Mapping[str, Sequence[Point]], *, label: str = "PSNR [d
         for number, (name, points) in enumerate(lines.items()):
             color, marker = STYLES[number % len(STYLES)]
             views, means = [p[0] for p in points], [p[1] for p in points]
-            ends = [
-                [mean - (p[2] if p[2] is not None else mean) for p, mean in zip(points, means)],
-                [(p[3] if p[3] is not None else mean) - mean for p, mean in zip(points, means)],
-            ]  # fmt: skip
+            # Without an interval, the ends are the mean itself.
+            below = [p[1] - (p[1] if p[2] is None else p[2]) for p in points]
+            above = [(p[1] if p[3] is None else p[3]) - p[1] for p in points]
             axes.errorbar(
-                views, means, yerr=ends, color=color, marker=marker, capsize=3, label=name
+                views, means, yerr=(below, above), color=color, marker=marker, capsize=3, label=name
             )
         axes.set_xticks(sorted({p[0] for points in lines.values() for p in points}))
         axes.set_xlabel("context views")

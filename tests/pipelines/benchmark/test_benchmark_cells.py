@@ -1,0 +1,146 @@
+"""Cells of a benchmark: figures within masks, resolutions, and processes of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_scan import write_colmap_scan, write_scan
+
+from gvtools.errors import ProjectError
+from gvtools.evaluation.images import psnr, ssim
+from gvtools.evaluation.published import load_benchmark
+from gvtools.scenes.project import open_project
+from pipelines.benchmark.cells import _ended, measure_apart, read_cell
+from pipelines.benchmark.measure import Cell, peak_bytes
+from pipelines.benchmark.methods import parse_methods
+from pipelines.benchmark.pictures import find_picture, masked_figures, object_mask
+from pipelines.benchmark.scenes import prepared, split_of_scene
+
+
+def cell(root, out, **changes) -> Cell:
+    values = {"benchmark": "few-view", "root": root, "scene": "scan", "views": 3, "seconds": None,
+              "method": parse_methods("fast")[0], "lpips": None, "out": out}  # fmt: skip
+    return Cell(**{**values, **changes})
+
+
+def test_pictures_have_the_benchmarks_size_and_points_of_the_context_alone(tmp_path):
+    scene = open_project(write_colmap_scan(tmp_path / "scan", views=12))
+    few = load_benchmark("few-view").at(3)
+    split = split_of_scene(few, scene)
+    assert prepared(few, scene, split)[scene.names[0]].load().rgb.shape == (72, 96, 3)
+    # Each point of this project is seen by one view alone.
+    assert len(prepared(few, scene, split).points.positions) == 0
+    llff = load_benchmark("llff").at(3)
+    assert prepared(llff, scene, split)[scene.names[0]].load().rgb.shape == (378, 504, 3)
+    assert parse_methods("fast")[0].config(seconds=None).max_side == 480
+    share = few.model_copy(
+        update={"splits": (few.splits[0].model_copy(update={"divided_by": 1.2}),)}
+    )
+    assert prepared(share, scene, split)[scene.names[0]].load().rgb.shape == (60, 80, 3)
+
+
+def test_masked_figures_are_of_the_object_on_white(tmp_path):
+    scene = open_project(write_scan(tmp_path / "scan", views=1))
+    (name,) = scene.names
+    truth = scene[name].load().rgb
+    rng = np.random.default_rng(0)
+    picture = np.clip(truth + rng.integers(-9, 9, truth.shape), 0, 255).astype(np.uint8)
+    mask = np.zeros(truth.shape[:2], bool)
+    mask[20:50, 30:70] = True
+    found = masked_figures({name: picture}, scene, {name: mask}, lpips=None)
+    error = (picture[mask].astype(float) - truth[mask]) / 255
+    assert found["psnr_masked"] == pytest.approx(-10 * np.log10((error**2).mean()))
+    ours, true = picture.copy(), truth.copy()
+    ours[~mask] = true[~mask] = 255
+    assert found["ssim_masked"] == pytest.approx(ssim(ours, true))
+    assert found["psnr_masked"] < psnr(ours, true)
+    assert masked_figures({name: picture}, scene, {name: None}, lpips=None) == {}
+
+
+def test_object_masks_are_white_and_lie_where_the_benchmark_says(tmp_path):
+    dtu = load_benchmark("dtu")
+    levels = np.zeros((60, 80, 3), np.uint8)
+    levels[:, 40:] = 255
+    levels[:, 38:40] = 250
+    for place, index in (("scan8", 3), ("scan40/mask", 4)):
+        folder = tmp_path / "idrmasks" / place
+        folder.mkdir(parents=True)
+        Image.fromarray(levels).save(folder / f"{index:03d}.png")
+    for scene, index in (("scan8", 3), ("scan40", 4)):
+        mask = object_mask(dtu, tmp_path, scene=scene, index=index, shape=(30, 40))
+        assert mask.shape == (30, 40) and mask[:, 20:].all() and not mask[:, :20].any()
+    assert object_mask(dtu, tmp_path, scene="scan8", index=4, shape=(30, 40)) is None
+
+
+def test_pictures_are_found_by_scene_and_number_of_views(tmp_path):
+    for place, level in (("scan/3_views", 1), ("scan", 2), (".", 3)):
+        (tmp_path / place).mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (4, 3), (level,) * 3).save(tmp_path / place / "IMG_1.png")
+    found = [find_picture(tmp_path, scene, "images/IMG_1.JPG", views=views)[0, 0, 0]
+             for scene, views in (("scan", 3), ("scan", 6), ("other", 3))]  # fmt: skip
+    assert found == [1, 2, 3]
+    with pytest.raises(ProjectError, match=r"no picture of IMG_2\.JPG"):
+        find_picture(tmp_path, "scan", "IMG_2.JPG", views=3)
+
+
+def test_peak_memory_follows_what_is_held():
+    before = peak_bytes()
+    held = np.ones(60_000_000, np.uint8)
+    assert held.sum() and peak_bytes() >= before
+    assert peak_bytes() > 60_000_000
+
+
+def test_a_cell_in_a_process_of_its_own_leaves_its_reason(tmp_path):
+    """The scene is not there, so that nothing heavy is loaded."""
+    one = cell(tmp_path, tmp_path / "out")
+    measure_apart(one)
+    found = read_cell(one)
+    assert found["status"] == "failed" and "no such folder" in found["reason"]
+    assert "memory runs out" in _ended(-9) and "exit status 3" in _ended(3)
+
+
+@pytest.mark.slow
+def test_a_killed_benchmark_goes_on_with_the_same_command(tmp_path):
+    """Killed in its second cell; that one's process ends, too, and the first is kept."""
+    root, out = tmp_path / "projects", tmp_path / "out"
+    write_scan(root / "one", views=12)
+    write_scan(root / "two", views=12)
+    command = [sys.executable, "-m", "pipelines.cli", "benchmark", "few-view", "--root", root,
+               "--out", out, "--views", "3", "--methods", "fast"]  # fmt: skip
+    process = subprocess.Popen([str(word) for word in command], stdout=subprocess.DEVNULL)
+    first = out / "cells/one/3_views/fast.json"
+    children = f"/proc/{process.pid}/task/{process.pid}/children"
+    started: list[int] = []
+    while process.poll() is None and not (first.is_file() and started):
+        time.sleep(0.05)
+        if first.is_file():
+            with open(children, encoding="ascii") as file:
+                started = [int(word) for word in file.read().split()]
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    before = first.read_bytes()
+    assert not (out / "results.json").is_file() or started
+    end = time.monotonic() + 20
+    while any(_alive(pid) for pid in started) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not any(_alive(pid) for pid in started)
+    subprocess.run([str(word) for word in command], check=True, stdout=subprocess.DEVNULL)
+    assert first.read_bytes() == before
+    results = json.loads((out / "results.json").read_text())["3_views"]["fast"]
+    assert list(results["scenes"]) == ["one", "two"] and not results["failures"]
+
+
+def _alive(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat", encoding="ascii") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

@@ -1,0 +1,173 @@
+"""``gvtools benchmark`` on tiny recordings."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from command_line import refused
+from PIL import Image
+from tiny_scan import write_scan
+
+from gvtools.evaluation.images import psnr
+from gvtools.scenes.project import open_project
+from pipelines.benchmark import cells
+from pipelines.cli import main
+
+VIEWS = 12
+# Of 12 views, 0 and 8 are targets; of the 10 others, places 0, 4.5 (to even) and 9.
+CONTEXT = [f"frame-{i:06d}" for i in (1, 5, 11)]
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Cells are measured here: a process each takes seconds to begin."""
+    measured = []
+
+    def measure(cell):
+        measured.append((cell.scene, cell.views, cell.method.name))
+        cells.measure_and_write(cell)
+
+    monkeypatch.setattr(cells, "measure_apart", measure)
+    return measured
+
+
+@pytest.fixture(scope="module")
+def projects(tmp_path_factory):
+    root = tmp_path_factory.mktemp("projects")
+    write_scan(root / "one", views=VIEWS)
+    write_scan(root / "two", views=VIEWS)
+    (root / "notes").mkdir()
+    return root
+
+
+def words(root, out, *more: object) -> list[str]:
+    return ["benchmark", "few-view", "--root", str(root), "--out", str(out), "--quiet",
+            "--views", "3", *map(str, more)]  # fmt: skip
+
+
+def rows_of(path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write_pictures(root, folder, *, noise: int) -> None:
+    """The photographs of the targets, with noise of some levels, as another method's pictures."""
+    rng = np.random.default_rng(0)
+    for project in ("one", "two"):
+        scene = open_project(root / project)
+        (folder / project).mkdir(parents=True)
+        for name in (scene.names[0], scene.names[8]):
+            rgb = scene[name].load().rgb.astype(int)
+            made = np.clip(rgb + rng.integers(-noise, noise + 1, rgb.shape), 0, 255)
+            stem = name.removesuffix(".png")
+            Image.fromarray(made.astype(np.uint8)).save(folder / project / f"{stem}.png")
+
+
+def test_a_benchmark_runs_goes_on_and_writes_its_tables(projects, tmp_path, in_process, capsys):
+    out, renders = tmp_path / "out", tmp_path / "renders"
+    write_pictures(projects, renders, noise=8)
+    assert main(words(projects, out, "--methods", f"fast,noisy={renders}")) == 0
+    assert in_process == [("one", 3, "fast"), ("one", 3, "noisy"),
+                          ("two", 3, "fast"), ("two", 3, "noisy")]  # fmt: skip
+    results = json.loads((out / "results.json").read_text())["3_views"]
+    cell = json.loads((out / "cells/one/3_views/fast.json").read_text())
+    assert [name.removesuffix(".color.png") for name in cell["split"]["context"]] == CONTEXT
+    assert cell["resolution"] == [96, 72] and len(cell["views"]) == 2
+    # The mean over scenes of the means over views, and its interval, which two scenes bound.
+    of_scenes = [results["fast"]["scenes"][name]["psnr"] for name in ("one", "two")]
+    interval = results["fast"]["intervals"]["psnr"]
+    assert results["fast"]["mean"]["psnr"] == pytest.approx(np.mean(of_scenes))
+    assert min(of_scenes) <= interval["low"] <= interval["high"] <= max(of_scenes)
+    assert results["fast"]["seconds"] > 0 and results["fast"]["peak_bytes"] > 2**20
+    # Another method's pictures are compared with the same photographs.
+    scene = open_project(projects / "one")
+    expected = []
+    for name in (scene.names[0], scene.names[8]):
+        made = np.array(Image.open(renders / "one" / name.replace(".png", ".png")))
+        expected.append(psnr(made, scene[name].load().rgb))
+    assert results["noisy"]["scenes"]["one"]["psnr"] == pytest.approx(np.mean(expected))
+    assert results["noisy"]["mean"]["psnr_observed"] is None
+    (fast, noisy) = rows_of(out / "3_views.csv")
+    assert (fast["System"], noisy["System"]) == ("fast", "noisy")
+    assert float(fast["PSNR (dB)"]) == pytest.approx(results["fast"]["mean"]["psnr"])
+    assert len(rows_of(out / "scenes.csv")) == 4
+    assert "PSNR" in (out / "3_views.md").read_text()
+    assert r"\begin{tabular}" in (out / "3_views.tex").read_text()
+    _check_page((out / "index.html").read_text())
+
+    # The same command again: runs are kept, pictures are looked at again.
+    in_process.clear()
+    before = (out / "cells/one/3_views/fast.json").read_bytes()
+    assert main(words(projects, out, "--methods", f"fast,noisy={renders}")) == 0
+    assert in_process == [("one", 3, "noisy"), ("two", 3, "noisy")]
+    assert (out / "cells/one/3_views/fast.json").read_bytes() == before
+    # A cell that is not there is measured; other settings are refused in one line.
+    (out / "cells/two/3_views/fast.json").unlink()
+    in_process.clear()
+    assert main(words(projects, out, "--methods", "fast")) == 0
+    assert in_process == [("two", 3, "fast")]
+    line = refused(capsys, *words(projects, out, "--methods", "fast", "--seconds", 3))
+    assert "measured with seconds None, now 3.0" in line and "--out" in line
+
+
+class _Page(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.cells = 0
+
+    def handle_starttag(self, tag, attrs):
+        self.addresses += [v or "" for k, v in attrs if k in ("src", "href")]
+        self.cells += tag == "td"
+
+
+def _check_page(html: str) -> None:
+    page = _Page()
+    page.feed(html)
+    pictures = [address for address in page.addresses if address.startswith("data:image/jpeg")]
+    # Of two scenes: given view, photograph, and picture and error of two methods.
+    assert len(pictures) == 2 * 6
+    assert all(a.startswith(("data:", "#")) for a in page.addresses)
+    assert page.cells > 20
+
+
+def test_a_scene_that_fails_is_kept_with_its_reason_and_the_rest_goes_on(
+    projects, tmp_path, in_process, capsys
+):
+    root, out = tmp_path / "projects", tmp_path / "out"
+    shutil.copytree(projects / "one", root / "one")
+    write_scan(root / "short", views=3)
+    assert main(words(root, out, "--methods", "fast")) == 0
+    assert in_process == [("one", 3, "fast"), ("short", 3, "fast")]
+    assert "failed: 3 views" in capsys.readouterr().err
+    results = json.loads((out / "results.json").read_text())["3_views"]["fast"]
+    assert list(results["scenes"]) == ["one"]
+    assert "expected at least 3" in results["failures"]["short"]
+    assert results["setting"]["failed"] == 1
+    (_, failed) = rows_of(out / "scenes.csv")
+    assert failed["note"].startswith("failed: 3 views")
+    # What failed is tried again.
+    in_process.clear()
+    assert main(words(root, out, "--methods", "fast")) == 0
+    assert in_process == [("short", 3, "fast")]
+
+
+def test_wrong_options_are_refused(projects, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert "did you mean 'few-view'" in refused(
+        capsys, "benchmark", "few-vew", "--root", projects, "--out", out
+    )
+    assert "did you mean 'fast'" in refused(capsys, *words(projects, out, "--methods", "fats"))
+    assert "each name once" in refused(capsys, *words(projects, out, "--methods", "fast,fast"))
+    assert "expected a folder" in refused(capsys, *words(projects, out, "--methods", "a=gone"))
+    assert "did you mean 'one'" in refused(capsys, *words(projects, out, "--scenes", "ones"))
+    assert "--seconds 0" in refused(capsys, *words(projects, out, "--seconds", 0))
+    assert "no project" in refused(capsys, *words(projects / "notes", out))
+    assert "no such folder" in refused(capsys, *words(tmp_path / "gone", out))
+    assert "expected one of 3, 6, 9" in refused(capsys, *words(projects, out, "--views", 4))
+    assert not out.exists()

@@ -1,0 +1,79 @@
+"""Scenes at one picture size, and with the points of some views alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gvtools.cameras import Cameras
+from gvtools.scenes.resized import resized, seen_by
+from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
+
+
+def scene(width: int = 90, height: int = 60) -> Scene:
+    """Two views of points at depth 2, whose pictures ramp across and down."""
+    ramp = np.zeros((height, width, 3), np.uint8)
+    ramp[..., 0] = np.arange(width)
+    ramp[..., 1] = np.arange(height)[:, None]
+    depth = np.full((height, width), 2.0, np.float32)
+    depth[:, : width // 2] = 3.0
+    views = []
+    for name, shift in (("a", 0.0), ("b", -0.1)):
+        pose = np.eye(4)
+        pose[0, 3] = shift
+        camera = Cameras.pinhole(width, height, focal=80.0, cam_from_world=pose, name=name)
+        views.append(View(name, camera, lambda: Frame(ramp, depth, depth > 2.5), has_depth=True))
+    positions = np.array([[0.0, 0.0, 2.0], [1.05, 0.0, 2.0], [0.2, 0.3, 2.0]])
+    # The first and the third are seen by both, the second by "a" alone, near its right border.
+    point, view = np.array([0, 0, 1, 2, 2], np.int32), np.array([0, 1, 0, 0, 1], np.int32)
+    seen = [view.camera.project(positions)[0][0] for view in views]
+    xy = np.stack([seen[v][p] for p, v in zip(point, view, strict=True)])
+    points = SparsePoints(
+        positions, np.full((3, 3), 9, np.uint8), np.ones(3, np.float32), point, view, xy
+    )
+    return Scene(root=None, kind="colmap", views=tuple(views), points=points)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("size", [(30, 30), (45, 30), (120, 60), (60, 120)])
+def test_cameras_points_and_pixels_stay_together(size):
+    whole = scene()
+    found = resized(whole, *size)
+    frame, camera = found["a"].load(), found["a"].camera
+    assert frame.rgb.shape == (size[1], size[0], 3)
+    assert frame.depth.shape == frame.mask.shape == size[::-1]
+    assert (int(camera.width[0]), int(camera.height[0])) == size
+    # A ray of the new picture meets the colours of the old one where the old camera sees it.
+    ray = camera.rays()[size[1] // 2, size[0] // 2]
+    xy = whole["a"].camera.project(ray[None])[0][0, 0]
+    np.testing.assert_allclose(
+        frame.rgb[size[1] // 2, size[0] // 2, :2], xy - 0.5, atol=0.51 + 0.5 * 90 / size[0]
+    )
+    # Detections stay where the camera projects their points.
+    points = found.points
+    for point, view, at in zip(points.point_index, points.view_index, points.xy, strict=True):
+        expected, _ = found.views[view].camera.project(points.positions[point][None])
+        np.testing.assert_allclose(at, expected[0, 0], atol=1e-9)
+
+
+def test_the_window_is_central_and_what_lies_outside_has_no_points():
+    found = resized(scene(), 30, 30)
+    # Of 90 pixels the middle 60 remain, two of which become one.
+    np.testing.assert_allclose(found["a"].load().rgb[0, 0], [15.5, 0.5, 0], atol=0.5)
+    np.testing.assert_allclose(found["a"].camera.K[0], [[40, 0, 15], [0, 40, 15], [0, 0, 1]])
+    assert found.points.positions.tolist() == scene().points.positions[[0, 2]].tolist()
+    assert found.points.point_index.tolist() == [0, 0, 1, 1]
+
+
+def test_a_scene_of_that_size_is_left_alone():
+    whole = scene()
+    assert resized(whole, 90, 60)["a"].load is whole["a"].load
+
+
+def test_points_that_held_out_views_saw_are_left_out():
+    whole = scene()
+    both = seen_by(whole, ["a", "b"])
+    assert both.points.positions.tolist() == whole.points.positions[[0, 2]].tolist()
+    assert both.points.point_index.tolist() == [0, 0, 1, 1]
+    assert len(seen_by(whole, ["a"]).points.positions) == 0
+    assert len(whole.points.positions) == 3
+    assert seen_by(whole.subset(["a"]), ["a"]).points is None
