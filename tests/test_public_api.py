@@ -26,6 +26,7 @@ DOCTESTED = (
     "gvtools.appearance.splat.splat",
     "gvtools.cameras",
     "gvtools.completers.complete",
+    "gvtools.evaluation.splits",
     "gvtools.evaluation.trajectories",
     "gvtools.scenes.data_sets.drawn",
     "gvtools.scenes.data_sets.spring",

@@ -115,8 +115,7 @@ def reasons_not_to_rank(setting: Setting, benchmark: Benchmark, figure: str) -> 
     if benchmark.targets is None:
         # The number follows from the split, which has to be the benchmark's own.
         del compared["target views a round"], compared["rounds"]
-        own = None if setting.split is None else name_key(setting.split)
-        if own != name_key(benchmark.name):
+        if setting.split is None or name_key(setting.split) != name_key(benchmark.name):
             reasons.append("views: another choice here than the benchmark's")
     if benchmark.resolution is None:
         del compared["resolution"]

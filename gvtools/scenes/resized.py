@@ -39,7 +39,7 @@ def resized(scene: Scene, width: int, height: int) -> Scene:
         left_top = np.array([window[:2] for window in windows], np.float64)[points.view_index]
         size = np.array([window[2:] for window in windows], np.float64)[points.view_index]
         xy = (points.xy - left_top) / size * (width, height)
-        inside = ((xy >= 0) & (xy <= (width, height))).all(axis=1)
+        inside = np.all((xy >= 0) & (xy <= (width, height)), axis=1)
         points = _with_tracks(replace(points, xy=xy), inside, least=1)
     return replace(scene, views=views, points=points)
 

@@ -167,13 +167,14 @@ def _reconstruct(cell: Cell, benchmark: Benchmark, scene: Scene, *, split: Scene
 def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
     """What tables show of an evaluated run."""
     from gvtools.evaluation.ranking import Setting
-    from pipelines.evaluation.tables import measured_row
+    from pipelines.evaluation.tables import measured_row, scalars
     from pipelines.report.nested import nested
 
     nothing = Setting(data_set=None, resolution=None, context=None, targets=None)
     figures = dict(measured_row("", [evaluation], nothing).figures)
     figures["psnr_observed"] = nested(evaluation, "images", "mean", "psnr_valid", "mean")
     figures["coverage"] = evaluation["coverage"]
+    figures |= {label: value for label, value, *_ in scalars(evaluation)}
     poses = evaluation.get("poses", {})
     found = None
     if nested(poses, "pictures"):

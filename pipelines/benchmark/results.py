@@ -76,6 +76,7 @@ def _result(
     failures = {s: str(r["reason"]) for s, r in found.items() if r["status"] == FAILED}
     scenes = {scene: result for scene, result in found.items() if scene not in failures}
     names = dict.fromkeys([*benchmark.figures, "psnr_observed", "coverage"])
+    names |= dict.fromkeys(name for result in scenes.values() for name in result["figures"])
     intervals = {
         figure: mean_interval([r["figures"].get(figure) for r in scenes.values()])
         for figure in names

@@ -13,9 +13,11 @@ from command_line import refused
 from PIL import Image
 from tiny_scan import write_scan
 
+from gvtools.evaluation import published
 from gvtools.evaluation.images import psnr
+from gvtools.evaluation.published import load_benchmark
 from gvtools.scenes.project import open_project
-from pipelines.benchmark import cells
+from pipelines.benchmark import cells, measure
 from pipelines.cli import main
 
 VIEWS = 12
@@ -155,6 +157,38 @@ def test_a_scene_that_fails_is_kept_with_its_reason_and_the_rest_goes_on(
     in_process.clear()
     assert main(words(root, out, "--methods", "fast")) == 0
     assert in_process == [("short", 3, "fast")]
+
+
+def test_the_papers_protocol_runs_in_rounds_and_measures_poses(tmp_path, in_process, monkeypatch):
+    """Three rounds of six targets on a recording that stands for a scene of ScanNet."""
+    root, out = tmp_path / "scans", tmp_path / "out"
+    write_scan(root / "scene0000_00", views=20)
+    spec = load_benchmark("scannetv2")
+    small = spec.model_copy(
+        update={
+            "resolution": (64, 64),
+            "splits": (spec.splits[0].model_copy(update={"stride": 1}),),
+            "data_set": spec.data_set.model_copy(update={"spec": ""}),
+        }
+    )
+    monkeypatch.setattr(measure, "load_benchmark", lambda name: small)
+    monkeypatch.setattr(published, "load_benchmark", lambda name: small)
+    command = ["benchmark", "scannetv2", "--root", str(root), "--out", str(out), "--quiet"]
+    assert main([*command, "--methods", "fast"]) == 0
+    cell = json.loads((out / "cells/scene0000_00/2_views/fast.json").read_text())
+    assert [len(names) for names in cell["split"]["rounds"]] == [6, 6, 6]
+    assert cell["resolution"] == [64, 64]
+    figures = cell["figures"]
+    assert figures["psnr"] > 10 and figures["time"] > 0
+    assert figures["reproj"] is None
+    assert "located, share" in figures and "depth reprojection, pixels" in figures
+    assert (figures["met3r"] is None) == (cell["met3r"] != "measured")
+    row = rows_of(out / "2_views.csv")[-1]
+    assert row["System"] == "fast" and row["Origin"] == "measured here" and not row["PSNR rank"]
+    table = (out / "2_views.md").read_text()
+    assert "fast, no rank in PSNR" in table and "resolution: 64x64" not in table
+    intervals = {row["figure"] for row in rows_of(out / "intervals.csv")}
+    assert {"psnr", "coverage", "located, share"} <= intervals
 
 
 def test_wrong_options_are_refused(projects, tmp_path, capsys):
