@@ -40,6 +40,7 @@ def test_cameras_points_and_pixels_stay_together(size):
     found = resized(whole, *size)
     frame, camera = found["a"].load(), found["a"].camera
     assert frame.rgb.shape == (size[1], size[0], 3)
+    assert frame.depth is not None and frame.mask is not None
     assert frame.depth.shape == frame.mask.shape == size[::-1]
     assert (int(camera.width[0]), int(camera.height[0])) == size
     # A ray of the new picture meets the colours of the old one where the old camera sees it.
@@ -49,10 +50,15 @@ def test_cameras_points_and_pixels_stay_together(size):
         frame.rgb[size[1] // 2, size[0] // 2, :2], xy - 0.5, atol=0.51 + 0.5 * 90 / size[0]
     )
     # Detections stay where the camera projects their points.
-    points = found.points
+    points = points_of(found)
     for point, view, at in zip(points.point_index, points.view_index, points.xy, strict=True):
         expected, _ = found.views[view].camera.project(points.positions[point][None])
         np.testing.assert_allclose(at, expected[0, 0], atol=1e-9)
+
+
+def points_of(found: Scene) -> SparsePoints:
+    assert found.points is not None
+    return found.points
 
 
 def test_the_window_is_central_and_what_lies_outside_has_no_points():
@@ -60,8 +66,8 @@ def test_the_window_is_central_and_what_lies_outside_has_no_points():
     # Of 90 pixels the middle 60 remain, two of which become one.
     np.testing.assert_allclose(found["a"].load().rgb[0, 0], [15.5, 0.5, 0], atol=0.5)
     np.testing.assert_allclose(found["a"].camera.K[0], [[40, 0, 15], [0, 40, 15], [0, 0, 1]])
-    assert found.points.positions.tolist() == scene().points.positions[[0, 2]].tolist()
-    assert found.points.point_index.tolist() == [0, 0, 1, 1]
+    assert points_of(found).positions.tolist() == points_of(scene()).positions[[0, 2]].tolist()
+    assert points_of(found).point_index.tolist() == [0, 0, 1, 1]
 
 
 def test_a_scene_of_that_size_is_left_alone():
@@ -72,8 +78,8 @@ def test_a_scene_of_that_size_is_left_alone():
 def test_points_that_held_out_views_saw_are_left_out():
     whole = scene()
     both = seen_by(whole, ["a", "b"])
-    assert both.points.positions.tolist() == whole.points.positions[[0, 2]].tolist()
-    assert both.points.point_index.tolist() == [0, 0, 1, 1]
-    assert len(seen_by(whole, ["a"]).points.positions) == 0
-    assert len(whole.points.positions) == 3
+    assert points_of(both).positions.tolist() == points_of(whole).positions[[0, 2]].tolist()
+    assert points_of(both).point_index.tolist() == [0, 0, 1, 1]
+    assert len(points_of(seen_by(whole, ["a"])).positions) == 0
+    assert len(points_of(whole).positions) == 3
     assert seen_by(whole.subset(["a"]), ["a"]).points is None
