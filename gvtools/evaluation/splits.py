@@ -36,6 +36,7 @@ class SplitRule(SpecRecord):
         targets: of "listed".
         file: of "files", in the scene's folder; {views} stands for the number of context views. It
             holds ``train_ids`` and ``test_ids``, numbers of the frames of ``transforms.json``.
+        copies: folder of the data set's own reduced pictures, which are read where they are there.
         divided_by: what the width and height of the recorded pictures are divided by; None leaves
             them, or takes the benchmark's resolution.
         stride: of "protocol", views from one of the window to the next; None takes the widest.
@@ -48,6 +49,7 @@ class SplitRule(SpecRecord):
     context: Numbers = ()
     targets: Numbers = ()
     file: str = ""
+    copies: str = ""
     divided_by: int | None = Field(None, ge=1)
     stride: int | None = Field(None, ge=1)
     source: str

@@ -70,14 +70,12 @@ class Run:
         record: what run.json holds.
         rounds: reports of the complete rounds, the context's (round 0) first; perhaps none.
         project: where its project lies now; None: where it lay.
-        opened: the project as the run read it, where that is at hand; None reads it anew.
     """
 
     path: Path
     record: Mapping[str, Any]
     rounds: tuple[Mapping[str, Any], ...]
     project: Path | None = None
-    opened: Scene | None = None
 
     @cached_property
     def settings(self) -> Mapping[str, Any]:
@@ -130,11 +128,8 @@ class Run:
         from gvtools.scenes.reduced import reduced
 
         max_side = self.settings.get("max_side")
-        read = self.opened
-        if read is None:
-            project, reading = self.record["project"], self.record["reading"]
-            read = open_recorded(project, reading, moved=self.project)
-        scene = reduced(read, max_side)
+        project, reading = self.record["project"], self.record["reading"]
+        scene = reduced(open_recorded(project, reading, moved=self.project), max_side)
         other = self.record["targets_project"]
         truths = scene if self.record["targets_kind"] == "hold-out" else None
         if other is not None:
@@ -168,19 +163,18 @@ class Run:
             yield view, files, truth
 
 
-def load_run(path: Path | str, *, project: Path | None = None, opened: Scene | None = None) -> Run:
+def load_run(path: Path | str, *, project: Path | None = None) -> Run:
     """The run in a folder, finished or not.
 
     Args:
         path: the folder.
         project: where its project lies now; None: where it lay.
-        opened: the project as the run read it, where that is at hand; None reads it anew.
 
     Raises:
         ProjectError: no run, a damaged one, or one of another version.
     """
     path = Path(path)
-    return Run(path, read_record(path), read_reports(path), project, opened)
+    return Run(path, read_record(path), read_reports(path), project)
 
 
 def load_growing_run(path: Path, *, project: Path | None = None) -> Run:

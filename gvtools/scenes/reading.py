@@ -35,6 +35,8 @@ def open_as(path: Path, reading: Mapping[str, Any]) -> Scene:
     Args:
         path: see ``gvtools.scenes.project.open_project``.
         reading: options by the names of READING, JSON-ready; absent and None leave the default.
+            ``resolution``, width and height in pixels, is that of a benchmark: see
+            ``gvtools.scenes.resized``.
 
     Raises:
         GvError: as of ``open_project``; OptionError also for a matrix file that is none.
@@ -43,7 +45,13 @@ def open_as(path: Path, reading: Mapping[str, Any]) -> Scene:
         name: None if reading.get(name) is None else Path(reading[name])
         for name in ("images", "masks", "root")
     }
-    return open_project(path, **folders, rgbd=rgbd_options(reading), model=reading.get("model"))
+    scene = open_project(path, **folders, rgbd=rgbd_options(reading), model=reading.get("model"))
+    if reading.get("resolution") is None:
+        return scene
+    from gvtools.scenes.resized import resized
+
+    width, height = reading["resolution"]
+    return resized(scene, width, height)
 
 
 def open_recorded(project: str, reading: Mapping[str, Any], *, moved: Path | None = None) -> Scene:

@@ -16,7 +16,12 @@ from gvtools.evaluation.published import Benchmark, load_benchmark
 from gvtools.files import make_folder
 from pipelines.benchmark.methods import Method
 from pipelines.benchmark.pictures import find_picture, masked_figures, object_mask, write_thumbnails
-from pipelines.benchmark.scenes import open_benchmark_scene, prepared, split_of_scene
+from pipelines.benchmark.scenes import (
+    longest_side,
+    open_benchmark_scene,
+    prepared,
+    split_of_scene,
+)
 from pipelines.console import Console
 
 if TYPE_CHECKING:
@@ -85,7 +90,8 @@ def measure_cell(cell: Cell) -> dict[str, Any]:
     scene = prepared(benchmark, recorded, split)
     lpips = None if cell.lpips is None else Lpips(cell.lpips[0], folder=cell.lpips[1])
     if cell.method.pictures is None:
-        figures, pictures = _of_run(cell, benchmark, scene, split=split, lpips=lpips)
+        side = longest_side(benchmark, recorded)
+        figures, pictures = _of_run(cell, benchmark, scene, split=split, side=side, lpips=lpips)
     else:
         figures, pictures = _of_pictures(cell, scene, split, lpips=lpips)
     masks = {
@@ -107,16 +113,22 @@ def measure_cell(cell: Cell) -> dict[str, Any]:
 
 
 def _of_run(
-    cell: Cell, benchmark: Benchmark, scene: Scene, *, split: SceneSplit, lpips: Lpips | None
+    cell: Cell,
+    benchmark: Benchmark,
+    scene: Scene,
+    *,
+    split: SceneSplit,
+    side: int | None,
+    lpips: Lpips | None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Figures, and completed pictures by target."""
     from gvtools.runs.run import load_run
     from pipelines.evaluation.record import described
     from pipelines.evaluation.run_evaluation import PARTS, evaluate_run
 
-    seconds = _reconstruct(cell, benchmark, scene, split=split)
+    seconds = _reconstruct(cell, benchmark, scene, split=split, side=side)
     peak = peak_bytes()
-    run = load_run(cell.run, opened=scene)
+    run = load_run(cell.run)
     poses = bool(OF_POSES & set(benchmark.figures))
     evaluation = described(
         run,
@@ -138,7 +150,9 @@ def _of_run(
     }, pictures
 
 
-def _reconstruct(cell: Cell, benchmark: Benchmark, scene: Scene, *, split: SceneSplit) -> float:
+def _reconstruct(
+    cell: Cell, benchmark: Benchmark, scene: Scene, *, split: SceneSplit, side: int | None
+) -> float:
     """Run the method from its start; seconds from the opened scene to the finished run."""
     from gvtools.settings import with_values
     from pipelines.reconstruction.compile_kernels import compile_kernels
@@ -149,7 +163,7 @@ def _reconstruct(cell: Cell, benchmark: Benchmark, scene: Scene, *, split: Scene
     # The size of the pictures is the benchmark's, also of methods that would work on smaller ones.
     decided: dict[str, Any] = {
         "context": ",".join(split.context), "targets": ",".join(split.targets), "seed": 0,
-        "max_side": None,
+        "max_side": side,
     }  # fmt: skip
     if benchmark.targets is not None:
         decided |= {"views_per_round": benchmark.targets, "rounds": benchmark.rounds}
@@ -159,7 +173,11 @@ def _reconstruct(cell: Cell, benchmark: Benchmark, scene: Scene, *, split: Scene
     make_folder(cell.run.parent)
     compile_kernels(config, Silent())
     start = time.perf_counter()
-    reading = {"benchmark": cell.benchmark, "scene": cell.scene}
+    # With this, every command opens the run's scene as it was.
+    size = benchmark.resolution
+    reading: dict[str, Any] = {} if size is None else {"resolution": list(size)}
+    if scene.origin is not None:
+        reading["root"] = str(scene.origin.root)
     reconstruct(scene, config, cell.run, console=Silent(), reading=reading, draw=draw_run)
     return time.perf_counter() - start
 

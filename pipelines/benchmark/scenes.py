@@ -62,7 +62,30 @@ def open_benchmark_scene(benchmark: Benchmark, name: str, root: Path) -> Scene:
     released = benchmark.split_of(benchmark.context).kind == "files"
     if released or not benchmark.data_set.spec:
         return open_project(root / name)
-    return open_data_set(benchmark.data_set.spec, name, root)
+    return open_data_set(benchmark.data_set.spec, _name_there(benchmark, name, root), root)
+
+
+def _name_there(benchmark: Benchmark, name: str, root: Path) -> str:
+    """A scene's name in the download: in whichever folder it lies, and of the reduced pictures.
+
+    Raises:
+        ProjectError: the pictures that are to be reduced, or their reduced copies, are not there.
+    """
+    from gvtools.scenes.data_sets.layouts import layout_of, scenes_of
+    from gvtools.scenes.data_sets.spec import load_spec
+
+    rule = benchmark.split_of(benchmark.context)
+    known = scenes_of(benchmark.data_set.spec, root)
+    name = next((one for one in known if one.rpartition("/")[2] == name), name)
+    variants = layout_of(load_spec(benchmark.data_set.spec)).variants(root)
+    if rule.copies and f"{name}/{rule.copies}" in variants:
+        return f"{name}/{rule.copies}"
+    if rule.divided_by and name in known and f"{name}/images" not in variants:
+        raise ProjectError(
+            f"{root / name}: neither {rule.copies} nor images; expected one, since other copies do "
+            "not tell the recorded size"
+        )
+    return name
 
 
 def split_of_scene(benchmark: Benchmark, scene: Scene) -> SceneSplit:
@@ -88,23 +111,35 @@ def split_of_scene(benchmark: Benchmark, scene: Scene) -> SceneSplit:
 
 
 def prepared(benchmark: Benchmark, scene: Scene, split: SceneSplit) -> Scene:
-    """The scene at the benchmark's picture size, with the sparse points of its context alone.
-
-    Where the benchmark leaves the size open, it is that of a run by default.
-    """
+    """The scene at the benchmark's picture size, with the sparse points of its context alone."""
     from gvtools.scenes.reduced import reduced
     from gvtools.scenes.resized import resized, seen_by
-    from pipelines.reconstruction.settings import RunSettings
 
-    divided_by = benchmark.split_of(benchmark.context).divided_by
     if benchmark.resolution is not None:
         scene = resized(scene, *benchmark.resolution)
-    elif divided_by is not None:
-        side = max(int(max(view.camera.width[0], view.camera.height[0])) for view in scene.views)
-        scene = reduced(scene, round(side / divided_by))
-    else:
-        scene = reduced(scene, RunSettings().max_side)
-    return seen_by(scene, split.context)
+    return seen_by(reduced(scene, longest_side(benchmark, scene)), split.context)
+
+
+def longest_side(benchmark: Benchmark, scene: Scene) -> int | None:
+    """What the benchmark reduces pictures to, pixels; None leaves them.
+
+    Where it leaves the size open, it is that of a run by default.
+
+    Args:
+        benchmark: with one number of context views.
+        scene: as recorded.
+    """
+    from pipelines.reconstruction.settings import RunSettings
+
+    rule = benchmark.split_of(benchmark.context)
+    if benchmark.resolution is not None:
+        return None
+    if rule.divided_by is None:
+        return RunSettings().max_side
+    if scene.origin is not None and scene.origin.address.endswith(f"/{rule.copies}"):
+        return None
+    side = max(int(max(view.camera.width[0], view.camera.height[0])) for view in scene.views)
+    return round(side / rule.divided_by)
 
 
 def object_mask_path(benchmark: Benchmark, root: Path, *, scene: str, index: int) -> Path | None:
