@@ -147,8 +147,11 @@ def _ended(code: int | None) -> str:
 
 
 def _child(cell: Cell) -> None:
+    import signal
     import threading
 
+    # A terminal interrupts this process, too; the command's own ends it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     measure_and_write(cell)

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 # Number of context views, mean, lower and upper end of its interval.
 Point = tuple[int, float, float | None, float | None]
+# Side by side, so that intervals of one number of views do not hide each other; views.
+APART = 0.12
 STYLES = tuple(zip((BLUE, ORANGE, GREEN, RED, SKY, PINK, BLACK, GREY), "os^vDPX*", strict=True))
 
 
@@ -31,7 +33,8 @@ def draw_by_views(lines: Mapping[str, Sequence[Point]], *, label: str = "PSNR [d
     def panel(axes: Axes) -> None:
         for number, (name, points) in enumerate(lines.items()):
             color, marker = STYLES[number % len(STYLES)]
-            views, means = [p[0] for p in points], [p[1] for p in points]
+            shift = APART * (number - (len(lines) - 1) / 2)
+            views, means = [p[0] + shift for p in points], [p[1] for p in points]
             # Without an interval, the ends are the mean itself.
             below = [p[1] - (p[1] if p[2] is None else p[2]) for p in points]
             above = [(p[1] if p[3] is None else p[3]) - p[1] for p in points]
