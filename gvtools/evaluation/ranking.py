@@ -191,7 +191,8 @@ def comparison_notes(rows: Sequence[SideBySideRow], benchmark: Benchmark) -> tup
             notes.append(f"Published{systems}: {source.title}, {source.table}{copy}.")
     if benchmark.not_stated and notes:
         notes.append(f"Not stated there: {'; '.join(benchmark.not_stated)}.")
-    notes += [f"In the source, {note}." for note in benchmark.notes]
+    where = "In the source" if len(benchmark.sources) == 1 else "In the sources"
+    notes += [f"{where}, {note}." for note in benchmark.notes]
     notes.append("Ranks count the published rows, and the comparable ones that were measured here.")
     for row in rows:
         labels: dict[str, list[str]] = {}

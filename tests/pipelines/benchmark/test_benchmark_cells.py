@@ -48,6 +48,21 @@ def test_pictures_have_the_benchmarks_size_and_points_of_the_context_alone(tmp_p
     assert prepared(share, scene, split)[scene.names[0]].load().rgb.shape == (60, 80, 3)
 
 
+def test_methods_are_settings_of_runs(tmp_path):
+    """The time of a fit is that of methods that fit."""
+    file = tmp_path / "mine.json"
+    file.write_text(json.dumps({"splat": {"nearest_views": 2}, "completer": "none"}))
+    methods = parse_methods(f"default, fast, none, paper, mine={file}")
+    found = {method.name: method.config(seconds=7) for method in methods}
+    seconds = {name: config.refine.seconds for name, config in found.items()}
+    assert seconds == {"default": 7, "fast": None, "none": 7, "paper": None, "mine": 7}
+    assert found["none"].completer == found["mine"].completer == "none"
+    assert found["mine"].splat.nearest_views == 2
+    assert (found["paper"].protocol, found["paper"].completer) == ("paper", "geoverse")
+    assert methods[0].config(seconds=None).refine.seconds is None
+    assert parse_methods(f"theirs={tmp_path}")[0].pictures == tmp_path.resolve()
+
+
 def test_masked_figures_are_of_the_object_on_white(tmp_path):
     scene = open_project(write_scan(tmp_path / "scan", views=1))
     (name,) = scene.names

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,8 +33,8 @@ def cameras() -> Cameras:
     poses[:, 0, 3] = -0.1 * np.arange(VIEWS)
     K = np.array([[150.0, 0, FULL[0] / 2], [0, 150, FULL[1] / 2], [0, 0, 1]])
     names = tuple(f"view_{i:02d}.png" for i in range(VIEWS))
-    sizes = (np.full(VIEWS, side) for side in FULL)
-    return Cameras(np.tile(K, (VIEWS, 1, 1)), poses, *sizes, names)
+    width, height = (np.full(VIEWS, side) for side in FULL)
+    return Cameras(np.tile(K, (VIEWS, 1, 1)), poses, width, height, names)
 
 
 def write_mipnerf360(root: Path, *copies: int) -> Path:
@@ -96,7 +97,7 @@ def test_llff_has_one_size_and_its_runs_are_opened_again_with_it(tmp_path, copie
     assert {size_of(view.camera) for view in found} == {(504, 378)}
     assert found.views[5].load().rgb.shape == (378, 504, 3)
     assert scene.origin is not None
-    record = {
+    record: dict[str, Any] = {
         "project": scene.address,
         "reading": {"root": str(root), "resolution": [504, 378]},
         "settings": {}, "derived": {}, "targets": [], "targets_kind": "hold-out",
