@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from gvtools.errors import ProjectError
 
@@ -132,6 +132,31 @@ def write_text(path: Path, text: str) -> None:
     """Write a whole text file (UTF-8) under its final name only when it is complete."""
     with replaced_when_written(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+class JsonList:
+    """A list within a JSON object that is written item by item, so that memory does not grow."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file, self._count = file, 0
+
+    def add(self, item: Mapping[str, Any]) -> None:
+        """Append; NaN and infinity become null."""
+        self._file.write((",\n" if self._count else "\n") + json.dumps(_finite(item)))
+        self._count += 1
+
+
+@contextmanager
+def json_list_written(path: Path, head: Mapping[str, Any], name: str) -> Iterator[JsonList]:
+    """Gives a list to append to; on success ``path`` holds ``head`` with it as ``name``.
+
+    Raises:
+        ProjectError: writing failed; ``path`` is as it was.
+    """
+    with replaced_when_written(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(json.dumps({**_finite(head), name: []})[: -len("]}")])
+        yield JsonList(file)
+        file.write("\n]}\n")
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

@@ -28,14 +28,18 @@ DOCTESTED = (
     "gvtools.completers.complete",
     "gvtools.evaluation.splits",
     "gvtools.evaluation.trajectories",
+    "gvtools.scenes.data_sets.address",
     "gvtools.scenes.data_sets.drawn",
+    "gvtools.scenes.data_sets.spec",
     "gvtools.scenes.data_sets.spring",
+    "gvtools.scenes.inspection",
     "gvtools.settings.base",
     "gvtools.scenes.shards.index",
     "gvtools.training.drawn",
     "gvtools.training.mixture",
     "gvtools.training.tune_options",
     "gvtools.trajectory_files",
+    "pipelines.data_sets.log_histogram",
 )
 
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 from gvtools.errors import OptionError
 from gvtools.scenes.collection import SceneCollection, digest_of, of_scenes
+from gvtools.scenes.data_sets.address import SPEC
 from gvtools.scenes.scene import Scene
-
-SPEC = "spec:"
 
 
 def open_collection(address: str, root: Path | None = None) -> SceneCollection:
@@ -51,11 +50,10 @@ def open_collection(address: str, root: Path | None = None) -> SceneCollection:
 
 
 def _read(data_set: str, scene: str, *, root: Path) -> Scene:
-    from gvtools.scenes.data_sets.layouts import layout_of
+    from gvtools.scenes.data_sets.layouts import read_scene
     from gvtools.scenes.data_sets.spec import load_spec
 
-    spec = load_spec(data_set)
-    return layout_of(spec).read(root, scene, spec)
+    return read_scene(load_spec(data_set), scene, root)
 
 
 def _project_or_shards(path: Path) -> SceneCollection:

@@ -93,13 +93,17 @@ class _Opened(NamedTuple):
     range: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-def inspect(scene: Scene) -> SceneReport:
+def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
     """Open a scene's files and sum up what a run would get.
 
     Files that cannot be read become error findings; nothing is raised for them.
+
+    Args:
+        scene: as it was read.
+        probes: how many views have their pixels decoded, evenly spread; None: all.
     """
     findings = list(scene.findings)
-    opened = _open(scene, findings)
+    opened = _open(scene, spread(len(scene), probes), findings)
     cameras = scene.cameras if scene.views else None
     focal = cameras.K[:, (0, 1), (0, 1)] if cameras is not None else np.zeros((1, 2))
     centers = cameras.centers if cameras is not None else np.zeros((1, 3))
@@ -154,10 +158,22 @@ def reprojection_errors(scene: Scene) -> np.ndarray:
     return errors
 
 
-def _open(scene: Scene, findings: list[Finding]) -> list[_Opened]:
+def spread(count: int, probes: int | None) -> list[int]:
+    """At most so many of ``count`` numbers, evenly spread, the first and the last among them.
+
+    >>> spread(10, 4), spread(2, 4), spread(2, None)
+    ([0, 3, 6, 9], [0, 1], [0, 1])
+    """
+    if probes is None or probes >= count:
+        return list(range(count))
+    return np.linspace(0, count - 1, probes).round().astype(int).tolist()
+
+
+def _open(scene: Scene, numbers: list[int], findings: list[Finding]) -> list[_Opened]:
     known = {finding.message for finding in findings}
     opened, empty = [], []
-    for number, view in enumerate(scene.views):
+    for number in numbers:
+        view = scene.views[number]
         try:
             frame = view.load()
         except GvError as error:

@@ -183,7 +183,7 @@ def contradictions(
         if a in thumbnails and b in thumbnails:
             pair = thumbnails[a], thumbnails[b]
             enough = 0.0 if unshared else DISAGREEING
-            differs = _disagreement(*pair, _homography(pair, cameras, (a, b)), enough)
+            differs = _disagreement(*pair, _homography(pair, cameras, (a, b)), enough=enough)
         if unshared or (differs is not None and differs > DISAGREEING):
             names = scene.views[a].name, scene.views[b].name
             shared, of = points or (None, None)
@@ -205,7 +205,7 @@ def disagreement(a: Thumbnail, b: Thumbnail, cameras: Cameras) -> float | None:
     return _disagreement(a, b, _homography((a, b), cameras, (0, 1)), enough=0.0)
 
 
-def _disagreement(a: Thumbnail, b: Thumbnail, H: Float64, enough: float) -> float | None:
+def _disagreement(a: Thumbnail, b: Thumbnail, H: Float64, *, enough: float) -> float | None:
     """As ``disagreement``; the search among shifts ends once the share is at most ``enough``.
 
     Each shift can lower the share alone, so that ending early never turns a pair into a

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.colmap_files import find_model
-from gvtools.scenes.data_sets.address import FORM, is_address, open_address
+from gvtools.scenes.data_sets.address import FORM, is_address
 from gvtools.scenes.photographs import named
 from gvtools.scenes.redwood import REDWOOD
 from gvtools.scenes.rgbd_recording import RgbdOptions
@@ -59,6 +59,8 @@ def open_project(
                 f"{path}: the data set's spec says how it is read; expected neither images, masks, "
                 "a model's number nor RGB-D options"
             )
+        from gvtools.scenes.data_sets.layouts import open_address
+
         return open_address(path, root)
     if root is not None:
         raise OptionError(

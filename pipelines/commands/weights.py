@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import CheckpointError, GvError, OptionError, ProjectError
+from pipelines.commands.actions import Action, AddOption, add_actions
 
 if TYPE_CHECKING:
     from gvtools.completers.geoverse.config import GeoVerseConfig
@@ -25,31 +26,14 @@ EXAMPLES = ("gvtools weights list base", "gvtools weights check weights/base --j
 DEPTH = "depth"
 # Seconds between two lines of progress.
 _INTERVAL = 10.0
-_Add = Callable[..., Any]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's actions and their options."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    for name, (run_action, add_options, summary, *examples) in _ACTIONS.items():
-        lines = "\n".join(f"  gvtools weights {name} {example}".rstrip() for example in examples)
-        added = actions.add_parser(
-            name,
-            help=summary,
-            description=f"examples:\n{lines}\n\n{summary}.",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-        )
-        added.set_defaults(act=run_action)
-        # As of every command; given before the action they hold as well.
-        for option, text in (("quiet", "print nothing but warnings"), ("debug", "tracebacks")):
-            added.add_argument(
-                f"--{option}", action="store_true", default=argparse.SUPPRESS, help=text
-            )
-        add_options(added.add_argument)
+    add_actions(parser, "weights", _ACTIONS)
 
 
-def _list_options(option: _Add) -> None:
+def _list_options(option: AddOption) -> None:
     option(
         "config",
         nargs="?",
@@ -58,24 +42,24 @@ def _list_options(option: _Add) -> None:
     )
 
 
-def _check_options(option: _Add) -> None:
+def _check_options(option: AddOption) -> None:
     option("folder", type=Path, metavar="DIR", help="a weights folder")
     option("--config", metavar="NAME|FILE", help="instead of the folder's own config.json")
     option("--json", type=Path, metavar="FILE", help="write the report there")
 
 
-def _create_options(option: _Add) -> None:
+def _create_options(option: AddOption) -> None:
     option("config", metavar="NAME", help="base, gld, tiny or a config.json")
     option("folder", type=Path, metavar="DIR", help="the folder to make")
     option("--seed", type=int, default=0, metavar="N", help="of the numbers (0)")
 
 
-def _pack_options(option: _Add) -> None:
+def _pack_options(option: AddOption) -> None:
     option("source", type=Path, metavar="TRAINING", help="of gvtools train --out")
     option("folder", type=Path, metavar="DIR", help="the folder to make or to renew")
 
 
-def _truncate_options(option: _Add) -> None:
+def _truncate_options(option: AddOption) -> None:
     option("source", type=Path, metavar="SOURCE", help="the published folder or safetensors file")
     option("folder", type=Path, metavar="DIR", help="the folder to make")
     option(
@@ -84,7 +68,7 @@ def _truncate_options(option: _Add) -> None:
     option("--blocks", type=int, default=16, metavar="N", help="backbone blocks to keep (16)")
 
 
-def _prompt_options(option: _Add) -> None:
+def _prompt_options(option: AddOption) -> None:
     option("source", type=Path, metavar="SOURCE", help="Wan's text encoder (transformers)")
     option("folder", type=Path, metavar="DIR", help="the video prior's folder")
 
@@ -250,41 +234,42 @@ def _config(name: str) -> GeoVerseConfig:
     raise OptionError(f"no configuration {name!r}; expected {', '.join(NAMES)} or a config.json")
 
 
-# Name: what it does, its options, a summary, examples.
-_ACTIONS: dict[str, tuple[Any, ...]] = {
-    "list": (_list, _list_options, "files, publishers, licences, sizes", "", "base"),
-    "check": (
+_ACTIONS = {
+    "list": Action(_list, _list_options, "files, publishers, licences, sizes", ("", "base")),
+    "check": Action(
         _check,
         _check_options,
         "say precisely what does not fit",
-        "weights/base",
-        "DIR --config tiny",
+        ("weights/base", "DIR --config tiny"),
     ),
-    "create": (
+    "create": Action(
         _create,
         _create_options,
         "write an untrained model, for tests and as a start of training",
-        "tiny weights/untrained",
-        "tiny weights/other --seed 1",
+        ("tiny weights/untrained", "tiny weights/other --seed 1"),
     ),
-    "pack": (
+    "pack": Action(
         _pack,
         _pack_options,
         "write a trained model in half precision, with its training's record",
-        "training/tiny weights/tiny",
+        ("training/tiny weights/tiny",),
     ),
-    "truncate-wan": (
+    "truncate-wan": Action(
         _truncate,
         _truncate_options,
         "make the video prior's folder from published Wan2.2-VACE weights",
-        "Wan2.2-VACE-Fun-A14B weights/base/video --vae Wan2.1-VACE-diffusers/vae",
-        "Wan2.2-VACE-Fun-14B-diffusers weights/base/video",
+        (
+            "Wan2.2-VACE-Fun-A14B weights/base/video --vae Wan2.1-VACE-diffusers/vae",
+            "Wan2.2-VACE-Fun-14B-diffusers weights/base/video",
+        ),
     ),
-    "empty-prompt": (
+    "empty-prompt": Action(
         _empty_prompt,
         _prompt_options,
         "add the empty prompt's embedding to the video prior's folder",
-        "Wan2.2-VACE-Fun-14B-diffusers/text_encoder weights/base/video",
-        "text_encoder weights/base/video",
+        (
+            "Wan2.2-VACE-Fun-14B-diffusers/text_encoder weights/base/video",
+            "text_encoder weights/base/video",
+        ),
     ),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -12,9 +13,15 @@ import pytest
 import skimage.data
 
 from gvtools.cameras import Cameras
+from gvtools.scenes import pose_contradictions
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.inspection import inspect
-from gvtools.scenes.pose_contradictions import contradictions, disagreement, thumbnail
+from gvtools.scenes.pose_contradictions import (
+    DISAGREEING,
+    contradictions,
+    disagreement,
+    thumbnail,
+)
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 
@@ -113,6 +120,22 @@ def test_pictures_without_contrast_cannot_be_compared() -> None:
     other = thumbnail(scene.views[0].load())
     assert disagreement(flat, other, scene.cameras) is None
     assert disagreement(other, other, scene.cameras[[0, 0]]) == 0
+
+
+def test_a_search_that_ends_early_finds_the_same_contradictions() -> None:
+    scene = walk(wrong=(1, 3, 4, 8))
+    pictures = [thumbnail(view.load()) for view in scene]
+    agree = 0
+    for a, b in combinations(range(len(scene)), 2):
+        pair = pictures[a], pictures[b]
+        whole = disagreement(*pair, scene.cameras[[a, b]])
+        H = pose_contradictions._homography(pair, scene.cameras, (a, b))
+        early = pose_contradictions._disagreement(*pair, H, enough=DISAGREEING)
+        assert whole is not None and early is not None
+        assert whole <= early
+        assert (whole > DISAGREEING) == (early > DISAGREEING)
+        agree += early <= DISAGREEING
+    assert 0 < agree < 66
 
 
 def test_masked_pixels_are_not_compared() -> None:

@@ -6,12 +6,13 @@ LAYOUTS. Several data sets may share one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import difflib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
-from gvtools.errors import ProjectError
+from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.data_sets.address import FORM, SPEC
 from gvtools.scenes.data_sets.spec import DataSetSpec, load_spec, name_key
 from gvtools.scenes.scene import Origin, Scene
@@ -97,8 +98,6 @@ def open_data_set(name: str, scene: str, root: Path) -> Scene:
         OptionError: no such data set.
         ProjectError: no such scene there, or nothing of it can be read.
     """
-    import difflib
-
     spec = load_spec(name)
     known = scenes_of(name, root)
     if not scene and len(known) == 1:
@@ -108,11 +107,53 @@ def open_data_set(name: str, scene: str, root: Path) -> Scene:
             f"{root}: holds {len(known)} scenes of {spec.name}, first {known[0]!r}; say which, as "
             f"{FORM}"
         )
-    if scene not in known and scene not in layout_of(spec).variants(Path(root)):
-        near = difflib.get_close_matches(scene, known, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"first of {len(known)}: {known[0]!r}"
-        raise ProjectError(f"{root}: {spec.name} has no scene {scene!r} there; {hint}")
+    _check_is_there(spec, scene, Path(root), known=known)
     return read_scene(spec, scene, Path(root))
+
+
+def open_address(address: Path | str, root: Path | None) -> Scene:
+    """The scene of a data set that an address names.
+
+    Args:
+        address: see FORM; the scene may be left out where the folder holds one alone.
+        root: the folder of the data set's download.
+
+    Raises:
+        OptionError: no such data set, or no root.
+        ProjectError: no such scene in the folder, or nothing of it can be read.
+    """
+    name, _, scene = str(address).removeprefix(SPEC).partition(":")
+    if not name:
+        raise OptionError(f"{address}: names no data set; expected {FORM}")
+    spec = load_spec(name)
+    if root is None:
+        raise OptionError(
+            f"{address}: where {spec.name} lies is not said; give the folder of its download by "
+            "--root DIR (root= in Python)"
+        )
+    return open_data_set(name, scene, Path(root))
+
+
+def chosen_scenes(name: str, root: Path, scenes: Sequence[str] = ()) -> tuple[str, ...]:
+    """The scenes of a download that a user names, or all of them.
+
+    Raises:
+        OptionError: no such data set.
+        ProjectError: the folder is absent or lacks one of them.
+    """
+    spec = load_spec(name)
+    known = scenes_of(name, root)
+    for scene in scenes:
+        _check_is_there(spec, scene, Path(root), known=known)
+    return tuple(dict.fromkeys(scenes)) or known
+
+
+def _check_is_there(spec: DataSetSpec, scene: str, root: Path, *, known: Sequence[str]) -> None:
+    if scene in known or scene in layout_of(spec).variants(root):
+        return
+    near = difflib.get_close_matches(scene, known, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"first of {len(known)}: {known[0]!r}"
+    raise ProjectError(f"{root}: {spec.name} has no scene {scene!r} there; {hint}")
 
 
 def read_scene(spec: DataSetSpec, scene: str, root: Path) -> Scene:

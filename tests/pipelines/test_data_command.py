@@ -1,0 +1,219 @@
+"""``gvtools data list``, ``check`` and ``stats`` on miniatures in the layout of 7-Scenes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import weakref
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import refused
+from tiny_scan import FOCAL, WIDTH, render, world_from_cam, write_scan
+
+from gvtools.scenes.data_sets.layouts import read_scene
+from gvtools.scenes.data_sets.spec import DataSetSpec, load_spec, spec_names
+from gvtools.scenes.scene import Scene
+from pipelines.cli import main
+from pipelines.data_sets import checking
+from pipelines.data_sets.log_histogram import LogHistogram
+
+FIRST, SECOND = "wall/seq-01", "wall/seq-02"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    write_scan(tmp_path / "7scenes" / FIRST)
+    write_scan(tmp_path / "7scenes" / SECOND, views=12)
+    return tmp_path / "7scenes"
+
+
+def data(*arguments: object) -> int:
+    return main(["data", *map(str, arguments)])
+
+
+def report(path: Path) -> dict[str, Any]:
+    return dict(json.loads(path.read_text(encoding="utf-8")))
+
+
+def test_the_list_has_a_row_for_each_data_set(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert data("list") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 1 + len(spec_names()) + 1
+    assert "66,033" in next(line for line in lines if "RealEstate10K" in line)
+    assert data("list", "--json", tmp_path / "sets.json") == 0
+    found = report(tmp_path / "sets.json")["data_sets"]
+    shares = {x["name"]: x["share"] for x in found if x["share"] is not None}
+    assert len(shares) == 15
+    assert sum(shares.values()) == pytest.approx(1)
+    # Four times the images are twice the weight.
+    images = {x["name"]: x["counts"]["images"] for x in found}
+    ratio = images["RealEstate10K"] / images["Spring"]
+    assert shares["RealEstate10K"] / shares["Spring"] == pytest.approx(np.sqrt(ratio))
+
+
+def test_all_that_is_known_of_one_data_set_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    import yaml
+
+    assert data("list", "Virtual KITTI") == 0
+    text = capsys.readouterr().out
+    spec = load_spec("virtualkitti")
+    assert yaml.safe_load(text) == spec.model_dump(mode="json", exclude_none=True)
+    assert "of a mixture of all training sets" in text
+    assert "did you mean 'virtualkitti'" in refused(capsys, "data", "list", "virtual kity")
+
+
+def test_each_scene_of_a_download_has_its_line(
+    root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (root / SECOND / "frame-000003.depth.png").unlink()
+    assert data("check", "7-Scenes", root, "--json", tmp_path / "check.json") == 0
+    out = capsys.readouterr().out
+    assert f"{FIRST}: 6 views of 96x72; 6 with depth; 1.8 to 3 m" in out
+    assert f"{SECOND}: 12 views of 96x72; 11 with depth" in out
+    # What both scenes have in common is said once.
+    assert out.count("info: depth unit: 0.001 m") == 1
+    assert "2 scenes, 18 views, 17 with depth (all of 7-Scenes: 7 scenes, 43,000 images)" in out
+    scenes = report(tmp_path / "check.json")["scenes"]
+    assert [scene["scene"] for scene in scenes] == [FIRST, SECOND]
+    assert [scene["views"] for scene in scenes] == [6, 12]
+    assert scenes[1]["views_opened"] == checking.PROBES
+    assert scenes[1]["depth"]["views"] == 11
+
+
+def test_damaged_scenes_are_reported_after_the_others(
+    root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (root / FIRST / "frame-000000.color.png").write_bytes(b"no picture")
+    for path in (root / SECOND).glob("*.color.png"):
+        path.unlink()
+    write_scan(root / "wall" / "seq-03")
+    line = refused(capsys, "data", "check", "7-Scenes", root, "--json", tmp_path / "check.json")
+    assert f"2 of 3 scenes cannot be used, first {FIRST}: " in line
+    scenes = report(tmp_path / "check.json")["scenes"]
+    assert [scene["ok"] for scene in scenes] == [False, False, True]
+    assert all(scene["problem"] for scene in scenes[:2])
+    assert data("check", "7-Scenes", root, "--scene", "wall/seq-03") == 0
+    # Figures are of what can be read.
+    assert data("stats", "7-Scenes", root, "--json", tmp_path / "stats.json") == 0
+    figures = report(tmp_path / "stats.json")
+    assert (figures["scenes"], figures["skipped"]) == (2, 1)
+    assert "1 of 3 scenes cannot be read, first wall/seq-02" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("action", ["check", "stats"])
+def test_bad_input_is_one_line(
+    action: str, root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "out.json"
+    cases = {
+        ("7-Scene", root): "data set '7-Scene' is unknown; did you mean '7scenes'",
+        ("7-Scenes", tmp_path / "nowhere"): "no such folder; expected SCENE/seq-NN/",
+        ("7-Scenes", tmp_path): "no scene of 7-Scenes; expected SCENE/seq-NN/",
+        ("7-Scenes", root, "--scene", "wall/seq-2"): "did you mean 'wall/seq-02'",
+    }
+    for arguments, message in cases.items():
+        assert message in refused(capsys, "data", action, *arguments, "--json", out)
+    assert not out.exists()
+    shutil.rmtree(root / SECOND)
+    for path in (root / FIRST).glob("*.color.png"):
+        path.unlink()
+    assert f"first {FIRST}: " in refused(capsys, "data", action, "7-Scenes", root)
+
+
+def test_figures_are_those_of_the_files(
+    root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert data("stats", "7-Scenes", root, "--scene", FIRST, "--json", tmp_path / "s.json") == 0
+    figures = report(tmp_path / "s.json")
+    assert figures["unit"] == "m"
+    assert figures["sizes"] == {"96x72": 6}
+    assert figures["focal"]["p50"] == FOCAL
+    assert figures["field_of_view"]["max"] == pytest.approx(
+        np.degrees(2 * np.arctan(WIDTH / 2 / FOCAL))
+    )
+    assert figures["baseline"]["count"] == 5
+    assert figures["baseline"]["p95"] == pytest.approx(0.2)
+    assert figures["turn"]["max"] == pytest.approx(0, abs=1e-6)
+    depth = np.concatenate([render(world_from_cam(i))[1].ravel() for i in range(6)])
+    assert figures["depth"]["count"] == depth.size
+    for name, percent in (("p5", 5), ("p50", 50), ("p95", 95)):
+        assert figures["depth"][name] == pytest.approx(np.percentile(depth, percent), rel=6e-3)
+    assert data("stats", "7-Scenes", root) == 0
+    out = capsys.readouterr().out
+    assert "2 scenes, 18 views, 18 with depth; depth of 14 sampled views" in out
+    assert "baseline to the next view, m" in out
+
+
+def test_percentiles_of_parts_are_those_of_the_whole() -> None:
+    rng = np.random.default_rng(0)
+    values = np.exp(rng.normal(0, 3, 20_000))
+    histogram = LogHistogram()
+    for part in np.split(values, 8):
+        histogram.add(part)
+    for percent in (1, 50, 99):
+        true = np.percentile(values, percent, method="inverted_cdf")
+        assert histogram.percentile(percent) == pytest.approx(true, rel=6e-3)
+    assert (histogram.minimum, histogram.maximum) == (values.min(), values.max())
+    assert np.isnan(LogHistogram().percentile(50))
+    zeros = LogHistogram()
+    zeros.add([0.0, 0.0, 5.0])
+    assert zeros.percentile(50) == 0
+    assert zeros.percentile(90) == pytest.approx(5, rel=6e-3)
+
+
+def test_one_scene_is_held_at_a_time(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import gc
+
+    seen: list[weakref.ref[Scene]] = []
+
+    def read(spec: DataSetSpec, scene: str, at: Path) -> Scene:
+        gc.collect()
+        assert [ref for ref in seen if ref() is not None] == []
+        opened = read_scene(spec, scene, at)
+        seen.append(weakref.ref(opened))
+        return opened
+
+    monkeypatch.setattr(checking, "read_scene", read)
+    monkeypatch.setattr("pipelines.data_sets.statistics.read_scene", read)
+    write_scan(root / "wall" / "seq-03")
+    assert data("check", "7-Scenes", root) == 0
+    assert data("stats", "7-Scenes", root) == 0
+    assert len(seen) == 6
+
+
+def test_the_command_line_loads_nothing_heavy() -> None:
+    script = "import sys, pipelines.commands.data; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert not {"numpy", "pydantic", "torch", "cv2"} & set(done.stdout.split())
+
+
+@pytest.mark.slow
+def test_ten_thousand_frames_stay_below_300_megabytes(tmp_path: Path) -> None:
+    """Of a process's peak above that of the interpreter alone."""
+    first = write_scan(tmp_path / "7scenes" / FIRST, views=1) / "frame-000000.pose.txt"
+    for i in range(1, 10_000):
+        for kind in ("color.png", "depth.png", "pose.txt"):
+            source = first.with_name(f"frame-000000.{kind}")
+            source.with_name(f"frame-{i:06d}.{kind}").hardlink_to(source)
+    peak = "import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    address = ["7-Scenes", str(tmp_path / "7scenes")]
+    for action in ("check", "stats"):
+        run = f"from pipelines.cli import main; main({['data', action, *address]})"
+        alone, whole = (float(printed(f"{script}; {peak}")) for script in ("pass", run))
+        assert whole - alone < 300
+
+
+def printed(script: str) -> str:
+    """The last line that a Python of its own prints."""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
