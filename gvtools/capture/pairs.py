@@ -36,8 +36,9 @@ def similar_pairs(database: Path, *, nearest: int = NEAREST) -> list[tuple[str, 
     stop = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0.0)
     cv2.setRNGSeed(0)
     words = min(WORDS, len(sample))
-    _, _, centres = cv2.kmeans(sample, words, None, stop, 1, cv2.KMEANS_PP_CENTERS)
-    described = np.stack([vlad(rows, centres) for rows in features])
+    labels = np.zeros((len(sample), 1), np.int32)
+    _, _, centres = cv2.kmeans(sample, words, labels, stop, 1, cv2.KMEANS_PP_CENTERS)
+    described = np.stack([vlad(rows, np.asarray(centres, np.float32)) for rows in features])
     alike = described @ described.T
     np.fill_diagonal(alike, -np.inf)
     pairs = set()

@@ -59,7 +59,8 @@ def place(
     import pycolmap
 
     placed = {name: value for name, value in locations.items() if _found(model, name) is not None}
-    placement, findings = None, []
+    placement: Placement | None = None
+    findings: list[Finding] = []
     if len(placed) >= LEAST_PLACED:
         placement, findings = _by_gps(model, placed)
     if placement is None:
@@ -67,13 +68,15 @@ def place(
         placement = Placement(metric=False, by="cameras")
     if distance is not None:
         first, second, metres = distance
-        centres = [_found(model, name) for name in (first, second)]
-        missing = [n for n, c in zip((first, second), centres, strict=True) if c is None]
-        if missing:
-            raise OptionError(
-                f"--distance: {missing[0]!r} is no registered picture; give two that are"
-            )
-        apart = float(np.linalg.norm(centres[0] - centres[1]))
+        ends = []
+        for name in (first, second):
+            centre = _found(model, name)
+            if centre is None:
+                raise OptionError(
+                    f"--distance: {name!r} is no registered picture; give two that are"
+                )
+            ends.append(centre)
+        apart = float(np.linalg.norm(ends[0] - ends[1]))
         if apart <= 1e-9:
             raise OptionError(f"--distance: {first!r} and {second!r} were taken at one place")
         identity = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.0, 1.0]))
@@ -114,7 +117,9 @@ def _by_gps(
     errors = [float(np.linalg.norm(at[name] - row)) for name, row in zip(names, east, strict=True)]
     error = float(np.median(errors))
     text = f"placed by GPS of {len(names)} pictures, which it differs from by {error:.2f} m"
-    return Placement(True, "GPS", tuple(float(x) for x in origin)), [Finding("info", text)]
+    return Placement(True, "GPS", (float(origin[0]), float(origin[1]), float(origin[2]))), [
+        Finding("info", text)
+    ]
 
 
 def _level(model: pycolmap.Reconstruction) -> None:

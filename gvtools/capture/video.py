@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +89,7 @@ def _measure(
     if not video.isOpened():
         raise ProjectError(f"{path}: no video that OpenCV reads; convert it to H.264 in MP4")
     moved, sharp = [0.0], []
-    before: NDArray[np.uint8] | None = None
+    before: NDArray[Any] | None = None
     while True:
         there, frame = video.read()
         if not there:
@@ -109,14 +110,14 @@ def _measure(
     return np.array(moved), np.array(sharp)
 
 
-def _motion(before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
+def _motion(before: NDArray[Any], now: NDArray[Any]) -> float:
     """Median motion of corners between two frames, in widths of the picture."""
     import cv2
 
     corners = cv2.goodFeaturesToTrack(before, CORNERS, 0.01, 5)
     if corners is None or len(corners) < 8:
         return 0.0
-    found, there, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None)
+    found, there, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, np.empty_like(corners))
     kept = there[:, 0] == 1
     if kept.sum() < 8:
         # Nothing of the one is found in the other: as far apart as can be measured.

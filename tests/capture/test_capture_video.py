@@ -23,7 +23,7 @@ def wall() -> np.ndarray:
 
 
 def write_video(path: Path, frames: list[np.ndarray]) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 25, (WIDTH, HEIGHT))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 25, (WIDTH, HEIGHT))
     for frame in frames:
         writer.write(frame)
     writer.release()
@@ -46,6 +46,7 @@ def test_frames_are_an_equal_motion_apart_and_sharp(tmp_path: Path, wall: np.nda
     written = sorted(file.name for file in (tmp_path / "frames").iterdir())
     assert written == [f"frame_{frame:06d}.jpg" for frame in picked.frames]
     first = cv2.imread(str(tmp_path / "frames" / written[0]))
+    assert first is not None
     assert np.abs(first.astype(int) - frames[picked.frames[0]]).mean() < 8
 
 

@@ -53,10 +53,25 @@ def draw_capture(
         axes.add_collection(LineCollection(lines, colors=shade, linewidths=0.8, zorder=1))
     if len(points):
         step = max(1, len(points) // MOST_POINTS)
-        axes.scatter(*points[::step, :2].T, s=0.6, color=GREY, alpha=0.5, linewidths=0, zorder=0)
+        axes.scatter(
+            points[::step, 0],
+            points[::step, 1],
+            s=0.6,
+            color=GREY,
+            alpha=0.5,
+            linewidths=0,
+            zorder=0,
+        )
     axes.plot(*centres.T, color=BLUE, linewidth=0.8, alpha=0.6, zorder=2)
     axes.quiver(*centres.T, *ahead.T, color=BLUE, width=0.003, scale=25, zorder=3)
-    axes.scatter(*centres[:1].T, color=ORANGE, s=30, zorder=4, label=f"first: {cameras.names[0]}")
+    axes.scatter(
+        centres[:1, 0],
+        centres[:1, 1],
+        color=ORANGE,
+        s=30,
+        zorder=4,
+        label=f"first: {cameras.names[0]}",
+    )
     everything = np.concatenate([centres, _near(points[:, :2])]) if len(points) else centres
     # A square about all that is shown, with a margin.
     middle = (everything.min(axis=0) + everything.max(axis=0)) / 2

@@ -96,4 +96,3 @@ def _resized(points: SparsePoints, model: ColmapModel, scene: Scene) -> SparsePo
     flat = np.concatenate([points.xy, np.ones((len(points.xy), 1))], axis=1)
     xy = np.einsum("nij,nj->ni", change, flat)
     return replace(points, xy=xy[:, :2])
-

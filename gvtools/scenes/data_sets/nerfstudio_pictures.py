@@ -37,9 +37,7 @@ def nerfstudio_pictures(
             path = picture_of(named)
             values = frame_keys(frame, data, what=what)
             pose = _matrix(values.transform_matrix)
-            pictures.append(
-                PosedPicture(path.name, path, values.lens(path, what=what), pose)
-            )
+            pictures.append(PosedPicture(path.name, path, values.lens(path, what=what), pose))
     return pictures
 
 
