@@ -1,4 +1,4 @@
-"""Pages that are generated for each build: commands, settings, Python names, data, measurements."""
+"""Pages that are generated for each build: commands, settings, Python names, data, data sets."""
 
 from __future__ import annotations
 
@@ -39,6 +39,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "training-settings.md": training_page(),
         "python.md": python_page(),
         "data.md": data_page(),
+        "data_sets.md": data_sets_page(),
     }
     pages |= {f"images/{name}.svg": diagram.svg() for name, diagram in DIAGRAMS.items()}
     for name, content in pages.items():
@@ -152,4 +153,19 @@ def data_page() -> str:
         text += [f"### {path.stem}", "", "```yaml", path.read_text(encoding="utf-8"), "```", ""]
     ranges = (folder / "ranges.md").read_text(encoding="utf-8")
     text.append(re.sub(r"^#", "##", ranges, flags=re.MULTILINE))
+    return "\n".join(text)
+
+
+def data_sets_page() -> str:
+    """The public data sets, from their specs: a table, then all that is known of each."""
+    from pipelines.data_sets.listing import COLUMNS, all_specs, as_yaml, table_rows
+
+    folder = ROOT / "data_specs" / "data_sets"
+    text = [(folder / "README.md").read_text(encoding="utf-8"), "## All of them", ""]
+    text += [f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS)]
+    for row in table_rows():
+        text.append(f"| {' | '.join(cell or '' for cell in row)} |")
+    text += ["", "## What is known of each", ""]
+    for spec in all_specs():
+        text += [f"### {spec.name}", "", "```yaml", as_yaml(spec).rstrip(), "```", ""]
     return "\n".join(text)

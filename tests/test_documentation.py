@@ -77,3 +77,17 @@ def test_every_setting_has_a_row_with_its_meaning(hooks: ModuleType) -> None:
     names = [row[0].strip("| `") for row in rows]
     assert {"voxel", "seed", "memory.weight_cap"} <= set(names)
     assert [row[0] for row in rows if len(row[-1].strip(" |")) < 3] == []
+
+
+def test_every_data_set_has_a_row_and_its_facts(hooks: ModuleType) -> None:
+    from gvtools.scenes.data_sets.spec import load_spec, spec_names
+
+    page = hooks.data_sets_page()
+    for spec in map(load_spec, spec_names()):
+        assert page.count(f"\n| {spec.name} | {spec.kind} |") == 1
+        _, _, facts = page.partition(f"\n### {spec.name}\n")
+        assert f"\nlayout: {spec.layout}\n" in facts.partition("\n### ")[0]
+    # The keys that the page explains are those of a spec.
+    explained = re.findall(r"^- (.*?)(?=^- |^$)", page, flags=re.DOTALL | re.MULTILINE)
+    names = set(re.findall(r"`(\w+)`", " ".join(explained)))
+    assert set(type(spec).model_fields) <= names
