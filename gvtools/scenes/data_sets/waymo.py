@@ -43,6 +43,7 @@ INTRINSICS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 # Waymo's camera axes (x forward, y left, z up) from OpenCV's.
 WAYMO_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 PICTURES_AT_ONCE = 4  # that are decoded from a row group to come to one of them
+ROWS_AT_ONCE = 1024  # of numbers
 
 
 def _scenes(root: Path) -> tuple[str, ...]:
@@ -121,7 +122,9 @@ def _rows(path: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, int, dict
             wanted = [name for name in columns if name in known]
             for group in range(file.num_row_groups):
                 row = 0
-                for batch in file.iter_batches(row_groups=[group], columns=wanted):
+                for batch in file.iter_batches(
+                    batch_size=ROWS_AT_ONCE, row_groups=[group], columns=wanted
+                ):
                     for record in batch.to_pylist():
                         yield group, row, record
                         row += 1
