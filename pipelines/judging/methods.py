@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from gvtools.evaluation.picture_sets.open_pictures import open_pictures
 from gvtools.evaluation.picture_sets.pictures import Picture, PictureSet
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.runs.layout import RECORD
-from gvtools.runs.run import load_run
+from gvtools.runs.run import RunTarget, load_run
 from gvtools.scenes.scene import Frame
 
 if TYPE_CHECKING:
@@ -129,11 +130,11 @@ def _run_pictures(path: Path) -> PictureSet:
     """What a run of gvtools completed, with its depth."""
     run = load_run(path)
 
-    def load(view: Any) -> Frame:
+    def load(view: RunTarget) -> Frame:
         files = view.read()
         return Frame(files.picture, files.depth)
 
-    pictures = tuple(Picture(view.name, lambda view=view: load(view)) for view in run.views)
+    pictures = tuple(Picture(view.name, partial(load, view)) for view in run.views)
     return PictureSet(path, OWN_LAYOUT, pictures)
 
 

@@ -179,6 +179,6 @@ def printed(tables: Mapping[str, Table], console: Console) -> None:
     for note in table.notes:
         console.line(f"  {note}")
     if "differences" in tables:
-        table = tables["differences"]
-        rows = [list(row) for row in table.rows if str(row[2]).startswith("psnr")]
-        console.table([column.heading for column in table.columns], rows)
+        apart = tables["differences"]
+        shown = [row for row in apart.rows if str(row[2]).startswith("psnr")]
+        console.table([column.heading for column in apart.columns], shown)

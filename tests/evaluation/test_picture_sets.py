@@ -11,6 +11,7 @@ from PIL import Image
 
 from gvtools.errors import ProjectError
 from gvtools.evaluation.picture_sets.open_pictures import open_pictures
+from gvtools.evaluation.picture_sets.pictures import Picture
 
 NAMES = ("cam/2.jpg", "cam/10.jpg", "cam/30.jpg")
 
@@ -30,6 +31,19 @@ def png(rgb) -> bytes:
     return out.getvalue()
 
 
+def truth_of(one: Picture) -> np.ndarray:
+    """What the tool kept as the truth."""
+    assert one.load_truth is not None
+    return one.load_truth()
+
+
+def depth_of(one: Picture) -> np.ndarray:
+    """The depth beside the picture."""
+    depth = one.load().depth
+    assert depth is not None
+    return depth
+
+
 def loaded(found):
     return {one.name: one.load().rgb for one in found.pictures}
 
@@ -44,7 +58,7 @@ def test_plain_folders_are_read_with_their_folders_and_depth(tmp_path):
     assert (found.layout, found.names) == ("plain folder", ("a/1.png", "a/2.png"))
     assert np.array_equal(loaded(found)["a/1.png"], picture(0))
     assert found.pictures[0].load().depth is None
-    assert np.array_equal(found.pictures[1].load().depth, depth)
+    assert np.array_equal(depth_of(found.pictures[1]), depth)
 
 
 def test_the_pictures_of_gvtools_render_are_read_without_their_other_files(tmp_path):
@@ -53,7 +67,7 @@ def test_the_pictures_of_gvtools_render_are_read_without_their_other_files(tmp_p
     np.savez(tmp_path / "frame-1.color.depth.npz", depth=np.ones((12, 16), np.float32))
     found = open_pictures(tmp_path)
     assert (found.layout, found.names) == ("gvtools render", ("frame-1.color.png",))
-    assert found.pictures[0].load().depth.sum() == 12 * 16
+    assert depth_of(found.pictures[0]).sum() == 12 * 16
 
 
 def test_transparent_pixels_lie_before_black(tmp_path):
@@ -76,7 +90,7 @@ def test_ns_render_dataset(tmp_path, folder):
     assert found.layout == "nerfstudio, ns-render dataset"
     assert found.names == ("cam/2.png", "cam/10.png", "cam/30.png")
     assert np.array_equal(found.pictures[1].load().rgb, picture(1))
-    assert np.array_equal(found.pictures[1].load_truth(), picture(11))
+    assert np.array_equal(truth_of(found.pictures[1]), picture(11))
     assert found.notes == (() if folder else ("split test taken; also there: train",))
 
 
@@ -89,7 +103,7 @@ def test_ns_eval(tmp_path):
     assert (found.layout, len(found.pictures)) == ("nerfstudio, ns-eval", 2)
     assert found.alphabetical
     # JPEG at its best quality is some levels off.
-    render, truth = found.pictures[1].load().rgb, found.pictures[1].load_truth()
+    render, truth = found.pictures[1].load().rgb, truth_of(found.pictures[1])
     assert np.abs(render.astype(int) - picture(11)).mean() < 5
     assert np.abs(truth.astype(int) - picture(1)).mean() < 5
 
@@ -106,7 +120,7 @@ def test_gsplat(tmp_path, folder):
     assert (found.layout, found.alphabetical) == ("gsplat", True)
     assert found.names == tuple(f"val_step29999_{i:04d}.png" for i in range(3))
     assert np.array_equal(found.pictures[2].load().rgb, picture(29999 + 2))
-    assert np.array_equal(found.pictures[2].load_truth(), picture(2))
+    assert np.array_equal(truth_of(found.pictures[2]), picture(2))
     assert "also there: compress_step29999, val_step6999" in found.notes[1]
 
 
@@ -149,7 +163,7 @@ def test_nerfbaselines(tmp_path, form):
     assert found.layout == "NerfBaselines"
     assert found.names == ("cam/2.png", "cam/10.png", "cam/30.png")
     assert np.array_equal(found.pictures[1].load().rgb, picture(1))
-    assert np.array_equal(found.pictures[1].load_truth(), picture(11))
+    assert np.array_equal(truth_of(found.pictures[1]), picture(11))
     taken = ("predictions-30000.tar.gz taken, the last of 2",)
     assert found.notes == (taken if form == "training" else ())
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gvtools.errors import ShapeError
-from viz.plots.palette import GREEN
+from viz.plots.palette import SKY
 from viz.report.judge_sheet import GAP, LETTERS, MISSING, JudgedView, sheet
 
-COLOR = [int(GREEN[i : i + 2], 16) for i in (1, 3, 5)]
+COLOR = [int(SKY[i : i + 2], 16) for i in (1, 3, 5)]
 WIDTH, HEIGHT = 64, 48
 
 
@@ -35,12 +35,15 @@ def test_a_view_has_truth_pictures_and_error_maps_below_its_methods():
     assert (exact == 100).all()
     assert (bright == 250).all()
     assert (absent == MISSING).all()
-    rim = (truth == COLOR).all(axis=2)
-    assert rim[10, 20:40].all()
-    assert rim[10:30, 39].all()
-    assert rim.sum() == 2 * 20 + 2 * 18
-    _, exact_error, bright_error, absent_error = tiles(canvas, 1)
-    inside = exact_error[12:28, 22:38]
+    assert (truth == 100).all()
+    dimmed, exact_error, bright_error, absent_error = tiles(canvas, 1)
+    assert (dimmed[10:30, 20:40] == 100).all()
+    assert dimmed.astype(int).sum() == 3 * (100 * 400 + 20 * (WIDTH * HEIGHT - 400))
+    rim = (exact_error == COLOR).all(axis=2)
+    assert rim[10:12, 20:40].all()
+    assert rim[10:30, 38:40].all()
+    assert rim.sum() == 20 * 20 - 16 * 16
+    inside = exact_error[13:27, 23:37]
     assert (inside == inside[0, 0]).all()
     assert inside.max() < 10
     # Off by more than the brightest difference.

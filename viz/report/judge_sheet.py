@@ -1,6 +1,7 @@
 """A contact sheet of several methods: truth, pictures, and error maps, a row of tiles a view.
 
-What the context never observed is outlined on the truth and on the error maps.
+What the context never observed is outlined on the error maps; below the truth stands the truth with
+everything else dimmed.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import ShapeError
-from viz.plots.palette import GREEN
+from viz.plots.palette import SKY
 from viz.report.contact_sheet import WORST, error_map
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ GAP = 6
 LETTERS = 15
 BACKGROUND, INK = (255, 255, 255), (20, 20, 20)
 MISSING = (200, 200, 200)
+DIM = 0.2  # of the brightness is left where the context observed
+RIM = 5  # pixels of the square that thins a region to its outline: two on either side
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +74,8 @@ def sheet(views: Sequence[JudgedView]) -> NDArray[np.uint8]:
         top += block.height
     text = (
         f"error maps: mean absolute difference over the channels, black 0 to bright {WORST:.0%} of "
-        "the range; outlined: never observed by the context; numbers: PSNR, dB"
+        "the range; bright below the truth, outlined on error maps: never observed by the context; "
+        "numbers: PSNR, dB"
     )
     ImageDraw.Draw(canvas).text((GAP, top + 2), text, INK, font=_font(LETTERS - 3))
     return np.asarray(canvas)
@@ -91,18 +95,25 @@ def _block(view: JudgedView, methods: Sequence[str]) -> Image:
     )
     draw, font = ImageDraw.Draw(block), _font(LETTERS - 2)
     first = [view.truth, *(view.pictures[method] for method in methods)]
-    second = [None, *(_error(view, method) for method in methods)]
+    second = [_dimmed(view), *(_error(view, method) for method in methods)]
     heads = [f"{view.name}, truth" if view.truth is not None else view.name]
     heads += [_heading(view, method) for method in methods]
     for column, head in enumerate(heads):
         left, top = GAP + column * step, LETTERS + GAP
         draw.text((left, GAP // 2), _cut(head, draw, font=font, width=size[0]), INK, font=font)
-        outlined = view.never_observed if column == 0 else None
-        block.paste(_tile(first[column], size, outlined), (left, top))
-        if lines == 2 and column:
-            error = _tile(second[column], size, view.never_observed)
-            block.paste(error, (left, top + size[1] + GAP))
+        block.paste(_tile(first[column], size), (left, top))
+        if lines == 2:
+            outlined = view.never_observed if column else None
+            block.paste(_tile(second[column], size, outlined), (left, top + size[1] + GAP))
     return block
+
+
+def _dimmed(view: JudgedView) -> NDArray[np.uint8] | None:
+    """The truth, dark where the context observed it."""
+    if view.truth is None:
+        return None
+    share = np.where(view.never_observed, 1.0, DIM)[..., None]
+    return np.rint(view.truth * share).astype(np.uint8)
 
 
 def _error(view: JudgedView, method: str) -> NDArray[np.uint8] | None:
@@ -127,7 +138,7 @@ def _heading(view: JudgedView, method: str) -> str:
 def _tile(
     picture: NDArray[np.uint8] | None,
     size: tuple[int, int],
-    outlined: NDArray[np.bool_] | None,
+    outlined: NDArray[np.bool_] | None = None,
 ) -> Image:
     """A thumbnail, grey where there is no picture, with the outline of a region."""
     from PIL import Image
@@ -138,7 +149,7 @@ def _tile(
     if outlined is None or not outlined.any():
         return small
     pixels = np.array(small)
-    pixels[_outline(outlined, size)] = [int(GREEN[i : i + 2], 16) for i in (1, 3, 5)]
+    pixels[_outline(outlined, size)] = [int(SKY[i : i + 2], 16) for i in (1, 3, 5)]
     return Image.fromarray(pixels)
 
 
@@ -148,7 +159,7 @@ def _outline(region: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.boo
 
     share = cv2.resize(region.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     inside = (share >= 0.5).astype(np.uint8)
-    rim = inside - cv2.erode(inside, np.ones((3, 3), np.uint8), borderValue=1)
+    rim = inside - cv2.erode(inside, np.ones((RIM, RIM), np.uint8), borderValue=1)
     return np.asarray(rim, np.bool_)
 
 
