@@ -100,8 +100,8 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
         return 2
     except KeyboardInterrupt:
         goes_on = (
-            "reconstruct goes on with --resume, tradeoff and benchmark by themselves; refine "
-            "changed nothing"
+            "reconstruct and train go on with --resume, tradeoff, benchmark and data shards by "
+            "themselves; refine changed nothing"
         )
         print(f"gvtools: interrupted; {goes_on}", file=sys.stderr)
         return 1

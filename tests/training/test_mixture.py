@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from gvtools.training.distributed import Processes
 from gvtools.training.drawn import drawn_lines
 from gvtools.training.invalid_sample import DEPTH, OVERLAP, UNREADABLE, InvalidSampleError
 from gvtools.training.mixture import TRIES, Mixture, OwnOrEstimated, Source, stratified_at
-from gvtools.training.view_sample import Sample
+from gvtools.training.view_sample import TENSORS, Sample
 
 MILLION = 10**6
 # Images of the paper's fifteen data sets, as its appendix lists them.
@@ -50,7 +51,8 @@ class Numbered:
         if reason:
             raise InvalidSampleError(reason, f"{self.name} {index} {attempt}")
         number = torch.tensor([index, attempt])
-        return Sample(*[number] * 8, context=1)
+        tensors: dict[str, Any] = dict.fromkeys(TENSORS, number)
+        return Sample(**tensors, context=1)
 
     def describe(self) -> dict[str, str]:
         return {"name": self.name}
@@ -139,16 +141,16 @@ def test_an_invalid_sample_is_drawn_again_from_its_source_and_counted():
     wanted = Counter(f"drawn/{data.sources[n].name}" for n in drawn)
     # What is invalid costs a source nothing of its share.
     assert {k: v for k, v in notes.items() if k.startswith("drawn")} == wanted
-    tries = Counter()
-    for index in np.flatnonzero(drawn == 1):
+    tries: Counter[str] = Counter()
+    for index in np.flatnonzero(drawn == 1).tolist():
         attempt = 0
         while (reason := half(index, attempt)) is not None:
             tries[f"resampled/flawed/{reason}"] += 1
             attempt += 1
     assert len(tries) == 2
     assert {k: v for k, v in notes.items() if k.startswith("resampled")} == tries
-    index = int(np.flatnonzero((drawn == 1) & (np.arange(400) % 4 == 0))[0])
-    assert data.sample(index).images.tolist() == [index, 2]
+    first = int(np.flatnonzero((drawn == 1) & (np.arange(400) % 4 == 0))[0])
+    assert data.sample(first).images.tolist() == [first, 2]
 
 
 def test_a_source_without_any_valid_sample_leaves_its_place_to_others():

@@ -15,6 +15,7 @@ from shard_rooms import small_collection, small_scene
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.collection import of_scenes
+from gvtools.scenes.project import open_project
 from gvtools.scenes.shards.index import is_shards, read_index
 from gvtools.scenes.shards.reader import open_shards, verify
 from gvtools.scenes.shards.writer import ShardOptions, write_shards
@@ -55,6 +56,7 @@ def test_every_view_comes_back_bit_by_bit(whole):
             assert np.array_equal(view.camera.cam_from_world, again.camera.cam_from_world)
             frame, found = view.load(), pickle.loads(pickle.dumps(again.load))()
             assert np.array_equal(frame.rgb, found.rgb)
+            assert frame.depth is not None and found.depth is not None
             assert found.depth.dtype == np.float32 and np.array_equal(frame.depth, found.depth)
             assert (frame.mask is None) == (found.mask is None)
             assert frame.mask is None or np.array_equal(frame.mask, found.mask)
@@ -85,9 +87,24 @@ def test_reduced_pictures_have_reduced_cameras(tmp_path):
     write_shards(collection, tmp_path, options=ShardOptions(max_side=64))
     view = next(iter(open_shards(tmp_path).read("one")))
     frame = view.load()
-    assert frame.rgb.shape == (48, 64, 3) and frame.depth.shape == (48, 64)
+    assert frame.depth is not None and frame.depth.shape == (48, 64)
+    assert frame.rgb.shape == (48, 64, 3)
     wanted = next(iter(collection.read("one"))).camera.resized(64, 48)
     assert np.array_equal(view.camera.K, wanted.K)
+
+
+@pytest.mark.data
+def test_real_frames_keep_their_depth(shared, tmp_path):
+    scene = open_project(shared / "data" / "sevenscenes_reg")
+    some = scene.subset(scene.names[:20:4])
+    write_shards(of_scenes([some]), tmp_path)
+    again = open_shards(tmp_path).read("sevenscenes_reg")
+    for view, found in zip(some, again, strict=True):
+        frame, loaded = view.load(), found.load()
+        assert frame.depth is not None and loaded.depth is not None
+        assert np.array_equal(frame.depth, loaded.depth)
+        assert np.abs(frame.rgb.astype(int) - loaded.rgb).mean() < 2
+        assert np.array_equal(view.camera.cam_from_world, found.camera.cam_from_world)
 
 
 _KILLED = """

@@ -52,7 +52,7 @@ def test_pixels_and_cameras_are_those_of_the_scenes(folder):
             depth *= np.float32(camera["depth_unit"])
         else:
             depth = np.load(io.BytesIO(sample["depth.npz"]))["depth"]
-        assert np.array_equal(depth, frame.depth)
+        assert frame.depth is not None and np.array_equal(depth, frame.depth)
         assert np.array_equal(camera["K"], view.camera.K[0])
         assert np.array_equal(camera["cam_from_world"], view.camera.cam_from_world[0])
         seen.append((scene, name))
