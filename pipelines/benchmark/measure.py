@@ -15,11 +15,17 @@ from gvtools.errors import ProjectError
 from gvtools.evaluation.published import Benchmark, load_benchmark
 from gvtools.files import make_folder
 from pipelines.benchmark.methods import Method
-from pipelines.benchmark.pictures import find_picture, masked_figures, object_mask, write_thumbnails
+from pipelines.benchmark.pictures import (
+    masked_figures,
+    object_mask,
+    pictures_folder,
+    write_thumbnails,
+)
 from pipelines.benchmark.scenes import (
-    longest_side,
     open_benchmark_scene,
+    picture_size,
     prepared,
+    reading_of,
     split_of_scene,
 )
 from pipelines.console import Console
@@ -73,6 +79,41 @@ class Cell:
         return self.out / "runs" / self.stem
 
 
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """A cell with what it is measured on.
+
+    Attributes:
+        cell: what is measured.
+        benchmark: with the cell's number of context views.
+        scene: at the benchmark's picture size.
+        split: of its views.
+        size: that picture size; None where it is the recorded one.
+        reading: how the run's scene is opened again.
+        lpips: the network; None leaves LPIPS out.
+    """
+
+    cell: Cell
+    benchmark: Benchmark
+    scene: Scene
+    split: SceneSplit
+    size: tuple[int, int] | None
+    reading: dict[str, Any]
+    lpips: Lpips | None
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What the benchmark's figures need."""
+        from pipelines.evaluation.measurement import PARTS
+
+        return PARTS if OF_POSES & set(self.benchmark.figures) else ("images",)
+
+    @property
+    def views(self) -> dict[str, str]:
+        """Selections of the context and of the targets."""
+        return {"context": ",".join(self.split.context), "targets": ",".join(self.split.targets)}
+
+
 def measure_cell(cell: Cell) -> dict[str, Any]:
     """Make the pictures of a cell, if they are not there, and measure them.
 
@@ -87,103 +128,121 @@ def measure_cell(cell: Cell) -> dict[str, Any]:
     benchmark = load_benchmark(cell.benchmark).at(cell.views)
     recorded = open_benchmark_scene(benchmark, cell.scene, cell.root)
     split = split_of_scene(benchmark, recorded)
-    scene = prepared(benchmark, recorded, split)
+    size = picture_size(benchmark, recorded)
+    scene = prepared(recorded, split, size=size)
     lpips = None if cell.lpips is None else Lpips(cell.lpips[0], folder=cell.lpips[1])
-    if cell.method.pictures is None:
-        side = longest_side(benchmark, recorded)
-        figures, pictures = _of_run(cell, benchmark, scene, split=split, side=side, lpips=lpips)
-    else:
-        figures, pictures = _of_pictures(cell, scene, split, lpips=lpips)
+    task = _Task(cell, benchmark, scene, split, size, reading_of(recorded, size), lpips)
+    of = _of_run if cell.method.pictures is None else _of_pictures
+    measured, pictures = of(task)
     masks = {
         name: object_mask(benchmark, cell.root, scene=cell.scene, index=recorded.names.index(name),
                           shape=picture.shape[:2])
         for name, picture in pictures.items()
     }  # fmt: skip
-    figures["figures"] |= masked_figures(pictures, scene, masks, lpips=lpips)
+    measured["figures"] |= masked_figures(pictures, scene, masks, lpips=lpips)
     write_thumbnails(cell.result, pictures, scene, context=split.context)
     sizes = {picture.shape[:2] for picture in pictures.values()}
     return {
         "split": {"context": list(split.context), "rounds": [list(r) for r in split.rounds]},
         "resolution": [*sizes.pop()][::-1] if len(sizes) == 1 else None,
         "masked": bool(masks) and all(mask is not None for mask in masks.values()),
-        "poses_from": None,
-        "met3r": None,
-        **figures,
+        **measured,
     }
 
 
-def _of_run(
-    cell: Cell,
-    benchmark: Benchmark,
-    scene: Scene,
-    *,
-    split: SceneSplit,
-    side: int | None,
-    lpips: Lpips | None,
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def _of_run(task: _Task) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Figures, and completed pictures by target."""
     from gvtools.runs.run import load_run
     from pipelines.evaluation.record import described
-    from pipelines.evaluation.run_evaluation import PARTS, evaluate_run
+    from pipelines.evaluation.run_evaluation import evaluate_run
 
-    seconds = _reconstruct(cell, benchmark, scene, split=split, side=side)
+    seconds = _reconstruct(task)
     peak = peak_bytes()
-    run = load_run(cell.run)
-    poses = bool(OF_POSES & set(benchmark.figures))
-    evaluation = described(
-        run,
-        evaluate_run(
-            run,
-            parts=PARTS if poses else ("images",),
-            lpips=lpips,
-            no_lpips=None,
-            control=False,
-            console=Silent(),
-        ),
+    run = load_run(task.cell.run)
+    figures = evaluate_run(
+        run, parts=task.parts, lpips=task.lpips, no_lpips=None, control=False, console=Silent()
     )
     pictures = {target.name: files.picture for target, files, _ in run.targets()}
     return {
-        **_summary(evaluation),
+        **_summary(described(run, figures)),
         "seconds": seconds,
         "peak_bytes": peak,
         "gpu_bytes": _gpu_bytes(),
     }, pictures
 
 
-def _reconstruct(
-    cell: Cell, benchmark: Benchmark, scene: Scene, *, split: SceneSplit, side: int | None
-) -> float:
+def _reconstruct(task: _Task) -> float:
     """Run the method from its start; seconds from the opened scene to the finished run."""
     from gvtools.settings import with_values
     from pipelines.reconstruction.compile_kernels import compile_kernels
     from pipelines.reconstruction.run import reconstruct
+    from pipelines.reconstruction.settings import RunSettings
     from pipelines.report.write import draw_run
 
-    config = cell.method.config(seconds=cell.seconds)
+    cell, benchmark = task.cell, task.benchmark
     # The size of the pictures is the benchmark's, also of methods that would work on smaller ones.
-    decided: dict[str, Any] = {
-        "context": ",".join(split.context), "targets": ",".join(split.targets), "seed": 0,
-        "max_side": side,
-    }  # fmt: skip
+    side = RunSettings().max_side if task.size is None else None
+    decided: dict[str, Any] = {**task.views, "seed": 0, "max_side": side}
     if benchmark.targets is not None:
         decided |= {"views_per_round": benchmark.targets, "rounds": benchmark.rounds}
-    config = with_values(config, decided)
+    config = with_values(cell.method.config(seconds=cell.seconds), decided)
     # What a kill left is made anew, so that seconds are those of a whole run.
     shutil.rmtree(cell.run, ignore_errors=True)
     make_folder(cell.run.parent)
     compile_kernels(config, Silent())
     start = time.perf_counter()
-    # With this, every command opens the run's scene as it was.
-    size = benchmark.resolution
-    reading: dict[str, Any] = {} if size is None else {"resolution": list(size)}
-    if scene.origin is not None:
-        reading["root"] = str(scene.origin.root)
-    reconstruct(scene, config, cell.run, console=Silent(), reading=reading, draw=draw_run)
+    reconstruct(task.scene, config, cell.run, console=Silent(), reading=task.reading, draw=draw_run)
     return time.perf_counter() - start
 
 
+def _of_pictures(task: _Task) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Figures of pictures in a folder, as ``gvtools judge`` has them, and the pictures by target.
+
+    Regions and poses are by a memory of the context alone, which lies in the cell's run.
+    """
+    from gvtools.runs.identity import versions
+    from pipelines.evaluation.measurement import Measurement
+    from pipelines.judging.methods import open_method
+    from pipelines.judging.reference import observe_context
+
+    cell = task.cell
+    assert cell.method.pictures is not None
+    make_folder(cell.run.parent)
+    reference = observe_context(
+        task.scene, cell.run, **task.views, cameras=None, reading=task.reading, console=Silent()
+    )
+    folder = pictures_folder(cell.method.pictures, cell.scene, views=cell.views)
+    method = open_method(folder, cell.method.name, reference.targets, rule="auto")
+    if method.matching.missing:
+        raise ProjectError(
+            f"{folder}: no picture of {len(method.matching.missing)} of {len(reference.targets)} "
+            f"targets, first {method.matching.missing[0]}; expected all"
+        )
+    if method.resized:
+        (width, height), *_ = method.resized
+        raise ProjectError(
+            f"{folder}: pictures of {width}x{height} pixels; expected the benchmark's size, that "
+            "of their targets"
+        )
+    measured = Measurement(
+        parts=task.parts,
+        context=reference.context,
+        truths=[],
+        lpips=task.lpips,
+        no_lpips=None,
+        control=False,
+        console=Silent(),
+    ).of([
+        reference.with_surface(target) if target.picture.depth is None else target
+        for target in method.targets
+    ])  # fmt: skip
+    evaluation = {**measured, "coverage": None, "versions": versions()}
+    pictures = {target.picture.name: target.picture.rgb for target in method.targets}
+    return _summary(evaluation), pictures
+
+
 def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
-    """What tables show of an evaluated run."""
+    """What tables show of measured pictures."""
     from gvtools.evaluation.ranking import Setting
     from pipelines.evaluation.tables import measured_row, scalars
     from pipelines.report.nested import nested
@@ -206,32 +265,6 @@ def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
         "masked_share": evaluation["images"]["settings"]["masked_share"],
         "notes": evaluation["images"]["notes"],
     }
-
-
-def _of_pictures(
-    cell: Cell, scene: Scene, split: SceneSplit, *, lpips: Lpips | None
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Figures of pictures in a folder, and the pictures by target."""
-    from gvtools.evaluation.view_figures import view_figures
-    from pipelines.reconstruction.measure import mean_of
-
-    assert cell.method.pictures is not None
-    pictures, views = {}, []
-    for name in split.targets:
-        picture = find_picture(cell.method.pictures, cell.scene, name, views=cell.views)
-        truth = scene[name].load()
-        if picture.shape != truth.rgb.shape:
-            raise ProjectError(
-                f"{cell.method.pictures}: the picture of {name} is {picture.shape[1]}x"
-                f"{picture.shape[0]} pixels; expected {truth.rgb.shape[1]}x{truth.rgb.shape[0]}"
-            )
-        # What stands on observations is a matter of a memory, which pictures do not have.
-        none = np.zeros(picture.shape[:2], np.bool_)
-        found = view_figures(picture, truth, observed=none, generated=none, lpips=lpips)
-        views.append({"name": name, "round": 1, **found})
-        pictures[name] = picture
-    figures = {name: mean_of(views, name) for name in ("psnr", "ssim", "lpips")}
-    return {"figures": figures, "views": views}, pictures
 
 
 def peak_bytes() -> int | None:

@@ -1,16 +1,15 @@
-"""Pictures of a benchmark's targets: found, compared within masks, kept small for the page."""
+"""Pictures of a benchmark's targets: compared within masks, and kept small for the page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gvtools.errors import ProjectError
 from gvtools.files import make_folder, replaced_when_written
-from gvtools.runs.layout import IMAGE_SUFFIXES
 from pipelines.benchmark.scenes import object_mask_path
 
 if TYPE_CHECKING:
@@ -22,32 +21,10 @@ if TYPE_CHECKING:
 SIDE = 400
 
 
-def find_picture(folder: Path, scene: str, target: str, *, views: int) -> np.ndarray:
-    """The picture that another method made of a target, (H, W, 3) uint8.
-
-    It lies in DIR/SCENE/N_views, DIR/SCENE or DIR, under the target's name with or without folders
-    and with any ending of a picture.
-
-    Raises:
-        ProjectError: it is not there, or no picture.
-    """
-    from PIL import Image
-
-    name = PurePosixPath(target)
-    stems = dict.fromkeys((str(name.with_suffix("")), str(name).replace("/", "__"), name.stem))
-    places = (folder / scene / f"{views}_views", folder / scene, folder)
-    for place in places:
-        for path in (place / f"{stem}{end}" for stem in stems for end in IMAGE_SUFFIXES):
-            if path.is_file():
-                try:
-                    with Image.open(path) as picture:
-                        return np.array(picture.convert("RGB"))
-                except (OSError, SyntaxError, ValueError) as error:
-                    raise ProjectError(f"{path}: no readable picture ({error})") from None
-    raise ProjectError(
-        f"{folder}: no picture of {target}; expected {scene}/{views}_views/{name.stem}.png, or the "
-        f"same in {scene} or in the folder itself"
-    )
+def pictures_folder(folder: Path, scene: str, *, views: int) -> Path:
+    """Where another method's pictures of a scene lie: DIR/SCENE/N_views, DIR/SCENE or DIR."""
+    places = (folder / scene / f"{views}_views", folder / scene)
+    return next((place for place in places if place.is_dir()), folder)
 
 
 def object_mask(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import ProjectError
 
@@ -110,36 +110,55 @@ def split_of_scene(benchmark: Benchmark, scene: Scene) -> SceneSplit:
     )
 
 
-def prepared(benchmark: Benchmark, scene: Scene, split: SceneSplit) -> Scene:
-    """The scene at the benchmark's picture size, with the sparse points of its context alone."""
-    from gvtools.scenes.reduced import reduced
-    from gvtools.scenes.resized import resized, seen_by
-
-    if benchmark.resolution is not None:
-        scene = resized(scene, *benchmark.resolution)
-    return seen_by(reduced(scene, longest_side(benchmark, scene)), split.context)
-
-
-def longest_side(benchmark: Benchmark, scene: Scene) -> int | None:
-    """What the benchmark reduces pictures to, pixels; None leaves them.
-
-    Where it leaves the size open, it is that of a run by default.
+def picture_size(benchmark: Benchmark, scene: Scene) -> tuple[int, int] | None:
+    """Width and height that the benchmark gives all pictures of a scene, pixels.
 
     Args:
         benchmark: with one number of context views.
         scene: as recorded.
-    """
-    from pipelines.reconstruction.settings import RunSettings
 
+    Returns:
+        None where it leaves them as they are: recorded, or in the data set's reduced copies.
+    """
     rule = benchmark.split_of(benchmark.context)
     if benchmark.resolution is not None:
-        return None
+        return benchmark.resolution
     if rule.divided_by is None:
-        return RunSettings().max_side
+        return None
     if scene.origin is not None and scene.origin.address.endswith(f"/{rule.copies}"):
         return None
-    side = max(int(max(view.camera.width[0], view.camera.height[0])) for view in scene.views)
-    return round(side / rule.divided_by)
+    camera = scene.views[0].camera
+    width, height = int(camera.width[0]), int(camera.height[0])
+    return round(width / rule.divided_by), round(height / rule.divided_by)
+
+
+def prepared(scene: Scene, split: SceneSplit, *, size: tuple[int, int] | None) -> Scene:
+    """The scene at a benchmark's picture size, with the sparse points of its context alone.
+
+    Args:
+        scene: as recorded.
+        split: of its views.
+        size: see ``picture_size``; None reduces pictures to what a run takes by default.
+    """
+    from gvtools.scenes.reduced import reduced
+    from gvtools.scenes.resized import resized, seen_by
+    from pipelines.reconstruction.settings import RunSettings
+
+    scene = reduced(scene, RunSettings().max_side) if size is None else resized(scene, *size)
+    return seen_by(scene, split.context)
+
+
+def reading_of(scene: Scene, size: tuple[int, int] | None) -> dict[str, Any]:
+    """With this, every command opens a run's scene as it was; JSON-ready.
+
+    Args:
+        scene: as recorded.
+        size: see ``picture_size``.
+    """
+    reading: dict[str, Any] = {} if size is None else {"resolution": list(size)}
+    if scene.origin is not None:
+        reading["root"] = str(scene.origin.root)
+    return reading
 
 
 def object_mask_path(benchmark: Benchmark, root: Path, *, scene: str, index: int) -> Path | None:

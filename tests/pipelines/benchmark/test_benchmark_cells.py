@@ -14,15 +14,14 @@ import pytest
 from PIL import Image
 from tiny_scan import write_colmap_scan, write_scan
 
-from gvtools.errors import ProjectError
 from gvtools.evaluation.images import psnr, ssim
 from gvtools.evaluation.published import load_benchmark
 from gvtools.scenes.project import open_project
 from pipelines.benchmark.cells import _ended, measure_apart, read_cell
 from pipelines.benchmark.measure import Cell, peak_bytes
 from pipelines.benchmark.methods import parse_methods
-from pipelines.benchmark.pictures import find_picture, masked_figures, object_mask
-from pipelines.benchmark.scenes import prepared, split_of_scene
+from pipelines.benchmark.pictures import masked_figures, object_mask, pictures_folder
+from pipelines.benchmark.scenes import picture_size, prepared, split_of_scene
 
 
 def cell(root, out, **changes) -> Cell:
@@ -35,17 +34,16 @@ def test_pictures_have_the_benchmarks_size_and_points_of_the_context_alone(tmp_p
     scene = open_project(write_colmap_scan(tmp_path / "scan", views=12))
     few = load_benchmark("few-view").at(3)
     split = split_of_scene(few, scene)
-    assert prepared(few, scene, split)[scene.names[0]].load().rgb.shape == (72, 96, 3)
+    found = prepared(scene, split, size=picture_size(few, scene))
+    assert found[scene.names[0]].load().rgb.shape == (72, 96, 3)
     # Each point of this project is seen by one view alone.
-    points = prepared(few, scene, split).points
-    assert points is not None and len(points.positions) == 0
-    llff = load_benchmark("llff").at(3)
-    assert prepared(llff, scene, split)[scene.names[0]].load().rgb.shape == (378, 504, 3)
-    assert parse_methods("fast")[0].config(seconds=None).max_side == 480
-    share = few.model_copy(
-        update={"splits": (few.splits[0].model_copy(update={"divided_by": 1.2}),)}
-    )
-    assert prepared(share, scene, split)[scene.names[0]].load().rgb.shape == (60, 80, 3)
+    assert found.points is not None and len(found.points.positions) == 0
+    assert picture_size(load_benchmark("llff").at(3), scene) == (504, 378)
+    eighth = load_benchmark("mipnerf360-few").at(12)
+    assert picture_size(eighth, scene) == (12, 9)
+    assert picture_size(load_benchmark("mipnerf360-few").at(3), scene) is None
+    found = prepared(scene, split, size=(48, 48))
+    assert found[scene.names[0]].load().rgb.shape == (48, 48, 3)
 
 
 def test_methods_are_settings_of_runs(tmp_path):
@@ -98,15 +96,13 @@ def test_object_masks_are_white_and_lie_where_the_benchmark_says(tmp_path):
     assert object_mask(dtu, tmp_path, scene="scan8", index=4, shape=(30, 40)) is None
 
 
-def test_pictures_are_found_by_scene_and_number_of_views(tmp_path):
-    for place, level in (("scan/3_views", 1), ("scan", 2), (".", 3)):
-        (tmp_path / place).mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", (4, 3), (level,) * 3).save(tmp_path / place / "IMG_1.png")
-    found = [find_picture(tmp_path, scene, "images/IMG_1.JPG", views=views)[0, 0, 0]
-             for scene, views in (("scan", 3), ("scan", 6), ("other", 3))]  # fmt: skip
-    assert found == [1, 2, 3]
-    with pytest.raises(ProjectError, match=r"no picture of IMG_2\.JPG"):
-        find_picture(tmp_path, "scan", "IMG_2.JPG", views=3)
+def test_pictures_are_sought_by_scene_and_number_of_views(tmp_path):
+    (tmp_path / "scan" / "3_views").mkdir(parents=True)
+    found = [
+        pictures_folder(tmp_path, scene, views=views).relative_to(tmp_path).as_posix()
+        for scene, views in (("scan", 3), ("scan", 6), ("other", 3))
+    ]
+    assert found == ["scan/3_views", "scan", "."]
 
 
 def test_peak_memory_follows_what_is_held():

@@ -16,7 +16,13 @@ from gvtools.runs.run import Run
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.data_sets import layouts
 from pipelines.benchmark import scenes
-from pipelines.benchmark.scenes import longest_side, open_benchmark_scene, prepared, split_of_scene
+from pipelines.benchmark.scenes import (
+    open_benchmark_scene,
+    picture_size,
+    prepared,
+    reading_of,
+    split_of_scene,
+)
 
 VIEWS, FULL = 16, (160, 120)
 
@@ -71,12 +77,9 @@ def test_the_data_sets_own_reduced_pictures_are_read_where_they_are_there(tmp_pa
     # 14 of 16 views are no targets, of which 12 at equal steps.
     assert [int(name[5:7]) for name in split.targets] == [0, 8]
     assert len(split.context) == 12
-    # A side of 20 pixels is below what a run takes, so that nothing is reduced further here.
-    if read == 8:
-        assert longest_side(benchmark, scene) is None
-        assert size_of(prepared(benchmark, scene, split).views[0].camera) == (20, 15)
-    else:
-        assert longest_side(benchmark, scene) == FULL[0] // 8
+    size = picture_size(benchmark, scene)
+    assert size == (None if read == 8 else (20, 15))
+    assert size_of(prepared(scene, split, size=size).views[0].camera) == (20, 15)
 
 
 def test_copies_that_do_not_tell_the_recorded_size_are_refused(tmp_path):
@@ -93,13 +96,14 @@ def test_llff_has_one_size_and_its_runs_are_opened_again_with_it(tmp_path, copie
     assert scene.views[3].load().rgb[0, 0].tolist() == [3, read, 0]
     split = split_of_scene(benchmark, scene)
     assert [int(name[5:7]) for name in split.context] == [1, 7, 15]
-    found = prepared(benchmark, scene, split)
+    size = picture_size(benchmark, scene)
+    found = prepared(scene, split, size=size)
     assert {size_of(view.camera) for view in found} == {(504, 378)}
     assert found.views[5].load().rgb.shape == (378, 504, 3)
     assert scene.origin is not None
     record: dict[str, Any] = {
         "project": scene.address,
-        "reading": {"root": str(root), "resolution": [504, 378]},
+        "reading": reading_of(scene, size),
         "settings": {}, "derived": {}, "targets": [], "targets_kind": "hold-out",
         "targets_project": None,
     }  # fmt: skip
