@@ -17,13 +17,17 @@ ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 @contextmanager
-def replaced_when_written(path: Path) -> Iterator[Path]:
+def replaced_when_written(path: Path, *, suffix: str = "") -> Iterator[Path]:
     """Gives a temporary name beside ``path``; on success it is flushed and takes that name.
+
+    Args:
+        path: the file.
+        suffix: that the temporary name ends with, for writers that tell the format by it.
 
     Raises:
         ProjectError: writing failed; the temporary file is removed and ``path`` is untouched.
     """
-    temporary = path.with_name(f".{path.name}.part")
+    temporary = path.with_name(f".{path.name}.part{suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary

@@ -24,7 +24,8 @@ class Thinned:
 
     Attributes:
         rows: (P,) int64, the observation that is kept: the most confident of its voxel.
-        group: (N,) int64, for each observation the point that stands for it.
+        group: (N,) int64, for each observation the point that stands for it; -1 where it was left
+            out.
         edge: voxel edge of the thinning, scene units.
     """
 
@@ -33,7 +34,9 @@ class Thinned:
     edge: float
 
 
-def thinned(store: Store, max_points: int | None) -> Thinned:
+def thinned(
+    store: Store, max_points: int | None, *, among: NDArray[np.bool_] | None = None
+) -> Thinned:
     """One point per voxel; voxels grow from the memory's own until at most ``max_points`` remain.
 
     Larger ones are counted from the points' least corner: around the origin eight of them would
@@ -42,11 +45,13 @@ def thinned(store: Store, max_points: int | None) -> Thinned:
     Args:
         store: with at least one observation.
         max_points: at least 1; None keeps the memory's voxels.
+        among: (N,) the observations that count, at least one; None for all.
     """
-    positions = store.columns.positions.astype(np.float64)
+    chosen = np.arange(len(store)) if among is None else np.flatnonzero(among)
+    positions = store.columns.positions[chosen].astype(np.float64)
     # The most confident first; of equals, the earlier observation.
-    order = np.argsort(-store.confidence, kind="stable")
-    level = store.columns.level
+    order = np.argsort(-store.confidence[chosen], kind="stable")
+    level = store.columns.level[chosen]
     edge, corner = store.voxel, np.zeros(3)
     while True:
         # Times the inverse, as the memory counts its voxels.
@@ -68,6 +73,6 @@ def thinned(store: Store, max_points: int | None) -> Thinned:
     rank = np.argsort(order[first], kind="stable")
     place = np.empty(len(rank), np.int64)
     place[rank] = np.arange(len(rank))
-    of_observation = np.empty(len(order), np.int64)
-    of_observation[order] = place[group]
-    return Thinned(order[first][rank], of_observation, edge)
+    of_observation = np.full(len(store), -1, np.int64)
+    of_observation[chosen[order]] = place[group]
+    return Thinned(chosen[order[first][rank]], of_observation, edge)

@@ -9,60 +9,75 @@ would no longer lie on the other exports. The node's extras tell both.
 from __future__ import annotations
 
 import io
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written
-from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.thinning import thinned
+from pipelines.export.source import ExportOptions, Source, middle, told
 
+# Web viewers are slow beyond it.
+MAX_POINTS = 2_000_000
 NODE = "gvtools_memory"
 FRAME = "input world frame, scene units, axes as in the input (not turned to y up)"
 
 
-def write_glb(
-    memory: SpatialMemory, path: Path, *, max_points: int | None = None
-) -> tuple[int, float]:
+def write(source: Source, path: Path, options: ExportOptions) -> str:
     """Write one point a voxel with its colour.
 
-    Args:
-        memory: with at least one observation.
-        path: the file.
-        max_points: thin to at most so many.
-
-    Returns:
-        Points written, and the voxel edge they were thinned to, scene units.
-
     Raises:
-        OptionError: trimesh is not installed.
+        OptionError: nothing is left.
         ProjectError: the file cannot be written.
     """
-    try:
-        import trimesh
-    except ImportError:
-        raise OptionError(
-            "--format glb needs trimesh, which is not installed; install it with "
-            "'pip install gvtools[glb]', or export ply"
-        ) from None
-    kept = thinned(memory, max_points)
-    positions = memory.positions[kept.rows]
-    middle = (positions.min(axis=0) + positions.max(axis=0)) / 2
-    cloud = trimesh.PointCloud(
-        (positions - middle).astype(np.float32), colors=memory.columns.colors[kept.rows]
+    import trimesh
+
+    points = source.points(options, most=MAX_POINTS)
+    write_scene(
+        lambda positions: trimesh.PointCloud(positions, colors=points.colors),
+        points.positions,
+        path,
+        node=NODE,
+        extras={"voxel": points.edge},
     )
+    return f"{told(points, source.memory)} in {path}, in the input's axes"
+
+
+def write_scene(
+    geometry: Callable[[NDArray[np.float32]], Any],
+    positions: NDArray[np.float64],
+    path: Path,
+    *,
+    node: str,
+    extras: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a scene of one node.
+
+    Args:
+        geometry: makes trimesh's geometry of positions (N, 3) around the node's origin.
+        positions: (N, 3) world frame, scene units.
+        path: the file.
+        node: its name.
+        extras: what the node says beside its origin and frame.
+
+    Raises:
+        ProjectError: the file cannot be written.
+    """
+    import trimesh
+
+    center = middle(positions)
     move = np.eye(4)
-    move[:3, 3] = middle
+    move[:3, 3] = center
     scene = trimesh.Scene()
     scene.add_geometry(
-        cloud,
-        node_name=NODE,
-        geom_name=NODE,
+        geometry((positions - center).astype(np.float32)),
+        node_name=node,
+        geom_name=node,
         transform=move,
-        metadata={"origin": middle.tolist(), "frame": FRAME, "voxel": kept.edge},
+        metadata={"origin": center.tolist(), "frame": FRAME, **(extras or {})},
     )
     buffer = io.BytesIO(scene.export(file_type="glb"))
     with replaced_when_written(path) as temporary:
         temporary.write_bytes(buffer.getbuffer())
-    return len(kept.rows), kept.edge

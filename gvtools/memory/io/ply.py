@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import MemoryFileError
+from gvtools.errors import MemoryFileError, OptionError
 from gvtools.files import replaced_when_written
 from gvtools.memory.store.store import Store
 from gvtools.memory.thinning import thinned
@@ -119,7 +119,7 @@ def read_point_cloud(path: Path) -> o3d.t.geometry.PointCloud:
 
 
 def export_memory_ply(
-    memory: Store, path: Path, *, max_points: int | None = None
+    memory: Store, path: Path, *, max_points: int | None = None, observed: bool = False
 ) -> tuple[int, float]:
     """Write the observations with colour, confidence, spacing, round, view and generated.
 
@@ -131,13 +131,21 @@ def export_memory_ply(
         path: the PLY.
         max_points: thin to at most so many points: one per voxel (the most confident), of voxels
             as much larger than the memory's as it takes; None keeps every observation.
+        observed: leave out what a completer made.
 
     Returns:
         Points written, and the voxel edge they were thinned to (0 when all were kept).
+
+    Raises:
+        OptionError: nothing was observed.
+        ProjectError: the file cannot be written.
     """
-    rows, edge = np.arange(len(memory)), 0.0
-    if max_points is not None and len(memory) > max_points:
-        thin = thinned(memory, max_points)
+    among = ~memory.generated if observed else np.ones(len(memory), np.bool_)
+    rows, edge = np.flatnonzero(among), 0.0
+    if observed and not len(rows):
+        raise OptionError(f"{path}: the memory holds nothing that was observed")
+    if max_points is not None and len(rows) > max_points:
+        thin = thinned(memory, max_points, among=among)
         rows, edge = thin.rows, thin.edge
     positions = memory.positions[rows]
     reach = float(np.abs(positions).max(initial=0))

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 import argparse
-import builtins
 import json
+import sys
 
 import numpy as np
 import pycolmap
@@ -18,8 +18,10 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thinned
 from gvtools.scenes.project import open_project
+from pipelines.cli import main
 from pipelines.commands import export
 from pipelines.console import Console
+from pipelines.export.formats import FORMATS
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 
@@ -198,18 +200,29 @@ def test_glb_keeps_millimetres_far_from_the_origin(scene, tmp_path):
     assert node["extras"]["origin"] == node["matrix"][12:15] == matrix[:3, 3].tolist()
 
 
-def test_glb_without_trimesh_says_what_to_install(saved, tmp_path, monkeypatch):
-    real = builtins.__import__
+@pytest.mark.parametrize("kind", [name for name, form in FORMATS.items() if form.needs])
+def test_an_absent_package_is_named_with_what_to_install(saved, tmp_path, monkeypatch, kind):
+    form = FORMATS[kind]
+    for package in form.needs:
+        monkeypatch.setitem(sys.modules, package, None)
+    out = tmp_path / f"out{next(iter(form.suffixes))}"
+    with pytest.raises(OptionError, match=rf'{form.needs[0]}.*pip install "gvtools\[export\]"'):
+        run(saved, "--format", kind, "--out", out)
+    assert not out.exists()
 
-    def refuse(name, *args, **options):
-        if name == "trimesh":
-            raise ImportError(name)
-        return real(name, *args, **options)
 
-    monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(OptionError, match=r"gvtools\[glb\]"):
-        run(saved, "--format", "glb", "--out", tmp_path / "cloud.glb")
-    assert not (tmp_path / "cloud.glb").exists()
+@pytest.mark.parametrize("kind", [name for name, form in FORMATS.items() if form.suffixes])
+def test_another_suffix_is_refused(saved, tmp_path, kind):
+    with pytest.raises(OptionError, match=f"ends with {next(iter(FORMATS[kind].suffixes))}"):
+        run(saved, "--format", kind, "--out", tmp_path / "out.jpg")
+    assert not (tmp_path / "out.jpg").exists()
+
+
+def test_the_command_line_ends_with_2_for_a_wrong_name(saved, tmp_path, capsys):
+    words = ["export", str(saved), "--format", "las", "--out", str(tmp_path / "out.txt")]
+    assert main(words) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and "ends with .las or .laz" in lines[0]
 
 
 def test_a_view_fused_twice_is_one_camera(scene, tmp_path):
@@ -222,21 +235,28 @@ def test_a_view_fused_twice_is_one_camera(scene, tmp_path):
 def test_options_that_make_no_sense(saved, tmp_path):
     with pytest.raises(OptionError, match="1 or more"):
         run(saved, "--format", "ply", "--out", tmp_path / "a.ply", "--max-points", 0)
-    with pytest.raises(OptionError, match="holds no points"):
+    with pytest.raises(OptionError, match="transforms does not take it"):
         run(saved, "--format", "transforms", "--out", tmp_path / "a", "--max-points", 5)
+    with pytest.raises(OptionError, match=r"las does not take it \(mesh do"):
+        run(saved, "--format", "las", "--out", tmp_path / "a.las", "--voxel", 0.1)
+    for option, value in (("--voxel", 0), ("--voxel", "nan"), ("--max-triangles", 0)):
+        with pytest.raises(OptionError, match="expected"):
+            run(saved, "--format", "mesh", "--out", tmp_path / "a.ply", option, value)
 
 
-@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+@pytest.mark.parametrize("kind", ["colmap", "transforms", "mesh"])
 def test_a_ply_has_no_cameras_to_export(memory, tmp_path, kind):
     export_memory_ply(memory, tmp_path / "cloud.ply")
     with pytest.raises(OptionError, match="a PLY, which holds no cameras"):
-        run(tmp_path / "cloud.ply", "--format", kind, "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+        run(tmp_path / "cloud.ply", "--format", kind, "--out", tmp_path / "out.ply")
+    assert not (tmp_path / "out.ply").exists()
 
 
-@pytest.mark.parametrize("kind", export.FORMATS)
+@pytest.mark.parametrize("kind", FORMATS)
 def test_a_target_that_cannot_be_written(saved, tmp_path, kind):
-    out = tmp_path / (f"out.{kind}" if kind in ("ply", "glb") else "out")
+    for package in FORMATS[kind].needs:
+        pytest.importorskip(package)
+    out = tmp_path / f"out{next(iter(FORMATS[kind].suffixes), '')}"
     if kind == "colmap":
         out.write_text("in the way")
     else:

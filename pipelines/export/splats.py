@@ -1,0 +1,182 @@
+"""The Gaussians of an export: those that the run fitted, and the memory's points beside them.
+
+Fitted Gaussians show what was observed, so of the memory only generated points join them. A memory
+without a fit is shown by its points alone: each becomes a round Gaussian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.appearance.exposed import exposed
+from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH
+from gvtools.appearance.turning import turned
+from gvtools.cameras import Cameras, concatenate
+from gvtools.errors import OptionError
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.memory.store.voxel_levels import levels_above
+from pipelines.export.source import ExportOptions, Source, middle
+
+# Standard deviation of a point's Gaussian, in shares of the distance to the next point.
+SPREAD = 0.5
+# Opacities of points, from those of hardly any confidence to those of most.
+LEAST_OPACITY, MOST_OPACITY = 0.5, 0.99
+# Confidence of a view straight ahead, at which half of the way is gone.
+HALFWAY = 0.5
+# Files hold float32; where that is coarser than this share of the smallest Gaussians' sizes,
+# positions are counted from the middle of the scene.
+ROUNDING, SMALLEST = 0.1, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """N Gaussians with the world's axes.
+
+    Attributes:
+        values: (N, VALUES) float32, see appearance.splat.project_kernels; positions count from
+            ``origin``.
+        origin: (3,) float64, world frame, scene units; zero where float32 allows.
+        fitted: how many were fitted; the others are points of the memory.
+        further: fits of the run that are not among them.
+    """
+
+    values: NDArray[np.float32]
+    origin: NDArray[np.float64]
+    fitted: int
+    further: int
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def positions(self) -> NDArray[np.float32]:
+        """(N, 3) from ``origin``."""
+        return self.values[:, :LOG_SCALE]
+
+    @property
+    def log_scales(self) -> NDArray[np.float32]:
+        """(N, 3) natural logarithms of the standard deviations, scene units."""
+        return self.values[:, LOG_SCALE:QUATERNION]
+
+    @property
+    def quaternions(self) -> NDArray[np.float32]:
+        """(N, 4) w, x, y, z of length 1."""
+        q = self.values[:, QUATERNION:LOGIT]
+        return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+    @property
+    def logits(self) -> NDArray[np.float32]:
+        """(N,) opacities before the sigmoid."""
+        return self.values[:, LOGIT]
+
+    @property
+    def harmonics(self) -> NDArray[np.float32]:
+        """(N, H, 3) coefficients, H = 9; 1 where nothing depends on the direction."""
+        sh = self.values[:, SH:].reshape(len(self), -1, 3)
+        return sh if self.fitted else sh[:, :1]
+
+    def told(self) -> str:
+        """What they are, for the user."""
+        points = len(self) - self.fitted
+        parts = [f"{self.fitted} fitted"] if self.fitted else []
+        if points or not parts:
+            parts.append(f"{points} from {'generated ' if self.fitted else ''}points")
+        text = f"{len(self)} Gaussians ({', '.join(parts)})"
+        if self.further:
+            text += f", the first of {self.further + 1} fits"
+        if self.origin.any():
+            text += f", counted from {' '.join(f'{x:.10g}' for x in self.origin)}"
+        return text
+
+
+def splats_of(source: Source, options: ExportOptions) -> Splats:
+    """The Gaussians that show a run or a memory.
+
+    Raises:
+        OptionError: fewer are allowed than were fitted, or nothing is left.
+        MemoryFileError: a damaged fit.
+    """
+    appearance, memory = source.appearance, source.memory
+    if appearance is None:
+        values, origin = _rounded(of_points(source, options), memory.frame.origin)
+        return Splats(values, origin, 0, 0)
+    first = appearance.gaussians
+    if appearance.exposures is not None:
+        first = exposed(first, appearance.exposures, _photographs(memory))
+    fitted = turned(first.values, first.frame.axes)
+    parts, rest = [fitted], None
+    if options.max_points is not None:
+        rest = options.max_points - len(fitted)
+        if rest < 0:
+            raise OptionError(
+                f"--max-points {options.max_points}: the run's fit has {len(fitted)} Gaussians, "
+                "which are kept whole; expected no less"
+            )
+    made = memory.generated
+    if made.any() and not options.observed and rest != 0:
+        points = of_points(source, ExportOptions(max_points=rest), among=made)
+        points[:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)
+        parts.append(points)
+    values, origin = _rounded(np.concatenate(parts), first.frame.origin)
+    return Splats(values, origin, len(fitted), len(appearance.others))
+
+
+def _rounded(
+    values: NDArray[np.float32], origin: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Positions as float32 in the world frame, or from a point near them where that is too coarse.
+
+    Args:
+        values: (N, VALUES), positions from ``origin``; changed.
+        origin: (3,) world frame.
+    """
+    positions = values[:, :LOG_SCALE].astype(np.float64) + origin
+    sizes = np.exp(values[:, LOG_SCALE:QUATERNION].max(axis=1))
+    reach = float(np.abs(positions).max())
+    if reach * 2.0**-24 > ROUNDING * float(np.quantile(sizes, SMALLEST)):
+        origin = np.round(middle(positions))
+    else:
+        origin = np.zeros(3)
+    values[:, :LOG_SCALE] = positions - origin
+    return values, origin
+
+
+def _photographs(memory: SpatialMemory) -> Cameras:
+    """The cameras of the observed views."""
+    return concatenate([view.camera for view in memory.views if not view.generated])
+
+
+def of_points(
+    source: Source, options: ExportOptions, *, among: NDArray[np.bool_] | None = None
+) -> NDArray[np.float32]:
+    """Round Gaussians of a memory's points, one a voxel.
+
+    Their size follows from the distance between points, their opacity from confidence.
+
+    Returns:
+        (N, VALUES) float32 with the world's axes, positions from the memory's origin.
+
+    Raises:
+        OptionError: nothing is left.
+    """
+    memory = source.memory
+    points = source.points(options, among=among)
+    columns = memory.columns
+    # Where every voxel has its point, the next one is a voxel's edge away.
+    above = levels_above(columns.level[points.rows], points.edge / memory.voxel)
+    edges = np.ldexp(points.edge, above)
+    apart = np.maximum(columns.spacing[points.rows], edges)
+    local = points.positions - memory.frame.origin
+    gaussians = Gaussians.at(
+        local, points.colors, sizes=SPREAD * apart, frame=LocalFrame.at(memory.frame.origin)
+    )
+    confidence = memory.confidence[points.rows]
+    share = confidence / (confidence + HALFWAY)
+    opacity = LEAST_OPACITY + (MOST_OPACITY - LEAST_OPACITY) * share
+    gaussians.values[:, LOGIT] = np.log(opacity / (1 - opacity))
+    return gaussians.values

@@ -1,0 +1,139 @@
+"""Triangles from a memory: by a TSDF volume of its own projections, or by Poisson reconstruction.
+
+Both are Open3D's. Everything is in the memory's frame, where float32 keeps its digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gvtools.cameras import Cameras
+from gvtools.errors import DegenerateError
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.thinning import thinned
+
+if TYPE_CHECKING:
+    import open3d as o3d
+
+# Voxels of a mesh in those of the memory, and in the footprints of most of its points.
+PER_VOXEL, PER_FOOTPRINT, MOST = 2.0, 1.5, 0.9
+# Open3D's blocks of voxels, a side, and how many there is room for at first.
+BLOCK_SIDE, BLOCKS = 16, 20_000
+# The signed distance is known so far from the surface, in voxels.
+TRUNCATION = 4.0
+# A voxel counts that one view saw.
+LEAST_WEIGHT = 1.0
+# Beyond every depth, scene units.
+FAR = 1e9
+# Neighbours that tell a normal; octree levels of Poisson's reconstruction, at most; and how far
+# from its points that surface is kept, in voxels.
+NEIGHBOURS, MOST_LEVELS, REACH = 24, 11, 3.0
+
+
+def mesh_voxel(memory: SpatialMemory) -> float:
+    """Edge of the voxels that a memory's mesh is made in, scene units."""
+    footprint = float(np.quantile(memory.columns.spacing, MOST))
+    return max(PER_VOXEL * memory.voxel, PER_FOOTPRINT * footprint)
+
+
+def tsdf_mesh(
+    memory: SpatialMemory, voxel: float, *, observed: bool = False
+) -> o3d.t.geometry.TriangleMesh:
+    """The zero of a truncated signed distance, integrated over what the memory shows its own views.
+
+    Args:
+        memory: with at least one view.
+        voxel: edge, scene units.
+        observed: leave out what a completer made, and its views.
+
+    Raises:
+        DegenerateError: no triangle came out.
+    """
+    import open3d as o3d
+
+    kind = o3d.core.float32
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight", "color"), (kind, kind, kind), ((1), (1), (3)), voxel, BLOCK_SIDE, BLOCKS
+    )
+    for camera in _cameras(memory, observed=observed):
+        shown = memory.project(camera)
+        depth = shown.depth[0]
+        if observed:
+            depth = np.where(shown.generated[0], np.float32(0), depth)
+        local = memory.frame.seen_from(camera)
+        # Open3D counts pixels' centres as whole numbers.
+        K = local.K[0] - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        lens, pose = (
+            o3d.core.Tensor(np.ascontiguousarray(x)) for x in (K, local.cam_from_world[0])
+        )
+        images = [
+            o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(x, np.float32)))
+            for x in (depth, shown.rgb[0])
+        ]
+        blocks = grid.compute_unique_block_coordinates(images[0], lens, pose, 1.0, FAR, TRUNCATION)
+        grid.integrate(blocks, *images, lens, lens, pose, 1.0, FAR, TRUNCATION)
+    mesh = grid.extract_triangle_mesh(LEAST_WEIGHT)
+    return _checked(mesh, f"a TSDF of voxels of {voxel:.4g}")
+
+
+def _cameras(memory: SpatialMemory, *, observed: bool) -> Iterator[Cameras]:
+    """The cameras of the memory's views, each once."""
+    seen = set()
+    for view in memory.views:
+        camera = view.camera
+        arrays = (camera.K, camera.cam_from_world, camera.width, camera.height)
+        key = tuple(array.tobytes() for array in arrays)
+        if key not in seen and not (observed and view.generated):
+            seen.add(key)
+            yield camera
+
+
+def poisson_mesh(
+    memory: SpatialMemory, voxel: float, *, observed: bool = False
+) -> o3d.t.geometry.TriangleMesh:
+    """Screened Poisson reconstruction of the memory's points, cut off where there are none.
+
+    Normals are those of the nearest points, turned to the view that saw the point.
+
+    Args:
+        memory: with at least one view.
+        voxel: edge of the finest cells, scene units.
+        observed: leave out what a completer made.
+
+    Raises:
+        DegenerateError: no triangle came out.
+    """
+    import open3d as o3d
+
+    chosen = ~memory.generated if observed else np.ones(len(memory), np.bool_)
+    if not chosen.any():
+        raise DegenerateError("the memory holds nothing that was observed; leave out --observed")
+    rows = thinned(memory, None, among=chosen).rows
+    columns = memory.columns
+    positions = columns.positions[rows].astype(np.float64)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(positions))
+    cloud.colors = o3d.utility.Vector3dVector(columns.colors[rows] / 255.0)
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
+    normals = np.asarray(cloud.normals)
+    away = positions - memory.views.centers[columns.view[rows]]
+    normals[(normals * away).sum(axis=1) > 0] *= -1
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    extent = float(np.ptp(positions, axis=0).max())
+    levels = int(np.clip(np.ceil(np.log2(1.1 * extent / voxel)), 5, MOST_LEVELS))
+    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=levels)
+    search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(positions))
+    search.knn_index()
+    _, squared = search.knn_search(o3d.core.Tensor(np.asarray(mesh.vertices)), 1)
+    reach = REACH * max(voxel, extent * 1.1 / 2**levels)
+    mesh.remove_vertices_by_mask(squared.numpy()[:, 0] > reach**2)
+    made = o3d.t.geometry.TriangleMesh.from_legacy(mesh)
+    return _checked(made, f"Poisson reconstruction with {levels} levels")
+
+
+def _checked(mesh: o3d.t.geometry.TriangleMesh, method: str) -> o3d.t.geometry.TriangleMesh:
+    if "indices" not in mesh.triangle or not len(mesh.triangle.indices):
+        raise DegenerateError(f"{method} has no triangle; give another --voxel or --method")
+    return mesh
