@@ -30,6 +30,8 @@ DOCTESTED = (
     "gvtools.evaluation.trajectories",
     "gvtools.scenes.data_sets.address",
     "gvtools.scenes.data_sets.drawn",
+    "gvtools.scenes.data_sets.mvsnet_cameras",
+    "gvtools.scenes.data_sets.posed_pictures",
     "gvtools.scenes.data_sets.spec",
     "gvtools.scenes.data_sets.spring",
     "gvtools.scenes.inspection",
