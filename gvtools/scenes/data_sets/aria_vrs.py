@@ -173,7 +173,10 @@ def _array(data: Any, path: Path) -> NDArray[Any]:
 @lru_cache(maxsize=OPEN_FILES)
 def _provider(path: Path) -> Any:
     """What reads a VRS file; opening one reads its whole index."""
-    provider = _tools().data_provider.create_vrs_data_provider(str(path))
+    try:
+        provider = _tools().data_provider.create_vrs_data_provider(str(path))
+    except RuntimeError as error:
+        raise ProjectError(f"{path}: no readable VRS file ({error}); copy it again") from None
     if provider is None:
         raise ProjectError(f"{path}: no readable VRS file; copy it again")
     return provider

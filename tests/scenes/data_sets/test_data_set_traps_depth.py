@@ -322,6 +322,19 @@ def test_aria_recordings_need_the_official_package(
         read("aria_digital_twin", tmp_path, expected.scene)
 
 
+def test_aria_recordings_that_end_early_give_their_first_frames(tmp_path: Path) -> None:
+    expected = mini_aria.write(tmp_path)
+    path = tmp_path / expected.scene / "video.vrs"
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 6 // 10])
+    with projectaria_tools():
+        scene = read("aria_digital_twin", tmp_path, expected.scene)
+        assert scene.names == expected.cameras.names[:2]
+        frame = scene.views[1].load()
+    assert expected.rgb is not None
+    assert np.abs(frame.rgb[frame.mask].astype(int) - expected.rgb[1][frame.mask]).mean() < 8
+
+
 def test_aria_frames_beyond_the_trajectory_are_left_out(tmp_path: Path) -> None:
     expected = mini_aria.write(tmp_path)
     path = tmp_path / expected.scene / "aria_trajectory.csv"
