@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import refused
+from data_sets.miniature import Miniature, miniatures
 from tiny_scan import FOCAL, WIDTH, render, world_from_cam, write_scan
 
 from gvtools.scenes.data_sets.layouts import read_scene
@@ -85,6 +86,30 @@ def test_each_scene_of_a_download_has_its_line(
     assert [scene["views"] for scene in scenes] == [6, 12]
     assert scenes[1]["views_opened"] == checking.PROBES
     assert scenes[1]["depth"]["views"] == 11
+
+
+@pytest.mark.parametrize("miniature", miniatures(), ids=lambda miniature: miniature.title)
+def test_every_layout_can_be_checked_and_summed_up(
+    miniature: Miniature, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = next(x for x in spec_names() if load_spec(x).layout == miniature.layout)
+    with miniature.within():
+        expected = miniature.write(tmp_path / "root")
+        assert data("check", name, tmp_path / "root") == 0
+        out = capsys.readouterr().out
+        assert f"{expected.scene}: {len(expected.cameras)} views of " in out
+        assert data("stats", name, tmp_path / "root", "--json", tmp_path / "stats.json") == 0
+    figures = report(tmp_path / "stats.json")
+    assert figures["unit"] == ("m" if expected.metric else "scene units")
+    steps = np.linalg.norm(np.diff(expected.cameras.centers, axis=0), axis=1)
+    assert figures["baseline"]["max"] == pytest.approx(steps.max(), abs=1e-6)
+    if expected.depth is None:
+        assert figures["depth"] is None
+    else:
+        deepest = max(float(depth.max()) for depth in expected.depth)
+        assert figures["depth"]["max"] == pytest.approx(
+            deepest, abs=float(np.max(expected.depth_step)) + 1e-5
+        )
 
 
 def test_damaged_scenes_are_reported_after_the_others(
