@@ -22,12 +22,12 @@ from gvtools.runs.memory_file import load_memory
 from gvtools.runs.poses import refined_poses_of
 from gvtools.runs.run import Run, load_run
 from gvtools.runs.target_files import to_bytes
+from pipelines.console import Console
 from pipelines.evaluation.measured_target import MeasuredTarget, context_pictures, run_targets
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.scenes.scene import Scene
-    from pipelines.console import Console
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +157,8 @@ def observe_context(
     resume = (out / RECORD).is_file()
     RunDirectory(out).refuse_foreign()
     config = with_values(RunSettings(), values)
-    return Reference(
-        load_run(reconstruct(scene, config, out, console=console, resume=resume, reading=reading))
-    )
+    console.line(f"fusing the context into {out}")
+    # What a run says of the memory's own pictures would be mistaken for a judgement.
+    quiet = Console(quiet=True)
+    reconstruct(scene, config, out, console=quiet, resume=resume, reading=reading)
+    return Reference(load_run(out))

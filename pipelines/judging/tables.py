@@ -25,14 +25,10 @@ SIDE_BY_SIDE: tuple[tuple[str, str, str, int, tuple[str, ...]], ...] = (
      ("images", "mean", "psnr_never_observed", "mean")),
     ("feature consistency", "", "lower", 3,
      ("consistency", "generated", "feature_consistency", "score", "mean")),
-    ("matches triangulated", "share", "higher", 3,
-     ("consistency", "generated", "geometric_verification", "triangulated_share")),
     ("located", "share", "higher", 3, ("poses", "success_share")),
     ("rotation error", "degrees", "lower", 3, ("poses", "rotation_error_deg", "median")),
     ("centre error", "scene units", "lower", 4, ("poses", "center_error", "median")),
 )  # fmt: skip
-# The true pictures' figures stand below a method's own.
-CONTROLS = {"consistency": ("true_pictures",), "poses": ("true_pictures",)}
 
 
 def judge_tables(figures: Figures) -> dict[str, Table]:
@@ -162,13 +158,18 @@ def judge_markdown(figures: Figures, tables: Mapping[str, Table], sheets: Sequen
         f"{len(figures['targets'])} targets, {figures['with_truth']} with a true picture."
     )
     parts = ["# Judgement", head]
-    parts += [
-        markdown(tables[name])
-        for name in ("side_by_side", "differences", "means")
-        if name in tables
-    ]
+    shown = [tables[name] for name in ("side_by_side", "differences") if name in tables]
+    parts += [markdown(table) for table in (*shown, _for_readers(tables["means"]))]
     parts += [f"![Contact sheet {number}]({name})" for number, name in enumerate(sheets, start=1)]
     return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def _for_readers(means: Table) -> Table:
+    """The means without the rounds' columns and without figures that no view has."""
+    columns = [i for i, c in enumerate(means.columns) if not c.title.startswith("round ")]
+    at = [column.title for column in means.columns].index("mean")
+    rows = [tuple(row[i] for i in columns) for row in means.rows if row[at] is not None]
+    return Table(tuple(means.columns[i] for i in columns), tuple(rows), means.caption)
 
 
 def printed(tables: Mapping[str, Table], console: Console) -> None:
@@ -180,5 +181,5 @@ def printed(tables: Mapping[str, Table], console: Console) -> None:
         console.line(f"  {note}")
     if "differences" in tables:
         apart = tables["differences"]
-        shown = [row for row in apart.rows if str(row[2]).startswith("psnr")]
+        shown: list[Sequence[Any]] = [row for row in apart.rows if str(row[2]).startswith("psnr")]
         console.table([column.heading for column in apart.columns], shown)
