@@ -1,11 +1,11 @@
 """Four methods judged side by side on a posed RGB-D recording: the table of docs/judge.md.
 
-    python benchmarks/judge.py SHARED OUT
+    python -m benchmarks.judge SHARED OUT
 
 SHARED is the folder of real scenes; its ``tools/peer_gaussians`` is plain 3D Gaussian splatting.
 Open3D's TSDF and points are called as its tutorials do. Every second frame is context, the frames
 between are targets. gvtools refines the recorded poses; the others are measured at the recorded
-ones, and splatting and the TSDF at gvtools' as well. gvtools fits for 60 seconds,
+ones, and splatting and the TSDF at gvtools' as well; poses are judged in both frames. gvtools fits for 60 seconds,
 splatting trains for 120 seconds of processor time, which is two cores for as long. Kept in OUT:
 runs, pictures and the judgement; what is there already is not made again.
 """
@@ -41,7 +41,8 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     run = args.out / "gvtools"
-    _reconstruct(args.shared / "data" / PROJECT, run)
+    project = args.shared / "data" / PROJECT
+    _reconstruct(project, run)
     train = args.shared / "tools" / "peer_gaussians" / "train.py"
     methods = {"gvtools": run}
     for poses in ("recorded", "refined"):
@@ -52,11 +53,18 @@ def main() -> None:
         methods[f"Open3D TSDF{mark}"] = _integrated(context, targets, made / "tsdf")
         if poses == "recorded":
             methods["Open3D points"] = _projected(context, targets, made / "points")
+    _judge(methods, str(run), "--out", str(args.out / "judged"))
+    recorded = {name: path for name, path in methods.items() if "refined" not in name}
+    split = ("--context", CONTEXT, "--targets", TARGETS, "--parts", "images,poses")
+    _judge(recorded, str(project), *split, "--out", str(args.out / "judged_recorded"))
+
+
+def _judge(methods: dict[str, Path], against: str, *options: str) -> None:
     words = [str(path) for path in methods.values()]
     for name in methods:
         words += ["--name", name]
-    judged = ["judge", *words, "--against", str(run), "--out", str(args.out / "judged")]
-    subprocess.run([sys.executable, "-m", "pipelines.cli", *judged], check=True)
+    command = [sys.executable, "-m", "pipelines.cli", "judge", *words, "--against", against]
+    subprocess.run([*command, *options], check=True)
 
 
 def _reconstruct(project: Path, run: Path) -> None:
