@@ -5,9 +5,9 @@
 SHARED is the folder of real scenes; its ``tools/peer_gaussians`` is plain 3D Gaussian splatting.
 Open3D's TSDF and points are called as its tutorials do. Every second frame is context, the frames
 between are targets. gvtools refines the recorded poses; the others are measured at the recorded
-ones, and splatting and the TSDF at gvtools' as well; poses are judged in both frames. gvtools fits for 60 seconds,
-splatting trains for 120 seconds of processor time, which is two cores for as long. Kept in OUT:
-runs, pictures and the judgement; what is there already is not made again.
+ones, and splatting and the TSDF at gvtools' as well; poses are judged at both. gvtools fits for 60
+seconds, splatting trains for 120 seconds of processor time, which is two cores for as long. Kept in
+OUT: runs, pictures and judgements; runs and pictures that are there already are not made again.
 """
 
 from __future__ import annotations

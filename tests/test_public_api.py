@@ -27,6 +27,7 @@ DOCTESTED = (
     "gvtools.cameras",
     "gvtools.completers.complete",
     "gvtools.evaluation.splits",
+    "gvtools.evaluation.picture_matching",
     "gvtools.evaluation.trajectories",
     "gvtools.scenes.data_sets.address",
     "gvtools.scenes.data_sets.drawn",
