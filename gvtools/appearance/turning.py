@@ -48,7 +48,8 @@ def harmonics_turned(axes: ArrayLike) -> NDArray[np.float64]:
     drawn = np.random.default_rng(SEED).normal(size=(DIRECTIONS, 3))
     outer = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
     inner = outer @ np.asarray(axes, np.float64)
-    return np.linalg.lstsq(harmonics(outer), harmonics(inner), rcond=None)[0]
+    turned = np.linalg.lstsq(harmonics(outer), harmonics(inner), rcond=None)[0]
+    return np.asarray(turned, np.float64)
 
 
 def turned(values: NDArray[np.float32], axes: NDArray[np.float64]) -> NDArray[np.float32]:

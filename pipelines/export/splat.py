@@ -7,6 +7,7 @@ w, x, y, z, and coefficients of spherical harmonics channel by channel.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
 def vertices(splats: Splats) -> NDArray[np.void]:
     """(N,) rows as the PLY has them; normals are zero, as INRIA's are."""
     rest = splats.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1)
-    columns = {
+    columns: dict[tuple[str, ...], NDArray[Any]] = {
         ("x", "y", "z"): splats.positions,
         ("nx", "ny", "nz"): np.zeros((len(splats), 3)),
         _numbered("f_dc", 3): splats.harmonics[:, 0],

@@ -37,8 +37,8 @@ def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = Non
     from gvtools.trajectory_files import Trajectory, read_poses
 
     if is_address(path):
-        cameras = open_address(path, root).cameras
-        return Trajectory(cameras.world_from_cam, cameras.names)
+        scene = open_address(path, root)
+        return Trajectory(scene.cameras.world_from_cam, scene.names)
     if not path.exists():
         raise ProjectError(f"{path}: no such file or folder; expected a trajectory")
     if path.is_file() and path.suffix.lower() not in (".json", ".npz"):
