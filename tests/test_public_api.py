@@ -24,6 +24,7 @@ DOCTESTED = (
     "gvtools.appearance.fit_options",
     "gvtools.appearance.gaussians",
     "gvtools.appearance.splat.splat",
+    "gvtools.appearance.turning",
     "gvtools.cameras",
     "gvtools.completers.complete",
     "gvtools.evaluation.splits",

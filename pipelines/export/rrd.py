@@ -126,7 +126,7 @@ def _log(
 
 
 def _shots(source: Source) -> Iterator[Shot]:
-    """Cameras of the memory's views and the run's targets, each with its picture if it is there."""
+    """Cameras of the memory's views and the run's targets, with pictures where they are there."""
     run = load_run(source.path) if (source.path / RECORD).is_file() else None
     scene = _scene(run)
     for view in source.memory.views:

@@ -1,8 +1,8 @@
 """Fewer triangles, by Open3D's quadric decimation.
 
-Decimation goes through all edges in order of their cost, one at a time: triangles without area,
-whose quadrics are not finite, keep it from ending, and a mesh of millions takes minutes. So the
-mesh is cleaned first; where far fewer triangles are wanted, vertices are merged in cells before.
+Decimation goes through all edges in order of their cost, one at a time: triangles without area
+confuse that order, and a mesh of millions takes minutes. So the mesh is cleaned first, and where
+far fewer triangles are wanted, vertices are merged in cells before.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ from gvtools.memory.store.voxel_levels import levels_above
 from pipelines.export.source import ExportOptions, Source, middle
 
 # Standard deviation of a point's Gaussian, in shares of the distance to the next point.
-SPREAD = 0.5
+SPREAD = 0.6
 # Opacities of points, from those of hardly any confidence to those of most.
-LEAST_OPACITY, MOST_OPACITY = 0.5, 0.99
+LEAST_OPACITY, MOST_OPACITY = 0.7, 0.99
 # Confidence of a view straight ahead, at which half of the way is gone.
 HALFWAY = 0.5
 # Files hold float32; where that is coarser than this share of the smallest Gaussians' sizes,

@@ -19,13 +19,16 @@ if TYPE_CHECKING:
     import open3d as o3d
 
 # Voxels of a mesh in those of the memory, and in the footprints of most of its points.
-PER_VOXEL, PER_FOOTPRINT, MOST = 2.0, 1.5, 0.9
-# Open3D's blocks of voxels, a side, and how many there is room for at first.
-BLOCK_SIDE, BLOCKS = 16, 20_000
+PER_VOXEL, PER_FOOTPRINT, MOST = 2.0, 1.0, 0.9
+# Open3D's blocks of voxels, a side; room is made for so many times those that hold a point (more is
+# made when it is needed), and for some at least.
+BLOCK_SIDE, ROOM, LEAST_BLOCKS = 16, 3, 64
+# What Open3D says of a picture without depth.
+NOTHING = "No block is touched"
 # The signed distance is known so far from the surface, in voxels.
 TRUNCATION = 4.0
-# A voxel counts that one view saw.
-LEAST_WEIGHT = 1.0
+# A voxel counts that one view saw: its weight has to be above this.
+LEAST_WEIGHT = 0.5
 # Beyond every depth, scene units.
 FAR = 1e9
 # Neighbours that tell a normal; octree levels of Poisson's reconstruction, at most; and how far
@@ -55,8 +58,9 @@ def tsdf_mesh(
     import open3d as o3d
 
     kind = o3d.core.float32
+    room = ROOM * _blocks(memory, BLOCK_SIDE * voxel) + LEAST_BLOCKS
     grid = o3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight", "color"), (kind, kind, kind), ((1), (1), (3)), voxel, BLOCK_SIDE, BLOCKS
+        ("tsdf", "weight", "color"), (kind, kind, kind), ((1), (1), (3)), voxel, BLOCK_SIDE, room
     )
     for camera in _cameras(memory, observed=observed):
         shown = memory.project(camera)
@@ -73,10 +77,43 @@ def tsdf_mesh(
             o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(x, np.float32)))
             for x in (depth, shown.rgb[0])
         ]
-        blocks = grid.compute_unique_block_coordinates(images[0], lens, pose, 1.0, FAR, TRUNCATION)
+        try:
+            blocks = grid.compute_unique_block_coordinates(
+                images[0], lens, pose, 1.0, FAR, TRUNCATION
+            )
+        except RuntimeError as error:
+            if NOTHING in str(error):
+                continue
+            raise
         grid.integrate(blocks, *images, lens, lens, pose, 1.0, FAR, TRUNCATION)
     mesh = grid.extract_triangle_mesh(LEAST_WEIGHT)
-    return _checked(mesh, f"a TSDF of voxels of {voxel:.4g}")
+    return _ordered(_checked(mesh, f"a TSDF of voxels of {voxel:.4g}"))
+
+
+def _blocks(memory: SpatialMemory, edge: float) -> int:
+    """How many cubes of an edge hold a point of a memory."""
+    cells = np.floor(memory.columns.positions.astype(np.float64) / edge).astype(np.int64)
+    return len(np.unique(cells, axis=0))
+
+
+def _ordered(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleMesh:
+    """The mesh with vertices and triangles in order of their places: threads make them in any."""
+    import open3d as o3d
+
+    positions, colors = mesh.vertex.positions.numpy(), mesh.vertex.colors.numpy()
+    order = np.lexsort(positions.T)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    faces = rank[mesh.triangle.indices.numpy()]
+    # Each triangle from its least vertex on, which leaves its side as it is.
+    first = faces.argmin(axis=1)[:, None]
+    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    out = o3d.t.geometry.TriangleMesh(
+        o3d.core.Tensor(positions[order]), o3d.core.Tensor(np.ascontiguousarray(faces))
+    )
+    out.vertex.colors = o3d.core.Tensor(colors[order])
+    return out
 
 
 def _cameras(memory: SpatialMemory, *, observed: bool) -> Iterator[Cameras]:

@@ -1,0 +1,147 @@
+"""Point clouds for other tools, as their own libraries read them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_project import fused, write_box
+from export_runs import export_run, saved_run
+
+from gvtools.errors import OptionError
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.memory.thinning import thinned
+
+ORIGIN = (431_000.0, 5_650_000.0, 120.0)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_box(tmp_path_factory.mktemp("box"))
+
+
+@pytest.fixture(scope="module")
+def run(scene, tmp_path_factory):
+    return saved_run(scene, tmp_path_factory.mktemp("bare") / "run", fitted=False)
+
+
+@pytest.fixture
+def far(scene, tmp_path):
+    """A memory in a georeferenced frame, and where its points are."""
+    memory = fused(scene, [0])
+    positions = memory.positions[thinned(memory, None).rows] + ORIGIN
+    memory.frame = memory.views.frame = LocalFrame.at(ORIGIN)
+    memory.save(tmp_path / "far.npz")
+    return tmp_path / "far.npz", positions
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_laspy_reads_points_colours_and_what_is_known_of_each(run, tmp_path, suffix):
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    out = tmp_path / f"out{suffix}"
+    export_run(run.folder, "--format", "las", "--out", out)
+    cloud = laspy.read(out)
+    memory, rows = run.memory, thinned(run.memory, None).rows
+    assert cloud.header.version == "1.4" and cloud.header.are_points_compressed == (
+        suffix == ".laz"
+    )
+    assert len(cloud.points) == len(rows) == memory.voxels
+    step = float(cloud.header.scales[0])
+    assert memory.voxel / 100 < step <= memory.voxel / 10
+    np.testing.assert_allclose(cloud.xyz, memory.positions[rows], atol=0.51 * step)
+    colors = np.stack([cloud.red, cloud.green, cloud.blue], axis=1)
+    np.testing.assert_array_equal(colors >> 8, memory.columns.colors[rows])
+    assert ((colors & 255) == colors >> 8).all()
+    for name in ("confidence", "spacing", "round", "generated"):
+        np.testing.assert_array_equal(cloud[name], getattr(memory.columns, name)[rows])
+    np.testing.assert_array_equal(np.asarray(cloud.synthetic), memory.generated[rows])
+    assert memory.generated[rows].any()
+
+
+def test_las_keeps_its_steps_far_from_the_origin(far, tmp_path):
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    memory, positions = far
+    export_run(memory, "--format", "las", "--out", tmp_path / "out.las")
+    cloud = laspy.read(tmp_path / "out.las")
+    np.testing.assert_allclose(cloud.xyz, positions, atol=0.51 * cloud.header.scales[0] + 1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".usdc", ".usda"])
+def test_pxr_reads_the_points(run, tmp_path, suffix):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    out = tmp_path / f"out{suffix}"
+    export_run(run.folder, "--format", "usd", "--out", out)
+    assert sorted(tmp_path.iterdir()) == [out]
+    stage = Usd.Stage.Open(str(out))
+    (cloud,) = (UsdGeom.Points(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Points))
+    world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(cloud.GetPrim()))
+    local = np.array(cloud.GetPointsAttr().Get(), np.float64)
+    memory, rows = run.memory, thinned(run.memory, None).rows
+    np.testing.assert_allclose(
+        local @ world[:3, :3] + world[3, :3], memory.positions[rows], atol=1e-5
+    )
+    widths = np.array(cloud.GetWidthsAttr().Get())
+    assert len(widths) == len(rows) and (widths >= memory.voxel * 0.999).all()
+    light = np.array(cloud.GetDisplayColorAttr().Get(), np.float64)
+    back = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    np.testing.assert_allclose(back * 255, memory.columns.colors[rows], atol=0.01)
+    generated = UsdGeom.PrimvarsAPI(cloud).GetPrimvar("generated").Get()
+    np.testing.assert_array_equal(np.array(generated), memory.generated[rows])
+
+
+def test_usd_moves_far_points_by_a_double_translation(far, tmp_path):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    memory, positions = far
+    export_run(memory, "--format", "usd", "--out", tmp_path / "out.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
+    cloud = UsdGeom.Points(stage.GetPrimAtPath("/gvtools/memory"))
+    local = np.array(cloud.GetPointsAttr().Get(), np.float64)
+    assert np.abs(local).max() < 5
+    world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(cloud.GetPrim()))
+    np.testing.assert_allclose(local + world[3, :3], positions, atol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["ply", "las", "glb"])
+def test_observed_leaves_out_what_was_generated(run, tmp_path, form):
+    trimesh = pytest.importorskip("trimesh")
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    out = tmp_path / f"out.{form}"
+    export_run(run.folder, "--format", form, "--out", out, "--observed")
+    memory = run.memory
+    if form == "ply":
+        count, expected = len(trimesh.load(out).vertices), int((~memory.generated).sum())
+    else:
+        expected = len(thinned(memory, None, among=~memory.generated).rows)
+        if form == "las":
+            cloud = laspy.read(out)
+            assert not np.asarray(cloud.generated).any()
+            count = len(cloud.points)
+        else:
+            (cloud,) = trimesh.load_scene(out).dump()
+            count = len(cloud.vertices)
+    assert count == expected < memory.voxels + len(memory)
+
+
+def test_nothing_observed_is_said(scene, tmp_path):
+    fused(scene, [0], generated=(0,)).save(tmp_path / "memory.npz")
+    for form, name in (("splat", "out.ply"), ("ply", "cloud.ply")):
+        with pytest.raises(OptionError, match="observed"):
+            export_run(
+                tmp_path / "memory.npz", "--format", form, "--out", tmp_path / name, "--observed"
+            )
+        assert not (tmp_path / name).exists()
+
+
+def test_thinning_some_observations_counts_no_others(run):
+    memory = run.memory
+    among = memory.generated
+    kept = thinned(memory, 100, among=among)
+    assert among[kept.rows].all() and 10 < len(kept.rows) <= 100
+    np.testing.assert_array_equal(kept.group >= 0, among)
+    np.testing.assert_array_equal(kept.group[kept.rows], np.arange(len(kept.rows)))

@@ -1,0 +1,115 @@
+"""Recordings of runs, as rerun's own reader has them."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from box_project import fused, write_box
+from export_runs import export_run
+from PIL import Image
+
+import gvtools
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.memory.thinning import thinned
+
+pytest.importorskip("rerun")
+
+ORIGIN = (431_000.0, 5_650_000.0, 120.0)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of two rounds after the context's."""
+    folder = tmp_path_factory.mktemp("box")
+    write_box(folder)
+    settings = {"rounds": 2, "views_per_round": 1, "voxel": 0.03, "refine.seconds": 0}
+    return gvtools.reconstruct(
+        folder, folder / "run", context="every:3", targets="every:3+1", settings=settings
+    )
+
+
+def chunks(path):
+    """Entity, and its columns by name, of every chunk that is not static."""
+    from rerun.chunk import RrdReader
+
+    for chunk in RrdReader(path).store().stream():
+        if not chunk.is_static:
+            batch = chunk.to_record_batch()
+            names = [name for name in batch.schema.names if name != "log_time"]
+            yield str(chunk.entity_path), batch.select(names).to_pydict()
+
+
+def points(path):
+    """By entity: round and positions (N, 3)."""
+    return {
+        entity: (columns["round"][0], np.array(columns["Points3D:positions"][0]))
+        for entity, columns in chunks(path)
+        if "Points3D:positions" in columns
+    }
+
+
+def test_points_come_with_their_rounds(run, tmp_path):
+    export_run(run.path, "--format", "rrd", "--out", tmp_path / "out.rrd")
+    memory = run.memory
+    rows = thinned(memory, None).rows
+    rounds, made = memory.columns.round[rows], memory.generated[rows]
+    found = points(tmp_path / "out.rrd")
+    expected = {}
+    for number in memory.rounds:
+        for kind, chosen in (("observed", ~made), ("generated", made)):
+            of_both = rows[chosen & (rounds == number)]
+            if len(of_both):
+                expected[f"/memory/{kind}/round_{number:03d}"] = memory.positions[of_both]
+    assert set(found) == set(expected) and len(found) > 1
+    for entity, positions in expected.items():
+        number, read = found[entity]
+        assert number == int(entity[-3:])
+        np.testing.assert_allclose(read, positions, atol=1e-5)
+
+
+def test_cameras_stand_where_they_stood_with_their_pictures(run, tmp_path):
+    export_run(run.path, "--format", "rrd", "--out", tmp_path / "out.rrd")
+    found = {
+        entity.split("/")[-1].replace("\\", ""): (entity, columns)
+        for entity, columns in chunks(tmp_path / "out.rrd")
+        if "Pinhole:image_from_camera" in columns
+    }
+    pictures = {
+        entity: columns["EncodedImage:blob"][0][0]
+        for entity, columns in chunks(tmp_path / "out.rrd")
+        if "EncodedImage:blob" in columns
+    }
+    scene, truths = run.scenes
+    targets = [view.name for view in run.views]
+    assert sorted(found) == sorted([*run.context, *targets]) and targets
+    for name, (entity, columns) in found.items():
+        view = (truths if name in targets else scene)[name]
+        kind = "generated" if name in targets else "context"
+        assert entity.startswith(f"/cameras/{kind}/round_00")
+        center = np.array(columns["Transform3D:translation"][0][0])
+        np.testing.assert_allclose(center, view.camera.centers[0], atol=1e-6)
+        turn = np.array(columns["Transform3D:mat3x3"][0][0]).reshape(3, 3).T
+        np.testing.assert_allclose(turn, view.camera.world_from_cam[0, :3, :3], atol=1e-6)
+        picture = np.asarray(Image.open(io.BytesIO(bytes(pictures[entity]))), float)
+        wanted = view.load().rgb
+        assert picture.shape == wanted.shape
+        assert np.abs(picture - wanted).mean() < 12
+
+
+def test_an_earlier_round_has_no_later_cameras(run, tmp_path):
+    export_run(run.path, "--format", "rrd", "--out", tmp_path / "out.rrd", "--round", 0)
+    entities = [entity for entity, _ in chunks(tmp_path / "out.rrd")]
+    assert entities and not any("generated" in entity for entity in entities)
+
+
+def test_a_memory_alone_far_from_the_origin(tmp_path):
+    memory = fused(write_box(tmp_path / "box"), [0, 2], generated=(2,))
+    near = memory.positions[thinned(memory, None).rows]
+    memory.frame = memory.views.frame = LocalFrame.at(ORIGIN)
+    memory.save(tmp_path / "far.npz")
+    export_run(tmp_path / "far.npz", "--format", "rrd", "--out", tmp_path / "out.rrd")
+    read = np.concatenate([positions for _, positions in points(tmp_path / "out.rrd").values()])
+    assert len(read) == len(near)
+    np.testing.assert_allclose(np.sort(read, axis=0), np.sort(near, axis=0), atol=1e-5)
