@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gvtools.cameras import Cameras
-from gvtools.errors import DegenerateError
+from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.thinning import thinned
 
@@ -23,6 +23,10 @@ PER_VOXEL, PER_FOOTPRINT, MOST = 2.0, 1.0, 0.9
 # Open3D's blocks of voxels, a side; room is made for so many times those that hold a point (more is
 # made when it is needed), and for some at least.
 BLOCK_SIDE, ROOM, LEAST_BLOCKS = 16, 3, 64
+# More blocks that hold a point, 82 kB each, do not fit the memory of a small machine.
+MOST_BLOCKS = 30_000
+# By what voxels grow until the scene has few enough blocks.
+WIDER = 1.25
 # What Open3D says of a picture without depth.
 NOTHING = "No block is touched"
 # The signed distance is known so far from the surface, in voxels.
@@ -39,7 +43,10 @@ NEIGHBOURS, MOST_LEVELS, REACH = 24, 11, 3.0
 def mesh_voxel(memory: SpatialMemory) -> float:
     """Edge of the voxels that a memory's mesh is made in, scene units."""
     footprint = float(np.quantile(memory.columns.spacing, MOST))
-    return max(PER_VOXEL * memory.voxel, PER_FOOTPRINT * footprint)
+    voxel = max(PER_VOXEL * memory.voxel, PER_FOOTPRINT * footprint)
+    while _blocks(memory, BLOCK_SIDE * voxel) > MOST_BLOCKS:
+        voxel *= WIDER
+    return voxel
 
 
 def tsdf_mesh(
@@ -53,12 +60,20 @@ def tsdf_mesh(
         observed: leave out what a completer made, and its views.
 
     Raises:
+        OptionError: so small voxels that there are too many.
         DegenerateError: no triangle came out.
     """
     import open3d as o3d
 
     kind = o3d.core.float32
-    room = ROOM * _blocks(memory, BLOCK_SIDE * voxel) + LEAST_BLOCKS
+    blocks_held = _blocks(memory, BLOCK_SIDE * voxel)
+    if blocks_held > MOST_BLOCKS:
+        raise OptionError(
+            f"--voxel {voxel:g}: the scene has {blocks_held} blocks of {BLOCK_SIDE} such voxels a "
+            f"side; expected at most {MOST_BLOCKS}; larger ones, such as {mesh_voxel(memory):.4g}, "
+            "have fewer"
+        )
+    room = ROOM * blocks_held + LEAST_BLOCKS
     grid = o3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight", "color"), (kind, kind, kind), ((1), (1), (3)), voxel, BLOCK_SIDE, room
     )

@@ -10,8 +10,9 @@ import pytest
 from box_project import VOXEL, write_box
 from export_runs import export_run, saved_run
 
-from gvtools.errors import DegenerateError
+from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
+from pipelines.export import surfaces
 from pipelines.export.simplify import simplified
 from pipelines.export.surfaces import tsdf_mesh
 
@@ -139,7 +140,7 @@ def test_simplified_meshes_keep_number_place_and_colours(scene, run, share):
     ]
     both = np.isfinite(depths[0]) & np.isfinite(depths[1])
     assert both.mean() > 0.7
-    assert np.median(np.abs(depths[0] - depths[1])[both]) < run.memory.voxel
+    assert np.median(np.abs(depths[0][both] - depths[1][both])) < run.memory.voxel
     assert fewer.vertex.colors.numpy().std() > 0.05
 
 
@@ -150,6 +151,15 @@ def test_triangles_without_area_do_not_stop_the_simplification(run):
     flat[:, 2] = flat[:, 1]
     mesh.triangle.indices = o3d.core.Tensor(np.concatenate([faces, flat, faces[:500]]))
     assert 0 < len(simplified(mesh, 400).triangle.indices) <= 400
+
+
+def test_voxels_that_would_fill_the_memory_are_refused_or_widened(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(surfaces, "MOST_BLOCKS", 20)
+    with pytest.raises(OptionError, match=r"--voxel 0.02: the scene has \d+ blocks"):
+        export_run(run.folder, "--format", "mesh", "--out", tmp_path / "out.ply", "--voxel", 0.02)
+    assert not (tmp_path / "out.ply").exists()
+    export_run(run.folder, "--format", "mesh", "--out", tmp_path / "out.ply")
+    assert len(trimesh.load(tmp_path / "out.ply").faces)
 
 
 def test_voxels_larger_than_the_scene_leave_no_triangle(run, tmp_path):

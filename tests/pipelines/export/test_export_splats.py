@@ -152,7 +152,7 @@ def test_gsply_reads_the_spz_as_the_ply(run, tmp_path):
     np.testing.assert_allclose(spz.scales, ply.scales, atol=1 / 32 + 1e-6)
     np.testing.assert_allclose(spz.sh0, ply.sh0, atol=0.5 / 255 / 0.15 + 1e-5)
     opacity = [1 / (1 + np.exp(-np.ravel(each.opacities))) for each in (ply, spz)]
-    np.testing.assert_allclose(*opacity, atol=0.5 / 255 + 1e-5)
+    np.testing.assert_allclose(opacity[1], opacity[0], atol=0.5 / 255 + 1e-5)
     turns = [
         rotations(torch.from_numpy(np.asarray(each.quats, np.float64))).numpy()
         for each in (ply, spz)
