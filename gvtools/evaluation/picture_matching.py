@@ -53,8 +53,8 @@ def match_pictures(
         views: names of the views that are to be judged.
         rule: "name", "order", or "auto": by name where every view or every picture finds its
             partner, by order where no name does and the numbers agree.
-        alphabetical: whether the order of the views is that of their letters, in which img10
-            stands before img2.
+        alphabetical: whether the pictures are counted in the order of the views' letters, in which
+            img10 stands before img2; "auto" is "order" then.
         what: of messages: what the pictures are.
 
     Raises:
@@ -70,7 +70,9 @@ def match_pictures(
         raise OptionError(f"--match {rule!r}; expected one of {', '.join(RULES)}")
     if not pictures:
         raise OptionError(f"{what}: no picture; expected one for each of {len(views)} views")
-    named = _by_name(pictures, views, what) if rule != "order" else None
+    # What counts the views is no view's name, even where it looks like one.
+    by_name = rule == "name" or (rule == "auto" and not alphabetical)
+    named = _by_name(pictures, views, what) if by_name else None
     found = 0 if named is None else sum(number is not None for number in named)
     if rule == "name" and not found:
         raise OptionError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -108,6 +109,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         seed=args.seed,
         lpips_net=args.lpips_net,
     )
+    _check_apart(args.pictures, args.out)
     lpips, no_lpips = open_lpips(args)
     make_folder(args.out)
     figures = judge(
@@ -122,6 +124,19 @@ def run(args: argparse.Namespace, console: Console) -> None:
     )
     if args.json is not None:
         write_json(args.json, figures)
+
+
+def _check_apart(pictures: Sequence[Path], out: Path) -> None:
+    """Refuse results among the pictures, where the next call would take sheets for pictures.
+
+    Raises:
+        OptionError: they are to lie there.
+    """
+    from gvtools.runs.layout import RECORD
+
+    for path in pictures:
+        if out.resolve().is_relative_to(path.resolve()) and not (path / RECORD).is_file():
+            raise OptionError(f"--out {out}: lies in the pictures {path}; give a folder elsewhere")
 
 
 def _reference(args: argparse.Namespace, console: Console) -> Reference:

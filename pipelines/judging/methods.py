@@ -121,8 +121,7 @@ def open_method(path: Path, name: str, targets: Sequence[MeasuredTarget], *, rul
         if size is not None:
             resized[size] = resized.get(size, 0) + 1
         placed.append(replace(target, picture=_posed(frame, target.picture)))
-    if matching.rule == "order":
-        _check_order(pictures, matching, targets)
+    _check_truths(pictures, matching, targets)
     return Method(name, pictures, matching, placed, resized)
 
 
@@ -168,10 +167,10 @@ def _sized(frame: Frame, camera: Cameras, *, what: str) -> tuple[Frame, tuple[in
     return Frame(rgb, depth), (columns, rows)
 
 
-def _check_order(
+def _check_truths(
     pictures: PictureSet, matching: Matching, targets: Sequence[MeasuredTarget]
 ) -> None:
-    """Refuse an order that the truths which a tool kept beside its renders contradict.
+    """Refuse a matching that the truths which a tool kept beside its renders contradict.
 
     Raises:
         ProjectError: a kept truth is clearly more like another view than like its own.
@@ -191,7 +190,7 @@ def _check_order(
         if distance[rows.index(row)] > CLEARLY * distance[best]:
             raise ProjectError(
                 f"{pictures.path}: {pictures.names[number]} stands for {targets[row].picture.name} "
-                f"by its order, but the truth beside it is {targets[rows[best]].picture.name}; "
+                f"by its {matching.rule}, but the truth beside it is {targets[rows[best]].picture.name}; "
                 "expected the same views in the same order; give the same --targets"
             )
 

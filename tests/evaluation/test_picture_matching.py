@@ -61,6 +61,15 @@ def test_order_may_be_the_alphabetical_one_of_the_views():
     assert (rule, found) == ("order", ["1.png", "0.png"])
 
 
+def test_pictures_that_count_views_are_never_matched_by_name():
+    # Of thirteen held-out views two are judged; 0008 is the ninth view here, not the view 0008.
+    pictures = [f"val_step29999_{i:04d}.png" for i in range(13)]
+    with pytest.raises(OptionError, match=r"13 pictures .*for 2 views"):
+        match_pictures(pictures, ["0000.jpg", "0008.jpg"], alphabetical=True)
+    views = [f"{i:04d}.jpg" for i in range(0, 104, 8)]
+    assert partners(pictures, views, alphabetical=True) == ("order", pictures)
+
+
 def test_names_that_match_by_chance_are_refused_where_the_order_would_do():
     # Renders counted from 0 for every eighth of the photographs, which are counted, too.
     pictures = [f"{i:05d}.png" for i in range(3)]

@@ -187,6 +187,14 @@ def test_pictures_of_another_shape_are_refused(small_run, tmp_path, capsys):
     assert "80x72 pixels; expected 96x72" in message
 
 
+def test_results_among_the_pictures_are_refused(small_run, tmp_path, capsys):
+    write_pictures(tmp_path / "some", noisy(small_run, 1))
+    for out in (tmp_path / "some", tmp_path / "some/judged"):
+        message = refused(capsys, "judge", tmp_path / "some", "--against", small_run, "--out", out)
+        assert "lies in the pictures" in message
+    assert not (tmp_path / "some/judged").exists()
+
+
 def gsplat_renders(folder, pictures, order) -> None:
     """The canvases of gsplat's trainer: truth and render of each view, by number."""
     for number, row in enumerate(order):
