@@ -17,6 +17,7 @@ from __future__ import annotations
 import re
 from functools import partial
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +126,7 @@ def _idr(folder: Path) -> list[PosedPicture]:
                 for key in data
                 if re.fullmatch(prefix + r"\d+", key)
             }
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise ProjectError(f"{folder / NPZ}: {error}; expected world_mat_0, ...") from None
     home = folder / "image"
     found = pictures_by_stem(home) if home.is_dir() else {}

@@ -20,6 +20,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -253,19 +254,21 @@ def _projection(parameters: dict[str, str]) -> tuple[Float64, tuple[int, int], l
         size = [
             int(float(parameters[f"settings_output_img_{side}"])) for side in ("width", "height")
         ]
-    except (KeyError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ProjectError(f"{PARAMETERS}: {error}; copy the file again") from None
     return uv, (size[0], size[1]), []
 
 
 def _metres_per_unit(path: Path, parameters: dict[str, str]) -> float:
+    texts = [parameters.get("settings_units_info_meters_scale")]
     if path.is_file():
-        with path.open(newline="", encoding="utf-8") as file:
-            for row in csv.reader(file):
-                if row[:1] == ["meters_per_asset_unit"]:
-                    return float(row[1])
-    if "settings_units_info_meters_scale" in parameters:
-        return float(parameters["settings_units_info_meters_scale"])
+        with path.open(newline="", encoding="utf-8", errors="replace") as file:
+            rows = [row for row in csv.reader(file) if row[:1] == ["meters_per_asset_unit"]]
+        texts = [row[1] for row in rows if len(row) > 1] + texts
+    for text in texts:
+        # An interrupted download may end before the number.
+        with suppress(ValueError):
+            return float(text or "")
     raise ProjectError(
         f"{path}: no meters_per_asset_unit, without which poses and depth have different units; "
         "complete the download"

@@ -56,7 +56,7 @@ def _rows(path: Path) -> Float64:
     """(N, 3, 5) float64 of a file of poses and bounds."""
     try:
         rows = np.load(path, allow_pickle=False).astype(np.float64)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError) as error:
         raise ProjectError(f"{path}: {error}; expected an array of N x 17 numbers") from None
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise ProjectError(f"{path}: shape {rows.shape}; expected N x 17")

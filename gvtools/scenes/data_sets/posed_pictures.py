@@ -110,7 +110,7 @@ def scaled_lens(lens: LensParameters, size: tuple[int, int]) -> LensParameters:
 
 
 def quaternion_pose(wxyz: ArrayLike, translation: ArrayLike) -> Float64:
-    """(4, 4) float64 of a quaternion, scalar first, and a translation.
+    """(4, 4) float64 of a quaternion, scalar first, and a translation; NaN where that is no pose.
 
     >>> quaternion_pose([1, 0, 0, 0], [1, 2, 3])[:3, 3]
     array([1., 2., 3.])
@@ -119,6 +119,8 @@ def quaternion_pose(wxyz: ArrayLike, translation: ArrayLike) -> Float64:
 
     pose = np.eye(4)
     w, x, y, z = np.asarray(wxyz, np.float64)
+    if not np.isfinite([w, x, y, z]).all() or w == x == y == z == 0:
+        return np.full((4, 4), np.nan)
     pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
     pose[:3, 3] = translation
     return pose

@@ -98,6 +98,18 @@ def test_mipnerf360_detections_move_with_the_intrinsics(tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.points.xy, seen, rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize("share", [0, 0.5])
+def test_arrays_that_were_cut_off_are_named(tmp_path: Path, share: float) -> None:
+    writers = {"llff": mini_colmap.write_llff, "dtu": mini_stereo_benchmarks.write_dtu_idr}
+    for layout, write in writers.items():
+        expected = write(tmp_path / layout)
+        path = next((tmp_path / layout).rglob("*.np[yz]"))
+        content = path.read_bytes()
+        path.write_bytes(content[: int(share * len(content))])
+        with pytest.raises(ProjectError, match=f"{path.name}: "):
+            read(layout, tmp_path / layout, expected.scene)
+
+
 def test_llff_does_not_guess_which_picture_a_row_is_of(tmp_path: Path) -> None:
     expected = mini_colmap.write_llff(tmp_path)
     folder = tmp_path / "fern" / "images_4"

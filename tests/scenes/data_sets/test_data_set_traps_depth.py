@@ -53,6 +53,38 @@ def test_mapfree_poses_that_are_withheld_are_left_out(tmp_path: Path) -> None:
     assert [view.has_depth for view in scene] == [False, True, True]
 
 
+def test_a_pose_without_numbers_leaves_its_frame_out(tmp_path: Path) -> None:
+    expected = mini_nerfstudio.write_mapfree(tmp_path)
+    path = tmp_path / expected.scene / "poses.txt"
+    lines = path.read_text().splitlines()
+    lines[3] = f"{lines[3].split()[0]} nan nan nan nan 0 0 0"
+    path.write_text("\n".join(lines))
+    scene = read("mapfree", tmp_path, expected.scene)
+    assert len(scene) == 3
+    assert "1 of 4 frames have no pose: dropped" in messages(scene)
+
+
+@pytest.mark.parametrize("text", ["meters_per_asset_unit", "meters_per_asset_unit,", ""])
+def test_hypersim_tables_that_were_cut_off_are_named(tmp_path: Path, text: str) -> None:
+    expected = mini_hypersim.MINIATURES[0].write(tmp_path)
+    scale = next(tmp_path.glob("*/_detail/metadata_scene.csv"))
+    scale.write_text(text)
+    table = tmp_path / "metadata_camera_parameters.csv"
+    whole = table.read_text()
+    table.unlink()
+    with pytest.raises(ProjectError, match="no meters_per_asset_unit"):
+        read("hypersim", tmp_path, expected.scene)
+    head, row = next(
+        (whole.splitlines()[0], line)
+        for line in whole.splitlines()
+        if line.startswith(expected.scene.partition("/")[0])
+    )
+    table.write_text("\n".join((head, ",".join(row.split(",")[:4]))))
+    scale.write_text("meters_per_asset_unit,0.5")
+    with pytest.raises(ProjectError, match="copy the file again"):
+        read("hypersim", tmp_path, expected.scene)
+
+
 @pytest.mark.parametrize("value", ["-inf", "nan", "2"])
 def test_scannet_frames_that_the_tracker_lost_are_left_out(tmp_path: Path, value: str) -> None:
     expected = mini_scannet.write_exported(tmp_path)
