@@ -2,7 +2,7 @@
 
 A selection is one of ``all``, ``every:K``, ``every:K+OFFSET``, ``first:N``, ``last:N``,
 ``range:A-B`` (indices from 0, both ends included), ``not:SPEC``, image names with commas between
-them, or ``@file`` with one name a line. A name with a comma is given alone or in a file.
+them, or ``@file`` with one name a line. Where names have commas, the longest that fits is taken.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
     keyword, colon, rest = spec.partition(":")
     if keyword == "not" and colon:
         return set(range(count)) - _chosen(names, rest.strip(), whole)
-    listed = [part.strip() for part in spec.split(",")]
+    listed = _listed(names, spec)
     if not colon or not set(names).isdisjoint(listed):
         return _by_name(names, listed, f"selection {whole!r}")
     if keyword not in _FORMS:
@@ -97,6 +97,18 @@ def _by_name(names: Sequence[str], listed: Sequence[str], what: str) -> set[int]
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
         raise OptionError(f"{what}: no view named {unknown[0]!r}{more} among {len(names)}; {hint}")
     return {index[name] for name in wanted}
+
+
+def _listed(names: Sequence[str], spec: str) -> list[str]:
+    """The parts between commas, those of one view's name together."""
+    known, parts, listed = set(names), spec.split(","), list[str]()
+    most = 1 + max((name.count(",") for name in names), default=0)
+    while parts:
+        joined = (",".join(parts[:count]).strip() for count in range(min(most, len(parts)), 0, -1))
+        name = next((name for name in joined if name in known), parts[0].strip())
+        listed.append(name)
+        del parts[: 1 + name.count(",")]
+    return listed
 
 
 def _lines(path: Path) -> list[str]:

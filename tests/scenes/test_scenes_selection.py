@@ -56,6 +56,9 @@ def test_names_in_a_file_and_names_with_commas_and_colons(tmp_path):
     assert select(odd, "a,b.png") == ("a,b.png",)
     assert select(odd, "first:2") == ("first:2",)
     assert select(odd, "not:first:2,c.png") == ("a,b.png",)
+    assert select(odd, "a,b.png,c.png") == ("a,b.png", "c.png")
+    assert select(odd, "c.png, a,b.png") == ("a,b.png", "c.png")
+    assert select(("a", "b", "a,b"), "a,b") == ("a,b",)
     with pytest.raises(OptionError, match=r"no view named 'd:oops' among 2; did you mean"):
         select(("d:1", "d:2"), "d:1,d:oops")
     with pytest.raises(OptionError, match=r"no view named 'b\.png'"):
