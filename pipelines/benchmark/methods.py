@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 DEFAULT = "default"
 PAPER = "paper"
 # Names become names of files.
-_NAME = re.compile(r"[\w+. -]+")
+_NAME = re.compile(r"\w[\w+. -]*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,10 @@ def _of_path(name: str, path: Path) -> Method:
     from pipelines.reconstruction.settings import RunSettings
 
     if not _NAME.fullmatch(name):
-        raise OptionError(f"method {name!r}; expected letters, digits, blanks and + . - _ alone")
+        raise OptionError(
+            f"method {name!r}; expected letters, digits, blanks and + . - _, the first a letter or "
+            "a digit"
+        )
     if path.is_dir():
         return Method(name=name, pictures=path.resolve())
     if path.suffix != ".json" or not path.is_file():

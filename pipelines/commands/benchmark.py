@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gvtools.errors import OptionError
+from gvtools.errors import OptionError, ProjectError
 from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
 
 if TYPE_CHECKING:
@@ -66,7 +66,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """Measure what is not measured yet, and write the tables.
 
     Raises:
-        GvError: an option is wrong, or results are there of other settings.
+        GvError: an option is wrong, results are there of other settings, or everything failed; the
+            tables with the reasons are out by then.
     """
     from gvtools.evaluation.published import load_benchmark
     from gvtools.runs.folder_lock import folder_lock
@@ -85,6 +86,21 @@ def run(args: argparse.Namespace, console: Console) -> None:
         tables = write_results(benchmark, cells, out, title=title)
     print_tables(tables, console)
     console.line(f"results in {out}: {PAGE}, results.json, and tables as .csv, .md and .tex")
+    _check_some_measured(cells, args.root)
+
+
+def _check_some_measured(cells: tuple[Cell, ...], root: Path) -> None:
+    """Refuse a benchmark without any figure, which a script would take for a success.
+
+    Raises:
+        ProjectError: everything failed.
+    """
+    from pipelines.benchmark.cells import MEASURED, read_cell
+
+    results = [read_cell(cell) for cell in cells]
+    if not any(result and result["status"] == MEASURED for result in results):
+        first = next((result["reason"] for result in results if result), "no results")
+        raise ProjectError(f"{root}: none of {len(cells)} measurements succeeded, first {first}")
 
 
 def planned_cells(

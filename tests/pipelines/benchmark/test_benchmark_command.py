@@ -163,6 +163,14 @@ def test_a_scene_that_fails_is_kept_with_its_reason_and_the_rest_goes_on(
     assert in_process == [("short", 3, "fast")]
 
 
+def test_a_benchmark_without_any_figure_is_no_success(tmp_path, in_process, capsys):
+    root, out = tmp_path / "projects", tmp_path / "out"
+    write_scan(root / "short", views=3)
+    message = refused(capsys, *words(root, out, "--methods", "fast"))
+    assert "none of 1 measurements succeeded, first 3 views" in message
+    assert "failed: 3 views" in (out / "3_views.md").read_text()
+
+
 def test_the_papers_protocol_runs_in_rounds_and_measures_poses(tmp_path, in_process, monkeypatch):
     """Three rounds of six targets on a recording that stands for a scene of ScanNet."""
     root, out = tmp_path / "scans", tmp_path / "out"
@@ -203,6 +211,8 @@ def test_wrong_options_are_refused(projects, tmp_path, capsys):
     assert "did you mean 'fast'" in refused(capsys, *words(projects, out, "--methods", "fats"))
     assert "each name once" in refused(capsys, *words(projects, out, "--methods", "fast,fast"))
     assert "expected a folder" in refused(capsys, *words(projects, out, "--methods", "a=gone"))
+    dots = words(projects, out, "--methods", f"..={projects}")
+    assert "the first a letter or a digit" in refused(capsys, *dots)
     assert "did you mean 'one'" in refused(capsys, *words(projects, out, "--scenes", "ones"))
     assert "--seconds 0" in refused(capsys, *words(projects, out, "--seconds", 0))
     assert "no project" in refused(capsys, *words(projects / "notes", out))
