@@ -190,7 +190,8 @@ def _check_truths(
         if distance[rows.index(row)] > CLEARLY * distance[best]:
             raise ProjectError(
                 f"{pictures.path}: {pictures.names[number]} stands for {targets[row].picture.name} "
-                f"by its {matching.rule}, but the truth beside it is {targets[rows[best]].picture.name}; "
+                f"by its {matching.rule}, but the truth beside it is "
+                f"{targets[rows[best]].picture.name}; "
                 "expected the same views in the same order; give the same --targets"
             )
 
