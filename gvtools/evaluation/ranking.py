@@ -17,6 +17,7 @@ from gvtools.evaluation.tables import Cell, Column, Table, Value
 PUBLISHED = "published"
 MEASURED = "measured here"
 NO_VALUE = "no value here"
+NOTHING_COMPARABLE = "published rows: none that is comparable has a value"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,12 +142,18 @@ def side_by_side(
 ) -> tuple[SideBySideRow, ...]:
     """Published rows, then measured ones, with ranks figure by figure where they are comparable.
 
-    Values are compared as published, in so many decimals; equal ones share a rank.
+    Where rows are published but none of them is comparable, measured ones have no rank either: the
+    first of themselves would stand beside better values. Values are compared as published, in so
+    many decimals; equal ones share a rank.
     """
     rows: list[PublishedRow | MeasuredRow] = [*benchmark.rows, *measured]
     why = [_reasons(row, benchmark) for row in rows]
     ranks = {}
     for name, figure in benchmark.figures.items():
+        published = zip(benchmark.rows, why, strict=False)
+        if benchmark.rows and all(name in w or r.figures[name] is None for r, w in published):
+            for reasons in why[len(benchmark.rows) :]:
+                reasons.setdefault(name, (NOTHING_COMPARABLE,))
         pairs = zip(rows, why, strict=True)
         values = [None if name in w else r.figures.get(name) for r, w in pairs]
         ranks[name] = _ranks(values, figure)

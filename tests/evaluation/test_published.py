@@ -17,6 +17,7 @@ from gvtools.evaluation.published import (
 from gvtools.evaluation.ranking import (
     MEASURED,
     NO_VALUE,
+    NOTHING_COMPARABLE,
     PUBLISHED,
     MeasuredRow,
     Setting,
@@ -308,6 +309,26 @@ def test_sizes_that_are_a_share_of_the_recorded_are_compared_as_such():
     assert reasons_not_to_rank(setting, benchmark, "psnr") == ()
     (reason,) = reasons_not_to_rank(dataclasses.replace(setting, divided_by=4), benchmark, "psnr")
     assert reason == "resolution divided by: 4 here, 8 published"
+
+
+@pytest.mark.parametrize(
+    ("name", "views", "size"), [("mipnerf360-few", 3, None), ("dtu", 3, (400, 300))]
+)
+def test_nothing_is_first_beside_rows_that_are_not_comparable(name, views, size):
+    """Rows of another or an unknown protocol, and rows without the figure."""
+    benchmark = load_benchmark(name).at(views)
+    setting = dataclasses.replace(
+        FEW, data_set=benchmark.name, split=benchmark.name, resolution=size,
+        scenes=len(benchmark.scenes),
+    )  # fmt: skip
+    assert reasons_not_to_rank(setting, benchmark, "psnr") == ()
+    row = side_by_side([MeasuredRow("mine", {"psnr": 5.0}, setting)], benchmark)[-1]
+    assert row.ranks["psnr"] is None
+    assert row.reasons["psnr"] == (NOTHING_COMPARABLE,)
+    own = load_benchmark("few-view").at(3)
+    setting = dataclasses.replace(setting, data_set="few-view", split="few-view", resolution=None)
+    rows = [MeasuredRow(name, {"psnr": psnr}, setting) for name, psnr in (("a", 9.0), ("b", 5.0))]
+    assert [row.ranks["psnr"] for row in side_by_side(rows, own)] == [1, 2]
 
 
 def test_masked_figures_need_masks():
