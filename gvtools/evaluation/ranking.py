@@ -103,6 +103,9 @@ def reasons_not_to_rank(setting: Setting, benchmark: Benchmark, figure: str) -> 
         reasons = ["scenes: a single one here, the published figures are of a data set"]
     elif benchmark.scenes and setting.scenes != len(benchmark.scenes):
         reasons = [f"scenes: {setting.scenes} here, {len(benchmark.scenes)} published"]
+    if benchmark.split_of(benchmark.context).kind == "protocol":
+        # Scenes and views that the source does not tell cannot be the same here.
+        reasons.append("views: an own choice here, not stated by the source")
     if setting.failed:
         reasons.append(f"scenes: {setting.failed} without figures here")
     divided_by = benchmark.split_of(benchmark.context).divided_by

@@ -46,6 +46,12 @@ ALIKE = Setting(
 RANKED = {"psnr", "ssim", "rpe_r", "met3r"}
 
 
+def with_stated_views(benchmark):
+    """As if the source told its views: a rule of its own instead of our choice."""
+    rule = benchmark.splits[0].model_copy(update={"kind": "every", "every": 8})
+    return benchmark.model_copy(update={"splits": (rule,)})
+
+
 def _paper(shared) -> str:
     texts = sorted((shared / "paper").glob("*.txt")) if (shared / "paper").is_dir() else []
     if not texts:
@@ -174,7 +180,7 @@ def _geoverse(name: str):
 
 
 def test_alike_settings_are_ranked_where_the_source_defines_the_figure():
-    benchmark = load_benchmark("dl3dv")
+    benchmark = with_stated_views(load_benchmark("dl3dv"))
     for name in FIGURES:
         reasons = reasons_not_to_rank(ALIKE, benchmark, name)
         assert (not reasons) == (name in RANKED)
@@ -212,14 +218,14 @@ def test_each_difference_is_a_reason_for_the_figures_it_concerns(change, reason,
 
 def test_a_definition_that_the_source_comes_to_state_lets_its_figure_be_ranked():
     text = published._specs()["dl3dv"]
-    told = parse_benchmark(text.replace("lpips_net: null", "lpips_net: VGG"))
+    told = with_stated_views(parse_benchmark(text.replace("lpips_net: null", "lpips_net: VGG")))
     assert reasons_not_to_rank(ALIKE, told, "lpips") == ()
     other = dataclasses.replace(ALIKE, lpips_net="alex")
     assert reasons_not_to_rank(other, told, "lpips") == ("LPIPS network: alex here, VGG published",)
 
 
 def test_measured_rows_join_the_ranking_only_where_they_are_comparable():
-    benchmark = load_benchmark("dl3dv")
+    benchmark = with_stated_views(load_benchmark("dl3dv"))
     values = {"psnr": 18.0, "ssim": 0.5984, "lpips": 0.1, "met3r": 0.9, "rpe_r": math.nan}
     alone = side_by_side([], benchmark)
     rows = side_by_side([MeasuredRow("mine", values, ALIKE)], benchmark)
@@ -259,6 +265,7 @@ def test_the_table_marks_where_rows_come_from_and_says_why_there_is_no_rank():
     assert notes == [
         "kitchen, no rank in PSNR, LPIPS: data set: a scene of one's own here, ScanNetV2 "
         "published.",
+        "kitchen, no rank in PSNR, LPIPS: views: an own choice here, not stated by the source.",
         "kitchen, no rank in LPIPS: LPIPS network: vgg here, not stated by the source.",
     ]
     assert any("World-Consistent" in note and "Table 1" in note for note in table.notes)
@@ -309,6 +316,17 @@ def test_sizes_that_are_a_share_of_the_recorded_are_compared_as_such():
     assert reasons_not_to_rank(setting, benchmark, "psnr") == ()
     (reason,) = reasons_not_to_rank(dataclasses.replace(setting, divided_by=4), benchmark, "psnr")
     assert reason == "resolution divided by: 4 here, 8 published"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_views_that_the_source_does_not_tell_agree_with_none(name):
+    benchmark = load_benchmark(name)
+    setting = dataclasses.replace(
+        ALIKE, data_set=benchmark.name, rounds=benchmark.rounds, split=benchmark.name
+    )
+    row = side_by_side([MeasuredRow("mine", dict.fromkeys(FIGURES, 99.0), setting)], benchmark)[-1]
+    assert set(row.ranks.values()) == {None}
+    assert "views: an own choice here, not stated by the source" in row.reasons["psnr"]
 
 
 @pytest.mark.parametrize(
