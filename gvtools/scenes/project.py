@@ -8,6 +8,10 @@ from pathlib import Path
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.colmap_files import find_model
 from gvtools.scenes.data_sets.address import FORM, is_address
+from gvtools.scenes.phones.polycam import POLYCAM
+from gvtools.scenes.phones.record3d import RECORD3D
+from gvtools.scenes.phones.scanner_app import SCANNER_APP
+from gvtools.scenes.phones.stray_scanner import STRAY_SCANNER
 from gvtools.scenes.photographs import named
 from gvtools.scenes.redwood import REDWOOD
 from gvtools.scenes.rgbd_recording import RgbdOptions
@@ -22,10 +26,12 @@ PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")
 # ScanNet before Redwood: both have colour and depth folders.
 LAYOUTS = (SEVENSCENES, TUM, SCANNET, REDWOOD)
+# What apps export; nothing has to be said about how they are read.
+PHONES = (RECORD3D, POLYCAM, SCANNER_APP, STRAY_SCANNER)
 LOOKED_FOR = (
     "a COLMAP model (cameras.bin or .txt in sparse/N, sparse, sparse_txt or the folder itself)",
     "transforms.json",
-    *(layout.looks_like for layout in LAYOUTS),
+    *(layout.looks_like for layout in (*LAYOUTS, *PHONES)),
 )
 
 
@@ -38,10 +44,11 @@ def open_project(
     root: Path | None = None,
     model: int | None = None,
 ) -> Scene:
-    """The scene of a COLMAP workspace or model, a posed RGB-D folder or a ``transforms.json``.
+    """The scene of a COLMAP workspace, a posed RGB-D folder, a phone's or a ``transforms.json``.
 
     Args:
-        path: the folder, a ``transforms.json``, or ``spec:NAME:SCENE`` for a scene of a data set.
+        path: the folder, a ``transforms.json``, an ``.r3d``, or ``spec:NAME:SCENE`` for a scene of
+            a data set.
         images: the image folder, where the project does not say it (COLMAP, transforms).
         masks: the mask folder (COLMAP, transforms).
         rgbd: what a posed RGB-D folder does not tell by itself.
@@ -75,7 +82,16 @@ def open_project(
     folder = find_model(path, number=model) if path.is_dir() else None
     if model is not None and folder is None:
         raise OptionError(f"{path}: a file; a model's number is of a COLMAP workspace")
-    if folder is not None or path.is_file() or (path / TRANSFORMS).is_file():
+    told = folder is not None or (path / TRANSFORMS).is_file()
+    phone = None if told else next((layout for layout in PHONES if layout.matches(path)), None)
+    if phone is not None:
+        if any(option is not None for option in (images, masks, rgbd)):
+            raise OptionError(
+                f"{path}: an export of {phone.name} says how it is read; expected neither images, "
+                "masks nor RGB-D options"
+            )
+        return phone.read(path)
+    if told or path.is_file():
         if rgbd is not None:
             raise OptionError(f"{path}: no posed RGB-D folder; expected no RGB-D options")
         if folder is None:
@@ -107,7 +123,7 @@ def is_project(folder: Path) -> bool:
     return (
         find_model(folder) is not None
         or (folder / TRANSFORMS).is_file()
-        or any(layout.matches(folder) for layout in LAYOUTS)
+        or any(layout.matches(folder) for layout in (*LAYOUTS, *PHONES))
     )
 
 
@@ -128,7 +144,7 @@ def _unknown(path: Path) -> str:
     held = f"holds {named(entries)}" if entries else "is empty"
     inside = [
         str(folder)
-        for folder in sorted([*path.glob("*/"), *path.glob("dense/*/")])
+        for folder in sorted([*path.glob("*/"), *path.glob("dense/*/"), *path.glob("*.r3d")])
         if is_project(folder)
     ]
     advice = f"did you mean {named(inside)}?" if inside else "give the project's folder"

@@ -103,7 +103,8 @@ class Scene:
 
     Attributes:
         root: the project's folder.
-        kind: "colmap", "rgbd", "transforms" or "data set" (a data set's native layout).
+        kind: "colmap", "rgbd", "transforms", "data set" (a data set's native layout), or the app
+            that exported it from a phone ("Polycam").
         views: in natural name order.
         points: sparse points, where the project has them.
         findings: everything dropped, converted, repaired or noteworthy.

@@ -27,6 +27,7 @@ from gvtools.scenes.data_sets.posed_pictures import (
     pinhole_lens,
     posed_scene,
 )
+from gvtools.scenes.data_sets.sky import sky_findings
 from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.data_sets.timed_poses import pose_at
 from gvtools.scenes.images import read_depth
@@ -39,7 +40,7 @@ DEPTH_OF = {LOW: "lowres_depth", HIGH: "highres_depth"}
 TRAJECTORY = "lowres_wide.traj"
 SAME = 1.5e-3  # seconds; stamps in names are rounded to a millisecond
 LONGEST_GAP = 0.2  # seconds between two poses that may be interpolated
-UP = {"Up": (0, -1), "Left": (-1, 0), "Down": (0, 1), "Right": (1, 0)}  # x, y in the picture
+UP = 2  # the world's z axis
 
 
 def _scenes(root: Path) -> tuple[str, ...]:
@@ -84,13 +85,7 @@ def _findings(poses: Float64, interpolated: int) -> list[Finding]:
     findings = []
     if interpolated:
         findings.append(Finding("info", f"{interpolated} frames have an interpolated pose"))
-    # The world's z axis points up; where that is in pictures says how the device was held.
-    up = poses[:, :2, 2].mean(axis=0)
-    sky = max(UP, key=lambda name: float(up @ np.array(UP[name])))
-    if sky != "Up":
-        line = f"the sky is to the {sky.lower()} of pictures: they are read as stored, not turned"
-        findings.append(Finding("info", line))
-    return findings
+    return findings + sky_findings(poses, UP)
 
 
 def _names(folder: Path, depths: Path) -> list[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.scene import Frame
@@ -48,12 +49,38 @@ def video_header(path: Path) -> VideoHeader:
         return VideoHeader((stream.width, stream.height), seconds, float(1 / rate))
 
 
-def read_frame(path: Path, *, seconds: float) -> Frame:
+def frame_seconds(path: Path, *, edits: bool = True) -> NDArray[np.float64]:
+    """(N,) seconds of all frames from the video's beginning, in their order; nothing is decoded.
+
+    Args:
+        path: the video.
+        edits: whether frames that the file's edit list hides are left out.
+
+    Raises:
+        ProjectError: absent, or no video.
+        OptionError: PyAV is not installed.
+    """
+    try:
+        with _opened(path, edits=edits) as container:
+            stream = container.streams.video[0]
+            ticks = sorted(
+                packet.pts
+                for packet in container.demux(stream)
+                if packet.pts is not None and not packet.is_discard
+            )
+            begin = stream.start_time or 0
+            return (np.array(ticks, np.float64) - begin) * float(stream.time_base)
+    except _av().error.FFmpegError as error:
+        raise ProjectError(f"{path}: no readable video ({error}); copy it again") from None
+
+
+def read_frame(path: Path, *, seconds: float, edits: bool = True) -> Frame:
     """The frame of a video whose time stamp is nearest.
 
     Args:
         path: the video.
         seconds: from its beginning.
+        edits: whether frames that the file's edit list hides are left out.
 
     Raises:
         ProjectError: absent, damaged, or without any frame.
@@ -61,7 +88,7 @@ def read_frame(path: Path, *, seconds: float) -> Frame:
     """
     best, best_off = None, np.inf
     try:
-        with _opened(path) as container:
+        with _opened(path, edits=edits) as container:
             stream = container.streams.video[0]
             begin = (stream.start_time or 0) * stream.time_base
             target = round((seconds + float(begin)) / float(stream.time_base))
@@ -80,10 +107,10 @@ def read_frame(path: Path, *, seconds: float) -> Frame:
     raise ProjectError(f"{path}: no frame at {seconds:.3f} s; copy the video again")
 
 
-def _opened(path: Path) -> Any:
+def _opened(path: Path, *, edits: bool = True) -> Any:
     av = _av()
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), options={} if edits else {"ignore_editlist": "1"})
     except (av.error.FFmpegError, OSError) as error:
         raise ProjectError(f"{path}: no readable video ({error}); copy it again") from None
     if not container.streams.video:

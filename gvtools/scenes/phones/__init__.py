@@ -1,0 +1,1 @@
+"""Recordings that apps for phones export, read with their own poses and LiDAR depth."""

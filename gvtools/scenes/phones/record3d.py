@@ -1,0 +1,263 @@
+"""Record3D: an ``.r3d`` archive, the folder that it was unpacked into, or an export of EXR and JPG.
+
+An archive (ZIP) has ``metadata``, a JSON, and ``rgbd/N.{jpg, depth, conf}``; depth is float32
+metres and confidence uint8, both compressed by LZFSE. The export has ``metadata.json``, ``rgb`` and
+``depth/N.exr`` (one float32 channel, metres) in a folder ``EXR_RGBD``, and no confidence.
+
+A frame's pose is the metadata's of its number: quaternion x, y, z, w and place of world_from_cam,
+OpenGL's axes. ``K`` is of the first frame, column by column; ``perFrameIntrinsicCoeffs`` has fx,
+fy, cx, cy of each. Both are of pictures of w x h. The world is where the recording began, so that
+none of its axes need be gravity's. Recordings of the selfie camera have no poses: each is the
+identity.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zlib
+from functools import partial
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile, ZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from pydantic import BaseModel, Field, ValidationError
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.data_sets.array_files import exr_channel
+from gvtools.scenes.data_sets.posed_pictures import (
+    Float64,
+    PosedPicture,
+    pinhole_lens,
+    quaternion_pose,
+    scaled_lens,
+)
+from gvtools.scenes.phones.arkit import PhoneLayout, numbers, opencv_pose, phone_scene, readings
+from gvtools.scenes.photographs import Depth
+from gvtools.scenes.scene import Finding, Frame, Scene
+from gvtools.scenes.transforms_frame import LensParameters
+
+NAME = "Record3D"
+ARCHIVE, EXPORT = ".r3d", "EXR_RGBD"
+PICTURES = (".jpg", ".png")
+CHANNELS = ("R", "Y", "Z")
+NO_POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+LIDAR = (192, 256)  # width and height of depth maps where the metadata does not say
+
+
+class Metadata(BaseModel):
+    """What is read of a recording's metadata, named as there."""
+
+    w: int = Field(gt=0)
+    h: int = Field(gt=0)
+    dw: int = Field(LIDAR[0], gt=0)
+    dh: int = Field(LIDAR[1], gt=0)
+    K: list[float] = Field(min_length=9, max_length=9)
+    poses: list[list[float]] = Field(min_length=1)
+    perFrameIntrinsicCoeffs: list[list[float]] = []
+
+    def lens(self, number: int) -> LensParameters | None:
+        """Of a frame, for pictures of ``w`` x ``h``; None where it is impossible."""
+        given = self.perFrameIntrinsicCoeffs
+        own = numbers(given[number], (4,)) if number < len(given) else None
+        K = numbers([self.K[place] for place in (0, 4, 6, 7)], (4,)) if own is None else own
+        return None if K is None else pinhole_lens(K, (self.w, self.h))
+
+    def pose(self, number: int) -> Float64 | None:
+        """(4, 4) world_from_cam of a frame, OpenCV axes, metres; None where there is none."""
+        values = numbers(self.poses[number], (7,)) if number < len(self.poses) else None
+        if values is None or not values[:4].any():
+            return None
+        x, y, z, w = values[:4]
+        return opencv_pose(quaternion_pose([w, x, y, z], values[4:]))
+
+    def frames(self, stems: set[str]) -> list[int]:
+        """Numbers of frames that have a pose or a picture of that name."""
+        return sorted({*range(len(self.poses)), *(int(stem) for stem in stems if stem.isdecimal())})
+
+
+def _matches(path: Path) -> bool:
+    if path.is_file():
+        return path.suffix.lower() == ARCHIVE
+    unpacked = (path / "metadata").is_file() and (path / "rgbd").is_dir()
+    return unpacked or _export(path) is not None
+
+
+def _export(path: Path) -> Path | None:
+    """The folder of an export of EXR and JPG, which may lie inside the one that is given."""
+    for home in (path, path / EXPORT):
+        if (home / "metadata.json").is_file() and (home / "rgb").is_dir():
+            return home
+    return None
+
+
+def _read(path: Path) -> Scene:
+    home = _export(path)
+    if home is None:
+        pictures, bare = _from_archive(path, _metadata(path, "metadata"))
+    else:
+        pictures, bare = _from_export(home, _metadata(home, "metadata.json"))
+    findings = [
+        Finding("info", "the world is where the recording began: which way is up is not said")
+    ]
+    if bare:
+        line = f"{bare} depth maps have no confidence map: all of their depth is used"
+        findings.append(Finding("info", line))
+    return phone_scene(path, NAME, pictures, upright=False, findings=findings)
+
+
+def _metadata(home: Path, name: str) -> Metadata:
+    try:
+        metadata = Metadata.model_validate(json.loads(_stored(home, name)))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise ProjectError(
+            f"{home}: {name} of another form ({place}: {first['msg']}); expected Record3D's with "
+            "w, h, K and poses; export the recording again"
+        ) from None
+    except ValueError as error:
+        raise ProjectError(
+            f"{home}: {name} is no JSON ({error}); export the recording again"
+        ) from None
+    if len(metadata.poses) > 1 and all(pose == NO_POSE for pose in metadata.poses):
+        raise ProjectError(
+            f"{home}: no frame has a pose, as in recordings of the selfie camera; expected one of "
+            "the LiDAR camera, or its pictures alone: gvtools capture finds their cameras"
+        )
+    return metadata
+
+
+def _from_export(home: Path, metadata: Metadata) -> tuple[list[PosedPicture], int]:
+    """The frames, and how many depth maps lack confidence."""
+    images = {path.stem: path for path in (home / "rgb").iterdir() if path.suffix in PICTURES}
+    pictures, bare = [], 0
+    for number in metadata.frames(set(images)):
+        depth = home / "depth" / f"{number}.exr"
+        bare += depth.is_file()
+        pictures.append(
+            PosedPicture(
+                f"{number}.jpg",
+                images.get(str(number), home / "rgb" / f"{number}.jpg"),
+                metadata.lens(number),
+                metadata.pose(number),
+                depth,
+                _exr,
+            )
+        )
+    return pictures, bare
+
+
+def _from_archive(path: Path, metadata: Metadata) -> tuple[list[PosedPicture], int]:
+    """The frames, and how many depth maps lack confidence."""
+    held, packed = _members(path), path.is_file()
+    stems = {Path(name).stem for name in held if name.endswith(".jpg")}
+    size = _picture_size(path, held) if packed else None
+    pictures, bare = [], 0
+    for number in metadata.frames(stems):
+        image, depth, conf = (f"rgbd/{number}.{kind}" for kind in ("jpg", "depth", "conf"))
+        lens = metadata.lens(number)
+        bare += depth in held and conf not in held
+        maps = [name for name in (depth, conf) if name in held]
+        pictures.append(
+            PosedPicture(
+                f"{number}.jpg",
+                # What an archive lacks is given as a path that does not exist.
+                path if packed and image in held else path / image,
+                lens if lens is None or size is None else scaled_lens(lens, size),
+                metadata.pose(number),
+                path if packed and depth in held else path / depth,
+                partial(_lzfse_depth, path, maps, shape=(metadata.dh, metadata.dw)),
+                read=partial(_picture, member=image) if packed and image in held else None,
+            )
+        )
+    return pictures, bare
+
+
+def _members(path: Path) -> set[str]:
+    """Names of the frames' files, in an archive or the folder that it was unpacked into."""
+    if not path.is_file():
+        return {f"rgbd/{item.name}" for item in (path / "rgbd").iterdir()}
+    try:
+        with ZipFile(path) as archive:
+            return {item.filename for item in archive.infolist() if item.file_size}
+    except (OSError, BadZipFile) as error:
+        raise _damaged(path, error) from None
+
+
+def _stored(home: Path, name: str) -> bytes:
+    """A file of a folder or of an archive."""
+    try:
+        if not home.is_file():
+            return (home / name).read_bytes()
+        with ZipFile(home) as archive:
+            return archive.read(name)
+    except (OSError, KeyError, BadZipFile, zlib.error) as error:
+        raise _damaged(home / name, error) from None
+
+
+def _damaged(path: Path, error: Exception) -> ProjectError:
+    return ProjectError(f"{path}: unreadable ({error}); export the recording again")
+
+
+def _picture_size(path: Path, held: set[str]) -> tuple[int, int] | None:
+    """Width and height of an archive's first readable picture."""
+    for name in sorted(held):
+        if name.endswith(".jpg"):
+            try:
+                return Image.open(io.BytesIO(_stored(path, name))).size
+            except (OSError, ProjectError):
+                continue
+    return None
+
+
+def _picture(path: Path, *, member: str) -> Frame:
+    try:
+        image = Image.open(io.BytesIO(_stored(path, member)))
+        return Frame(np.array(image.convert("RGB")))
+    except (OSError, SyntaxError) as error:
+        raise _damaged(path / member, error) from None
+
+
+def _exr(path: Path) -> Depth:
+    return readings(exr_channel(path, CHANNELS), None)
+
+
+def _lzfse_depth(home: Path, maps: list[str], _: Path, *, shape: tuple[int, int]) -> Depth:
+    """Depth, and its confidence where there is any.
+
+    Args:
+        home: the archive, or the folder that it was unpacked into.
+        maps: names of depth and confidence in it.
+        shape: height and width.
+    """
+    depth = _unpacked(home, maps[0], "<f4", shape=shape)
+    if len(maps) == 1:
+        return readings(depth, None)
+    return readings(depth, _unpacked(home, maps[1], "u1", shape=shape) > 0)
+
+
+def _unpacked(home: Path, name: str, dtype: str, *, shape: tuple[int, int]) -> NDArray[Any]:
+    try:
+        import lzfse
+    except ImportError:
+        raise ProjectError(
+            f"{home}: depth is compressed by LZFSE, which is read with lzfse, which is absent; "
+            "pip install 'gvtools[phones]', or export EXR and JPG"
+        ) from None
+    try:
+        data = lzfse.decompress(_stored(home, name))
+        return np.frombuffer(data, dtype).reshape(shape)
+    except (lzfse.error, ValueError) as error:
+        raise ProjectError(
+            f"{home / name}: unreadable ({error}); expected {shape[0]}x{shape[1]} values by LZFSE; "
+            "export the recording again"
+        ) from None
+
+
+RECORD3D = PhoneLayout(
+    NAME, f"{NAME} (an .r3d file, metadata with rgbd/, or {EXPORT}/metadata.json)", _matches, _read
+)
