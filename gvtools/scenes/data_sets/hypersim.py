@@ -260,7 +260,7 @@ def _projection(parameters: dict[str, str]) -> tuple[Float64, tuple[int, int], l
 
 
 def _metres_per_unit(path: Path, parameters: dict[str, str]) -> float:
-    texts = [parameters.get("settings_units_info_meters_scale")]
+    texts = [parameters.get("settings_units_info_meters_scale") or ""]
     if path.is_file():
         with path.open(newline="", encoding="utf-8", errors="replace") as file:
             rows = [row for row in csv.reader(file) if row[:1] == ["meters_per_asset_unit"]]
@@ -268,7 +268,7 @@ def _metres_per_unit(path: Path, parameters: dict[str, str]) -> float:
     for text in texts:
         # An interrupted download may end before the number.
         with suppress(ValueError):
-            return float(text or "")
+            return float(text)
     raise ProjectError(
         f"{path}: no meters_per_asset_unit, without which poses and depth have different units; "
         "complete the download"
