@@ -83,7 +83,7 @@ def read_frame(path: Path, *, seconds: float, edits: bool = True) -> Frame:
         edits: whether frames that the file's edit list hides are left out.
 
     Raises:
-        ProjectError: absent, damaged, or without any frame.
+        ProjectError: absent, damaged, or it ends before.
         OptionError: PyAV is not installed.
     """
     best, best_off = None, np.inf
@@ -100,6 +100,12 @@ def read_frame(path: Path, *, seconds: float, edits: bool = True) -> Frame:
                 if off >= best_off:
                     break
                 best, best_off = frame, off
+            else:
+                # The last frame stands for its own time alone, or a copy that was cut off would
+                # give it for all that is missing.
+                rate = stream.average_rate or stream.guessed_rate or 30
+                if best is not None and best_off * stream.time_base > 0.75 / float(rate):
+                    best = None
             if best is not None:
                 return Frame(np.ascontiguousarray(best.to_ndarray(format="rgb24")))
     except (_av().error.FFmpegError, IndexError) as error:

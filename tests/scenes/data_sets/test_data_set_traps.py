@@ -51,6 +51,19 @@ def test_realestate10k_takes_the_video_frame_nearest_to_a_time_stamp(tmp_path: P
         assert not read_frame(video, seconds=seconds).rgb.any()
 
 
+def test_realestate10k_frames_that_a_cut_video_lacks_are_refused(tmp_path: Path) -> None:
+    """Its head still tells the whole length; no other frame may stand for a missing one."""
+    expected = mini_realestate10k.write_video(tmp_path)
+    video = next(tmp_path.glob("videos/*"))
+    content = video.read_bytes()
+    video.write_bytes(content[: len(content) // 2])
+    views = read("realestate10k", tmp_path, expected.scene).views
+    assert expected.rgb is not None
+    np.testing.assert_array_equal(views[0].load().rgb, expected.rgb[0])
+    with pytest.raises(ProjectError, match=r"no frame at .* copy the video again"):
+        views[-1].load()
+
+
 def test_realestate10k_frames_past_the_videos_end_are_left_out(tmp_path: Path) -> None:
     expected = mini_realestate10k.write_video(tmp_path)
     path = next(tmp_path.glob("train/*.txt"))
