@@ -21,6 +21,7 @@ from gvtools.scenes.sevenscenes import SEVENSCENES
 from gvtools.scenes.transforms_json import FILE as TRANSFORMS
 from gvtools.scenes.transforms_json import read_transforms
 from gvtools.scenes.tum import TUM
+from gvtools.scenes.unposed import count_unposed
 
 PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")
@@ -137,6 +138,10 @@ def _nearest(path: Path) -> str:
 
 
 def _unknown(path: Path) -> str:
+    unposed = count_unposed(path)
+    if unposed:
+        advice = f"find them first: gvtools capture {path} --out PROJECT"
+        return f"{path}: {unposed} RGB-D frames without poses; {advice}"
     entries = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
     pictures = [name for name in entries if Path(name).suffix.lower() in PICTURES]
     if len(pictures) > 1:

@@ -36,13 +36,13 @@ PRIMESENSE = pinhole((525.0, 525.0, 319.5, 239.5))
 
 
 def _matches(root: Path) -> bool:
-    folders = (root / "depth").is_dir() and _color_folder(root) is not None
+    folders = (root / "depth").is_dir() and color_folder(root) is not None
     return folders and any(root.glob("*.log"))
 
 
 def _record(root: Path, options: RgbdOptions) -> Recording:
     findings = []
-    folder = _color_folder(root)
+    folder = color_folder(root)
     logs = sorted(root.glob("*.log"), key=lambda path: (path.name != PREFERRED_LOG, path.name))
     if folder is None or not logs:
         raise ProjectError(f"{root}: expected folders color and depth and a .log trajectory")
@@ -69,17 +69,25 @@ def _record(root: Path, options: RgbdOptions) -> Recording:
         )
         for number, row, pose in zip(numbers, rows, poses, strict=True)
     ]
-    K = PRIMESENSE
+    K, met = intrinsics(root, options)
+    return Recording(root, frames, K, findings=[*findings, *met])
+
+
+def intrinsics(root: Path, options: RgbdOptions) -> tuple[Float64, list[Finding]]:
+    """(3, 3) of the colour camera as published, and where they come from.
+
+    Raises:
+        ProjectError: a malformed file.
+    """
     cameras = sorted(
         path for path in root.glob("*.json") if b"intrinsic_matrix" in path.read_bytes()
     )
     if cameras:
-        K = open3d_intrinsics(cameras[0])
-        findings.append(Finding("info", f"intrinsics: {cameras[0].name}"))
-    elif options.color_K is None:
-        message = "no intrinsics file: the PrimeSense default 525, 525, 319.5, 239.5 is taken"
-        findings.append(Finding("warning", message))
-    return Recording(root, frames, K, findings=findings)
+        return open3d_intrinsics(cameras[0]), [Finding("info", f"intrinsics: {cameras[0].name}")]
+    if options.color_K is not None:
+        return np.asarray(options.color_K), []
+    message = "no intrinsics file: the PrimeSense default 525, 525, 319.5, 239.5 is taken"
+    return PRIMESENSE, [Finding("warning", message)]
 
 
 def read_log(path: Path) -> tuple[list[int], list[Float64]]:
@@ -135,7 +143,8 @@ def _rows_of(numbers: list[int], pictures: int, path: Path) -> list[int]:
     )
 
 
-def _color_folder(root: Path) -> Path | None:
+def color_folder(root: Path) -> Path | None:
+    """The folder of the pictures, None where there is none."""
     return next((root / name for name in COLOR_FOLDERS if (root / name).is_dir()), None)
 
 

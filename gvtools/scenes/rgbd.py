@@ -187,8 +187,17 @@ def _common_size(frames: Sequence[RgbdFrame]) -> tuple[int, int]:
 def _lens(K: Float64, recording: Recording, options: RgbdOptions, *, size: tuple[int, int]) -> Any:
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     what = f"{recording.root}, colour camera"
-    if recording.distortion and options.color_K is None:
-        params += [*recording.distortion, 0.0, 0.0, 0.0]
+    if options.distortion is not None:
+        distortion: Sequence[float] = options.distortion
+        if len(distortion) != 5 or not np.isfinite(distortion).all():
+            raise OptionError(
+                f"{what}: distortion {distortion}; expected five numbers k1, k2, p1, p2, k3"
+            )
+    else:
+        # What a layout publishes belongs to the intrinsics that it publishes.
+        distortion = recording.distortion if options.color_K is None else ()
+    if any(distortion):
+        params += [*distortion, 0.0, 0.0, 0.0]
         return undistortion("FULL_OPENCV", params, size, what=what)
     return undistortion("PINHOLE", params, size, what=what)
 

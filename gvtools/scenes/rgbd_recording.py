@@ -41,6 +41,8 @@ class RgbdOptions(Settings):
     """(3, 3) intrinsics of the depth camera, pixels; None: depth is of the colour camera."""
     color_from_depth: Matrix | None = None
     """(4, 4) rigid, metres; None with ``depth_K`` given: the same place."""
+    distortion: list[float] | None = None
+    """k1, k2, p1, p2, k3 of the colour camera, as OpenCV has them."""
     depth_max: float | None = Field(None, gt=0)
     """Metres; greater readings are ignored."""
     max_time_difference: float = Field(0.02, gt=0)

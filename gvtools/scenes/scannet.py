@@ -8,6 +8,8 @@ pixel centres as integers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.rgbd import RgbdLayout
 from gvtools.scenes.rgbd_recording import (
     Recording,
+    RgbdFrame,
     RgbdOptions,
     load_matrix,
     pictures_in,
@@ -30,11 +33,26 @@ def _matches(root: Path) -> bool:
 
 
 def _record(root: Path, options: RgbdOptions) -> Recording:
-    files = [
+    frames, findings = posed_frames(frame_files(root), (4, 4))
+    recording = calibrated(root, options, frames=frames)
+    return replace(recording, findings=[*findings, *recording.findings])
+
+
+def frame_files(root: Path) -> list[tuple[Path, Path, Path]]:
+    """Picture, depth map and pose of each frame; the last two may be absent."""
+    return [
         (color, root / "depth" / f"{color.stem}.png", root / "pose" / f"{color.stem}.txt")
         for color in pictures_in(root / "color")
     ]
-    frames, findings = posed_frames(files, (4, 4))
+
+
+def calibrated(root: Path, options: RgbdOptions, *, frames: Sequence[RgbdFrame]) -> Recording:
+    """The recording of these frames, with the calibration in ``intrinsic``.
+
+    Raises:
+        ProjectError: the colour camera's intrinsics are absent, or a file is malformed.
+    """
+    findings = []
     folder = root / "intrinsic"
     if options.color_K is not None:
         K = np.asarray(options.color_K)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.rgbd import RgbdLayout
@@ -24,19 +25,30 @@ def _matches(root: Path) -> bool:
 
 
 def _record(root: Path, options: RgbdOptions) -> Recording:
-    colors = sorted(path for path in root.iterdir() if path.name.endswith(COLOR_SUFFIXES))
-    stems = [root / color.name[: color.name.rindex(".color.")] for color in colors]
-    frames, findings = posed_frames(
-        [
-            (color, Path(f"{stem}.depth.png"), Path(f"{stem}.pose.txt"))
-            for color, stem in zip(colors, stems, strict=True)
-        ],
-        (4, 4),
-        (3, 4),
-    )
-    without = set(root.glob("*.pose.txt")) - {Path(f"{stem}.pose.txt") for stem in stems}
+    files = frame_files(root)
+    frames, findings = posed_frames(files, (4, 4), (3, 4))
+    without = set(root.glob("*.pose.txt")) - {pose for _, _, pose in files}
     if without:
         findings.append(Finding("warning", f"{len(without)} poses have no picture: dropped"))
+    return Recording(root, frames, intrinsics(root, options), findings=findings)
+
+
+def frame_files(root: Path) -> list[tuple[Path, Path, Path]]:
+    """Picture, depth map and pose of each frame; the last two may be absent."""
+    colors = sorted(path for path in root.iterdir() if path.name.endswith(COLOR_SUFFIXES))
+    stems = [root / color.name[: color.name.rindex(".color.")] for color in colors]
+    return [
+        (color, Path(f"{stem}.depth.png"), Path(f"{stem}.pose.txt"))
+        for color, stem in zip(colors, stems, strict=True)
+    ]
+
+
+def intrinsics(root: Path, options: RgbdOptions) -> NDArray[np.float64]:
+    """(3, 3) of the colour camera as published: the folder's file, else the option.
+
+    Raises:
+        ProjectError: neither is there, or the file is malformed.
+    """
     files = [folder / INTRINSICS for folder in (root, root.resolve().parent)]
     path = next((path for path in files if path.is_file()), None)
     if path is None and options.color_K is None:
@@ -44,8 +56,7 @@ def _record(root: Path, options: RgbdOptions) -> Recording:
             f"{root}: no {INTRINSICS} there or in the parent folder; expected three lines "
             "'fx 0 cx', '0 fy cy', '0 0 1'; write it, or give color_K"
         )
-    K = np.asarray(options.color_K) if path is None else load_matrix(path, (3, 3))
-    return Recording(root, frames, K, findings=findings)
+    return np.asarray(options.color_K) if path is None else load_matrix(path, (3, 3))
 
 
 SEVENSCENES = RgbdLayout("7-Scenes (*.color.*, *.depth.png, *.pose.txt)", _matches, _record)

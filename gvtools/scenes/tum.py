@@ -53,18 +53,45 @@ def _matches(root: Path) -> bool:
 
 def _record(root: Path, options: RgbdOptions) -> Recording:
     findings = []
-    colors, depths = _read_list(root / "rgb.txt"), _read_list(root / "depth.txt")
+    limit = options.max_time_difference
+    colors, absent = frame_files(root, limit)
     truth = read_poses(root / "groundtruth.txt", layout="tum")
     assert truth.stamps is not None
-    limit = options.max_time_difference
-    color_times = np.array([time for time, _ in colors])
-    depth_of = associate(color_times, np.array([time for time, _ in depths]), limit)
-    frames, absent, unposed = [], 0, 0
-    for i, (time, name) in enumerate(colors):
+    frames, unposed = [], 0
+    for time, color, depth in colors:
         nearest = int(np.argmin(np.abs(truth.stamps - time)))
         if abs(truth.stamps[nearest] - time) > limit:
             unposed += 1
             continue
+        where = f"{root / 'groundtruth.txt'}, time {truth.stamps[nearest]:.6f}"
+        frames.append(RgbdFrame(color.name, color, depth, truth.poses[nearest], where))
+    if unposed:
+        message = f"{unposed} of {len(colors)} pictures have no pose within {limit:g} s: dropped"
+        findings.append(Finding("warning", message))
+    if absent:
+        findings.append(Finding("warning", f"{absent} files named in the lists are absent on disk"))
+    K, distortion, source = intrinsics(root)
+    if options.color_K is None:
+        findings.append(Finding("info", f"intrinsics: {source}"))
+    return Recording(root, frames, K, distortion, depth_unit=DEPTH_UNIT, findings=findings)
+
+
+def frame_files(root: Path, limit: float) -> tuple[list[tuple[float, Path, Path | None]], int]:
+    """Time, picture and depth map of each frame, and the number of listed files that are absent.
+
+    Args:
+        root: the folder with rgb.txt and depth.txt.
+        limit: between the times of a picture and its depth map, seconds.
+
+    Raises:
+        ProjectError: a list is unreadable or malformed.
+    """
+    colors, depths = _read_list(root / "rgb.txt"), _read_list(root / "depth.txt")
+    color_times = np.array([time for time, _ in colors])
+    depth_of = associate(color_times, np.array([time for time, _ in depths]), limit)
+    frames: list[tuple[float, Path, Path | None]] = []
+    absent = 0
+    for i, (time, name) in enumerate(colors):
         if not (root / name).is_file():
             absent += 1
             continue
@@ -72,17 +99,8 @@ def _record(root: Path, options: RgbdOptions) -> Recording:
         if depth is not None and not depth.is_file():
             absent += 1
             depth = None
-        where = f"{root / 'groundtruth.txt'}, time {truth.stamps[nearest]:.6f}"
-        frames.append(RgbdFrame(Path(name).name, root / name, depth, truth.poses[nearest], where))
-    if unposed:
-        message = f"{unposed} of {len(colors)} pictures have no pose within {limit:g} s: dropped"
-        findings.append(Finding("warning", message))
-    if absent:
-        findings.append(Finding("warning", f"{absent} files named in the lists are absent on disk"))
-    K, distortion, source = _intrinsics(root)
-    if options.color_K is None:
-        findings.append(Finding("info", f"intrinsics: {source}"))
-    return Recording(root, frames, K, distortion, depth_unit=DEPTH_UNIT, findings=findings)
+        frames.append((time, root / name, depth))
+    return frames, absent
 
 
 def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:
@@ -132,7 +150,12 @@ def _read_list(path: Path) -> list[tuple[float, str]]:
     return entries
 
 
-def _intrinsics(root: Path) -> tuple[Float64, tuple[float, ...], str]:
+def intrinsics(root: Path) -> tuple[Float64, tuple[float, ...], str]:
+    """(3, 3) and distortion of the colour camera as published, and where they come from.
+
+    Raises:
+        ProjectError: a malformed file.
+    """
     if (root / "camera-intrinsics.txt").is_file():
         path = root / "camera-intrinsics.txt"
         return load_matrix(path, (3, 3)), (), path.name

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError, ProjectError
+from pipelines.commands.scene_arguments import add_rgbd_arguments, rgbd_reading_of
 
 if TYPE_CHECKING:
     from gvtools.capture.project import CaptureReport
+    from gvtools.capture.rgbd_project import RgbdCaptureReport
     from pipelines.console import Console
 
-SUMMARY = "find the cameras of photographs or of a video, and write a project"
+SUMMARY = "find the cameras of photographs, a video or an RGB-D recording; write a project"
 EXAMPLES = (
     "gvtools capture photos/garden --out garden",
     "gvtools capture walk.mp4 --frames 80 --out walk",
     "gvtools capture photos/room --distance IMG_01.jpg,IMG_09.jpg,2.4 --out room",
+    "gvtools capture recordings/kitchen --color-intrinsics 525,525,319.5,239.5 --out kitchen",
 )
 # The picture of the cameras, in the project.
 PICTURE = "capture.png"
@@ -25,7 +28,10 @@ PICTURE = "capture.png"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument(
-        "input", type=Path, metavar="INPUT", help="a folder of photographs, or a video"
+        "input",
+        type=Path,
+        metavar="INPUT",
+        help="a folder of photographs, a video, or a folder of colour and depth without poses",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="PROJECT", help="a new folder")
     parser.add_argument(
@@ -40,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="A,B,METRES",
         help="between the places of two pictures, for a project in metres",
     )
+    add_rgbd_arguments(parser.add_argument_group("RGB-D recording"))
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
@@ -50,6 +57,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """
     from gvtools.capture.project import capture_photographs
     from gvtools.scenes.project import VIDEOS
+    from gvtools.scenes.unposed import count_unposed
 
     if not args.input.exists():
         raise ProjectError(f"{args.input}: no such file or folder; expected photographs or a video")
@@ -59,12 +67,43 @@ def run(args: argparse.Namespace, console: Console) -> None:
         )
     if args.masks is not None and not args.masks.is_dir():
         raise ProjectError(f"--masks {args.masks}: no such folder")
+    reading = rgbd_reading_of(args)
+    if args.input.is_dir() and count_unposed(args.input):
+        _run_rgbd(args, reading, console)
+        return
+    if reading:
+        raise OptionError(
+            f"{args.input}: no folder of colour and depth; expected none of the options of RGB-D "
+            f"recordings ({', '.join(reading)})"
+        )
     report = capture_photographs(
         args.input, args.out, frames=args.frames, masks=args.masks, distance=args.distance,
         say=console.line,
     )  # fmt: skip
     _print(report, console)
     _draw(args.out, report)
+    console.line(f"{args.out}: gvtools check {args.out}; gvtools reconstruct {args.out} --out RUN")
+
+
+def _run_rgbd(args: argparse.Namespace, reading: dict[str, Any], console: Console) -> None:
+    from gvtools.capture.rgbd_project import capture_rgbd
+    from gvtools.scenes.project import is_project
+    from gvtools.scenes.reading import rgbd_options
+
+    if is_project(args.input):
+        raise ProjectError(
+            f"{args.input}: has poses already; expected a recording without; give it to gvtools "
+            "reconstruct as it is"
+        )
+    for name in ("frames", "masks", "distance"):
+        if getattr(args, name) is not None:
+            raise OptionError(
+                f"--{name}: of photographs and videos; {args.input} is an RGB-D recording, of "
+                "which all frames are taken and depth tells the metres"
+            )
+    report = capture_rgbd(args.input, args.out, options=rgbd_options(reading), say=console.line)
+    _print_rgbd(report, console)
+    _draw_rgbd(args.out, report)
     console.line(f"{args.out}: gvtools check {args.out}; gvtools reconstruct {args.out} --out RUN")
 
 
@@ -82,10 +121,7 @@ def _distance(text: str) -> tuple[str, str, float]:
 
 
 def _print(report: CaptureReport, console: Console) -> None:
-    for finding in report.findings:
-        (console.warn if finding.level == "warning" else console.line)(finding.message)
-    for name, reason in list(report.left_out.items())[:10]:
-        console.line(f"  {name}: {reason}")
+    _print_findings(report, console)
     unit = "metres" if report.metric else "no known unit"
     rows = [
         ("registered pictures", f"{len(report.registered)} of {report.pictures}"),
@@ -102,6 +138,30 @@ def _print(report: CaptureReport, console: Console) -> None:
     console.table(("what", "found"), rows)
 
 
+def _print_rgbd(report: RgbdCaptureReport, console: Console) -> None:
+    _print_findings(report, console)
+    rows: list[tuple[str, object]] = [
+        ("frames with a pose", f"{len(report.registered)} of {report.pictures}"),
+        ("path, m", f"{report.path_m:.3f}"),
+        ("pairs that agree", len(report.overlap)),
+        ("keyframes", len(report.keyframes)),
+        ("loops", len(report.loops)),
+    ]
+    for what, figures in (("drift", report.drift), ("after optimisation", report.residuals)):
+        if figures is not None:
+            text = "{median_mm:.1f} mm, {median_deg:.2f} degrees; at most {max_mm:.1f} mm"
+            rows.append((f"loops miss by, {what}, median", text.format(**figures)))
+    rows.append(("unit", "metres; the world is the first frame's camera"))
+    console.table(("what", "found"), rows)
+
+
+def _print_findings(report: CaptureReport | RgbdCaptureReport, console: Console) -> None:
+    for finding in report.findings:
+        (console.warn if finding.level == "warning" else console.line)(finding.message)
+    for name, reason in list(report.left_out.items())[:10]:
+        console.line(f"  {name}: {reason}")
+
+
 def _draw(out: Path, report: CaptureReport) -> None:
     """``capture.png``: the cameras from above, and which of them overlap."""
     from gvtools.files import replaced_when_written
@@ -113,6 +173,23 @@ def _draw(out: Path, report: CaptureReport) -> None:
     figure = draw_capture(
         scene.cameras, scene.points.positions, report.overlap,
         title=f"{out.name}: {len(report.registered)} of {report.pictures} pictures",
+    )  # fmt: skip
+    with replaced_when_written(out / PICTURE) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def _draw_rgbd(out: Path, report: RgbdCaptureReport) -> None:
+    """``capture.png``: the cameras from above, among the depth of some keyframes."""
+    from gvtools.capture.rgbd_project import points_from_above
+    from gvtools.files import replaced_when_written
+    from gvtools.scenes.project import open_project
+    from viz.plots.capture import draw_capture
+
+    scene = open_project(out)
+    cameras, points = points_from_above(scene, report.keyframes)
+    figure = draw_capture(
+        cameras, points, report.overlap,
+        title=f"{out.name}: {len(report.registered)} of {report.pictures} frames",
     )  # fmt: skip
     with replaced_when_written(out / PICTURE) as temporary:
         figure.savefig(temporary, format="png")

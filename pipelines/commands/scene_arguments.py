@@ -28,6 +28,11 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--model", type=int, metavar="N", help="COLMAP's sparse/N, where it holds several (largest)"
     )
+    add_rgbd_arguments(group)
+
+
+def add_rgbd_arguments(group: argparse._ActionsContainer) -> None:
+    """Options that say what RGB-D folders leave open."""
     group.add_argument(
         "--depth-unit", type=_positive, metavar="METRES", help="of one stored unit of RGB-D depth"
     )
@@ -95,7 +100,18 @@ def reading_of(args: argparse.Namespace) -> dict[str, Any]:
     """The options of ``add_scene_arguments`` that were given, JSON-ready."""
     from gvtools.scenes.reading import READING
 
-    values = {name: getattr(args, name) for name in READING}
+    return _given(args, READING)
+
+
+def rgbd_reading_of(args: argparse.Namespace) -> dict[str, Any]:
+    """The options of ``add_rgbd_arguments`` that were given, JSON-ready."""
+    from gvtools.scenes.reading import READING
+
+    return _given(args, [name for name, option in READING.items() if option is not None])
+
+
+def _given(args: argparse.Namespace, names: Iterable[str]) -> dict[str, Any]:
+    values = {name: getattr(args, name) for name in names}
     return {
         name: str(value.resolve()) if isinstance(value, Path) else value
         for name, value in values.items()

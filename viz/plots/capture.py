@@ -23,7 +23,7 @@ MOST_POINTS = 20_000
 def draw_capture(
     cameras: Cameras,
     points: NDArray[np.float64],
-    overlap: Sequence[tuple[str, str, int]],
+    overlap: Sequence[tuple[str, str, float]],
     *,
     title: str,
 ) -> Figure:
@@ -32,7 +32,7 @@ def draw_capture(
     Args:
         cameras: the registered ones, in the order of their names.
         points: (N, 3) triangulated points.
-        overlap: pairs of names with their number of matches; other names are left out.
+        overlap: pairs of names with how much they share; other names are left out.
         title: of the figure.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg

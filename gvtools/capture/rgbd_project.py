@@ -1,0 +1,316 @@
+"""From an RGB-D recording without poses to a posed project, in the layout of 7-Scenes.
+
+``frame-NNNNNN.color.*``, ``.depth.png`` and ``.pose.txt``, ``camera-intrinsics.txt``, ``rgbd.json``
+and ``capture.json``, a report. Pictures and depth maps are the recording's own files. All of it
+appears at once, when it is complete.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from gvtools.cameras import Cameras
+from gvtools.capture.project import REPORT, replaced_folder
+from gvtools.capture.rgbd_frames import RgbdFrames
+from gvtools.capture.rgbd_poses import Found, find_poses
+from gvtools.errors import ProjectError
+from gvtools.files import write_json
+from gvtools.scenes.photographs import named
+from gvtools.scenes.rgbd import SIDECAR, resolve_options, rgbd_scene
+from gvtools.scenes.rgbd_recording import Recording, RgbdOptions
+from gvtools.scenes.scene import Finding, Scene
+from gvtools.scenes.sevenscenes import INTRINSICS
+from gvtools.scenes.unposed import LOOKS_LIKE, read_unposed
+
+Float64 = NDArray[np.float64]
+
+# Keyframes whose depth the picture shows.
+DRAWN = 12
+# Loops that still miss by this (median) tell of wrong intrinsics, or of too fast a motion.
+DOUBTFUL_MM = 30.0
+
+Say = Callable[[str], object]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RgbdCaptureReport:
+    """What the capture of an RGB-D recording found.
+
+    Attributes:
+        pictures: frames with depth that were tried.
+        registered: names of those with a pose, in order of time.
+        left_out: file of the recording and reason of each other one.
+        sources: file of the recording that each registered frame's picture is.
+        matching: how pairs were chosen.
+        overlap: pairs of frames, and the share of each first one's depth that the second sees.
+        other_parts: frames of further connected parts, the largest first.
+        keyframes: names of the frames that loops were looked for among.
+        loops: pairs of keyframes that close loops.
+        drift: median and greatest residual of loops on the chain of neighbours: millimetres and
+            degrees; None where no loop says it.
+        residuals: the same after optimisation.
+        path_m: length of the path, metres.
+        cameras: model and parameters of the camera.
+        metric: True.
+        placed_by: "first frame": the world's frame is that of the first frame's camera.
+        findings: what was met.
+    """
+
+    pictures: int
+    registered: tuple[str, ...]
+    left_out: dict[str, str]
+    sources: dict[str, str]
+    matching: str
+    overlap: tuple[tuple[str, str, float], ...]
+    other_parts: tuple[int, ...]
+    keyframes: tuple[str, ...]
+    loops: tuple[tuple[str, str], ...]
+    drift: dict[str, float] | None
+    residuals: dict[str, float] | None
+    path_m: float
+    cameras: tuple[dict[str, Any], ...]
+    metric: bool = True
+    placed_by: str = "first frame"
+    findings: tuple[Finding, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        return asdict(self)
+
+
+def capture_rgbd(
+    source: Path,
+    out: Path,
+    *,
+    options: RgbdOptions | None = None,
+    say: Say = lambda text: None,
+) -> RgbdCaptureReport:
+    """Find the poses of an RGB-D recording, and write a project.
+
+    Args:
+        source: a folder of colour and depth, see ``gvtools.scenes.unposed``.
+        out: the project's folder; must not hold anything yet.
+        options: what the folder does not tell by itself.
+        say: told of each step.
+
+    Raises:
+        ProjectError: no RGB-D recording, no two frames that agree, or no place to write.
+        OptionError: options that contradict each other.
+    """
+    resolved, met = resolve_options(source, options)
+    recording = read_unposed(source, resolved)
+    if recording is None:
+        raise ProjectError(
+            f"{source}: no RGB-D recording; expected one of: {'; '.join(LOOKS_LIKE)}"
+        )
+    if len(recording.frames) < 2:
+        raise ProjectError(
+            f"{source}: {len(recording.frames)} frames with picture and depth; expected at least "
+            "two that overlap; look whether names of pictures and depth maps belong together"
+        )
+    recording = replace(recording, findings=[*met, *recording.findings])
+    scene = rgbd_scene(recording, resolved)
+    recording = _in_order(recording, scene)
+    with replaced_folder(out) as work:
+        say(f"comparing {len(scene)} frames")
+        found = find_poses(RgbdFrames(scene), say=say)
+        if len(found.poses) < 2:
+            raise ProjectError(
+                f"{source}: no two of {len(scene)} frames agree in colour and depth; expected "
+                "neighbours that share most of what they show; look at --color-intrinsics, "
+                "--depth-intrinsics and --depth-unit, and record with slower motion"
+            )
+        names = _names(recording)
+        report = _report(scene, found, names, sources=recording)
+        _write(work, recording, resolved, found=found, names=names)
+        write_json(work / REPORT, report.to_dict())
+    return report
+
+
+def _in_order(recording: Recording, scene: Scene) -> Recording:
+    """The recording with its frames in the order of the scene's views."""
+    frames = {frame.name: frame for frame in recording.frames}
+    return replace(recording, frames=[frames[name] for name in scene.names])
+
+
+def _names(recording: Recording) -> list[str]:
+    """Names of the project's pictures: 7-Scenes' own stay, others are numbered in order."""
+    names = []
+    for number, frame in enumerate(recording.frames):
+        kept = ".color." in frame.color.name
+        suffix = frame.color.suffix.lower()
+        names.append(frame.color.name if kept else f"frame-{number:06d}.color{suffix}")
+    return names
+
+
+def _write(
+    work: Path,
+    recording: Recording,
+    options: RgbdOptions,
+    *,
+    found: Found,
+    names: Sequence[str],
+) -> None:
+    """The project's files but the report."""
+    for number, pose in found.poses.items():
+        frame = recording.frames[number]
+        assert frame.depth is not None
+        stem = names[number][: names[number].rindex(".color.")]
+        _link(frame.color, work / names[number])
+        _link(frame.depth, work / f"{stem}.depth.png")
+        _save(work / f"{stem}.pose.txt", pose)
+    color_K = recording.color_K if options.color_K is None else np.asarray(options.color_K)
+    _save(work / INTRINSICS, np.asarray(color_K)[:3, :3])
+    depth_K = recording.depth_K if options.depth_K is None else options.depth_K
+    moved = options.color_from_depth
+    if moved is None and recording.color_from_depth is not None:
+        moved = recording.color_from_depth.tolist()
+    distortion = options.distortion
+    if distortion is None and options.color_K is None and any(recording.distortion):
+        distortion = list(recording.distortion)
+    sidecar = {
+        "depth_unit": options.depth_unit or recording.depth_unit,
+        "depth_K": None if depth_K is None else np.asarray(depth_K).tolist(),
+        "color_from_depth": moved,
+        "distortion": distortion,
+        "depth_max": options.depth_max,
+    }
+    write_json(
+        work / SIDECAR, {name: value for name, value in sidecar.items() if value is not None}
+    )
+
+
+def _save(path: Path, matrix: Float64) -> None:
+    """A matrix with all digits of float64."""
+    np.savetxt(path, matrix, fmt="%.17g")
+
+
+def _link(source: Path, target: Path) -> None:
+    """The same file under another name, or a copy of it on another disk."""
+    try:
+        os.link(source.resolve(), target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def _report(
+    scene: Scene, found: Found, names: Sequence[str], *, sources: Recording
+) -> RgbdCaptureReport:
+    kept = sorted(found.poses)
+    files = [os.path.relpath(frame.color, sources.root) for frame in sources.frames]
+    left_out = {
+        files[number]: f"agrees with {len(part) - 1} other frames, and none of the largest part"
+        if len(part) > 1
+        else "agrees with no other frame"
+        for part in found.parts[1:]
+        for number in part
+    }
+    camera = scene.views[0].camera
+    centres = np.array([found.poses[number][:3, 3] for number in kept])
+    return RgbdCaptureReport(
+        pictures=len(scene),
+        registered=tuple(names[number] for number in kept),
+        left_out=left_out,
+        sources={names[number]: files[number] for number in kept},
+        matching="neighbours in time, and keyframes that look alike or are near",
+        overlap=tuple(
+            (names[pair.target], names[pair.source], round(pair.overlap, 4)) for pair in found.pairs
+        ),
+        other_parts=tuple(len(part) for part in found.parts[1:]),
+        keyframes=tuple(names[number] for number in found.keyframes),
+        loops=tuple((names[pair.target], names[pair.source]) for pair in found.loops),
+        drift=_summary(found.drift),
+        residuals=_summary(found.residuals),
+        path_m=float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum()),
+        cameras=(
+            {
+                "model": "PINHOLE",
+                "width": int(camera.width[0]),
+                "height": int(camera.height[0]),
+                "params": [float(camera.K[0][at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))],
+            },
+        ),
+        findings=tuple([*scene.findings, *_findings(found, left_out, count=len(scene))]),
+    )
+
+
+def points_from_above(scene: Scene, keyframes: Sequence[str]) -> tuple[Cameras, Float64]:
+    """Cameras and a sparse cloud of a captured project, turned so that z is up, for its picture.
+
+    Args:
+        scene: the project.
+        keyframes: names of views that give points; of many, DRAWN are taken.
+
+    Returns:
+        The cameras, and (N, 3) points, metres; up is against the mean of the cameras' y axes.
+
+    Raises:
+        ProjectError: a file is unreadable.
+    """
+    cameras = scene.cameras
+    down = cameras.world_from_cam[:, :3, 1].mean(axis=0)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.align_vectors([[0, 0, -1]], [down])[0].as_matrix()
+    shown = [name for name in keyframes if name in set(scene.names)]
+    points = []
+    for name in shown[:: max(1, len(shown) // DRAWN)]:
+        view = scene[name]
+        depth = view.load().depth
+        assert depth is not None
+        line, column = np.mgrid[0 : depth.shape[0] : 12, 0 : depth.shape[1] : 12]
+        z = depth[line, column]
+        line, column, z = line[z > 0], column[z > 0], z[z > 0].astype(np.float64)
+        rays = np.stack([column + 0.5, line + 0.5, np.ones(len(z))]) * z
+        points.append(
+            (turn @ view.camera.world_from_cam[0])[:3]
+            @ np.vstack([np.linalg.inv(view.camera.K[0]) @ rays, np.ones(len(z))])
+        )
+    turned = replace(cameras, cam_from_world=cameras.cam_from_world @ turn.T)
+    return turned, np.concatenate(points, axis=1).T if points else np.zeros((0, 3))
+
+
+def _summary(rows: Float64) -> dict[str, float] | None:
+    if not len(rows):
+        return None
+    median, most = np.median(rows, axis=0), rows.max(axis=0)
+    return {
+        "median_mm": float(median[0]),
+        "max_mm": float(most[0]),
+        "median_deg": float(median[1]),
+        "max_deg": float(most[1]),
+    }
+
+
+def _findings(found: Found, left_out: dict[str, str], *, count: int) -> list[Finding]:
+    findings = []
+    if left_out:
+        findings.append(
+            Finding(
+                "warning",
+                f"{len(left_out)} of {count} frames could not be connected "
+                f"({named(list(left_out))}): left out; record with slower motion, and nothing "
+                "nearer than the depth camera's range",
+            )
+        )
+    if not found.loops:
+        text = (
+            "no loop closes: drift cannot be told; let the camera return to where it has been, and "
+            "record more frames a second"
+        )
+        findings.append(Finding("warning", text))
+    elif np.median(found.residuals[:, 0]) > DOUBTFUL_MM:
+        text = (
+            f"loops miss by {np.median(found.residuals[:, 0]):.0f} mm (median) after optimisation: "
+            "the poses are doubtful; look at the intrinsics, and record with slower motion"
+        )
+        findings.append(Finding("warning", text))
+    return findings
