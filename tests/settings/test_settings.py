@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -113,8 +114,12 @@ def test_a_range_holds_its_ends_and_nothing_beyond(section, name):
         for value in [beyond, float("nan"), *([] if included else [limit])]:
             with pytest.raises(OptionError, match=rf"{name} .*; expected "):
                 section.replaced(**{name: value})
-        # The other fields of stereo have to fit an end.
-        room = {"sources": 8} if name == "views" and isinstance(section, StereoOptions) else {}
+        # Other fields have to fit an end.
+        room: dict[str, Any] = {}
+        if name == "views" and isinstance(section, StereoOptions):
+            room = {"sources": 8}
+        if name == "scene_share" and limit == 1:
+            room = {"scenes": ("scan",)}
         if included and not (name == "sources" and limit == 0):
             assert getattr(section.replaced(**room, **{name: limit}), name) == limit
 
