@@ -243,7 +243,7 @@ def write_results(
     tables["intervals"] = interval_table(benchmark, by_views)
     tables["scenes"] = scene_table(benchmark, by_views)
     write_tables(out, tables)
-    write_json(out / RESULTS, _plain(by_views))
+    write_json(out / RESULTS, {"benchmark": cells[0].benchmark, **_plain(by_views)})
     page = page_of(benchmark, cells, by_views, tables=tables, title=title)
     write_text(out / PAGE, benchmark_html(page))
     return compared

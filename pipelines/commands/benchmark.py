@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -81,12 +82,31 @@ def run(args: argparse.Namespace, console: Console) -> None:
     def write() -> None:
         write_results(benchmark, cells, out, title=title)
 
+    _refuse_others(out, args.name)
     with folder_lock(out):
         measure_cells(cells, console=console, measure=measure_apart, after=write)
         tables = write_results(benchmark, cells, out, title=title)
     print_tables(tables, console)
     console.line(f"results in {out}: {PAGE}, results.json, and tables as .csv, .md and .tex")
     _check_some_measured(cells, args.root)
+
+
+def _refuse_others(out: Path, name: str) -> None:
+    """Refuse a folder with the tables of another benchmark, which would be overwritten.
+
+    Raises:
+        OptionError: it holds such tables.
+    """
+    from pipelines.benchmark.results import RESULTS
+
+    try:
+        found = json.loads((out / RESULTS).read_text(encoding="utf-8"))["benchmark"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if found != name:
+        raise OptionError(
+            f"{out}: holds the results of {found!r}, not {name!r}; give another --out"
+        )
 
 
 def _check_some_measured(cells: tuple[Cell, ...], root: Path) -> None:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gvtools.errors import ProjectError
+from gvtools.errors import OptionError, ProjectError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,11 +50,14 @@ def shards(args: argparse.Namespace, console: Console) -> None:
         GvError: nothing there, an unknown scene, another conversion in the folder.
     """
     from gvtools.scenes.addresses import SPEC, open_collection
+    from gvtools.scenes.data_sets.spec import name_key, spec_names
     from gvtools.scenes.shards.writer import MEGABYTE, ShardOptions, write_shards
 
     address = args.scenes_of
     if args.root is not None and not address.startswith(SPEC):
         address = SPEC + address
+    if args.root is None and not Path(address).exists() and name_key(address) in spec_names():
+        raise OptionError(f"{address}: a data set; give the folder of its download by --root DIR")
     collection = open_collection(address, args.root)
     if args.scenes:
         collection = collection.subset(args.scenes)

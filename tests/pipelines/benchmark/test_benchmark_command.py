@@ -219,3 +219,7 @@ def test_wrong_options_are_refused(projects, tmp_path, capsys):
     assert "no such folder" in refused(capsys, *words(tmp_path / "gone", out))
     assert "expected one of 3, 6, 9" in refused(capsys, *words(projects, out, "--views", 4))
     assert not out.exists()
+    out.mkdir()
+    (out / "results.json").write_text('{"benchmark": "llff"}')
+    assert "holds the results of 'llff'" in refused(capsys, *words(projects, out))
+    assert [path.name for path in out.iterdir()] == ["results.json"]

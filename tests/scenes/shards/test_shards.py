@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import refused
 from shard_rooms import small_collection, small_scene
 
 from gvtools.errors import OptionError, ProjectError
@@ -230,3 +231,8 @@ def test_an_index_of_another_version_or_damaged_is_one_line(whole, tmp_path):
     path.write_text(text[: len(text) // 2])
     with pytest.raises(ProjectError, match=r"index\.json: unreadable"):
         open_shards(out)
+
+
+def test_a_data_set_without_its_folder_is_told_what_to_give(tmp_path, capsys):
+    line = refused(capsys, "data", "shards", "7-Scenes", "--out", tmp_path / "out")
+    assert "by --root DIR" in line
