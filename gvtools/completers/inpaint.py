@@ -70,20 +70,27 @@ class InpaintCompleter(Completer):
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:
         """Fill the holes of all views; see ``Completer.complete``. Nothing here is random."""
+        return self.filled(context, guidance)[0]
+
+    def filled(
+        self, context: Sequence[ContextView], guidance: Guidance
+    ) -> tuple[Completion, NDArray[np.float32]]:
+        """The completion, and (V, H, W) the weight of the photographs that holes were seen in."""
         check_views(context, guidance)
         valid = guidance.valid
         rgb = np.where(valid[..., None], guidance.rgb, np.float32(0))
         depth = np.where(valid, guidance.depth, np.float32(0))
         confidence = np.where(valid, np.minimum(guidance.confidence, 1), 0).astype(np.float32)
+        looked_up = np.zeros_like(depth)
         for index in range(len(guidance)):
             if valid[index].all() or valid[index].sum() < self.settings.min_support:
                 continue
             view = (rgb[index], depth[index], confidence[index])
-            self._fill(
+            looked_up[index] = self._fill(
                 view, valid[index], guidance.cameras[index],
                 generated=guidance.generated[index], context=context,
             )  # fmt: skip
-        return Completion(rgb, depth, confidence)
+        return Completion(rgb, depth, confidence), looked_up
 
     def _fill(
         self,
@@ -93,7 +100,7 @@ class InpaintCompleter(Completer):
         *,
         generated: NDArray[np.bool_],
         context: Sequence[ContextView],
-    ) -> None:
+    ) -> NDArray[np.float32]:
         """Write depth, then colour, then confidence into a view's holes.
 
         Args:
@@ -102,6 +109,9 @@ class InpaintCompleter(Completer):
             camera: a batch of one.
             generated: (H, W) which of these a completer made.
             context: photographs to look points up in.
+
+        Returns:
+            (H, W) weight of the photographs that a hole's point was seen in.
         """
         rgb, depth, confidence = view
         options = self.settings
@@ -122,6 +132,7 @@ class InpaintCompleter(Completer):
         color = fill_color(rgb, valid, surface, evidence=evidence, sweeps=options.sweeps)
         rgb[holes], depth[holes] = color[holes], fill[holes]
         confidence[holes] = _confidence(valid, surface, options)[holes]
+        return weight
 
 
 def _confidence(

@@ -24,17 +24,22 @@ class Filled:
         rgb: (T, H, W, 3) in [0, 1].
         depth: (T, H, W) z-depth, scene units; 0 = none.
         confidence: (T, H, W) of the depth, in [0, 1]; None where the fill has no notion of it.
+        looked_up: (T, H, W) weight of the photographs that a hole's colour was seen in, in [0, 1];
+            None where none was looked at.
     """
 
     rgb: NDArray[np.float32]
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32] | None = None
+    looked_up: NDArray[np.float32] | None = None
 
     def rows(self, index: Sequence[int]) -> Filled:
         """Some views, in that order."""
         rows = list(index)
-        confidence = None if self.confidence is None else self.confidence[rows]
-        return Filled(self.rgb[rows], self.depth[rows], confidence)
+        confidence, looked_up = (
+            None if values is None else values[rows] for values in (self.confidence, self.looked_up)
+        )
+        return Filled(self.rgb[rows], self.depth[rows], confidence, looked_up)
 
 
 def push_pull(values: Tensor, valid: Tensor) -> Tensor:

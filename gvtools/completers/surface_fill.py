@@ -45,10 +45,10 @@ def surface_fill(
         guidance: the projections.
         shared: carry fills from view to view; their order does not matter.
     """
-    completion = InpaintCompleter().complete(context, guidance)
+    completion, looked_up = InpaintCompleter().filled(context, guidance)
     known = guidance.valid
     if shared and len(guidance) > 1:
-        known = _shared(context, guidance, completion)
+        known = _shared(context, guidance, completion, looked_up=looked_up)
     rgb, depth, confidence = (
         completion.rgb.copy(),
         completion.depth.copy(),
@@ -64,13 +64,19 @@ def surface_fill(
         rgb[index][hole] = averaged[hole]
         depth[index][hole] = push_pull_depth(lengths, filled)[0, 0].numpy()[hole]
         confidence[index][hole] = AVERAGED
-    return Filled(rgb, depth, confidence)
+    return Filled(rgb, depth, confidence, looked_up)
 
 
 def _shared(
-    context: Sequence[ContextView], guidance: Guidance, completion: Completion
+    context: Sequence[ContextView],
+    guidance: Guidance,
+    completion: Completion,
+    *,
+    looked_up: NDArray[np.float32],
 ) -> NDArray[np.bool_]:
-    """Carry fills from view to view, the best known view first; ``completion`` is written into.
+    """Carry fills from view to view, the best known view first.
+
+    ``completion`` and ``looked_up`` are written into.
 
     Returns:
         (V, H, W) where memory or another view's fill knows.
@@ -87,9 +93,9 @@ def _shared(
             surer &= carried.confidence > SURER * completion.confidence[index]
             if surer.any():
                 view = _with(view, carried, surer)
-                again = InpaintCompleter().complete(context, view)
+                again, weight = InpaintCompleter().filled(context, view)
                 completion.rgb[index], completion.depth[index] = again.rgb[0], again.depth[0]
-                completion.confidence[index] = again.confidence[0]
+                completion.confidence[index], looked_up[index] = again.confidence[0], weight[0]
                 known[index] = view.valid[0]
         if index != order[-1]:
             memory = _lifted(memory, view, completion, index=index)

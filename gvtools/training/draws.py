@@ -33,8 +33,12 @@ class Draws:
 
     def chance(self, name: str, share: float) -> bool:
         """Whether something happens in this step; the same for all samples and processes."""
+        return float(self.numbers(name, 1)) < share
+
+    def numbers(self, name: str, count: int) -> Tensor:
+        """(count,) in [0, 1); the same for all samples and processes."""
         seed = view_seed(self.seed, self.stage, name, "step", self.step)
-        return float(torch.rand((), generator=torch.Generator().manual_seed(seed))) < share
+        return torch.rand(count, generator=torch.Generator().manual_seed(seed))
 
     def uniform(self, name: str, *shape: int) -> Tensor:
         """(B, *shape) in [0, 1), float32 on the CPU."""

@@ -1,4 +1,4 @@
-"""The last stage: the heads of a small model, on what its frozen denoisers make.
+"""The stage after the denoisers: the heads of a small model, on what its frozen denoisers make.
 
 Colour and depth learn from completions, made in as many steps as in use: what is uncertain about
 generated features, and where their tokens meet, the encoder's stage could not know. Cameras are

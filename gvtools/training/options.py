@@ -165,7 +165,7 @@ class ReflowStageOptions(Settings):
 
 
 class HeadsStageOptions(FeatureOptions):
-    """The last stage, for small models: the heads, on what the frozen denoisers make."""
+    """For small models: the heads, on what the frozen denoisers make."""
 
     section = "heads"
 
@@ -191,6 +191,16 @@ class HeadsStageOptions(FeatureOptions):
         if not (self.ray or self.rgb or self.depth):
             raise OptionError("heads: ray, rgb and depth are all 0; give one of them a weight")
         return self
+
+
+class RefinerStageOptions(Settings):
+    """After the heads, for small models: the refiner, on what the frozen core makes."""
+
+    section = "refiner"
+
+    optimizer: OptimizerOptions = OptimizerOptions()
+    depth: float = Field(0.2, ge=0)
+    """Weight of what is said of the depth against the colours."""
 
 
 class SceneSource(Settings):
@@ -272,7 +282,9 @@ class TrainingSettings(Settings):
     reflow: ReflowStageOptions = ReflowStageOptions()
     """Stage 2."""
     heads: HeadsStageOptions | None = None
-    """The last stage; none leaves it out."""
+    """A small model's heads; none leaves them as they are."""
+    refiner: RefinerStageOptions | None = None
+    """The last stage, of a model with a refiner; none leaves it out."""
 
     def network(self, folder: Path | None = None) -> GeoVerseConfig:
         """The network's configuration; a relative path is looked up from ``folder``."""

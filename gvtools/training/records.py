@@ -8,7 +8,7 @@ from typing import Any
 
 from gvtools.files import write_text
 
-STAGES = ("encoder", "denoiser", "reflow", "heads")  # in order
+STAGES = ("encoder", "denoiser", "reflow", "heads", "refiner")  # in order
 LOG = "log.jsonl"
 
 

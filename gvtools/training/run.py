@@ -13,6 +13,7 @@ import torch
 
 from gvtools.completers.geoverse.config import FlowConfig, GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.refiner import Refiner
 from gvtools.completers.geoverse.video_prior.prior import VideoPrior
 from gvtools.completers.geoverse.weights.folder import config_of, from_pretrained, save_pretrained
 from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER, WHOLE_FILE
@@ -30,6 +31,7 @@ from gvtools.training.heads_stage import HeadsStage
 from gvtools.training.loop import Record, Reporting, Trainer
 from gvtools.training.options import ReflowStageOptions, TrainingSettings
 from gvtools.training.records import STAGES, TrainingLog, read_log
+from gvtools.training.refiner_stage import RefinerStage
 from gvtools.training.reflow_stage import ReflowStage
 from gvtools.training.samples import TrainingSamples
 from gvtools.training.sheets import completion_sheet, encoder_sheet, write_png
@@ -43,11 +45,11 @@ SHEET_SAMPLES = 3
 # Log keys with these endings count the pixels or samples behind a loss term: logged, not printed.
 COUNT_SUFFIXES = ("_pixels", "_empty", "_without_scale")
 # Stages after which the model can complete views.
-GENERATIVE = ("denoiser", "reflow", "heads")
+GENERATIVE = ("denoiser", "reflow", "heads", "refiner")
 # Those of them that learn from the output of a trained denoiser.
-AFTER_DENOISER = ("reflow", "heads")
+AFTER_DENOISER = ("reflow", "heads", "refiner")
 STAGE_OF: dict[str, type[Stage]] = {
-    kind.name: kind for kind in (EncoderStage, DenoiserStage, ReflowStage, HeadsStage)
+    kind.name: kind for kind in (EncoderStage, DenoiserStage, ReflowStage, HeadsStage, RefinerStage)
 }
 # A weights file is fingerprinted by its name, its size and this many bytes at either end.
 FINGERPRINT_BYTES = 2**22
@@ -79,6 +81,9 @@ class StageRun:
         self.folder = out / stage
         self.processes = processes
         self.model_config = config.network(model_folder)
+        if stage != "refiner":
+            # It learns from what the finished model makes.
+            self.model_config = replace(self.model_config, refiner=None)
         self.init = init
         self.options = getattr(config, stage)
         if self.options is None:
@@ -204,8 +209,9 @@ class StageRun:
     def _start(self, say: Callable[[str], None]) -> GeoVerse:
         """Build the model from ``init``, else the last earlier stage with weights, else at random.
 
-        Sets ``_source`` (the weights' folder, None for random weights); for stage "heads" it also
-        takes the sampling of the start weights into ``model_config``. ``_identity`` needs both.
+        Sets ``_source`` (the weights' folder, None for random weights); for stages "heads" and
+        "refiner" it also takes the sampling of the start weights into ``model_config``.
+        ``_identity`` needs both.
         """
         before = STAGES[: STAGES.index(self.stage)]
         source = self.init
@@ -230,15 +236,27 @@ class StageRun:
                     f"{source}: its denoisers are untrained, and stage {self.stage} learns "
                     "from what they make; run --stage denoiser to its end first"
                 )
-            if self.stage == "heads":
+            if self.stage in ("heads", "refiner"):
                 self.model_config = _with_sampling_of(self.model_config, found.flow)
-        model = from_pretrained(source, config=self.model_config)
+        model = self._model_of(source)
         if model.without_video:
             raise CheckpointError(
                 f"{source}: no {VIDEO_FOLDER}/; training {self.model_config.name} needs the video "
                 "prior; make it with gvtools weights truncate-wan, or train a model with injection "
                 "= 'none'"
             )
+        return model
+
+    def _model_of(self, source: Path) -> GeoVerse:
+        """The model of a weights folder, with a fresh refiner where stage "refiner" needs one."""
+        config = self.model_config
+        if config.refiner is None or config_of(source).refiner is not None:
+            return from_pretrained(source, config=config)
+        model = from_pretrained(source, config=replace(config, refiner=None))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.config.seed)
+            model.refiner = Refiner(config.refiner)
+        model.config = config
         return model
 
     def _refuse_unfinished(self, before: Sequence[str]) -> None:

@@ -24,7 +24,7 @@ from gvtools.files import replaced_when_written
 from gvtools.training.dataset import Samples
 from gvtools.training.view_sample import TENSORS, Sample
 
-COLORS, DEPTHS = ("images", "hint"), ("depth", "hint_depth")
+COLORS, DEPTHS = ("images", "hint"), ("depth", "hint_depth", "evidence")
 GREATEST = float(np.finfo(np.float16).max)
 
 

@@ -36,6 +36,7 @@ class Sample:
         hint: (V, 3, H, W): context pictures as given; projections on targets, holes at 0 or filled.
         hint_depth: (V, 1, H, W): likewise; 0 = none.
         valid: (V, 1, H, W) bool: True on context; True where the projection knows a target.
+        evidence: (V, 2, H, W) of the fill, see ``ViewBatch``; zeros without one.
         cam_from_world: (V, 4, 4).
         K: (V, 3, 3), pixels, pixel centres at + 0.5.
         place: (V,) int64, where each view stands along the path.
@@ -48,6 +49,7 @@ class Sample:
     hint: Tensor
     hint_depth: Tensor
     valid: Tensor
+    evidence: Tensor
     cam_from_world: Tensor
     K: Tensor
     place: Tensor
@@ -111,6 +113,7 @@ def make_sample(
         hint=hint.contiguous(),
         hint_depth=views.depth[0] * factor,
         valid=views.valid[0],
+        evidence=torch.zeros(len(order), 2, *size) if views.evidence is None else views.evidence[0],
         cam_from_world=torch.from_numpy(relative).float(),
         K=views.K[0],
         place=torch.tensor(order),
@@ -168,5 +171,6 @@ def collated(samples: Sequence[Sample]) -> TrainingBatch:
         cam_from_world=stacked["cam_from_world"],
         K=stacked["K"],
         context=samples[0].context,
+        evidence=stacked["evidence"],
     )
     return TrainingBatch(views, stacked["images"], stacked["depth"], notes)

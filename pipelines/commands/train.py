@@ -43,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="all",
         help="encoder: pretraining of a small encoder with its heads; denoiser: both denoisers; "
         "reflow: distillation to few steps; heads: a small model's heads on what it completes; "
+        "refiner: what tells how far its completions are to be trusted; "
         "all: those that the training has, one after the other (%(default)s)",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the training")

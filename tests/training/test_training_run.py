@@ -49,13 +49,14 @@ def weights_of(folder: Path) -> dict[str, torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
-    """All four stages, a few steps each."""
+    """All stages, a few steps each."""
     out = tmp_path_factory.mktemp("training")
     torch.set_num_threads(1)
     assert train(out, "encoder", *steps("encoder", 24)) == 0
     assert train(out, "denoiser", *steps("denoiser", 6)) == 0
     assert train(out, "reflow", *steps("reflow", 3)) == 0
     assert train(out, "heads", *steps("heads", 4)) == 0
+    assert train(out, "refiner", *steps("refiner", 3)) == 0
     return out
 
 
@@ -90,7 +91,7 @@ def of_rays(name: str) -> bool:
     return name.startswith("geometry.head.") and "_aux" in name
 
 
-def test_the_last_stage_moves_the_heads_alone(trained):
+def test_the_stage_of_the_heads_moves_them_alone(trained):
     names = moved(trained / "reflow", trained / "heads")
     colors = {name for name in names if name.startswith("rgb_head.")}
     rays = {name for name in names if of_rays(name)}
@@ -105,6 +106,19 @@ def test_the_last_stage_moves_the_heads_alone(trained):
     record = read_log(trained / "heads")[-1]
     for name in ("origin", "direction", "rgb", "hf", "rgb_decoded", "depth", "depth_decoded"):
         assert 0 < record[name] < 10, name
+
+
+def test_the_last_stage_adds_a_refiner_and_moves_nothing_else(trained):
+    before, after = weights_of(trained / "heads"), weights_of(trained / "refiner")
+    assert all(torch.equal(after[name], tensor) for name, tensor in before.items())
+    assert set(after) - set(before) and all(
+        name.startswith("refiner.") for name in set(after) - set(before)
+    )
+    assert from_pretrained(trained / "heads" / "weights").config.refiner is None
+    assert from_pretrained(trained / "refiner" / "weights").config.trained
+    record = read_log(trained / "refiner")[-1]
+    assert {"color", "depth_right", "psnr", "gain"} <= set(record)
+    assert 0 < record["depth_right"] < 2 and 3 < record["psnr"] < 60
 
 
 def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
@@ -142,7 +156,12 @@ def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
 
-LATER = {"denoiser": ("encoder", 6), "reflow": ("denoiser", 3), "heads": ("reflow", 4)}
+LATER = {
+    "denoiser": ("encoder", 6),
+    "reflow": ("denoiser", 3),
+    "heads": ("reflow", 4),
+    "refiner": ("heads", 3),
+}
 
 
 @pytest.mark.parametrize("stage", LATER)
@@ -181,6 +200,7 @@ def test_finished_stages_are_left_as_they_are(trained, tmp_path, capsys):
     """Else the next stage, whose state names its start by its bytes, might not go on."""
     shutil.copytree(trained, tmp_path / "out")
     out, counts = tmp_path / "out", {"encoder": 24, "denoiser": 6, "reflow": 3, "heads": 4}
+    counts["refiner"] = 3
     files = sorted(path for path in out.rglob("*") if path.is_file())
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
     more = [word for stage, count in counts.items() for word in steps(stage, count)]
@@ -209,7 +229,7 @@ def test_a_student_is_sampled_by_the_bounds_that_it_was_distilled_for(trained, t
     assert len(own.level1) == 4
 
 
-@pytest.mark.parametrize("stage", ["reflow", "heads"])
+@pytest.mark.parametrize("stage", ["reflow", "heads", "refiner"])
 def test_what_learns_from_an_untrained_denoiser_is_refused(trained, tmp_path, capsys, stage):
     shutil.copytree(trained / "encoder", tmp_path / "encoder")
     assert train(tmp_path, stage) == 2
@@ -311,11 +331,11 @@ def test_two_processes_see_what_one_would(tmp_path):
 def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
     out = tmp_path / "packed"
     assert main(["weights", "pack", str(trained), str(out)]) == 0
-    assert str(trained / "heads" / "weights") in capsys.readouterr().out
-    student, packed = weights_of(trained / "heads"), from_pretrained(out).state_dict()
+    assert str(trained / "refiner" / "weights") in capsys.readouterr().out
+    student, packed = weights_of(trained / "refiner"), from_pretrained(out).state_dict()
     for name, tensor in student.items():
         assert torch.allclose(packed[name], tensor, rtol=2e-3, atol=1e-5), name
-    whole = (trained / "heads" / "weights" / "geoverse.safetensors").stat().st_size
+    whole = (trained / "refiner" / "weights" / "geoverse.safetensors").stat().st_size
     assert (out / "geoverse.safetensors").stat().st_size < 0.6 * whole
     settings = json.loads((out / "training_encoder.json").read_text())
     assert settings["encoder"]["optimizer"]["steps"] == 24 and settings["data"]["cache"] is None
@@ -325,7 +345,8 @@ def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
     os.utime(tmp_path / "again" / "reflow" / "weights" / "geoverse.safetensors")
     assert main(["weights", "pack", str(tmp_path / "again"), str(out)]) == 2
     assert "an earlier stage made" in capsys.readouterr().err
-    shutil.rmtree(tmp_path / "again" / "heads")
+    for later in ("heads", "refiner"):
+        shutil.rmtree(tmp_path / "again" / later)
     assert main(["weights", "pack", str(tmp_path / "again"), str(out)]) == 0
     assert (out / "log_reflow.jsonl").exists() and not (out / "log_heads.jsonl").exists()
     assert main(["weights", "pack", str(tmp_path / "nothing"), str(out)]) == 2

@@ -20,6 +20,7 @@ from gvtools.completers.base import (
     check_views,
 )
 from gvtools.completers.geoverse.completer_settings import GeoVerseSettings
+from gvtools.completers.geoverse.conditioning import filled
 from gvtools.completers.geoverse.context_views import chosen_views
 from gvtools.completers.geoverse.correction import seamless
 from gvtools.completers.geoverse.flow import interval_bounds
@@ -29,6 +30,7 @@ from gvtools.completers.geoverse.postprocess import (
     Completed,
     averaged,
     corrected,
+    refined,
     to_scene_scale,
 )
 from gvtools.completers.geoverse.resampling import model_size
@@ -218,12 +220,17 @@ class GeoVerseCompleter(Completer):
         if base is None:
             return decoded_in_scene_units(options.color_alignment or self.config.color_alignment)
         generated = seamless(generated, self.config.patch)
-        return corrected(
+        completed = corrected(
             generated,
             part,
             base,
             back=None if base_is_complete else decoded_in_scene_units("unchanged"),
         )
+        refiner = self.model.refiner
+        if refiner is None:
+            return completed
+        batch = filled(batch.to(self._device), self.config.hints)
+        return refined(completed, part, refiner, batch=batch, generated=generated)
 
     @property
     def _shift(self) -> float:

@@ -9,7 +9,7 @@ joint encoding, since it has nothing to tell and its black picture would disturb
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import torch
@@ -76,6 +76,9 @@ class ViewBatch:
         cam_from_world: (B, V, 4, 4).
         K: (B, V, 3, 3), px of ``images``, pixel centres at + 0.5.
         context: number of context views, at least one.
+        evidence: (B, V, 2, H, W) what the caller's fill of holes rests on: the confidence of its
+            depth, and the weight of the photographs that its colour was seen in, in [0, 1]; None
+            without such a fill.
     """
 
     images: Tensor
@@ -84,6 +87,7 @@ class ViewBatch:
     cam_from_world: Tensor
     K: Tensor
     context: int
+    evidence: Tensor | None = None
 
     def __post_init__(self) -> None:
         views, channels = self.images.shape[1:3] if self.images.ndim == 5 else (0, 0)
@@ -101,6 +105,11 @@ class ViewBatch:
         ):
             if tuple(value.shape) != shape:
                 raise ShapeError(f"{what} {tuple(value.shape)}; expected {shape}")
+        if self.evidence is not None and self.evidence.shape != (batch, views, 2, height, width):
+            raise ShapeError(
+                f"evidence {tuple(self.evidence.shape)}; expected "
+                f"{(batch, views, 2, height, width)}"
+            )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -118,7 +127,8 @@ class ViewBatch:
     def _each(self, change: Callable[[Tensor], Tensor]) -> ViewBatch:
         tensors = (self.images, self.depth, self.valid, self.cam_from_world, self.K)
         images, depth, valid, pose, K = (change(tensor) for tensor in tensors)
-        return ViewBatch(images, depth, valid, pose, K, self.context)
+        evidence = None if self.evidence is None else change(self.evidence)
+        return ViewBatch(images, depth, valid, pose, K, self.context, evidence)
 
 
 @dataclass(frozen=True)
@@ -174,7 +184,7 @@ def filled(batch: ViewBatch, config: HintConfig) -> ViewBatch:
     shape = batch.images.shape[:2]
     images = push_pull(batch.images.flatten(0, 1), flat).unflatten(0, shape)
     depth = push_pull_depth(batch.depth.flatten(0, 1), flat).unflatten(0, shape)
-    return ViewBatch(images, depth, batch.valid, batch.cam_from_world, batch.K, batch.context)
+    return replace(batch, images=images, depth=depth)
 
 
 @torch.no_grad()

@@ -15,6 +15,7 @@ from gvtools.completers.geoverse.conditioning import HintConfig
 from gvtools.completers.geoverse.control import ControlConfig
 from gvtools.completers.geoverse.denoiser import DenoiserConfig
 from gvtools.completers.geoverse.flow import check_bounds
+from gvtools.completers.geoverse.refiner import RefinerConfig
 from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
 from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
 from gvtools.completers.geoverse.video_prior.prior import VideoPriorConfig
@@ -113,6 +114,8 @@ class GeoVerseConfig:
             "correction" of the filled projection, see ``correction``; it needs ``hints.fill``.
         color_alignment: whether generated colours stay "unchanged" (the paper) or follow the
             memory's by a "field", see ``postprocess.aligned_color``.
+        refiner: what is asked how far completions are to be trusted, see ``refiner``; None for a
+            model without one. It needs ``composition = "correction"``.
         video: the video prior; None for a model without one.
         injection: how video features enter: "control", "shared" (MoT) or "none".
         control: of the control branch.
@@ -139,6 +142,7 @@ class GeoVerseConfig:
     alignment: str = "centres"
     color_alignment: str = "unchanged"
     composition: str = "decoded"
+    refiner: RefinerConfig | None = None
     video: VideoPriorConfig | None = field(default_factory=VideoPriorConfig)
     injection: str = "control"
     control: ControlConfig = field(default_factory=ControlConfig)
@@ -155,6 +159,8 @@ class GeoVerseConfig:
         check_choice("alignment", self.alignment, ("centres", "hint", "field"))
         if self.composition == "correction" and self.hints.fill == "none":
             raise OptionError("composition = 'correction' needs filled hints; set hints.fill")
+        if self.refiner is not None and self.composition != "correction":
+            raise OptionError("a refiner refines corrections; set composition = 'correction'")
         if (self.injection == "none") != (self.video is None):
             raise OptionError(
                 "a video prior needs injection = 'control' or 'shared', and 'none' goes without one"

@@ -30,6 +30,7 @@ from gvtools.completers.geoverse.flow import (
 from gvtools.completers.geoverse.injection import video_keys
 from gvtools.completers.geoverse.passes import Decoded, Prepared
 from gvtools.completers.geoverse.plucker import camera_condition
+from gvtools.completers.geoverse.refiner import Refiner
 from gvtools.completers.geoverse.rgb_head import RGBHead
 from gvtools.completers.geoverse.shared_attention import SharedAttention
 from gvtools.completers.geoverse.stages import Clock, no_clock
@@ -69,6 +70,8 @@ class GeoVerseNetworks(nn.Module):
                 heads=config.level1.heads,
                 video_channels=config.video.channels,
             )
+        # Used on completions, see ``postprocess.refined``; it stays float32.
+        self.refiner = None if config.refiner is None else Refiner(config.refiner)
         # Not a submodule: its weights live in a folder of their own and are never trained.
         self._video: list[VideoPrior] = []
         # True passes the video prior over: its branch is untrained and adds nothing.

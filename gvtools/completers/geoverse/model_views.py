@@ -62,6 +62,7 @@ def view_batch(
     joined = concatenate(cameras)
     seen = torch.ones((len(context), 1, *size), dtype=torch.bool)
     depth = torch.cat((torch.stack(depths), projected))
+    evidence = None if fill is None else _evidence(fill, len(context), size)
     relative, unit = _relative(joined, depth)
     batch = ViewBatch(
         images=torch.cat((torch.stack(pictures), rgb))[None],
@@ -70,6 +71,7 @@ def view_batch(
         cam_from_world=torch.from_numpy(relative).float()[None],
         K=torch.from_numpy(joined.K).float()[None],
         context=len(context),
+        evidence=evidence,
     )
     return batch, joined
 
@@ -121,6 +123,14 @@ def _over(rgb: Tensor, depth: Tensor, valid: Tensor, *, fill: Filled) -> tuple[T
     lengths = F.interpolate(lengths, size=size, mode="nearest-exact")
     color = torch.where(lengths > 0, color, 0.0)
     return torch.where(valid, rgb, color), torch.where(valid, depth, lengths)
+
+
+def _evidence(fill: Filled, context: int, size: tuple[int, int]) -> Tensor:
+    """(1, V, 2, h, w) confidence of the fill and weight of the photographs; 0 on the context."""
+    nothing = np.zeros_like(fill.depth)
+    maps = [nothing if known is None else known for known in (fill.confidence, fill.looked_up)]
+    evidence = resampled(torch.from_numpy(np.stack(maps, 1)), size).clamp(0, 1)
+    return torch.cat((evidence.new_zeros((context, 2, *size)), evidence))[None]
 
 
 def _picture(picture: NDArray[np.float32], size: tuple[int, int]) -> Tensor:

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gvtools.cameras import Cameras
-from gvtools.completers.geoverse.correction import corrected_color, corrected_depth
+from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.correction import composed, corrected_color, corrected_depth
 from gvtools.completers.geoverse.depth_scale import MAX_FACTOR, both_known, pass_scale, scaled_depth
 from gvtools.completers.geoverse.passes import Generated
+from gvtools.completers.geoverse.refiner import Refiner, completed_views
 from gvtools.completers.geoverse.resampling import resampled, resampled_depth
 from gvtools.completers.push_pull import Filled, push_pull, push_pull_depth
 from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
@@ -28,6 +30,8 @@ GENERATED = 0.9
 UNSCALED = 0.1
 # What remains of a fill's confidence where the model moves its depth, and in such a view.
 DOUBTED = 0.5
+# Confidence of a refined pixel whose depth is right for certain.
+REFINED = 0.5
 # A view's scale is taken from at least so many pixels, and from about so many at most.
 LEAST, LOOKED_AT = 50, 5_000
 
@@ -168,6 +172,41 @@ def corrected(
             else alignment
             for view, alignment in zip(known, back.alignment, strict=True)
         ),
+    )
+
+
+@torch.no_grad()
+def refined(
+    completed: Completed,
+    guidance: Guidance,
+    refiner: Refiner,
+    *,
+    batch: ViewBatch,
+    generated: Generated,
+) -> Completed:
+    """Completed views with the refiner's colours, and its confidence, in their holes.
+
+    Args:
+        completed: at the targets' size.
+        guidance: the targets' projections.
+        refiner: on the device of the pass.
+        batch: filled as the model saw it (``conditioning.filled``).
+        generated: of the pass, with the hints' decoding.
+    """
+    full = (guidance.depth.shape[1], guidance.depth.shape[2])
+    made, _ = composed(batch, generated.decoded, generated.hint)
+    finite = made.isfinite()
+    found = refiner(completed_views(batch, torch.where(finite, made, 0.0)))
+    found = replace(found, **{name: values.cpu() for name, values in vars(found).items()})
+    valid = torch.from_numpy(guidance.valid)[:, None]
+    rgb = torch.from_numpy(completed.rgb).permute(0, 3, 1, 2)
+    rgb = found.colors(rgb, valid).clamp(0, 1)
+    right = resampled(found.depth_right, full).sigmoid()[:, 0].numpy()
+    certain = np.where(completed.depth > 0, REFINED * right**4, 0)
+    return replace(
+        completed,
+        rgb=rgb.permute(0, 2, 3, 1).numpy(),
+        confidence=np.where(guidance.valid, completed.confidence, certain).astype(np.float32),
     )
 
 

@@ -1,0 +1,133 @@
+"""The refiner's stage: what it is shown is changed alike, kept, and learnt from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import geoverse_models as micro
+import pytest
+import torch
+
+from gvtools.completers.geoverse.refiner import CompletedViews, RefinerConfig
+from gvtools.errors import OptionError
+from gvtools.training.batch import TrainingBatch
+from gvtools.training.draws import Draws
+from gvtools.training.options import RefinerStageOptions
+from gvtools.training.refiner_stage import CUT, RefinerStage, changed, view_errors
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def draws(step: int = 0, samples: int = 2) -> Draws:
+    return Draws(0, "refiner", step, tuple(range(samples)))
+
+
+@pytest.mark.parametrize("step", range(6))
+def test_views_and_truth_are_changed_alike(step):
+    generator = torch.Generator().manual_seed(step)
+    picture = torch.rand(4, 3, 32, 40, generator=generator)
+    place = torch.arange(32.0 * 40).reshape(1, 1, 32, 40).expand(4, 1, 32, 40)
+    views = CompletedViews(
+        filled=picture,
+        depth=place,
+        valid=place % 2 == 0,
+        evidence=place.expand(4, 2, 32, 40),
+        made=picture,
+        mean=picture[..., 3, 4],
+    )
+    found, truth, (where,) = changed(views, picture, [place], draws=draws(step))
+    height, width = truth.shape[-2:]
+    assert CUT * 32 - 1 <= height <= 32 and height % 2 == width % 2 == 0
+    assert torch.equal(found.made, truth) and torch.equal(found.filled, truth)
+    assert torch.equal(found.depth, where) and torch.equal(found.evidence[:, 1:], where)
+    assert torch.equal(found.valid, where % 2 == 0)
+    # Pixels keep their neighbours, and a sample's views are changed alike.
+    step_right = (where[..., 1:] - where[..., :-1]).unique()
+    assert step_right.numel() <= 2 and set(step_right.abs().tolist()) == {1.0}
+    assert torch.equal(where[0], where[1]) and torch.equal(where[2], where[3])
+    # The mean colour is changed as a pixel of that colour.
+    at = (where[0, 0] == 3 * 40 + 4).nonzero()
+    if len(at):
+        row, column = at[0].tolist()
+        assert torch.allclose(found.mean[0], truth[0, :, row, column])
+
+
+def test_steps_change_views_differently():
+    picture = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    one = torch.ones(2, 1, 16, 16)
+    views = CompletedViews(
+        picture, one, one > 0, one.expand(2, 2, 16, 16), picture, one[:, :, 0, 0].expand(2, 3)
+    )
+    shown = [changed(views, picture, [], draws=draws(step))[1] for step in (1, 1, 2)]
+    assert torch.equal(shown[0], shown[1])
+    assert shown[0].shape != shown[2].shape or not torch.equal(shown[0], shown[2])
+
+
+def test_errors_are_of_holes_alone():
+    truth = torch.zeros(2, 3, 4, 4)
+    made, holes = truth.clone(), torch.zeros(2, 1, 4, 4, dtype=torch.bool)
+    made[0, :, :2] = 0.5
+    holes[0, :, 1:] = True
+    error, count = view_errors(made, truth, holes)
+    assert count.tolist() == [12, 0]
+    torch.testing.assert_close(error, torch.tensor([0.25 * 4 / 12, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def stage() -> RefinerStage:
+    configuration = micro.config(
+        hints={"fill": "surfaces"},
+        composition="correction",
+        refiner=RefinerConfig(widths=(8, 16)),
+    )
+    return RefinerStage(micro.model(configuration), RefinerStageOptions())
+
+
+def training_batch() -> TrainingBatch:
+    views = micro.batch(2)
+    truth = torch.full_like(views.images, 0.4)
+    views = replace(views, images=torch.where(views.valid, truth, 0.0))
+    return TrainingBatch(views, truth, 2 + torch.rand_like(views.depth))
+
+
+def test_it_completes_a_sample_once_and_learns_from_it(stage):
+    batch = training_batch()
+    calls = []
+    made = stage._made
+    stage._made = lambda views, names: calls.append(len(names)) or made(views, names)
+    assert {name.split(".")[1] for name, p in stage.named_parameters() if p.requires_grad} == {
+        "refiner"
+    }
+    learning = [p for p in stage.parameters() if p.requires_grad]
+    optimizer = torch.optim.Adam(learning, 5e-3)
+    values = []
+    for step in range(12):
+        loss, terms = stage(batch, draws(step))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        values.append(float(terms["gain"].detach()))
+    assert calls == [2]
+    # The truth is one colour, that of what is known: everything but the core's picture is right.
+    assert values[-1] > max(values[0], 0) + 1
+
+
+def test_what_is_kept_is_what_is_made(stage):
+    batch = training_batch()
+    stage._kept.clear()
+    fresh = stage._completions(batch.views)
+    kept = stage._completions(batch.views)
+    turned = stage._completions(batch.views.samples(torch.tensor([1, 0])))
+    for one, two, three in zip(fresh, kept, turned, strict=True):
+        assert torch.equal(one, two) and torch.equal(one[[1, 0]], three)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"refiner": None}, {"composition": "decoded", "refiner": None}]
+)
+def test_a_model_without_a_refiner_is_refused(changes):
+    configuration = micro.config(
+        **{"hints": {"fill": "surfaces"}, "composition": "correction", **changes}
+    )
+    with pytest.raises(OptionError, match="stage refiner: expected a model with refiner"):
+        RefinerStage(micro.model(configuration), RefinerStageOptions())
