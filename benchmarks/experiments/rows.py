@@ -44,7 +44,7 @@ def geoverse(weights: Path | None, **options: object) -> Completer:
 
 @contextmanager
 def with_heads_of(teacher: Path, student: Path | None) -> Iterator[Path]:
-    """A folder with the teacher's denoisers and the student's heads, while the block runs.
+    """A folder with the teacher's denoisers, the student's heads and refiner, while the block runs.
 
     Heads that are trained after a distillation would otherwise be compared with those before it,
     and their gain be taken for the distillation's.
@@ -56,6 +56,7 @@ def with_heads_of(teacher: Path, student: Path | None) -> Iterator[Path]:
     model, other = from_pretrained(teacher), from_pretrained(student or SHIPPED)
     model.rgb_head.load_state_dict(other.rgb_head.state_dict())
     model.geometry.head.load_state_dict(other.geometry.head.state_dict())
+    model.refiner = other.refiner
     model.config = other.config
     with tempfile.TemporaryDirectory() as folder:
         save_pretrained(model, folder)

@@ -248,15 +248,15 @@ class StageRun:
         return model
 
     def _model_of(self, source: Path) -> GeoVerse:
-        """The model of a weights folder, with a fresh refiner where stage "refiner" needs one."""
-        config = self.model_config
-        if config.refiner is None or config_of(source).refiner is not None:
-            return from_pretrained(source, config=config)
-        model = from_pretrained(source, config=replace(config, refiner=None))
+        """The model of a weights folder: its refiner is left out, or a fresh one put in."""
+        wanted, found = self.model_config.refiner, config_of(source).refiner
+        model = from_pretrained(source, config=replace(self.model_config, refiner=found))
+        if wanted == found:
+            return model
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.config.seed)
-            model.refiner = Refiner(config.refiner)
-        model.config = config
+            model.refiner = None if wanted is None else Refiner(wanted)
+        model.config = self.model_config
         return model
 
     def _refuse_unfinished(self, before: Sequence[str]) -> None:

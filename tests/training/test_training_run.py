@@ -121,6 +121,15 @@ def test_the_last_stage_adds_a_refiner_and_moves_nothing_else(trained):
     assert 0 < record["depth_right"] < 2 and 3 < record["psnr"] < 60
 
 
+def test_an_earlier_stage_leaves_the_refiner_of_its_start_out(trained, tmp_path):
+    start = ["--init", str(trained / "refiner" / "weights")]
+    assert train(tmp_path, "heads", *steps("heads", 1), *start) == 0
+    assert from_pretrained(tmp_path / "heads" / "weights").refiner is None
+    assert train(tmp_path / "again", "refiner", *steps("refiner", 1), *start) == 0
+    names = moved(trained / "refiner", tmp_path / "again" / "refiner")
+    assert names and all(name.startswith("refiner.") for name in names)
+
+
 def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
     shutil.copytree(trained / "reflow", tmp_path / "reflow")
     rays = ["--set", "heads.rgb=0", "--set", "heads.depth=0", *steps("heads", 2)]

@@ -175,7 +175,10 @@ class Refiner(nn.Module):
         rest = offset + sum(
             share * guess for share, guess in zip(shares[:, 1:].split(1, 1), guesses, strict=True)
         )
-        return Refinement(shares[:, :1], rest, out[:, -1:])
+        # Of a view that nothing is known of there is no fill: the core's picture is all there is.
+        some = _some_known(small)
+        share = torch.where(some, shares[:, :1], 1.0)
+        return Refinement(share, torch.where(some, rest, 0.0), out[:, -1:])
 
 
 class _Block(nn.Module):
@@ -230,15 +233,19 @@ def _mean_color(small: _Half) -> Tensor:
     return (total / count)[:, :, None, None]
 
 
+def _some_known(small: _Half) -> Tensor:
+    """(N, 1, 1, 1) bool, whether anything is known of a view."""
+    return small.valid.flatten(1).any(1)[:, None, None, None]
+
+
 def _guesses(small: _Half, mean: Tensor) -> list[Tensor]:
     """GUESSES pictures (N, 3, h, w), from sharp to smooth."""
     weight = _blurred(small.share, KNOWN) + PRIOR_WEIGHT
     pulled = push_pull(small.known / small.share.clamp_min(1e-6), small.valid)
-    some = small.valid.flatten(1).any(1)[:, None, None, None]
     return [
         _blurred(small.made, NARROW),
         _blurred(small.made, WIDE),
-        torch.where(some, pulled, mean),
+        torch.where(_some_known(small), pulled, mean),
         (_blurred(small.known, KNOWN) + PRIOR_WEIGHT * mean) / weight,
         mean.expand_as(small.made),
     ]

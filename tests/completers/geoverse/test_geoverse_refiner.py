@@ -12,6 +12,7 @@ from gvtools.completers import create
 from gvtools.completers.geoverse.conditioning import filled
 from gvtools.completers.geoverse.postprocess import REFINED
 from gvtools.completers.geoverse.refiner import (
+    PRIOR_PIXELS,
     CompletedViews,
     Refiner,
     RefinerConfig,
@@ -81,21 +82,28 @@ def test_colours_are_mixed_of_what_is_there_and_a_bounded_offset():
     assert torch.allclose(still(plain).colors(plain.made, plain.valid), grey, atol=1e-5)
 
 
-def test_a_view_of_which_nothing_is_known_may_take_the_photographs_mean():
-    given = views(1)
+def test_a_view_of_which_nothing_is_known_keeps_the_cores_picture():
+    given = views(2)
     nothing = replace(
         given,
         valid=torch.zeros_like(given.valid),
         depth=torch.zeros_like(given.depth),
         evidence=torch.zeros_like(given.evidence),
     )
+    found = refiner()(nothing)
+    assert torch.equal(found.colors(nothing.made, nothing.valid), nothing.made)
+    # A pixel is enough, and most of its mean is the photographs'.
+    nothing.valid[1, :, 4, 6] = True
     network = refiner(awake=False)
     with torch.no_grad():
         # All to the last guess.
         network.leave.bias[5] = 50.0
     picture = network(nothing).colors(nothing.made, nothing.valid)
-    expected = given.mean[:, :, None, None].expand_as(picture)
-    assert torch.allclose(picture, expected, atol=1e-4)
+    assert torch.equal(picture[0], nothing.made[0])
+    hole = picture[1][:, ~nothing.valid[1, 0]]
+    share = 0.25 / (0.25 + PRIOR_PIXELS)
+    expected = torch.lerp(given.mean[1], given.filled[1, :, 4, 6], share)
+    assert torch.allclose(hole, expected[:, None].expand_as(hole), atol=1e-4)
 
 
 @pytest.mark.parametrize("size", [(16, 16), (18, 34), (7, 9), (24, 2)])
