@@ -149,10 +149,10 @@ class Refiner(nn.Module):
         self.ascending = nn.ModuleList(_Block(width) for width in widths[:-1])
         self.leave = nn.Conv2d(widths[0], 1 + GUESSES + 3 + 1, 1)
         # Untrained it changes little.
+        bias = torch.zeros(1 + GUESSES + 3 + 1)
+        bias[0] = TRUST
         nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)
-        with torch.no_grad():
-            self.leave.bias[0] = TRUST
+        self.leave.bias = nn.Parameter(bias)
 
     def forward(self, views: CompletedViews) -> Refinement:
         """What to make of N views."""
