@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import invert_rigid
-from gvtools.capture.odometry import Pair, chained, compare, start_from_features
+from gvtools.capture.odometry import Pair, chained, compare, start_from_features, within
 from gvtools.capture.pose_graph import connected, first_poses, optimised, residual
 from gvtools.capture.rgbd_frames import RgbdFrames
 
@@ -169,17 +169,12 @@ def _keyframes(count: int, chain: dict[int, Pair]) -> list[int]:
             pose = np.eye(4)
             continue
         pose = pose @ chain[at].target_from_source
-        if not _within(pose, KEY_SHIFT, KEY_TURN):
+        if not within(pose, KEY_SHIFT, KEY_TURN):
             keys.append(at)
             pose = np.eye(4)
     if keys[-1] != count - 1:
         keys.append(count - 1)
     return keys
-
-
-def _within(pose: Float64, shift: float, turn: float) -> bool:
-    cosine = np.clip((np.trace(pose[:3, :3]) - 1) / 2, -1, 1)
-    return bool(np.linalg.norm(pose[:3, 3]) <= shift and np.degrees(np.arccos(cosine)) <= turn)
 
 
 def _loops_alike(
@@ -217,7 +212,7 @@ def _loops_near(
         near = []
         for target in keyframes[:row]:
             start = invert_rigid(poses[target]) @ poses[source]
-            if (source, target) not in pairs and _within(start, NEAR_SHIFT, NEAR_TURN):
+            if (source, target) not in pairs and within(start, NEAR_SHIFT, NEAR_TURN):
                 near.append((float(np.linalg.norm(start[:3, 3])), target, start))
         for _, target, start in sorted(near, key=lambda item: item[:2])[:NEAR]:
             pair = compare(frames, source, target, start=start)
