@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras
+from gvtools.capture.bag import take_apart
 from gvtools.capture.project import REPORT, replaced_folder
 from gvtools.capture.rgbd_frames import RgbdFrames
 from gvtools.capture.rgbd_poses import Found, find_poses
@@ -97,7 +98,7 @@ def capture_rgbd(
     """Find the poses of an RGB-D recording, and write a project.
 
     Args:
-        source: a folder of colour and depth, see ``gvtools.scenes.unposed``.
+        source: a folder of colour and depth, see ``gvtools.scenes.unposed``, or a ``.bag``.
         out: the project's folder; must not hold anything yet.
         options: what the folder does not tell by itself.
         say: told of each step.
@@ -106,6 +107,32 @@ def capture_rgbd(
         ProjectError: no RGB-D recording, no two frames that agree, or no place to write.
         OptionError: options that contradict each other.
     """
+    with replaced_folder(out) as work:
+        folder = source
+        if source.is_file():
+            folder = work / "recording"
+            say(f"taking {source} apart")
+            unit = take_apart(source, folder)
+            options = (options or RgbdOptions()).replaced(depth_unit=unit)
+        recording, scene, resolved = _read(folder, options)
+        say(f"comparing {len(scene)} frames")
+        found = find_poses(RgbdFrames(scene), say=say)
+        if len(found.poses) < 2:
+            raise ProjectError(
+                f"{source}: no two of {len(scene)} frames agree in colour and depth; expected "
+                "neighbours that share most of what they show; look at --color-intrinsics, "
+                "--depth-intrinsics and --depth-unit, and record with slower motion"
+            )
+        names = _names(recording)
+        report = _report(scene, found, names, sources=recording)
+        _write(work, recording, resolved, found=found, names=names)
+        write_json(work / REPORT, report.to_dict())
+        shutil.rmtree(work / "recording", ignore_errors=True)
+    return report
+
+
+def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene, RgbdOptions]:
+    """The recording in the order of its scene's views, the scene, and the options in force."""
     resolved, met = resolve_options(source, options)
     recording = read_unposed(source, resolved)
     if recording is None:
@@ -119,27 +146,8 @@ def capture_rgbd(
         )
     recording = replace(recording, findings=[*met, *recording.findings])
     scene = rgbd_scene(recording, resolved)
-    recording = _in_order(recording, scene)
-    with replaced_folder(out) as work:
-        say(f"comparing {len(scene)} frames")
-        found = find_poses(RgbdFrames(scene), say=say)
-        if len(found.poses) < 2:
-            raise ProjectError(
-                f"{source}: no two of {len(scene)} frames agree in colour and depth; expected "
-                "neighbours that share most of what they show; look at --color-intrinsics, "
-                "--depth-intrinsics and --depth-unit, and record with slower motion"
-            )
-        names = _names(recording)
-        report = _report(scene, found, names, sources=recording)
-        _write(work, recording, resolved, found=found, names=names)
-        write_json(work / REPORT, report.to_dict())
-    return report
-
-
-def _in_order(recording: Recording, scene: Scene) -> Recording:
-    """The recording with its frames in the order of the scene's views."""
     frames = {frame.name: frame for frame in recording.frames}
-    return replace(recording, frames=[frames[name] for name in scene.names])
+    return replace(recording, frames=[frames[name] for name in scene.names]), scene, resolved
 
 
 def _names(recording: Recording) -> list[str]:

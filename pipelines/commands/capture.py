@@ -55,20 +55,26 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: nothing that can be used, or no place to write to.
     """
+    from gvtools.capture.bag import SUFFIX as BAG
     from gvtools.capture.project import capture_photographs
     from gvtools.scenes.project import VIDEOS
     from gvtools.scenes.unposed import count_unposed
 
     if not args.input.exists():
-        raise ProjectError(f"{args.input}: no such file or folder; expected photographs or a video")
-    if args.input.is_file() and args.input.suffix.lower() not in VIDEOS:
+        raise ProjectError(
+            f"{args.input}: no such file or folder; expected photographs, a video, or a folder of "
+            "colour and depth"
+        )
+    is_bag = args.input.is_file() and args.input.suffix.lower() == BAG
+    if args.input.is_file() and not is_bag and args.input.suffix.lower() not in VIDEOS:
         raise OptionError(
-            f"{args.input}: expected a folder of photographs, or a video ({', '.join(VIDEOS)})"
+            f"{args.input}: expected a folder of photographs or of colour and depth, a video "
+            f"({', '.join(VIDEOS)}), or a RealSense recording ({BAG})"
         )
     if args.masks is not None and not args.masks.is_dir():
         raise ProjectError(f"--masks {args.masks}: no such folder")
     reading = rgbd_reading_of(args)
-    if args.input.is_dir() and count_unposed(args.input):
+    if is_bag or (args.input.is_dir() and count_unposed(args.input)):
         _run_rgbd(args, reading, console)
         return
     if reading:
@@ -90,7 +96,7 @@ def _run_rgbd(args: argparse.Namespace, reading: dict[str, Any], console: Consol
     from gvtools.scenes.project import is_project
     from gvtools.scenes.reading import rgbd_options
 
-    if is_project(args.input):
+    if args.input.is_dir() and is_project(args.input):
         raise ProjectError(
             f"{args.input}: has poses already; expected a recording without; give it to gvtools "
             "reconstruct as it is"

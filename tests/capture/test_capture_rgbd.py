@@ -197,6 +197,10 @@ def test_what_cannot_be_captured_is_refused(walked, recording, captured, tmp_pat
         tmp_path / "strange", walked[1][:2], np.stack([walked[2][0], np.zeros_like(walked[2][0])])
     )
     assert "no two of 2 frames agree" in refused(capsys, "capture", strange, "--out", out)
+    (tmp_path / "damaged.bag").write_bytes(bytes(1000))
+    assert "Open3D cannot read it" in refused(
+        capsys, "capture", tmp_path / "damaged.bag", "--out", out
+    )
     assert not out.exists()
     assert not list(tmp_path.glob(".*"))
 
