@@ -102,7 +102,7 @@ class RgbdFrames:
             o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(rgb))),
             o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth[..., None]))),
         )
-        return SmallFrame(image, depth)
+        return SmallFrame(image, np.asarray(depth, np.float32))
 
     def features(self, index: int) -> Features:
         """What a frame is recognised by; kept, so ask for keyframes alone.
@@ -124,9 +124,9 @@ class RgbdFrames:
         depth = cv2.resize(frame.depth, self.feature_size, interpolation=cv2.INTER_NEAREST)
         keypoints, descriptors = cv2.SIFT.create(MAX_FEATURES).detectAndCompute(grey, None)
         small = cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64)
-        small = cv2.GaussianBlur(small, (0, 0), 1.0).ravel()
-        small -= small.mean()
-        thumbnail = small / max(float(np.linalg.norm(small)), 1e-9)
+        blurred = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0), np.float64).ravel()
+        blurred -= blurred.mean()
+        thumbnail = blurred / max(float(np.linalg.norm(blurred)), 1e-9)
         if not keypoints:
             empty = np.zeros((0, 3))
             return Features(

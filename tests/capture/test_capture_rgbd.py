@@ -1,3 +1,4 @@
+# mypy: no-check-untyped-defs
 """RGB-D recordings without poses become projects."""
 
 from __future__ import annotations
@@ -88,6 +89,7 @@ def test_a_tum_recording_keeps_its_depth_unit_and_its_order(walked, tmp_path) ->
     report = capture_rgbd(source, tmp_path / "project")
     assert worst_centre(tmp_path / "project", poses[:4]) < 0.01
     first = open_project(tmp_path / "project").views[0].load()
+    assert first.depth is not None
     np.testing.assert_allclose(first.depth, depth[0] / 1000, atol=1e-3)
     np.testing.assert_array_equal(first.rgb, rgb[0])
     assert report.sources["frame-000001.color.png"] == "rgb/1000.033333.png"
@@ -110,7 +112,7 @@ def test_a_depth_camera_of_its_own_and_given_intrinsics_go_into_the_project(
     assert sidecar["color_from_depth"] == np.eye(4).tolist()
     np.testing.assert_allclose(
         open_project(out).cameras.K[0],
-        [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]],
+        np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], float),
     )
 
 

@@ -1,3 +1,4 @@
+# mypy: no-check-untyped-defs
 """The refiner's stage: what it is shown is changed alike, kept, and learnt from."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# mypy: no-check-untyped-defs
 from __future__ import annotations
 
 from dataclasses import replace
