@@ -203,6 +203,9 @@ def refined(
     rgb = found.colors(rgb, valid).clamp(0, 1)
     right = resampled(found.depth_right, full).sigmoid()[:, 0].numpy()
     certain = np.where(completed.depth > 0, REFINED * right**4, 0)
+    # Where the model's depth is far from the memory's, what was said before holds, too.
+    unscaled = ~np.isfinite(completed.scales)[:, None, None]
+    certain = np.where(unscaled, np.minimum(certain, completed.confidence), certain)
     return replace(
         completed,
         rgb=rgb.permute(0, 2, 3, 1).numpy(),
