@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,12 +97,14 @@ class RgbdFrames:
         frame = self.scene.views[index].load()
         assert frame.depth is not None
         rgb = cv2.resize(frame.rgb, self._size, interpolation=cv2.INTER_AREA)
-        depth = cv2.resize(frame.depth, self._size, interpolation=cv2.INTER_NEAREST)
+        depth = np.asarray(
+            cv2.resize(frame.depth, self._size, interpolation=cv2.INTER_NEAREST), np.float32
+        )
         image = o3d.t.geometry.RGBDImage(
             o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(rgb))),
             o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth[..., None]))),
         )
-        return SmallFrame(image, np.asarray(depth, np.float32))
+        return SmallFrame(image, depth)
 
     def features(self, index: int) -> Features:
         """What a frame is recognised by; kept, so ask for keyframes alone.
@@ -123,10 +125,7 @@ class RgbdFrames:
         grey = cv2.resize(grey, self.feature_size, interpolation=cv2.INTER_AREA)
         depth = cv2.resize(frame.depth, self.feature_size, interpolation=cv2.INTER_NEAREST)
         keypoints, descriptors = cv2.SIFT.create(MAX_FEATURES).detectAndCompute(grey, None)
-        small = cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64)
-        blurred = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0), np.float64).ravel()
-        blurred -= blurred.mean()
-        thumbnail = blurred / max(float(np.linalg.norm(blurred)), 1e-9)
+        thumbnail = _thumbnail(grey)
         if not keypoints:
             empty = np.zeros((0, 3))
             return Features(
@@ -139,6 +138,16 @@ class RgbdFrames:
         points = rays * np.where(z > 0, z, np.nan)[:, None]
         rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
         return Features(pixels, rooted, points, thumbnail)
+
+
+def _thumbnail(grey: NDArray[Any]) -> NDArray[np.float64]:
+    """A grey picture's small copy as a row of zero mean and unit length."""
+    import cv2
+
+    small = cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA)
+    row = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0), np.float64).ravel()
+    row -= row.mean()
+    return row / max(float(np.linalg.norm(row)), 1e-9)
 
 
 def _reduced(width: int, height: int, *, side: int) -> tuple[int, int]:

@@ -21,7 +21,7 @@ SURE = 0.9
 # A frame is compared with those so many before it; every n-th with the one n before.
 GAPS = (2, 4, 8, 16, 32)
 # A new keyframe after so much motion [m, degrees].
-KEY_SHIFT, KEY_TURN = 0.15, 12.0
+KEY_SHIFT, KEY_TURN = 0.08, 5.0
 # A keyframe is compared with so many of those that look most like it, or are near by their poses.
 ALIKE, NEAR = 6, 4
 # Near: within these [m, degrees].
@@ -97,6 +97,7 @@ def find_poses(frames: RgbdFrames, *, say: Say = lambda text: None) -> Found:
 
 
 def _solve(count: int, pairs: list[Pair]) -> tuple[list[int], dict[int, Float64]]:
+    """The largest connected part and its poses."""
     part = connected(count, pairs)[0]
     inside = set(part)
     own = sorted(
