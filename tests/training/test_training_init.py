@@ -81,6 +81,8 @@ def training(tmp_path_factory) -> str:
     data = json.loads((SHIPPED / "micro.json").read_text())
     for stage in STAGES:
         data[stage]["optimizer"]["steps"] = 1
+    # As ``base``: a model without a refiner.
+    del data["refiner"]
     (folder / "training.json").write_text(json.dumps({**data, "model": "model.json"}))
     return str(folder / "training.json")
 
