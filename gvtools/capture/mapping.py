@@ -1,10 +1,11 @@
 """Cameras from photographs: features, matching and mapping by pycolmap.
 
 Global mapping (GLOMAP, Pan et al. 2024) solves for all cameras at once. It can end in a model whose
-parts have different scales, with every picture registered and small reprojection errors (fox:
-centres wrong by 35 % of their extent, errors of 0.5 pixels). What tells such a model is how many
-verified matches became points: 69 % there, 94 % in the right one. So incremental mapping is tried
-as well where that share is low, and the model that explains more is kept.
+parts have different scales, with every picture registered and small reprojection errors (a scene of
+a stuffed fox: camera centres wrong by 35 % of their extent, errors of 0.5 pixels). Such a model is
+told by the share of verified matches that became 3D points: 69 % there, 94 % in the right one.
+Where that share is low, incremental mapping is tried as well, and the model with the larger share
+is kept.
 """
 
 from __future__ import annotations
@@ -25,18 +26,21 @@ if TYPE_CHECKING:
 
     import pycolmap
 
-# Up to so many pictures, all are matched with all.
+# Up to this many pictures, every pair is matched.
 EXHAUSTIVE = 60
-# A picture of a video is matched with so many after it, and with those 2, 4, 8, ... further on.
+# A frame of a video is matched with this many after it, and with those 16, 32, 64 and 128 later.
 SEQUENTIAL_OVERLAP = 10
-# Features of a picture at most, and the longer side that they are found at.
+# Most features of a picture, and the longer side that it is reduced to before, pixels.
 MAX_FEATURES, MAX_SIDE = 8192, 1600
-# A global model that explains a smaller share of the verified matches is not taken unseen.
+# Where a smaller share of the verified matches became points of the global model, it is compared
+# with an incremental one.
 ENOUGH = 0.9
-# A camera that fewer points hold is taken out: global mapping keeps some that a dozen points hold,
-# which bend the whole model (demo room: errors of centres of 28 % of the extent, 2 % without them).
+# A picture that sees fewer 3D points is deregistered: global mapping keeps some that see a dozen,
+# and these distort the whole model (demo room: camera centres wrong by 28 % of their extent, by 2 %
+# without them).
 LEAST_POINTS = 30
-# The principal point is refined where a camera took so many pictures; fewer do not tell it.
+# Principal points are refined where every camera took at least this many pictures; fewer do not
+# determine them.
 REFINED_FROM = 8
 SEED = 1
 
@@ -48,12 +52,12 @@ class Mapped:
     """What mapping found.
 
     Attributes:
-        model: the largest model.
-        how: "global" or "incremental".
-        others: numbers of registered pictures of further models, largest first.
+        model: the one with the most registered pictures; its scale is arbitrary.
+        how: "global" or "incremental" mapping.
+        others: how many pictures each further model registered, most first.
         matching: how pairs were chosen, in words.
         pairs: number of verified matches of each pair of pictures, by their names.
-        explained: share of these matches that became points of the model.
+        explained: share of these matches that became points of the model, 0 to 1.
     """
 
     model: pycolmap.Reconstruction
@@ -73,15 +77,17 @@ def find_cameras(
     masks: Path | None = None,
     say: Say = lambda text: None,
 ) -> Mapped:
-    """Find the cameras of pictures.
+    """Find intrinsics and poses of pictures.
 
     Args:
         images: the folder of the pictures.
         cameras: names of the pictures that each camera took; they share its intrinsics.
-        work: a folder for the database.
-        in_order: the pictures follow a path in the order of their names, as frames of a video do.
-        masks: ``NAME.png`` of pictures, black where features are not to be found; None for none.
-        say: told of each step.
+        work: a folder without files yet, for COLMAP's database and models.
+        in_order: the pictures follow a path in the order of their names, as frames of a video do;
+            then neighbours are matched, too, where there are too many pictures to match all pairs.
+        masks: folder of masks as COLMAP has them, ``a.jpg.png`` for ``a.jpg``, black where no
+            features are to be found; None for none.
+        say: is called with a line of text at each step.
 
     Raises:
         ProjectError: no two pictures overlap, or no model comes of those that do.
@@ -95,7 +101,7 @@ def find_cameras(
         say(f"finding features in {len(names)} pictures")
         for group in cameras:
             _extract(database, images, group, masks=masks)
-        how = _match(database, work, count=len(names), in_order=in_order, say=say)
+        matching = _match(database, work, count=len(names), in_order=in_order, say=say)
         pairs = _verified(database)
         if not pairs:
             raise ProjectError(
@@ -112,10 +118,10 @@ def find_cameras(
             f"{pairs[best]} matches), and no model comes of them; expected views from different "
             "places; take pictures while walking, not while turning on the spot"
         )
-    kind, models, share = found
-    first, *rest = sorted(models, key=lambda model: -model.num_reg_images())
+    how, models, share = found
+    largest, *rest = sorted(models, key=lambda model: -model.num_reg_images())
     others = tuple(model.num_reg_images() for model in rest)
-    return Mapped(first, kind, others, how, pairs=pairs, explained=share)
+    return Mapped(largest, how, others, matching, pairs=pairs, explained=share)
 
 
 def _extract(database: Path, images: Path, names: Sequence[str], *, masks: Path | None) -> None:
@@ -134,7 +140,7 @@ def _extract(database: Path, images: Path, names: Sequence[str], *, masks: Path 
 
 
 def _match(database: Path, work: Path, *, count: int, in_order: bool, say: Say) -> str:
-    """Match, and say how in words."""
+    """Match features of pairs of pictures; returns in words how the pairs were chosen."""
     import pycolmap
 
     verification = pycolmap.TwoViewGeometryOptions()
@@ -180,9 +186,10 @@ def _verified(database: Path) -> dict[tuple[str, str], int]:
 def _map(
     database: Path, images: Path, work: Path, *, pairs: Mapping[tuple[str, str], int], say: Say
 ) -> tuple[str, list[pycolmap.Reconstruction], float] | None:
-    """How the best models were made, these, and the share that the largest explains.
+    """The better of global and incremental mapping; None where neither gives a model.
 
-    None where there is no model.
+    Returns:
+        "global" or "incremental", its models, and ``explained`` of the largest of them.
     """
     import pycolmap
 
@@ -202,7 +209,7 @@ def _map(
         say("global mapping gives no model; trying incremental mapping")
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.random_seed = SEED
-    # A scene of few pictures is a model, too.
+    # COLMAP's default drops models of fewer than 10 pictures.
     pipeline.min_model_size = 3
     models = _models(
         pycolmap.incremental_mapping, database, images, out=work / "incremental", options=pipeline
@@ -252,7 +259,7 @@ def _models(
 
 
 def _settle(model: pycolmap.Reconstruction) -> None:
-    """Take cameras out that hardly any points hold, and adjust the rest once more."""
+    """Deregister pictures that see too few points, then bundle-adjust the rest once more."""
     import pycolmap
 
     for image in list(model.images.values()):
@@ -264,8 +271,8 @@ def _settle(model: pycolmap.Reconstruction) -> None:
     options.print_summary = False
     pycolmap.bundle_adjustment(model, options)
     images = [image for image in model.images.values() if image.has_pose]
-    taken = [sum(image.camera_id == camera for image in images) for camera in model.cameras]
-    if min(taken) >= REFINED_FROM:
+    counts = [sum(image.camera_id == camera for image in images) for camera in model.cameras]
+    if min(counts) >= REFINED_FROM:
         options.refine_principal_point = True
         pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
@@ -273,7 +280,7 @@ def _settle(model: pycolmap.Reconstruction) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep COLMAP's progress from the terminal; its errors become ours."""
+    """Keep COLMAP's log off the terminal; what fails is raised or reported by the caller."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel

@@ -1,9 +1,9 @@
 """Which picture stands for which view: by name, or by order where names do not match.
 
-Names are compared without folders of the pictures' own, without the ending of an image, and without
-what all pictures have before or behind the view's name (``generated_NAME.png``, ``NAME.rgb.png``).
-By order, the pictures in natural order of their names are the views in natural order of theirs;
-that needs as many pictures as views.
+Names are compared in lower case, without the file extension, without folders where that finds more
+partners, and without a prefix or suffix that most pictures share (``generated_NAME.png``,
+``NAME.rgb.png``). By order, both are sorted naturally by name (2 before 10), and the first picture
+stands for the first view and so on; that needs as many pictures as views.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Matching:
 
     Attributes:
         rule: "name" or "order".
-        picture_of: for each view the number of its picture; None where there is none.
+        picture_of: for each view the index of its picture; None where there is none.
         missing: names of the views without a picture.
         left_over: names of the pictures that stand for none of the views.
     """
@@ -51,15 +51,16 @@ def match_pictures(
     Args:
         pictures: names, folders included.
         views: names of the views that are to be judged.
-        rule: "name", "order", or "auto": by name where every view or every picture finds its
-            partner, by order where no name does and the numbers agree.
-        alphabetical: whether the pictures are counted in the order of the views' letters, in which
-            img10 stands before img2; "auto" is "order" then.
-        what: of messages: what the pictures are.
+        rule: "name", "order", or "auto": by name where any name matches, by order where none does
+            and there are as many pictures as views.
+        alphabetical: whether numbers in the pictures' names count the views in alphabetical order
+            (img10 before img2); "auto" is "order" then.
+        what: the pictures, as error messages call them.
 
     Raises:
-        OptionError: no picture; two pictures of one view; names of which only some match, though
-            the order would do as well; or an order that the numbers do not allow.
+        OptionError: no picture; two pictures of one view; no name that matches, by "name"; another
+            number of pictures than of views, by order; or, by "auto", only some names match while
+            there are as many pictures as views, so that either rule might be meant.
 
     >>> match_pictures(["r_2.png", "r_10.png"], ["2.jpg", "10.jpg"])
     Matching(rule='name', picture_of=(0, 1), missing=(), left_over=())
@@ -70,7 +71,7 @@ def match_pictures(
         raise OptionError(f"--match {rule!r}; expected one of {', '.join(RULES)}")
     if not pictures:
         raise OptionError(f"{what}: no picture; expected one for each of {len(views)} views")
-    # What counts the views is no view's name, even where it looks like one.
+    # Pictures that are numbered alphabetically must not be taken for views whose names are numbers.
     by_name = rule == "name" or (rule == "auto" and not alphabetical)
     named = _by_name(pictures, views, what) if by_name else None
     found = 0 if named is None else sum(number is not None for number in named)
@@ -122,7 +123,9 @@ def _natural_order(names: Sequence[str]) -> list[int]:
 
 
 def _by_name(pictures: Sequence[str], views: Sequence[str], what: str) -> list[int | None]:
-    """For each view the picture with its name, in the way that finds most partners.
+    """For each view the index of the picture with its name; None where there is none.
+
+    Names are compared with and without folders; what finds most partners is taken.
 
     Raises:
         OptionError: two pictures for one view.
@@ -144,22 +147,23 @@ def _by_name(pictures: Sequence[str], views: Sequence[str], what: str) -> list[i
 
 
 def _partners(pictures: Sequence[str], views: Sequence[str]) -> list[list[int]]:
-    """For each view the pictures that have its name between what all have before and behind it.
+    """For each view the indices of the pictures that have its name between a prefix and a suffix.
 
-    None where two ways to read the names find as many partners, and neither is the plain name.
+    Prefix and suffix are those that most pictures have, none if possible. No view has a picture
+    where several pairs of them are equally frequent.
     """
     index = {view: number for number, view in enumerate(views)}
-    pattern, around = _any_of(views), Counter[tuple[str, str]]()
+    pattern, affixes = _any_of(views), Counter[tuple[str, str]]()
     for picture in pictures:
-        around.update(
+        affixes.update(
             {(picture[: m.start(1)], picture[m.end(1) :]) for m in pattern.finditer(picture)}
         )
     out: list[list[int]] = [[] for _ in views]
-    most = max(around.values(), default=0)
-    ways = [ends for ends, count in around.items() if count == most]
-    if len(ways) != 1 and ("", "") not in ways:
+    most = max(affixes.values(), default=0)
+    commonest = [pair for pair, count in affixes.items() if count == most]
+    if len(commonest) != 1 and ("", "") not in commonest:
         return out
-    before, behind = ("", "") if ("", "") in ways else ways[0]
+    before, behind = ("", "") if ("", "") in commonest else commonest[0]
     for number, picture in enumerate(pictures):
         inner = picture[len(before) : len(picture) - len(behind)]
         if before + inner + behind == picture and inner in index:
@@ -168,7 +172,7 @@ def _partners(pictures: Sequence[str], views: Sequence[str]) -> list[list[int]]:
 
 
 def _any_of(views: Sequence[str]) -> re.Pattern[str]:
-    """A view's name that no letter or digit continues; the longest that fits at a place."""
+    """Matches any view's name as a whole word, the longest first; group 1 is the name."""
     names = "|".join(re.escape(view) for view in sorted(views, key=len, reverse=True))
     return re.compile(rf"(?=(?<![a-z0-9])({names})(?![a-z0-9]))")
 

@@ -1,7 +1,8 @@
-"""Samples of several sources by weight: which source a number has follows from seed and number.
+"""Training samples drawn from several sources in proportion to their weights.
 
-All draws of a mixture are fixed places of random streams, so that the sample of a number is the
-same on any number of processes and workers, and a million draws are one call.
+A sample's source follows from the seed and the sample's number (its index) alone: random numbers
+are read from a counter-based generator at a position that the index gives. So sample 1000 is the
+same on any number of processes and workers, and no earlier sample has to be drawn for it.
 """
 
 from __future__ import annotations
@@ -22,27 +23,31 @@ from gvtools.training.view_sample import Sample
 
 Float64 = NDArray[np.float64]
 
-# Of an invalid sample, the same source is asked so often, so that sources keep their shares; then
-# one of the others is drawn, until none is left.
+# After an invalid sample, another one is drawn from the same source, so that sources keep their
+# shares: this many attempts in all. Then another source is drawn, until none is left.
 TRIES = 10
-# Streams of a mixture.
+# Which random stream: that which chooses the source, and that which chooses the geometry.
 SOURCES, GEOMETRY = range(2)
-# Numbers that Philox makes in one step of its counter.
+# Random numbers that Philox makes in one step of its counter.
 _BLOCK = 4
-# Numbers that are spread evenly together.
+# Length of the blocks that ``stratified_at`` spreads evenly.
 _RUN = 1024
-# The source of procedural rooms.
+# Name of the source of procedural rooms.
 ROOMS = "rooms"
-# What notes begin with: samples by source, invalid ones by source and reason, where geometry
-# comes from.
+# Kinds of notes, which are ``KIND/SOURCE/...``: a sample of the source was drawn; one was invalid,
+# for the reason that follows; whose geometry it has. Training counts them.
 DRAWN, RESAMPLED, GEOMETRY_OF = "drawn", "resampled", "geometry"
 
 
 class Redrawable(Protocol):
-    """Samples by number, of which another one can be drawn."""
+    """Samples by index, of which another one can be drawn where one is invalid."""
 
     def sample(self, index: int, attempt: int = 0) -> Sample:
-        """The sample of a number; InvalidSampleError asks for the next attempt."""
+        """The sample of an index; each attempt gives another one.
+
+        Raises:
+            InvalidSampleError: not to be used; draw the next attempt.
+        """
         ...
 
     def describe(self) -> dict[str, Any]:
@@ -56,7 +61,7 @@ class Source:
 
     Attributes:
         name: unique in a mixture; part of the notes.
-        weight: its share is its part of the sum of all weights.
+        weight: 0 or more; its share of the samples is weight / sum of all weights.
         samples: drawn from it.
     """
 
@@ -92,26 +97,27 @@ class Mixture:
         return weights / weights.sum()
 
     def drawn(self, start: int, count: int, *, without: Collection[int] = ()) -> NDArray[np.int64]:
-        """(count,) which source the numbers from ``start`` on have.
+        """(count,) index of the source of each of the samples from ``start`` on.
 
         Args:
-            start: 0 or more.
-            count: how many.
-            without: sources that had no valid sample; not all of those with a share.
+            start: number of the first sample, 0 or more.
+            count: how many samples.
+            without: indices of sources that are not to be drawn; another one with a weight above 0
+                has to remain.
         """
         numbers = stratified_at(start, count, stream=[self.seed, MIXED, SOURCES, len(without)])
         shares = np.where(np.isin(np.arange(len(self.sources)), list(without)), 0, self.shares)
         ends = np.cumsum(shares) / shares.sum()
-        # Rounding must not leave a gap at the end, nor give it to a source of weight 0.
+        # If rounding leaves the last end below 1, the last source of weight above 0 gets the rest.
         last = int(np.flatnonzero(shares)[-1])
         return np.minimum(np.searchsorted(ends, numbers, side="right"), last)
 
     def sample(self, index: int) -> Sample:
-        """The sample of a number, 0 or more, with notes of what its drawing met.
+        """The sample of an index, 0 or more, with notes of its source and of invalid draws.
 
         Raises:
-            OptionError: a number below 0.
-            DegenerateError: nothing valid was found.
+            OptionError: an index below 0.
+            DegenerateError: no source has a valid sample.
         """
         if index < 0:
             raise OptionError(f"sample {index}; expected a number of 0 or more")
@@ -148,15 +154,16 @@ class Mixture:
 
 @dataclass(frozen=True)
 class OwnOrEstimated:
-    """Samples with a data set's own geometry or with estimated geometry, as the paper mixes them.
+    """Samples with a data set's own poses and depth, or with estimated ones, at a given ratio.
 
-    Where an estimate is drawn and none is at hand, the own geometry stands in; where own depth is
-    missing or incomplete, the estimate does. Both are noted.
+    The GeoVerse paper mixes both. Where the estimate is to be used and there is none, the data
+    set's own is; where own depth is missing or incomplete, the estimate is. Both cases are noted.
 
     Attributes:
-        own: with recorded poses and depth.
-        estimated: with estimated poses and depth; None where there are none.
-        own_share: of samples that are to have the own geometry; 2/3 for the paper's 2:1.
+        own: samples with recorded poses and depth.
+        estimated: samples with estimated poses and depth; None where there are none.
+        own_share: share of samples that are to have recorded geometry, 0 to 1; 2/3 for the paper's
+            2:1.
         seed: 0 or more.
     """
 
@@ -172,15 +179,15 @@ class OwnOrEstimated:
             raise OptionError("own share 0 without estimated geometry; expected some geometry")
 
     def wants_own(self, start: int, count: int, attempt: int = 0) -> NDArray[np.bool_]:
-        """(count,) whether the numbers from ``start`` on are to have the own geometry."""
+        """(count,) whether the samples from ``start`` on are to have recorded geometry."""
         stream = [self.seed, MIXED, GEOMETRY, attempt]
         return stratified_at(start, count, stream=stream) < self.own_share
 
     def sample(self, index: int, attempt: int = 0) -> Sample:
-        """The sample of a number, 0 or more; of each attempt another one.
+        """The sample of an index, 0 or more; each attempt gives another one.
 
         Raises:
-            InvalidSampleError: as of the geometry that was taken.
+            InvalidSampleError: from ``own`` or ``estimated``, whichever was taken.
         """
         if self.wants_own(index, 1, attempt)[0]:
             try:
@@ -201,12 +208,14 @@ class OwnOrEstimated:
 
 
 def stratified_at(start: int, count: int, *, stream: Sequence[int]) -> Float64:
-    """(count,) numbers in [0, 1) from a place of a random stream on, found without those before.
+    """(count,) random numbers in [0, 1): those at ``start``, ``start`` + 1, ... of a stream.
 
-    Each is uniform by itself. Every run of 1024, from a multiple of it, has one number in each
-    1/1024 in random order, so that what is drawn by them keeps closer to its shares than by
-    independent numbers: of fifteen sources, those miss three standard deviations with one seed in
-    thirty.
+    They do not depend on ``start`` and ``count`` otherwise, and take no time for those before.
+
+    Each number is uniform by itself, but each block of 1024 (from a multiple of 1024 on) is
+    stratified: it has one number in every interval of length 1/1024, in random order. So the
+    shares of what is drawn by them are closer to those wanted than with independent numbers, of
+    which one seed in thirty has one of fifteen sources more than three standard deviations off.
 
     >>> whole = stratified_at(0, 10, stream=[1, 2])
     >>> bool((stratified_at(7, 2, stream=[1, 2]) == whole[7:9]).all())
@@ -217,9 +226,9 @@ def stratified_at(start: int, count: int, *, stream: Sequence[int]) -> Float64:
     True
 
     Args:
-        start: 0 or more.
+        start: position in the stream, 0 or more.
         count: how many.
-        stream: names it; numbers of 0 or more.
+        stream: integers of 0 or more that name the stream, the seed among them.
     """
     first, last = start // _RUN, -(-(start + count) // _RUN)
     key = np.random.SeedSequence(list(stream)).generate_state(2, np.uint64)

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from gvtools.evaluation.splits import SceneSplit
     from gvtools.scenes.scene import Scene
 
-# Figures that take more than comparing pictures.
-OF_POSES = {"ate", "rpe_r", "rpe_t", "reproj", "met3r"}
+# Figures of poses and of consistency between views; the others compare pictures with their truth.
+BEYOND_PICTURES = {"ate", "rpe_r", "rpe_t", "reproj", "met3r"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +44,12 @@ class Cell:
     """What is measured, and where it is kept.
 
     Attributes:
-        benchmark: name of its specification.
+        benchmark: its name, that of a file in data_specs/benchmarks.
         root: folder of the data set, or of the projects.
         scene: its name.
         views: number of context views.
         method: what makes the pictures.
-        seconds: of each fit; None leaves it to the method.
+        seconds: time for fitting the appearance; None leaves it to the method.
         lpips: network of LPIPS and the folder of its weights; None where it is not measured.
         out: folder of the benchmark's results.
     """
@@ -70,26 +70,26 @@ class Cell:
 
     @property
     def result(self) -> Path:
-        """The file of the figures."""
+        """The JSON file of the figures."""
         return (self.out / "cells" / self.stem).with_name(f"{self.method.name}.json")
 
     @property
     def run(self) -> Path:
-        """The folder of the run, where gvtools makes the pictures."""
+        """The folder of the run; for pictures made elsewhere, of the memory of their context."""
         return self.out / "runs" / self.stem
 
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """A cell with what it is measured on.
+    """A cell with its opened scene.
 
     Attributes:
         cell: what is measured.
         benchmark: with the cell's number of context views.
         scene: at the benchmark's picture size.
-        split: of its views.
-        size: that picture size; None where it is the recorded one.
-        reading: how the run's scene is opened again.
+        split: its context and target views.
+        size: that picture size (width, height); None where the benchmark sets none.
+        reading: options by which later commands open the run's scene as it was here.
         lpips: the network; None leaves LPIPS out.
     """
 
@@ -103,19 +103,19 @@ class _Task:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """What the benchmark's figures need."""
+        """The parts of ``gvtools evaluate`` that the benchmark's figures need."""
         from pipelines.evaluation.measurement import PARTS
 
-        return PARTS if OF_POSES & set(self.benchmark.figures) else ("images",)
+        return PARTS if BEYOND_PICTURES & set(self.benchmark.figures) else ("images",)
 
     @property
     def views(self) -> dict[str, str]:
-        """Selections of the context and of the targets."""
+        """The context and the targets, as settings of a run name them."""
         return {"context": ",".join(self.split.context), "targets": ",".join(self.split.targets)}
 
 
 def measure_cell(cell: Cell) -> dict[str, Any]:
-    """Make the pictures of a cell, if they are not there, and measure them.
+    """Make the pictures of a cell, unless the method is a folder of pictures, and measure them.
 
     Returns:
         Figures and what they were measured on, JSON-ready.
@@ -132,8 +132,8 @@ def measure_cell(cell: Cell) -> dict[str, Any]:
     scene = prepared(recorded, split, size=size)
     lpips = None if cell.lpips is None else Lpips(cell.lpips[0], folder=cell.lpips[1])
     task = _Task(cell, benchmark, scene, split, size, reading_of(recorded, size), lpips)
-    of = _of_run if cell.method.pictures is None else _of_pictures
-    measured, pictures = of(task)
+    measure = _of_run if cell.method.pictures is None else _of_pictures
+    measured, pictures = measure(task)
     masks = {
         name: object_mask(benchmark, cell.root, scene=cell.scene, index=recorded.names.index(name),
                           shape=picture.shape[:2])
@@ -151,7 +151,7 @@ def measure_cell(cell: Cell) -> dict[str, Any]:
 
 
 def _of_run(task: _Task) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Figures, and completed pictures by target."""
+    """Run gvtools; its figures and cost, and its pictures (H, W, 3) uint8 by target."""
     from gvtools.runs.run import load_run
     from pipelines.evaluation.record import described
     from pipelines.evaluation.run_evaluation import evaluate_run
@@ -172,7 +172,7 @@ def _of_run(task: _Task) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def _reconstruct(task: _Task) -> float:
-    """Run the method from its start; seconds from the opened scene to the finished run."""
+    """Run the method; returns the seconds from the opened scene to the finished run."""
     from gvtools.settings import with_values
     from pipelines.reconstruction.compile_kernels import compile_kernels
     from pipelines.reconstruction.run import reconstruct
@@ -180,13 +180,13 @@ def _reconstruct(task: _Task) -> float:
     from pipelines.report.write import draw_run
 
     cell, benchmark = task.cell, task.benchmark
-    # The size of the pictures is the benchmark's, also of methods that would work on smaller ones.
+    # All methods work at the benchmark's size, also profiles that would reduce pictures further.
     side = RunSettings().max_side if task.size is None else None
     decided: dict[str, Any] = {**task.views, "seed": 0, "max_side": side}
     if benchmark.targets is not None:
         decided |= {"views_per_round": benchmark.targets, "rounds": benchmark.rounds}
     config = with_values(cell.method.config(seconds=cell.seconds), decided)
-    # What a kill left is made anew, so that seconds are those of a whole run.
+    # A killed run is started from scratch, so that the seconds are those of a whole run.
     shutil.rmtree(cell.run, ignore_errors=True)
     make_folder(cell.run.parent)
     compile_kernels(config, Silent())
@@ -198,7 +198,8 @@ def _reconstruct(task: _Task) -> float:
 def _of_pictures(task: _Task) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Figures of pictures in a folder, as ``gvtools judge`` has them, and the pictures by target.
 
-    Regions and poses are by a memory of the context alone, which lies in the cell's run.
+    What the context observed, and the poses that pictures are located against, come from a memory
+    of the context alone, which is kept in the cell's run.
     """
     from gvtools.runs.identity import versions
     from pipelines.evaluation.measurement import Measurement
@@ -242,7 +243,7 @@ def _of_pictures(task: _Task) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
-    """What tables show of measured pictures."""
+    """What tables show of an evaluation, as ``gvtools evaluate`` has it."""
     from gvtools.evaluation.ranking import Setting
     from pipelines.evaluation.tables import measured_row, scalars
     from pipelines.report.nested import nested
@@ -268,7 +269,7 @@ def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def peak_bytes() -> int | None:
-    """The most memory that this process has held, bytes; None where the system does not tell."""
+    """Peak memory (RSS) of this process, bytes; None where the system does not tell."""
     try:
         with open("/proc/self/status", encoding="ascii") as status:
             return next(int(line.split()[1]) * 1024 for line in status if line[:6] == "VmHWM:")
@@ -278,12 +279,12 @@ def peak_bytes() -> int | None:
         import resource
     except ImportError:
         return None
-    # Only Linux counts kilobytes, and it is served above.
+    # Bytes on macOS; Linux, where these are kilobytes, was read above.
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _gpu_bytes() -> int | None:
-    """The most that torch has held of a CUDA device; None where none was used."""
+    """Peak memory that torch allocated on the CUDA device, bytes; None where none was used."""
     import sys
 
     torch = sys.modules.get("torch")
@@ -293,7 +294,7 @@ def _gpu_bytes() -> int | None:
 
 
 class Silent(Console):
-    """Prints nothing, warnings included; what went wrong stands in a cell's file."""
+    """Prints nothing, warnings included; why a cell failed is written to its file."""
 
     def __init__(self) -> None:
         super().__init__(quiet=True)

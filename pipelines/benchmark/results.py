@@ -1,4 +1,4 @@
-"""What a benchmark writes: tables beside published rows, intervals, scenes, one page."""
+"""What a benchmark writes: comparison with published rows, intervals, scenes, an HTML page."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class MethodResult:
 
     Attributes:
         row: means over the scenes, and how they were measured.
-        intervals: of each figure, over the scenes that have it.
-        seconds: mean of a run; None for pictures that were there.
-        peak_bytes: largest of the runs; None likewise.
-        failures: reasons by scene.
-        scenes: results by scene.
+        intervals: by figure, the mean over the scenes that have it with its bootstrap interval.
+        seconds: mean wall-clock time of a run; None for pictures that were made elsewhere.
+        peak_bytes: most main memory of any run; None likewise.
+        failures: by scene that failed, why.
+        scenes: by scene that was measured, what ``measure_cell`` returned.
     """
 
     row: MeasuredRow
@@ -52,10 +52,10 @@ class MethodResult:
 
 
 def collected(benchmark: Benchmark, cells: Sequence[Cell]) -> list[MethodResult]:
-    """The results of the methods, in their order; those without a cell are left out.
+    """The results of the methods, in the cells' order, without methods not yet measured.
 
     Args:
-        benchmark: with one number of context views.
+        benchmark: with one number of context views; cells with another are ignored.
         cells: of all methods and numbers of views.
     """
     own = [cell for cell in cells if cell.views == benchmark.context]
@@ -81,7 +81,7 @@ def _result(
         figure: mean_interval([r["figures"].get(figure) for r in scenes.values()])
         for figure in names
     }
-    # A mean over some of the scenes alone would stand beside means over others.
+    # A figure that some scenes lack has no mean: it would be over other scenes than other methods'.
     figures = {
         figure: interval.mean if interval.n == len(scenes) else None
         for figure, interval in intervals.items()
@@ -130,7 +130,7 @@ def _setting(
 
 
 def comparison(benchmark: Benchmark, results: Sequence[MethodResult]) -> Table:
-    """Published rows and measured ones, ranked where they are comparable.
+    """A table of published and measured rows, with ranks where they are comparable.
 
     Args:
         benchmark: with one number of context views.
@@ -178,7 +178,7 @@ def _cells(
 
 
 def interval_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodResult]]) -> Table:
-    """One row a number of views, method and figure: mean over scenes and its interval."""
+    """For each number of views, method and figure one row: mean over scenes, its interval."""
     columns = (Column("views"), Column("method"), Column("figure"), Column("mean", digits=4),
                Column("low", digits=4), Column("high", digits=4), Column("scenes"))  # fmt: skip
     rows: list[tuple[Value, ...]] = []
@@ -192,7 +192,7 @@ def interval_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodR
 
 
 def scene_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodResult]]) -> Table:
-    """One row a cell, with the reason where it has no figures."""
+    """One row for each cell that was tried: its figures, or why it failed."""
     figures = list(benchmark.figures.values())
     columns = [Column("scene"), Column("views"), Column("method")]
     columns += [_column(figure) for figure in figures]
@@ -220,7 +220,7 @@ def scene_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodResu
 def write_results(
     benchmark: Benchmark, cells: Sequence[Cell], out: Path, *, title: str
 ) -> dict[int, Table]:
-    """Write results.json, the tables in three forms, and the page.
+    """Write results.json, the tables (CSV, Markdown, LaTeX), and the HTML page.
 
     Args:
         benchmark: of the cells.
@@ -250,7 +250,7 @@ def write_results(
 
 
 def _plain(by_views: Mapping[int, Sequence[MethodResult]]) -> dict[str, Any]:
-    """As JSON: means with intervals, costs and failures, by number of views and method."""
+    """JSON-ready means with intervals, costs and failures, by number of views and method."""
     return {
         f"{views}_views": {
             result.row.system: {
@@ -269,7 +269,7 @@ def _plain(by_views: Mapping[int, Sequence[MethodResult]]) -> dict[str, Any]:
 
 
 def print_tables(tables: Mapping[int, Table], console: Console) -> None:
-    """The comparison tables in Markdown."""
+    """Print the comparison tables in Markdown."""
     from gvtools.evaluation.tables import markdown
 
     for table in tables.values():

@@ -1,4 +1,4 @@
-"""A method's pictures in the places of the targets: read, matched, brought to size, checked."""
+"""A method's pictures: read, matched with the targets, resized to them, and checked."""
 
 from __future__ import annotations
 
@@ -25,9 +25,12 @@ if TYPE_CHECKING:
     from pipelines.evaluation.measured_target import MeasuredTarget
 
 OWN_LAYOUT = "gvtools run"
-# A picture has its target's shape when its height is so many pixels off what its width says.
+# A picture has its target's aspect when its height differs by at most this from the height that
+# its width and the target's aspect give, pixels.
 SHAPE_TOLERANCE = 1.0
-# Thumbnails by which the order of pictures is checked; the right view has to be this much nearer.
+# The ground truth that a tool wrote beside a render is compared with that of the views, as
+# thumbnails (width, height). Where another view's is nearer by more than this factor than that of
+# the matched view, the match is refused.
 THUMBNAIL = (32, 24)
 CLEARLY = 2.0
 
@@ -39,9 +42,10 @@ class Method:
     Attributes:
         name: of the method.
         pictures: as they were found.
-        matching: with the targets.
-        targets: those that have a picture, with it.
-        resized: sizes (width, height) of pictures that were brought to the target's, and how many.
+        matching: which picture stands for which target.
+        targets: those that the method has a picture of, each with this picture.
+        resized: original sizes (width, height) of the pictures that were resized to their target's,
+            with the number of pictures of each.
     """
 
     name: str
@@ -77,7 +81,7 @@ def method_names(paths: Sequence[Path], names: Sequence[str]) -> list[str]:
     """A name for each method: those given, else the folders'.
 
     Raises:
-        OptionError: another number of names, or one twice.
+        OptionError: there are not as many names as folders, or a name occurs twice.
     """
     if names and len(names) != len(paths):
         raise OptionError(
@@ -96,16 +100,16 @@ def _twice(names: Sequence[str]) -> str:
 
 
 def open_method(path: Path, name: str, targets: Sequence[MeasuredTarget], *, rule: str) -> Method:
-    """The pictures at ``path`` in the places of the targets.
+    """The pictures at ``path``, matched with the targets and resized to them.
 
     Args:
         path: a run of gvtools, or what ``open_pictures`` reads.
         name: of the method.
-        targets: all of them, with any picture.
+        targets: all of them; the picture that each holds is replaced.
         rule: how to match, see ``match_pictures``.
 
     Raises:
-        GvError: unreadable or ambiguous pictures, or one of another shape than its target.
+        GvError: unreadable or ambiguous pictures, or one of another aspect than its target.
     """
     pictures = _run_pictures(path) if (path / RECORD).is_file() else open_pictures(path)
     views = [target.picture.name for target in targets]
@@ -142,10 +146,10 @@ def _posed(frame: Frame, target: PosedPicture) -> PosedPicture:
 
 
 def _sized(frame: Frame, camera: Cameras, *, what: str) -> tuple[Frame, tuple[int, int] | None]:
-    """The picture in the target's size, and the size that it had if that was another.
+    """The picture in its target's size, and the size (width, height) that it had if another.
 
     Raises:
-        ProjectError: another shape.
+        ProjectError: its aspect is not the target's.
     """
     import cv2
 
@@ -170,10 +174,12 @@ def _sized(frame: Frame, camera: Cameras, *, what: str) -> tuple[Frame, tuple[in
 def _check_truths(
     pictures: PictureSet, matching: Matching, targets: Sequence[MeasuredTarget]
 ) -> None:
-    """Refuse a matching that the truths which a tool kept beside its renders contradict.
+    """Compare the ground truth that a tool wrote beside its renders with that of the targets.
+
+    Nothing is checked where it is missing beside any render.
 
     Raises:
-        ProjectError: a kept truth is clearly more like another view than like its own.
+        ProjectError: one is clearly more like another target's than like the matched target's.
     """
     kept = [picture.load_truth for picture in pictures.pictures]
     rows = [row for row, target in enumerate(targets) if target.truth is not None]

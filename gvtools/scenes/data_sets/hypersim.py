@@ -1,18 +1,20 @@
 """Hypersim: ``SCENE/_detail/cam_XX`` (HDF5) with ``SCENE/images/scene_cam_XX_*``.
 
-Cameras look along -z with y up, ``camera_keyframe_orientations.hdf5`` is world_from_cam, and
-positions are in asset units, which ``_detail/metadata_scene.csv`` converts to metres.
-``depth_meters`` is the distance from the camera's centre, not z, in metres, NaN for none. Colour is
-``final_hdf5/frame.IIII.color.hdf5`` with the tone curve that the data set's tools use, or else
-the JPEG preview ``final_preview/frame.IIII.tonemap.jpg``.
+Cameras look along -z with y up (OpenGL axes), ``camera_keyframe_orientations.hdf5`` holds rotations
+world_from_cam, and positions are in asset units; ``_detail/metadata_scene.csv`` has the metres per
+unit. ``depth_meters`` is the distance from the camera's centre, not z, in metres, NaN for none.
+Colour is the linear ``final_hdf5/frame.IIII.color.hdf5`` with the tone curve that the data set's
+tools use, or else the JPEG preview ``final_preview/frame.IIII.tonemap.jpg``.
 
-A scene's intrinsics stand in ``metadata_camera_parameters.csv`` (of the data set's repository; it
-is looked for in the root and above) as a 3x3 matrix that takes u (right) and v (up), both from -1
-to 1 across the picture, to a ray. With a tilted lens the picture's plane is not square to the view.
-Such a camera is a pinhole all the same, one that is turned: matrix and orientation are split anew,
-so that nothing is resampled, and z is along the turned axis. A lens that is tilted both ways skews
-the pixels besides, and rows of such pictures and maps are moved sideways to those of a pinhole.
-Without the file the published 60 degrees are taken, which a finding tells.
+A scene's intrinsics are in ``metadata_camera_parameters.csv`` (from the data set's repository; it
+is looked for in the root and the folder above) as a 3x3 matrix that takes u (right) and v (up),
+both from -1 to 1 across the picture, to a ray. With a tilted (tilt-shift) lens the image plane is
+not perpendicular to the viewing direction. Such a camera equals an ordinary pinhole that looks
+along the image plane's normal. So the matrix is split (QR) into a rotation, which goes into the
+pose, and an upper triangular K; pictures stay as they are, and z is along the rotated axis. A lens
+that is tilted about both axes has a skew in K besides: rows of its pictures and depth maps are
+shifted sideways, so that K has none. Without the file, the published horizontal field of view of 60
+degrees is taken, and a finding says so.
 """
 
 from __future__ import annotations
@@ -49,13 +51,14 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 PARAMETERS = "metadata_camera_parameters.csv"
-SIZE = (1024, 768)
+SIZE = (1024, 768)  # width, height of the pictures where the file of parameters is absent
 FIELD_OF_VIEW = math.radians(60)  # horizontal, of scenes without lens shift
-SKEW = 1e-6  # slopes below this are rounding
-# The tone curve: this share of pixels is below this brightness, after the display's gamma.
+SKEW = 1e-6  # smaller values of TurnedPinhole.slope are rounding errors
+# The tone curve: colours are scaled so that this percentile of the pixels' brightness is displayed
+# as this share of white, after gamma.
 PERCENTILE, BRIGHTNESS, GAMMA = 90, 0.8, 2.2
-DARK = 1e-4  # a picture whose brightness is below this stays black
-NO_ENTITY = -1
+DARK = 1e-4  # a picture whose percentile is not above this becomes black
+NO_ENTITY = -1  # in render_entity_id: the pixel shows no object
 
 
 def _scenes(root: Path) -> tuple[str, ...]:
@@ -103,12 +106,14 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
 
 @dataclass(frozen=True)
 class TurnedPinhole:
-    """The pinhole of a perspective camera whose picture may be tilted.
+    """The pinhole that equals a camera with a tilted lens.
 
     Attributes:
-        lens: of the pinhole.
-        stored_from_turned: (3, 3) rotation from the pinhole's axes to the stored camera's, OpenCV.
-        slope: by how many pixels a row of the stored picture lies farther right than the one above.
+        lens: intrinsics of the pinhole, pixels.
+        stored_from_turned: (3, 3) rotation from the pinhole's axes to those of the stored pose,
+            both OpenCV.
+        slope: pixels by which each row of the stored picture is shifted right against the row
+            above (skew / fy); 0 for none.
     """
 
     lens: LensParameters
@@ -116,7 +121,10 @@ class TurnedPinhole:
     slope: float
 
     def straight(self, values: NDArray[Any], *, nearest: bool) -> NDArray[Any]:
-        """A stored picture or map (h, w, ...) with its rows moved to the pinhole's."""
+        """A stored picture or map (h, w, ...) with its rows shifted, so that it has no skew.
+
+        Pixels from outside of the stored picture are 0. ``nearest`` resamples without blending.
+        """
         import cv2
 
         if not self.slope:
@@ -129,10 +137,11 @@ class TurnedPinhole:
 
 
 def turned_pinhole(cam_from_uv: Float64, size: tuple[int, int]) -> TurnedPinhole:
-    """The pinhole of a projection.
+    """Split a projection into a rotation and a pinhole, see the top of this module.
 
     Args:
-        cam_from_uv: (3, 3), from u, v, 1 to a ray; x right, y up, z backward.
+        cam_from_uv: (3, 3), from (u, v, 1) to a ray; x right, y up, z backward. u and v are from
+            -1 to 1 across the picture.
         size: width and height of the picture, pixels.
 
     Raises:
@@ -152,7 +161,7 @@ def turned_pinhole(cam_from_uv: Float64, size: tuple[int, int]) -> TurnedPinhole
 
 
 def read_distance(path: Path, *, camera: TurnedPinhole) -> Depth:
-    """``depth_meters`` as (h, w) float32 z-depth, metres, of a pinhole; 0 for none.
+    """``depth_meters`` as (h, w) float32 depth along the pinhole's z, metres; 0 for none.
 
     Raises:
         ProjectError: absent or damaged.
@@ -171,8 +180,8 @@ def read_distance(path: Path, *, camera: TurnedPinhole) -> Depth:
 def read_color(path: Path) -> Frame:
     """A picture of linear colour through the tone curve of the data set's tools.
 
-    The brightness below which 90 % of the pixels lie becomes 0.8 of the display's; pixels that show
-    nothing do not count, where the scene's ``render_entity_id`` is there to tell.
+    The 90th percentile of the pixels' brightness becomes 0.8 of white. Pixels that show no object
+    do not count, where the scene's ``render_entity_id`` is there.
 
     Raises:
         ProjectError: absent or damaged.
@@ -191,7 +200,7 @@ def read_color(path: Path) -> Frame:
 
 
 def read_straight(path: Path, *, camera: TurnedPinhole, reader: Callable[[Path], Frame]) -> Frame:
-    """A picture with its rows moved to the pinhole's; the mask tells what lies outside of it."""
+    """A picture without skew; its mask is False where the stored picture has no pixel."""
     frame = reader(path)
     rgb = camera.straight(frame.rgb, nearest=False)
     seen = camera.straight(np.ones(rgb.shape[:2], np.uint8), nearest=True)
@@ -201,7 +210,7 @@ def read_straight(path: Path, *, camera: TurnedPinhole, reader: Callable[[Path],
 def _color(
     images: Path, camera: str, stem: str, *, turned: TurnedPinhole
 ) -> tuple[Path, Callable[[Path], Frame] | None]:
-    """The picture of a frame, and its reader; None for a picture file as it is."""
+    """The file of a frame's colour, and what reads it; None for the usual reader of pictures."""
     linear = images / f"scene_{camera}_final_hdf5" / f"{stem}.color.hdf5"
     preview = images / f"scene_{camera}_final_preview" / f"{stem}.tonemap.jpg"
     path, reader = (linear, read_color) if linear.is_file() else (preview, read_image)
@@ -242,7 +251,7 @@ def _parameters(root: Path, scene: str) -> dict[str, str]:
 
 
 def _projection(parameters: dict[str, str]) -> tuple[Float64, tuple[int, int], list[Finding]]:
-    """(3, 3) matrix from u, v, 1 to a ray, the pictures' size, and what was met."""
+    """(3, 3) matrix from (u, v, 1) to a ray, the pictures' width and height, and findings."""
     if not parameters:
         x = math.tan(FIELD_OF_VIEW / 2)
         line = f"no {PARAMETERS} with this scene: 60 degrees across are taken, without lens shift"
@@ -276,7 +285,7 @@ def _metres_per_unit(path: Path, parameters: dict[str, str]) -> float:
 
 
 def _hdf5(path: Path) -> Float64:
-    """The data set of a file, as stored."""
+    """The array ``dataset`` of an HDF5 file, with its stored shape and type."""
     try:
         with _h5py().File(path, "r") as file:
             return np.asarray(file["dataset"])

@@ -1,7 +1,7 @@
 """The native layouts of data sets: which scenes a download holds, and how one is read.
 
-A layout is one module of this package that defines a ``Layout`` named LAYOUT, and a line in
-LAYOUTS. Several data sets may share one.
+To add a layout, write a module of this package that defines a ``Layout`` named LAYOUT, and add a
+line to LAYOUTS. Several data sets may share a layout.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gvtools.scenes.data_sets.address import FORM, SPEC
 from gvtools.scenes.data_sets.spec import DataSetSpec, load_spec, name_key
 from gvtools.scenes.scene import Origin, Scene
 
-# Name of a layout, as specs have it: its module in this package.
+# The ``layout`` of a data set's spec (data_sets/*.yaml): the module of this package that reads it.
 LAYOUTS: dict[str, str] = {
     "gta_sfm": "gta_sfm",
     "mvs_synth": "mvs_synth",
@@ -49,13 +49,14 @@ class Layout:
     """How a data set lies on disk, as its authors publish it.
 
     Attributes:
-        looks_like: what the root of a download holds, for messages.
-        scenes: the names of the scenes that are there at least in part, in natural order; a name
-            is a relative path with "/". A partial download is no error.
-        read: one of them as a scene. What is missing or damaged is left out and reported in
-            ``Scene.findings``; ProjectError if nothing is left.
-        variants: names under which ``read`` gives the same scenes from other pictures, such as
-            SCENE/images_4; they are read on request alone.
+        looks_like: what the root folder of a download holds, for error messages.
+        scenes: takes the root; returns the names of the scenes that are there at least in part, in
+            natural order. A name is a relative path with "/". A partial download is no error.
+        read: takes the root, a scene's name and the data set's spec; returns the scene. What is
+            missing or damaged is left out and reported in ``Scene.findings``; ProjectError if
+            nothing is left.
+        variants: takes the root; returns further names that ``read`` takes: the same scenes with
+            reduced pictures, such as SCENE/images_4. ``scenes`` does not list them.
     """
 
     looks_like: str
@@ -91,7 +92,7 @@ def open_data_set(name: str, scene: str, root: Path) -> Scene:
 
     Args:
         name: of the data set, see ``spec.load_spec``.
-        scene: as ``scenes_of`` names it, or a variant; may be empty where the folder holds one.
+        scene: as ``scenes_of`` names it, or a variant; "" for the only one of the folder.
         root: the folder of the download.
 
     Raises:
@@ -115,7 +116,7 @@ def open_address(address: Path | str, root: Path | None) -> Scene:
     """The scene of a data set that an address names.
 
     Args:
-        address: see FORM; the scene may be left out where the folder holds one alone.
+        address: ``spec:NAME:SCENE``; ":SCENE" may be left out where the folder holds only one.
         root: the folder of the data set's download.
 
     Raises:
@@ -135,7 +136,7 @@ def open_address(address: Path | str, root: Path | None) -> Scene:
 
 
 def chosen_scenes(name: str, root: Path, scenes: Sequence[str] = ()) -> tuple[str, ...]:
-    """The scenes of a download that a user names, or all of them.
+    """The scenes of a download that a user names, without repeats; all of them if none is named.
 
     Raises:
         OptionError: no such data set.
@@ -157,7 +158,7 @@ def _check_is_there(spec: DataSetSpec, scene: str, root: Path, *, known: Sequenc
 
 
 def read_scene(spec: DataSetSpec, scene: str, root: Path) -> Scene:
-    """A scene that ``scenes_of`` names, without looking for the others.
+    """A scene by its name, without listing the others first, as ``open_data_set`` does.
 
     Raises:
         ProjectError: nothing of it can be read.

@@ -1,4 +1,4 @@
-"""Poses of a trajectory at the times of frames."""
+"""Camera poses at the times of frames, from a trajectory with times of its own."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from gvtools.scenes.data_sets.posed_pictures import Float64
 def pose_at(
     time: float, times: Float64, poses: Float64, *, same: float, longest_gap: float
 ) -> Float64 | None:
-    """(4, 4) cam_from_world at a time: a pose, or two interpolated; None where none is near.
+    """(4, 4) cam_from_world at a time: a stored pose, or one interpolated between its neighbours.
 
-    The camera's place and orientation in the world are interpolated, not the inverse pose.
+    The camera's centre is interpolated linearly, its rotation spherically (slerp). None outside of
+    the trajectory, and where the neighbours are too far apart in time.
 
     Args:
-        time: of the frame.
-        times: (N,) of the poses, increasing, in the same unit.
+        time: of the frame, in any unit.
+        times: (N,) of the poses, increasing; at least one. This and what follows in the same unit.
         poses: (N, 4, 4) cam_from_world, rigid.
         same: a pose whose time differs by no more than this is taken as it is.
-        longest_gap: between two poses that may be interpolated.
+        longest_gap: longest time between two poses that may be interpolated.
     """
     from scipy.spatial.transform import Rotation, Slerp
 

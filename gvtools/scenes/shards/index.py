@@ -1,6 +1,6 @@
 """What a folder of shards holds: ``index.json`` for all, ``shard-NNNNNN.json`` beside each tar.
 
-Numbers of views decide nothing: a scene's views are read from the indices of its own shards alone.
+``index.json`` says which shards hold a scene; only the indices of these are read to open it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gvtools.errors import ProjectError
 
 INDEX = "index.json"
 FORMAT, VERSION = "gvtools shards", 1
-# Of the shards whose views a process keeps at hand.
+# How many shards' indices a process keeps in memory.
 KEPT_INDICES = 64
 _CHUNK = 2**22
 
@@ -49,9 +49,9 @@ class ViewRecord(_Record):
     cam_from_world: tuple[tuple[float, float, float, float], ...]
     """(4, 4), scene units."""
     depth_unit: float | None = None
-    """Scene units of a stored unit of depth, where it is a 16-bit picture."""
+    """Scene units of a stored value of 1, where depth is a 16-bit picture."""
     members: dict[str, tuple[int, int, int]]
-    """By the end of a file's name: its first byte in the tar, its bytes, their CRC-32."""
+    """By file extension, such as "depth.png": byte offset in the tar, size in bytes, CRC-32."""
 
     @property
     def has_depth(self) -> bool:
@@ -193,11 +193,12 @@ def read_index(folder: Path) -> ShardsIndex:
 
 @lru_cache(KEPT_INDICES)
 def read_shard_index(path: Path, checksum: str) -> ShardRecord:
-    """The index beside a shard; kept at hand.
+    """The index beside a shard; the last ones read are cached.
 
     Args:
         path: of the file.
-        checksum: as ``index.json`` lists it: of another one, nothing is at hand.
+        checksum: as ``index.json`` lists it; part of the cache's key, so that a shard that was
+            converted anew is read again. It is not compared with the file.
 
     Raises:
         ProjectError: absent or damaged.

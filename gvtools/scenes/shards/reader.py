@@ -1,7 +1,7 @@
-"""Shards read as scenes: each view by its place in the tar, nothing is extracted.
+"""Shards read as scenes.
 
-Views are found by their numbers, so that any number of processes reads the same folder, each what
-its own samples need.
+A view's files are read at their byte offsets in the tar, which the index beside it lists. Nothing
+is extracted, and any number of processes may read the same folder in any order.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ def open_shards(folder: Path) -> SceneCollection:
 
 
 class ShardScenes:
-    """Reads the scenes of a folder by name.
+    """Called with a scene's name, opens that scene of a folder of shards.
 
     Args:
         folder: of the shards.
-        index: of the folder.
+        index: what its ``index.json`` holds.
     """
 
     def __init__(self, folder: Path, index: ShardsIndex) -> None:
@@ -84,11 +84,14 @@ class ShardScenes:
 
 
 def verify(folder: Path, *, progress: Callable[[str], None] = lambda text: None) -> list[str]:
-    """Compare every shard with its checksum; what is wrong, one line each.
+    """Compare every shard and its index with their checksums.
 
     Args:
         folder: of the shards.
-        progress: is told each shard's name before it is read.
+        progress: is called with each shard's file name before it is read.
+
+    Returns:
+        What is wrong, one line for each damaged or missing shard; empty if nothing is.
 
     Raises:
         ProjectError: the folder holds no complete shards.
@@ -140,7 +143,14 @@ def _view(tar: Path, record: ViewRecord) -> View:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a view's files lie in a tar, see ViewRecord."""
+    """Where a view's files lie in a tar.
+
+    Attributes:
+        tar: the file.
+        members: by file extension, such as "depth.png": offset, size in bytes, CRC-32.
+        depth_unit: scene units of 1 in a 16-bit depth picture; None for other depth.
+        name: of the view, for error messages.
+    """
 
     tar: Path
     members: dict[str, tuple[int, int, int]]
