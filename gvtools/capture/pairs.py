@@ -54,7 +54,8 @@ def _features(
 ) -> tuple[list[str], list[NDArray[np.float32]]]:
     """Names and RootSIFT descriptors of the pictures that have any."""
     names, features = [], []
-    for image in database.read_all_images():
+    # In the order of their names: that of the database depends on threads.
+    for image in sorted(database.read_all_images(), key=lambda image: image.name):
         rows = np.asarray(database.read_descriptors(image.image_id).data, np.float32)
         if len(rows) == 0:
             continue

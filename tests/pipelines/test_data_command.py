@@ -193,6 +193,7 @@ def test_percentiles_of_parts_are_those_of_the_whole() -> None:
     assert zeros.percentile(90) == pytest.approx(5, rel=6e-3)
 
 
+@pytest.mark.slow
 def test_one_scene_is_held_at_a_time(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import gc
 

@@ -85,6 +85,7 @@ def test_commands_take_it(root: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "--root belongs to 'gvtools train tune'" in line
 
 
+@pytest.mark.slow
 def test_a_run_is_resumed_and_evaluated(
     root: Path,
     tmp_path: Path,

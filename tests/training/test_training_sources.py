@@ -174,6 +174,7 @@ def train(out: Path, home: Path, *more: str) -> int:
     return main([*words(out, home), *more])
 
 
+@pytest.mark.slow
 def test_a_continued_training_sees_the_same_samples_and_counts(home, tmp_path, capsys):
     assert train(tmp_path / "whole", home) == 0
     said = capsys.readouterr().out

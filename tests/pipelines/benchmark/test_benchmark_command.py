@@ -70,6 +70,7 @@ def write_pictures(root, folder, *, noise: int) -> None:
             Image.fromarray(made.astype(np.uint8)).save(folder / project / f"{stem}.png")
 
 
+@pytest.mark.slow
 def test_a_benchmark_runs_goes_on_and_writes_its_tables(projects, tmp_path, in_process, capsys):
     out, renders = tmp_path / "out", tmp_path / "renders"
     write_pictures(projects, renders, noise=8)
@@ -171,6 +172,7 @@ def test_a_benchmark_without_any_figure_is_no_success(tmp_path, in_process, caps
     assert "failed: 3 views" in (out / "3_views.md").read_text()
 
 
+@pytest.mark.slow
 def test_the_papers_protocol_runs_in_rounds_and_measures_poses(tmp_path, in_process, monkeypatch):
     """Three rounds of six targets on a recording that stands for a scene of ScanNet."""
     root, out = tmp_path / "scans", tmp_path / "out"
