@@ -43,6 +43,7 @@ def test_a_part_that_fails_is_a_row_and_the_others_go_on(capsys):
     ]
 
 
+@pytest.mark.slow
 def test_failing_tests_are_named(tmp_path):
     file = tmp_path / "test_two.py"
     file.write_text("def test_good(): pass\ndef test_bad(): assert False\n")

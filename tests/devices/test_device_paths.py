@@ -16,8 +16,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).parents[2]
 
 
-# These take 8 to 12 seconds each: too long for every run of the tests.
-SLOW = ("train and resume, all stages", "depth plane-sweep, torch", "reconstruct")
+# These take 8 to 22 seconds each: too long for every run of the tests.
+SLOW = {"depth plane-sweep, torch", "reconstruct", *(name for name in PATHS if name[:5] == "train")}
 NAMES = [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in PATHS]
 
 

@@ -172,6 +172,7 @@ def limited(size: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up(scan, tmp_path):
     """A real failing write (EFBIG) in the middle of round 1; round 0 stands, resuming works."""
     whole, out = tmp_path / "whole", tmp_path / "run"

@@ -37,6 +37,7 @@ def test_json_has_both_times_and_their_ratio(tmp_path, what, rows):
         assert row["ours_min_s"] <= row["ours_s"]
 
 
+@pytest.mark.slow
 def test_the_table_is_printed(capsys):
     run("fuse", "--points", 2_000, "--repeat", 1)
     out = capsys.readouterr().out
@@ -50,6 +51,7 @@ def test_sizes_that_measure_nothing():
         run("splat", "--repeat", 0)
 
 
+@pytest.mark.slow
 def test_calls_take_turns_and_warm_ups_are_not_counted():
     seen: list[tuple[str, int]] = []
     seconds = side_by_side.alternate(

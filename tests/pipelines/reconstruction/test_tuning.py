@@ -99,6 +99,7 @@ def test_another_tuning_is_another_run(run, scan, weights, capsys):
     assert "settings differ" in line
 
 
+@pytest.mark.slow
 def test_weights_that_are_no_better_leave_the_run_as_it_is(scan, weights, tmp_path):
     out, plain = tmp_path / "run", tmp_path / "plain"
     figures = iter([9.0, 1.0, 1.0, 1.0, 1.0])
