@@ -22,7 +22,7 @@ MOST = 300
 # A whole video with less motion than this share of the width shows the scene from one place.
 STANDS_STILL = 0.05
 JPEG_QUALITY = 97
-# Corners that are followed from frame to frame.
+# Corners (Shi-Tomasi) that are tracked from frame to frame, at most.
 CORNERS = 200
 
 
