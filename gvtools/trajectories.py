@@ -6,6 +6,8 @@ cameras' own up vectors (−y of each), which keeps a path free of roll jitter.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -14,6 +16,7 @@ from gvtools.errors import DegenerateError, OptionError
 
 Float64 = NDArray[np.float64]
 
+PATHS = ("orbit", "spiral", "interpolate")
 # Centres nearer than this share of their coordinates' magnitude differ by rounding alone.
 ROUNDING = 1e-13
 # A step below this share of the others is none.
@@ -244,3 +247,31 @@ def _like_first(cameras: Cameras, world_from_cam: Float64) -> Cameras:
         np.repeat(cameras.height[:1], count),
         (),
     )
+
+
+def named_path(
+    name: str, cameras: Cameras, *, count: int, depth: Callable[[], tuple[Cameras, float] | None]
+) -> Cameras:
+    """One of PATHS; an orbit of parallel views goes around what they look at.
+
+    Args:
+        name: of PATHS.
+        cameras: that the path goes by.
+        count: number of cameras.
+        depth: one of these cameras and the median depth that it sees, scene units; asked for only
+            where the views have no common focus. None where nothing tells it.
+
+    Raises:
+        OptionError: too few cameras given or asked for.
+        DegenerateError: no such path leads through these cameras.
+    """
+    make = {"interpolate": interpolate, "orbit": orbit, "spiral": spiral}[name]
+    try:
+        return make(cameras, count)
+    except DegenerateError:
+        seen = depth() if name == "orbit" else None
+        if seen is None:
+            raise
+        camera, distance = seen
+        ahead = camera.world_from_cam[0, :3, 2] * distance
+        return orbit(cameras, count, center=cameras.centers.mean(axis=0) + ahead)

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gvtools import trajectories
 from gvtools.cameras import Cameras
-from gvtools.errors import DegenerateError, OptionError
+from gvtools.errors import OptionError
+from gvtools.trajectories import PATHS, named_path
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
 
-PATHS = ("orbit", "spiral", "interpolate")
 CAPTURED = "cameras"
 FRAMES = 120
 FORMS = (
@@ -82,17 +81,11 @@ def _cameras(memory: SpatialMemory, captured: Cameras, path: str) -> Cameras:
 
 
 def _named_path(memory: SpatialMemory, captured: Cameras, name: str, *, count: int) -> Cameras:
-    make = getattr(trajectories, name)
-    try:
-        return make(captured, count)
-    except DegenerateError:
-        # Parallel views have no common focus; what they look at lies at their median depth.
-        if name != "orbit":
-            raise
+    def depth() -> tuple[Cameras, float] | None:
         middle = captured[len(captured) // 2]
         guidance = memory.project(middle)
         if not guidance.valid.any():
-            raise
-        depth = float(np.median(guidance.depth[guidance.valid]))
-        ahead = middle.world_from_cam[0, :3, 2] * depth
-        return make(captured, count, center=captured.centers.mean(axis=0) + ahead)
+            return None
+        return middle, float(np.median(guidance.depth[guidance.valid]))
+
+    return named_path(name, captured, count=count, depth=depth)

@@ -14,12 +14,12 @@ from gvtools.scenes.data_sets.address import is_address
 from gvtools.scenes.reduced import reduced
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import check_disjoint, select
+from gvtools.trajectories import PATHS, named_path
 
 # Two pictures are one shot when their centres are this near (a share of the context's extent) and
 # their rotations differ by no more than this many degrees, whatever their sizes and lenses.
 SAME_PLACE = 1e-4
 SAME_DIRECTION = 0.05
-PATHS = ("interpolate", "orbit", "spiral")
 FORMS = (
     "a selection of the project's views, interpolate:N, orbit:N, spiral:N, a trajectory file "
     "(TUM or KITTI), or another project as PATH, spec:NAME:SCENE or either with @SELECTION"
@@ -98,23 +98,14 @@ def _exists(text: str) -> bool:
 
 
 def _path(scene: Scene, context: tuple[str, ...], name: str, *, count: int) -> Targets:
-    from gvtools import trajectories
-    from gvtools.errors import DegenerateError
-
-    context_cameras = scene.subset(context).cameras
-    make = getattr(trajectories, name)
-    try:
-        cameras = make(context_cameras, count)
-    except DegenerateError:
-        # Parallel views have no common focus; what they look at lies at their median depth.
-        if name != "orbit":
-            raise
+    def depth() -> tuple[Cameras, float] | None:
         view = scene[context[len(context) // 2]]
-        depth = view.load().depth if view.has_depth else None
-        if depth is None or not (depth > 0).any():
-            raise
-        ahead = view.camera.world_from_cam[0, :3, 2] * float(np.median(depth[depth > 0]))
-        cameras = make(context_cameras, count, center=context_cameras.centers.mean(axis=0) + ahead)
+        seen = view.load().depth if view.has_depth else None
+        if seen is None or not (seen > 0).any():
+            return None
+        return view.camera, float(np.median(seen[seen > 0]))
+
+    cameras = named_path(name, scene.subset(context).cameras, count=count, depth=depth)
     named = Cameras(
         cameras.K,
         cameras.cam_from_world,
