@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
 from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
+from pipelines.commands.measurement_arguments import add_measurement_arguments
 from pipelines.commands.scene_arguments import add_scene_arguments
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ EXAMPLES = (
 )
 # As pipelines.evaluation.protocol_run has them, which is not loaded for the parser.
 PROTOCOLS = ("pass", "long")
-MATCHERS = ("sift", "lightglue")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,21 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a run, several, or (--protocol) a project",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="default RUN/evaluation")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
-    parser.add_argument(
-        "--parts",
-        default="images,consistency,poses",
-        metavar="NAMES",
-        help="what to measure (default %(default)s)",
-    )
-    parser.add_argument(
-        "--no-control",
-        action="store_true",
-        help="leave out the same measures on the true pictures, which tell how to read the figures",
-    )
-    parser.add_argument(
-        "--matcher", choices=MATCHERS, default="sift", help="of the pose probe (default sift)"
-    )
+    add_measurement_arguments(parser)
     parser.add_argument(
         "--against",
         action="append",

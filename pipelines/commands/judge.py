@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
 from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
+from pipelines.commands.measurement_arguments import add_measurement_arguments
 from pipelines.commands.scene_arguments import add_scene_arguments
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ EXAMPLES = (
     "gvtools judge renders --against scans/kitchen --context not:every:8 --targets every:8 "
     "--out judged",
 )
-MATCHERS = ("sift", "lightglue")
 MATCHES = ("auto", "name", "order")
 
 
@@ -64,19 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="pictures with views: by name, or by order where no name matches (default auto)",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="for the results")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
-    parser.add_argument(
-        "--parts",
-        default="images,consistency,poses",
-        metavar="NAMES",
-        help="what to measure (default %(default)s)",
-    )
-    parser.add_argument(
-        "--no-control", action="store_true", help="leave out the same measures on the true pictures"
-    )
-    parser.add_argument(
-        "--matcher", choices=MATCHERS, default="sift", help="of the pose probe (default sift)"
-    )
+    add_measurement_arguments(parser)
     parser.add_argument(
         "--sheet-views", type=int, default=12, metavar="N", help="views on contact sheets (12)"
     )
