@@ -32,12 +32,14 @@ class Case:
         context: the views that are given.
         targets: those that are held out.
         budgets: seconds of processor time that a whole run may take.
+        own: start from the sparse points alone that two views of the context detected.
     """
 
     project: str
     context: str
     targets: str
     budgets: tuple[int, ...]
+    own: bool = False
 
 
 CASES = {
@@ -46,6 +48,11 @@ CASES = {
     "fox, 7 views": Case("fox_colmap", "every:8", "every:8+4", (30, 100)),
     "fern, 3 views": Case("fern_colmap", "every:8", "every:8+4", (30, 90)),
     "fox, 3 views": Case("fox_colmap", "0012.jpg,0044.jpg,0090.jpg", "every:8+4", (30, 90)),
+    "fox, 7 views, own points": Case("fox_colmap", "every:8", "every:8+4", (30, 100), own=True),
+    "fern, 3 views, own points": Case("fern_colmap", "every:8", "every:8+4", (30, 90), own=True),
+    "fox, 3 views, own points": Case(
+        "fox_colmap", "0012.jpg,0044.jpg,0090.jpg", "every:8+4", (30, 90), own=True
+    ),
     "kitchen": Case("sevenscenes_reg", "every:2", "every:2+1", (60, 300)),
     "demo room": Case("room", "first:8", "not:first:8", (30, 60)),
     "noisy room": Case("noisy-room", "first:8", "not:first:8", (30, 60)),
@@ -107,9 +114,10 @@ def _seconds(command: list[str]) -> float:
 
 def _run(case: Case, project: Path, budget: int, out: Path) -> dict[str, Any]:
     """Run gvtools; the seconds of fitting are what a run without it leaves of the budget."""
-    stem = f"{case.project}-{case.context}-{budget}".replace(":", "")
+    stem = f"{case.project}-{case.context}-{'own-' * case.own}{budget}".replace(":", "")
     command = [sys.executable, "-m", "pipelines.cli", "reconstruct", str(project), "--quiet"]
     command += ["--context", case.context, "--targets", case.targets, "--out", str(out / stem)]
+    command += ["--set", f"points={'context' if case.own else 'all'}"]
     refine = 0.0
     if budget:
         # What the rest of a run takes, about: views with recorded depth have their poses refined.
@@ -154,8 +162,11 @@ def _has_depth(project: Path) -> bool:
 def _peer(case: Case, project: Path, budget: int, train: Path, out: Path) -> dict[str, Any]:
     """Run plain splatting on the same split for the same processor time."""
     from gvtools import open_project
+    from gvtools.scenes.resized import seen_by
 
     scene = open_project(project)
+    if case.own:
+        scene = seen_by(scene, [scene.names[row] for row in _selected(project, case.context)])
     given, held_out = _selected(project, case.context), _selected(project, case.targets)
     frames = {row: scene[scene.names[row]].load() for row in {*given, *held_out}}
     cameras = scene.cameras

@@ -57,10 +57,28 @@ def from_depth(
     Raises:
         DegenerateError: next to no pixel has depth.
     """
-    rng = np.random.default_rng(seed)
     count = STARTING_GAUSSIANS if most is None else min(most, STARTING_GAUSSIANS)
+    positions, colors = pixels_with_depth(views, seed=seed, count=count)
+    if len(positions) <= NEIGHBOURS:
+        raise DegenerateError(
+            f"{len(positions)} pixels with depth in {len(views)} views; expected more"
+        )
+    return from_points(positions, colors, frame=frame, most=most)
+
+
+def pixels_with_depth(
+    views: Sequence[FitView], *, seed: int, count: int
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Positions, in the local frame, and colours of randomly picked pixels with depth.
+
+    Args:
+        views: those without depth give none; each other one at most its share of ``count``.
+        seed: of which pixels.
+        count: about how many.
+    """
+    rng = np.random.default_rng(seed)
     share = max(count // max(sum(view.depth is not None for view in views), 1), 1)
-    positions, colors = [], []
+    positions, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     for view in views:
         if view.depth is None:
             continue
@@ -73,11 +91,7 @@ def from_depth(
         pose = view.cam_from_local
         positions.append((points - pose[:3, 3]) @ pose[:3, :3])
         colors.append(view.rgb[row, column])
-    if sum(map(len, positions)) <= NEIGHBOURS:
-        raise DegenerateError(
-            f"{sum(map(len, positions))} pixels with depth in {len(views)} views; expected more"
-        )
-    return from_points(np.concatenate(positions), np.concatenate(colors), frame=frame, most=most)
+    return np.concatenate(positions), np.concatenate(colors)
 
 
 def _sizes(positions: NDArray[np.float64]) -> NDArray[np.float64]:

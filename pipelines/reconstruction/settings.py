@@ -148,6 +148,9 @@ class RunSettings(Settings):
     protocol: str = "gvtools"
     """What the completer's pixels are used for: gvtools keeps what was observed and fuses holes,
     paper runs GeoVerse as published; sets several of the others."""
+    points: Literal["all", "context"] = "all"
+    """Sparse points of the project that may be used: all, or those alone that two context views
+    detected. The others tell what held-out views see."""
     voxel: float | None = Field(None, gt=0)
     """Voxel edge; none derives it from the pixel footprints. [scene units]"""
     seed: int = Field(0, ge=0)

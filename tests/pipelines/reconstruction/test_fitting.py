@@ -17,6 +17,7 @@ from gvtools.appearance.blending import Blend
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture
 from gvtools.appearance.splat.project_kernels import VALUES
+from gvtools.appearance.start import from_points
 from gvtools.depth.foundation.source import FoundationDepth
 from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError, MemoryFileError
@@ -186,13 +187,35 @@ def test_photographs_alone_get_depth_by_the_gaussians(tmp_path, points):
     assert 1.5 < np.median(shown[shown > 0]) < 3.5
 
 
-def test_few_sparse_points_are_not_begun_with(tmp_path, monkeypatch):
+def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeypatch):
+    begun = []
+
+    def watched(positions, colors, **kwargs):
+        begun.append(positions)
+        return from_points(positions, colors, **kwargs)
+
+    monkeypatch.setattr(fitting, "from_points", watched)
+    scan = write_colmap_scan(tmp_path / "scan", views=10, points=15)
+    plan = planned(scan, "refine.steps=1", "refine.most_gaussians=20000")
+    fit_appearance(plan, Console(quiet=True))
+    monkeypatch.setattr(fitting, "ENOUGH_POINTS", 150)
+    fit_appearance(plan, Console(quiet=True))
+    few, enough = begun
+    assert len(enough) == 150
+    assert len(few) > 2000
+    np.testing.assert_array_equal(few[:150], enough)
+    # A wall and a square before it, both parallel to the pictures.
+    known = np.unique(enough[:, 2].round(6))
+    assert len(known) == 2
+    error = np.abs(few[150:, 2, None] - known).min(axis=1)
+    assert np.median(error) < 0.05
+
+
+def test_nothing_is_fitted_to_views_that_tell_no_depth(tmp_path, monkeypatch):
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=6)
-    monkeypatch.setattr(fitting, "from_points", not_to_be_called)
-    fit_appearance(planned(scan, "refine.steps=1"), Console(quiet=True))
-    monkeypatch.setattr(fitting, "FEWEST_POINTS", 50)
-    with pytest.raises(AssertionError, match="called"):
-        fit_appearance(planned(scan, "refine.steps=1"), Console(quiet=True))
+    monkeypatch.setattr(fitting, "_swept", lambda plan, views: [])
+    console = Console(quiet=True)
+    assert fit_appearance(planned(scan, "refine.steps=1"), console) is None
 
 
 def test_refined_poses_move_context_and_targets(scan):

@@ -2,13 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tiny_scan import write_scan
+from tiny_scan import write_colmap_scan, write_scan
 from trajectory_writers import write_tum
 
 from gvtools.errors import OptionError
 from gvtools.runs.layout import target_stems
 from gvtools.scenes.project import open_project
-from pipelines.reconstruction.plan import make_schedule
+from pipelines.reconstruction.plan import make_plan, make_schedule
+from pipelines.reconstruction.settings import RunSettings
 from pipelines.reconstruction.targets import resolve_targets
 
 
@@ -118,3 +119,17 @@ def test_targets_with_alike_names_have_files_of_their_own():
     assert len({stem.lower() for stem in stems}) == len(names)
     assert not any("/" in stem for stem in stems)
     assert stems[4:] == ("b", "interpolate_0001")
+
+
+def test_points_of_held_out_views_are_used_and_said_so_or_left_out(tmp_path):
+    scan = write_colmap_scan(tmp_path / "scan", views=4, points=10)
+    scene, said = open_project(scan), []
+    settings = {"context": "first:3", "targets": "last:1", "depth": "plane-sweep"}
+    plan = make_plan(scene, RunSettings(**settings), say=said.append)
+    assert plan.scene.points is not None
+    assert len(plan.scene.points.positions) == 40
+    assert any("40 of 40 sparse points" in line and "points=context" in line for line in said)
+    # Each point is detected by one view here; the context would have to detect it twice.
+    strict = make_plan(scene, RunSettings(**settings, points="context", voxel=0.1))
+    assert strict.scene.points is not None
+    assert len(strict.scene.points.positions) == 0
