@@ -11,6 +11,7 @@ from typing import NoReturn
 
 import gvtools
 from gvtools.errors import GvError
+from gvtools.system_libraries import advice, missing_libraries
 from pipelines.console import Console
 
 # Each module has SUMMARY, EXAMPLES, add_arguments(parser) and run(args, console).
@@ -108,6 +109,11 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
     except Exception as error:
         if args.debug:
             raise
+        missing = missing_libraries() if isinstance(error, ImportError | OSError) else ()
+        # A loader's error names a library; a file's does not.
+        if missing and ".so" in str(error):
+            print(f"gvtools: {advice(missing)}", file=sys.stderr)
+            return 2
         name = type(error).__name__
         print(f"gvtools: unexpected {name}: {error}; --debug shows where", file=sys.stderr)
         return 1

@@ -29,7 +29,7 @@ from gvtools.scenes.photographs import (
     rotation_findings,
 )
 from gvtools.scenes.scene import Finding, Scene, natural_key
-from gvtools.scenes.transforms_frame import LensParameters, frame_keys
+from gvtools.scenes.transforms_frame import FrameKeys, LensParameters, frame_keys
 from gvtools.scenes.undistort import Undistortion, undistortion
 
 FILE = "transforms.json"
@@ -110,11 +110,9 @@ def _photographs(
             absent.append(name)
             continue
         keys = frame_keys(frame, data, what=what)
-        pose, defect = rigid_transform(_matrix(keys.transform_matrix, what), what=what)
+        cam_from_world, defect = _pose(keys, what)
         defects.append(defect)
-        params = keys.lens(file, what=what)
-        if params not in lenses:
-            lenses[params] = undistortion(params.model, params.values, params.size, what=what)
+        lens = _lens(keys, file, lenses, what=what)
         mask = _beside(path.parent, keys.mask_path)
         depth = _beside(path.parent, keys.depth_file_path)
         lost = [item.name for item in (mask, depth) if item and not os.path.isfile(item)]
@@ -127,8 +125,8 @@ def _photographs(
             Photograph(
                 name,
                 file,
-                lenses[params],
-                invert_rigid(pose @ OPENCV_FROM_OPENGL),
+                lens,
+                cam_from_world,
                 mask if mask and os.path.isfile(mask) else None,
                 depth if depth and os.path.isfile(depth) else None,
                 partial(read_depth, unit=keys.depth_unit_scale_factor),
@@ -136,6 +134,41 @@ def _photographs(
         )
     findings += mask_findings(unmasked, masks)
     return photographs, absent, defects
+
+
+def read_transforms_cameras(path: Path) -> Cameras:
+    """The cameras of a ``transforms.json`` alone, as a path has them: no picture has to be there.
+
+    Distorted cameras become the pinhole cameras that ``read_transforms`` gives them.
+
+    Args:
+        path: the file.
+
+    Returns:
+        One camera a frame, in the order of names as ``read_transforms`` has it.
+
+    Raises:
+        ProjectError: no such file, malformed, or a camera whose picture's size nothing tells.
+        ShapeError: a pose with NaN, a scale or a mirror.
+    """
+    data = load_frames(path)
+    frames = data["frames"]
+    files = [_picture(path.parent, frame, f"{path}, frame {i}") for i, frame in enumerate(frames)]
+    names = _names(files)
+    lenses: dict[LensParameters, Undistortion] = {}
+    K, poses, sizes = [], [], []
+    order = sorted(range(len(frames)), key=lambda i: natural_key(names[i]))
+    for i in order:
+        what = f"{path}, frame {i} ({names[i]})"
+        keys = frame_keys(frames[i], data, what=what)
+        lens = _lens(keys, files[i], lenses, what=what)
+        K.append(lens.K)
+        poses.append(_pose(keys, what)[0])
+        sizes.append(lens.size)
+    width, height = np.array(sizes).T
+    return Cameras(
+        np.array(K), np.array(poses), width, height, tuple(names[i] for i in order)
+    )  # fmt: skip
 
 
 def write_transforms(
@@ -174,6 +207,15 @@ def write_transforms(
         frames.append(frame)
     data = {"exported_by": EXPORTER, "camera_model": "PINHOLE", "frames": frames}
     write_text(path, json.dumps(data, indent=2))
+
+
+def written_here(path: Path) -> bool:
+    """Whether ``write_transforms`` wrote a file that is there."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return bool(data.get("exported_by") == EXPORTER)
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return False
 
 
 def _relative(file: str | Path, folder: Path) -> str:
@@ -222,6 +264,22 @@ def _names(files: Sequence[Path]) -> list[str]:
     whole = [Path(os.path.abspath(file)) for file in files]
     shared = Path(os.path.commonpath([file.parent for file in whole]))
     return [file.relative_to(shared).as_posix() for file in whole]
+
+
+def _pose(keys: FrameKeys, what: str) -> tuple[np.ndarray, float]:
+    """(4, 4) cam_from_world with OpenCV axes, and how far the rotation was off."""
+    pose, defect = rigid_transform(_matrix(keys.transform_matrix, what), what=what)
+    return invert_rigid(pose @ OPENCV_FROM_OPENGL), defect
+
+
+def _lens(
+    keys: FrameKeys, file: Path, lenses: dict[LensParameters, Undistortion], *, what: str
+) -> Undistortion:
+    """A frame's lens, one object for all frames that share it; ``lenses`` is added to."""
+    params = keys.lens(file, what=what)
+    if params not in lenses:
+        lenses[params] = undistortion(params.model, params.values, params.size, what=what)
+    return lenses[params]
 
 
 def _matrix(value: Any, what: str) -> np.ndarray:

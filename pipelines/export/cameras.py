@@ -9,7 +9,6 @@ picture; in a
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
@@ -25,8 +24,8 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.thinning import thinned
 from gvtools.runs.target_files import completed_picture
 from gvtools.scenes.colmap_writer import write_colmap
-from gvtools.scenes.transforms_json import EXPORTER, write_transforms
 from gvtools.scenes.transforms_json import FILE as TRANSFORMS
+from gvtools.scenes.transforms_json import write_transforms, written_here
 
 GENERATED = "generated.txt"
 HEADER = "# views that a completer made: name, and its picture where the run kept it"
@@ -161,13 +160,7 @@ def foreign_model(folder: Path) -> Path | None:
 def foreign_transforms(path: Path) -> Path | None:
     """What a ``transforms.json`` written to ``path`` would replace and no export wrote, if any."""
     file = transforms_file(path)
-    if not file.is_file():
-        return None
-    try:
-        ours = json.loads(file.read_text(encoding="utf-8")).get("exported_by") == EXPORTER
-    except (OSError, ValueError, AttributeError):
-        ours = False
-    return None if ours else file
+    return file if file.is_file() and not written_here(file) else None
 
 
 def distinct_cameras(memory: SpatialMemory, run: Path) -> DistinctCameras:

@@ -43,12 +43,14 @@ class Splats:
         origin: (3,) float64, world frame, scene units; zero where float32 allows.
         fitted: how many were fitted; the others are points of the memory.
         further: fits of the run that are not among them.
+        rounds: (N,) int32, the round that each came with.
     """
 
     values: NDArray[np.float32]
     origin: NDArray[np.float64]
     fitted: int
     further: int
+    rounds: NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.values)
@@ -103,13 +105,15 @@ def splats_of(source: Source, options: ExportOptions) -> Splats:
     """
     appearance, memory = source.appearance, source.memory
     if appearance is None:
-        values, origin = _rounded(of_points(source, options), memory.frame.origin)
-        return Splats(values, origin, 0, 0)
+        values, rounds = of_points(source, options)
+        values, origin = _rounded(values, memory.frame.origin)
+        return Splats(values, origin, 0, 0, rounds)
     first = appearance.gaussians
     if appearance.exposures is not None:
         first = exposed(first, appearance.exposures, _photographs(memory))
     fitted = turned(first.values, first.frame.axes)
     parts, rest = [fitted], None
+    rounds = [np.zeros(len(fitted), np.int32)]
     if options.max_points is not None:
         rest = options.max_points - len(fitted)
         if rest < 0:
@@ -119,11 +123,12 @@ def splats_of(source: Source, options: ExportOptions) -> Splats:
             )
     made = memory.generated
     if made.any() and not options.observed and rest != 0:
-        points = of_points(source, ExportOptions(max_points=rest), among=made)
+        points, came = of_points(source, ExportOptions(max_points=rest), among=made)
         points[:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)
         parts.append(points)
+        rounds.append(came)
     values, origin = _rounded(np.concatenate(parts), first.frame.origin)
-    return Splats(values, origin, len(fitted), len(appearance.others))
+    return Splats(values, origin, len(fitted), len(appearance.others), np.concatenate(rounds))
 
 
 def _rounded(
@@ -153,13 +158,14 @@ def _photographs(memory: SpatialMemory) -> Cameras:
 
 def of_points(
     source: Source, options: ExportOptions, *, among: NDArray[np.bool_] | None = None
-) -> NDArray[np.float32]:
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Round Gaussians of a memory's points, one a voxel.
 
     Their size follows from the distance between points, their opacity from confidence.
 
     Returns:
-        (N, VALUES) float32 with the world's axes, positions from the memory's origin.
+        (N, VALUES) float32 with the world's axes, positions from the memory's origin; and (N,)
+        int32, the round that each point came with.
 
     Raises:
         OptionError: nothing is left.
@@ -179,4 +185,4 @@ def of_points(
     share = confidence / (confidence + HALFWAY)
     opacity = LEAST_OPACITY + (MOST_OPACITY - LEAST_OPACITY) * share
     gaussians.values[:, LOGIT] = np.log(opacity / (1 - opacity))
-    return gaussians.values
+    return gaussians.values, columns.round[points.rows].astype(np.int32)

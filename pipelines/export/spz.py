@@ -1,4 +1,4 @@
-"""3D Gaussians as SPZ, version 3: Niantic's format, a tenth of the PLY's size.
+"""3D Gaussians as SPZ, version 3: Niantic's format, a tenth of the PLY's size; also read.
 
 A gzip stream of a header and one array after the other: positions (24-bit fixed point), opacities,
 colours and logarithms of sizes (8 bits each), rotations (32 bits: the three smallest components and
@@ -11,13 +11,22 @@ from __future__ import annotations
 
 import gzip
 import struct
+import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.splat.project_kernels import LOG_SCALE
+from gvtools.appearance.splat.project_kernels import (
+    LOG_SCALE,
+    LOGIT,
+    QUATERNION,
+    SH,
+    VALUES,
+)
 from gvtools.appearance.turning import turned
+from gvtools.errors import MemoryFileError
 from gvtools.files import replaced_when_written
 from pipelines.export.source import ExportOptions, Source
 from pipelines.export.splats import Splats, splats_of
@@ -37,6 +46,8 @@ COLOR, SCALE, SHIFT = 0.15, 16, 10
 HARMONIC_BITS = (5, 4)
 # A component's 9 bits of magnitude; the three smallest are at most this.
 COMPONENT, LARGEST = 511, np.sqrt(0.5)
+# From 0 and from 1, of opacities that are read: their logits are finite.
+LEAST = 1e-4
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
@@ -57,7 +68,7 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
 def packed(splats: Splats) -> tuple[bytes, int]:
     """The stream before gzip, and how many bits of a position lie behind the point."""
     values = turned(splats.values, TO_RUB)
-    one = Splats(values, splats.origin, splats.fitted, splats.further)
+    one = replace(splats, values=values)
     reach = float(np.abs(values[:, :LOG_SCALE]).max())
     # As fine as the smallest Gaussians ask for and the farthest position allows.
     size = float(np.exp(np.quantile(one.log_scales.min(axis=1), SMALLEST)))
@@ -76,6 +87,74 @@ def packed(splats: Splats) -> tuple[bytes, int]:
         _harmonics(one.harmonics[:, 1:]),
     ]
     return header + b"".join(np.ascontiguousarray(part).tobytes() for part in parts), fractional
+
+
+def read(path: Path) -> Splats:
+    """The Gaussians of a file, with the axes of a PLY; harmonics above degree 2 are left out.
+
+    Raises:
+        MemoryFileError: unreadable, of another version than 2 and 3, or of another size than its
+            header says.
+    """
+    try:
+        data = gzip.decompress(path.read_bytes())
+        magic, version, count, degree, fractional, _, _ = HEADER.unpack_from(data)
+    except (OSError, EOFError, zlib.error, struct.error) as error:
+        raise MemoryFileError(
+            f"{path}: no SPZ of version 2 or 3 ({error}); expected a gzip stream"
+        ) from None
+    if magic != MAGIC or version not in (2, 3) or degree > 3:
+        raise MemoryFileError(
+            f"{path}: SPZ version {version}, harmonics of degree {degree}; expected version 2 or "
+            "3, degree 3 at most"
+        )
+    terms = (degree + 1) ** 2 - 1
+    lengths = [9, 1, 3, 3, 3 if version == 2 else 4, 3 * terms]
+    bytes_ = np.frombuffer(data, np.uint8, offset=HEADER.size)
+    if len(bytes_) != count * sum(lengths):
+        raise MemoryFileError(
+            f"{path}: {len(bytes_)} bytes of Gaussians; its header says {count} of {sum(lengths)}"
+        )
+    parts = np.split(bytes_, np.cumsum(lengths)[:-1] * count)
+    places, opacity, color, size, turns, rest = (part.reshape(count, -1) for part in parts)
+    values = np.zeros((count, VALUES), np.float32)
+    padded = np.zeros((count, 3, 4), np.uint8)
+    # Above the byte that is not there, so that the sign is kept.
+    padded[:, :, 1:] = places.reshape(count, 3, 3)
+    fixed = padded.reshape(count, -1).view("<i4") >> 8
+    values[:, :LOG_SCALE] = fixed / 2.0**fractional
+    values[:, LOG_SCALE:QUATERNION] = size / SCALE - SHIFT
+    values[:, QUATERNION:LOGIT] = _first_three(turns) if version == 2 else _from_smallest(turns)
+    share = np.clip(opacity[:, 0] / 255, LEAST, 1 - LEAST)
+    values[:, LOGIT] = np.log(share / (1 - share))
+    values[:, SH : SH + 3] = (color / 255 - 0.5) / COLOR
+    kept = (rest.astype(np.float32) - 128) / 128
+    kept = kept[:, : VALUES - SH - 3]
+    values[:, SH + 3 : SH + 3 + kept.shape[1]] = kept
+    rounds = np.zeros(count, np.int32)
+    return Splats(turned(values, TO_RUB), np.zeros(3), count, 0, rounds)
+
+
+def _first_three(turns: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(N, 4) w, x, y, z of version 2's (N, 3) bytes: x, y and z of quaternions with w >= 0."""
+    xyz = turns / 127.5 - 1
+    w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
+    return np.concatenate([w, xyz], axis=1)
+
+
+def _from_smallest(turns: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(N, 4) w, x, y, z: the inverse of ``_smallest_three``."""
+    word = np.ascontiguousarray(turns).view("<u4")[:, 0]
+    largest = word >> 30
+    q = np.zeros((len(word), 4))
+    for axis in (3, 2, 1, 0):
+        stored = largest != axis
+        size = (word & COMPONENT) * (LARGEST / COMPONENT)
+        q[:, axis] = np.where(stored, np.where(word >> 9 & 1, -size, size), 0)
+        word = np.where(stored, word >> 10, word)
+    rest = np.sqrt(np.maximum(1 - np.square(q).sum(axis=1), 0))
+    np.put_along_axis(q, largest[:, None].astype(np.int64), rest[:, None], axis=1)
+    return np.roll(q, 1, axis=1)
 
 
 def _byte(values: NDArray[np.floating]) -> NDArray[np.uint8]:

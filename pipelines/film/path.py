@@ -18,7 +18,8 @@ CAPTURED = "cameras"
 FRAMES = 120
 FORMS = (
     f"{', '.join(f'{name}:N' for name in PATHS)}, {CAPTURED} (the captured views in order), a "
-    "trajectory file (TUM or KITTI), or a project as PATH or PATH@SELECTION"
+    "trajectory file (TUM or KITTI), a transforms.json such as 'gvtools view' saves, or a project, "
+    "the last two as PATH or PATH@SELECTION"
 )
 
 
@@ -69,9 +70,15 @@ def _cameras(memory: SpatialMemory, captured: Cameras, path: str) -> Cameras:
     place, at, selection = path.partition("@")
     if not Path(place).exists():
         raise OptionError(f"--path {path!r}; expected {FORMS}")
-    if Path(place).is_dir() or Path(place).suffix.lower() == ".json":
+    from gvtools.scenes.selection import select
+
+    if Path(place).suffix.lower() == ".json":
+        from gvtools.scenes.transforms_json import read_transforms_cameras
+
+        cameras = read_transforms_cameras(Path(place))
+        return cameras[list(map(cameras.names.index, select(cameras.names, selection or "all")))]
+    if Path(place).is_dir():
         from gvtools.scenes.project import open_project
-        from gvtools.scenes.selection import select
 
         scene = open_project(Path(place))
         return scene.subset(select(scene.names, selection if at else "all")).cameras

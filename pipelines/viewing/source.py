@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,19 +11,22 @@ from gvtools.errors import GvError, ProjectError
 from gvtools.runs.layout import RECORD
 from gvtools.runs.memory_file import load_memory
 from gvtools.runs.run import Run, count_rounds, load_growing_run
-from viz.run_view.view import RunView, cameras_of
+from pipelines.viewing.files import open_file
+from pipelines.viewing.gaussians import run_gaussians
+from viz.run_view.view import POINTS, RENDERED, SPLATS, RunView, cameras_of
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Frame, Scene
 
 KEPT_FRAMES = 8
+LOOKS = (POINTS, SPLATS, RENDERED)
 
 
 class ViewSource:
     """A run or a memory that can be read again and again.
 
     Args:
-        path: a run's folder, a memory file or a coloured PLY.
+        path: a run's folder, a memory file, or what ``gvtools export`` writes.
         project: where the run's project lies now; None: where it lay.
     """
 
@@ -43,8 +46,15 @@ class ViewSource:
             GvError: no run or memory, a damaged file.
         """
         if not (self.path / RECORD).is_file():
+            shown = open_file(self.path)
+            if shown is not None:
+                return shown
             memory = load_memory(self.path)
-            return RunView(self.path, memory, (), cameras_of(memory, ()), self._frames)
+            cameras = cameras_of(memory, ())
+            return RunView(
+                self.path, memory, (), cameras, self._frames, None, LOOKS,
+                partial(run_gaussians, self.path, memory),
+            )  # fmt: skip
         run = load_growing_run(self.path, project=self.project)
         if self._frames.run is None:
             self._frames = ProjectFrames(run)
@@ -55,7 +65,10 @@ class ViewSource:
                 f"{self.path}: its rounds' reports hold a camera that is none ({error}); run "
                 "reconstruct again"
             ) from None
-        return RunView(self.path, run.memory, run.rounds, cameras, self._frames, run.planned)
+        return RunView(
+            self.path, run.memory, run.rounds, cameras, self._frames, run.planned, LOOKS,
+            partial(run_gaussians, self.path, run.memory),
+        )  # fmt: skip
 
     def lacking(self) -> str | None:
         """Why the project's own pictures cannot be shown; None when they can."""

@@ -25,9 +25,10 @@ from viz.run_view.view import TARGET
 
 pytest.importorskip("viser", reason="viser is not installed (extra web)")
 
+from viz.web.rendered import LONGEST
+
 from viz.web.frame import FIELD_OF_VIEW, PageFrame, home
 from viz.web.pictures import GAP, ROW_WIDTH
-from viz.web.splats import LONGEST
 from viz.web.viewer import WebViewer
 
 # A page in software on a busy machine.

@@ -18,6 +18,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.runs.layout import AFTER, COMPLETION, GUIDANCE, round_folder
 from gvtools.runs.target_files import entry_camera, read_picture
+from viz.run_view.gaussians import ShownGaussians, Surface
 from viz.run_view.point_colors import PointColors, point_colors, view_counts
 from viz.run_view.upright import STRAY, guessed_up
 
@@ -29,6 +30,9 @@ CONTEXT, TARGET = "context", "target"
 # The pictures that a round leaves of a target, by the title that a viewer gives them.
 PICTURES = {"guidance": GUIDANCE, "completion": COMPLETION, "memory after": AFTER}
 TRUTH = "truth"
+# How a viewer may show it: as points, as the Gaussians of an export, as the project's own splatter
+# renders it, or as a file's mesh.
+POINTS, SPLATS, RENDERED, MESH = "points", "splats", "rendered", "mesh"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +76,9 @@ class RunView:
         cameras: context first, then targets, in the order of rounds.
         frame_of: the project's pixels of a view by its name; None where it has none.
         planned: how many rounds, the context's included, the run is to have; None if unknown.
+        looks: of POINTS, SPLATS, RENDERED and MESH, those that there are; the first to begin with.
+        gaussians_of: the Gaussians to draw for SPLATS, so many of the memory's points at most.
+        surface: to draw for MESH.
     """
 
     path: Path
@@ -80,6 +87,9 @@ class RunView:
     cameras: tuple[ShownCamera, ...]
     frame_of: Callable[[str], Frame | None]
     planned: int | None = None
+    looks: tuple[str, ...] = (POINTS, RENDERED)
+    gaussians_of: Callable[[int], ShownGaussians] | None = None
+    surface: Surface | None = None
 
     @property
     def title(self) -> str:

@@ -97,10 +97,10 @@ class CameraNodes:
     def mark(self, shown: ShownCamera) -> None:
         """Paint the selected camera, and the one before in its own colour again."""
         if self._marked in self._nodes:
-            self._nodes[self._marked].color = _rgb(KINDS[self._marked[1]])
+            self._nodes[self._marked].color = rgb_of(KINDS[self._marked[1]])
         self._marked = _key(shown)
         if self._marked in self._nodes:
-            self._nodes[self._marked].color = _rgb(RED)
+            self._nodes[self._marked].color = rgb_of(RED)
 
     def stop(self) -> None:
         """Add no more."""
@@ -119,7 +119,7 @@ class CameraNodes:
             aspect=width / height,
             scale=self._depth,
             thickness=0.02 * self._depth,
-            color=_rgb(RED if _key(shown) == self._marked else KINDS[shown.kind]),
+            color=rgb_of(RED if _key(shown) == self._marked else KINDS[shown.kind]),
             wxyz=wxyz,
             position=position,
             visible=self._shows(shown.kind, shown.round),
@@ -203,5 +203,6 @@ def _key(shown: ShownCamera) -> tuple[str, str, int]:
     return shown.name, shown.kind, shown.round
 
 
-def _rgb(color: str) -> tuple[int, int, int]:
+def rgb_of(color: str) -> tuple[int, int, int]:
+    """A colour "#rrggbb" as bytes."""
     return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)

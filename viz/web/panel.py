@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     import viser
 
 NO_CAMERA = "none"
-# As points, or as the project's splatter renders the viewer's own view.
-LOOKS = ("points", "splats")
+LOOKS_HINT = "splats: as exported; rendered: as gvtools render draws this view"
 # Of the panel with the selected camera's pictures, CSS pixels: a little over half of the scene in a
 # window of 1280. It can be moved, made larger and folded away.
 PICTURES_WIDTH = 500
@@ -34,9 +33,10 @@ class Panel:
     Args:
         server: that shows them.
         mode: colours to begin with.
+        looks: to choose from.
         on_round: told the round to show.
         on_mode: told the colour mode, of MODES.
-        on_look: told whether splats instead of points.
+        on_look: told which of the looks.
         on_camera: told the camera that was chosen, and by whom.
         on_size: told the points' size in spacings.
         on_kinds: told which kinds of cameras to show.
@@ -47,9 +47,10 @@ class Panel:
         server: viser.ViserServer,
         *,
         mode: str,
+        looks: tuple[str, ...],
         on_round: Callable[[int], None],
         on_mode: Callable[[str], None],
-        on_look: Callable[[bool], None],
+        on_look: Callable[[str], None],
         on_camera: Callable[[ShownCamera, viser.ClientHandle | None], None],
         on_size: Callable[[float], None],
         on_kinds: Callable[[dict[str, bool]], None],
@@ -65,7 +66,7 @@ class Panel:
         self._counts = gui.add_html("")
         self._mode = gui.add_dropdown("Colour", tuple(MODES.values()), initial_value=MODES[mode])
         self._legend = gui.add_html("")
-        self._look = gui.add_dropdown("Look", LOOKS)
+        self._look = gui.add_dropdown("Look", looks, hint=LOOKS_HINT)
         self._size = gui.add_slider("Point size", 0.25, 4.0, 0.25, 1.0, hint="in spacings")
         self._camera = gui.add_dropdown("Camera", (NO_CAMERA,), hint="choose or click one")
         kinds = {
@@ -82,7 +83,7 @@ class Panel:
 
         self._round.on_update(lambda event: on_round(int(event.target.value)))
         self._mode.on_update(lambda _: on_mode(self.mode))
-        self._look.on_update(lambda event: on_look(event.target.value == LOOKS[1]))
+        self._look.on_update(lambda event: on_look(str(event.target.value)))
         self._size.on_update(lambda event: on_size(float(event.target.value)))
         for box in kinds.values():
             box.on_update(lambda _: on_kinds({kind: b.value for kind, b in kinds.items()}))

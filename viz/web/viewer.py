@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 
 from viz.run_view.detail import detail
 from viz.run_view.point_colors import MODES, Legend
-from viz.run_view.view import RunView, ShownCamera
+from viz.run_view.view import MESH, POINTS, RENDERED, SPLATS, RunView, ShownCamera
+from viz.web.camera_path import CameraPath
 from viz.web.cameras import CameraNodes, fly_to
 from viz.web.frame import FIELD_OF_VIEW, PageFrame, home
+from viz.web.gaussians import GaussianNodes, add_surface
 from viz.web.panel import Panel
 from viz.web.pictures import shown_pictures
 from viz.web.points import PointNodes
-from viz.web.server import LOCAL, address_of, make_server
-from viz.web.splats import SplatLook
+from viz.web.rendered import RenderedLook
+from viz.web.server import LOCAL, address_of, is_loopback, make_server
 
 if TYPE_CHECKING:
     import viser
@@ -69,10 +71,16 @@ class WebViewer:
         self.server = make_server(host, port, run.title)
         self._points = PointNodes(self.server, self.frame)
         self._cameras = CameraNodes(self.server, self.frame, self._clicked)
-        self._splats = SplatLook(self.server, self.frame)
+        self._gaussians = GaussianNodes(self.server, self.frame)
+        self._mesh = (
+            None if run.surface is None else add_surface(self.server, self.frame, run.surface)
+        )
+        self._rendered = RenderedLook(self.server, self.frame)
+        self._look = run.looks[0]
         self._panel = Panel(
             self.server,
             mode=mode,
+            looks=run.looks,
             on_round=self._show_round,
             on_mode=self._show_mode,
             on_look=self._show_look,
@@ -80,6 +88,7 @@ class WebViewer:
             on_size=self._set_size,
             on_kinds=self._cameras.set_kinds,
         )
+        self.path = CameraPath(self.server, self.frame, run, saves=is_loopback(host))
         self.server.scene.set_up_direction(tuple(run.up()))
         self.server.scene.world_axes.visible = False
         self._set_home()
@@ -101,10 +110,12 @@ class WebViewer:
         with self._lock:
             self.run = run
             drawn = detail(run.memory, self.budget)
-            self._splats.set_run(run)
+            self._rendered.set_run(run)
             self._panel.set_run(run, drawn, go_to=go_to)
             self._points.set_points(run, drawn, self._colors(drawn.rows))
             self._panel.set_size(self._points.size)
+            self._gaussians.clear()
+            self._show_look(self._look)
             self._show_round(self._panel.round)
             self._cameras.set_cameras(run)
 
@@ -114,7 +125,7 @@ class WebViewer:
 
     def stop(self) -> None:
         """End the server."""
-        self._splats.stop()
+        self._rendered.stop()
         self._cameras.stop()
         with redirect_stdout(io.StringIO()):
             self.server.stop()
@@ -128,21 +139,28 @@ class WebViewer:
         with self._lock:
             with self.server.atomic():
                 self._points.show(number)
+                self._gaussians.show(number)
                 self._cameras.show(number)
             self._panel.set_counts(self.run, number, self._points.drawn(number))
-            self._splats.set_state(number, self._panel.mode)
+            self._rendered.set_state(number, self._panel.mode)
 
     def _show_mode(self, mode: str) -> None:
         with self._lock:
             if mode in MODES:
                 self._panel.set_legend(Legend("..."))
                 self._points.recolor(self._colors(self._points.rows))
-                self._splats.set_state(self._panel.round, mode)
+                self._rendered.set_state(self._panel.round, mode)
 
-    def _show_look(self, splats: bool) -> None:
+    def _show_look(self, look: str) -> None:
         with self._lock:
-            self._points.set_visible(not splats)
-            self._splats.set_on(splats)
+            self._look = look
+            if look == SPLATS and not self._gaussians and self.run.gaussians_of is not None:
+                self._gaussians.set_gaussians(self.run.gaussians_of(self.budget), self.run)
+            self._points.set_visible(look == POINTS)
+            self._gaussians.set_visible(look == SPLATS)
+            self._rendered.set_on(look == RENDERED)
+            if self._mesh is not None:
+                self._mesh.visible = look == MESH
 
     def _set_size(self, scale: float) -> None:
         with self._lock:

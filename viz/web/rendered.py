@@ -21,7 +21,7 @@ LONGEST = 960
 FARTHEST = 167.0
 
 
-class SplatLook:
+class RenderedLook:
     """Renders for each client whenever its camera, the round or the colour mode has changed.
 
     Args:

@@ -1,0 +1,180 @@
+"""Files that ``gvtools export`` writes, opened for viewers.
+
+Each becomes a memory of its points, and keeps its Gaussians or its mesh beside it. Axes are the
+file's, which for exports are the input's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import GvError, MemoryFileError, OptionError
+from gvtools.memory.spatial_memory import SpatialMemory
+from pipelines.export import splat, spz
+from pipelines.export.splats import Splats
+from pipelines.viewing.gaussians import shown_gaussians
+from viz.run_view.gaussians import Surface
+from viz.run_view.view import MESH, POINTS, RENDERED, SPLATS, RunView
+
+if TYPE_CHECKING:
+    import trimesh
+
+# As much of a PLY as tells what it holds.
+HEADER = 1 << 16
+GREY = 160
+
+
+def open_file(path: Path) -> RunView | None:
+    """What a file shows; None where it is no export but, perhaps, a memory or a run.
+
+    Raises:
+        MemoryFileError: damaged, or of another kind than its name says.
+        OptionError: a package that reads it is not installed.
+    """
+    suffix = path.suffix.lower()
+    if not path.is_file() or suffix not in OPENERS:
+        return None
+    try:
+        return OPENERS[suffix](path)
+    except ImportError as error:
+        raise OptionError(
+            f"{path}: {suffix} needs {error.name}, not installed here; run 'pip install "
+            '"gvtools[export]"\''
+        ) from None
+    except GvError:
+        raise
+    except Exception as error:  # Readers of other packages raise what they please.
+        text = str(error) or type(error).__name__
+        raise MemoryFileError(
+            f"{path}: cannot be read as {suffix} ({text.splitlines()[0]}); expected a file as "
+            "gvtools export writes it"
+        ) from error
+
+
+def _open_ply(path: Path) -> RunView | None:
+    with path.open("rb") as file:
+        words = [line.split() for line in file.read(HEADER).split(b"end_header")[0].splitlines()]
+    if any(line[:2] == [b"element", b"face"] and line[2:] != [b"0"] for line in words):
+        return _open_mesh(path)
+    names = {line[-1].decode("ascii", "replace") for line in words if line[:1] == [b"property"]}
+    if not splat.is_splat(names):
+        return None
+    return _splat_view(path, splat.read(path))
+
+
+def _open_spz(path: Path) -> RunView:
+    return _splat_view(path, spz.read(path))
+
+
+def _open_mesh(path: Path) -> RunView:
+    import trimesh
+
+    loaded = trimesh.load_scene(path, process=False).to_geometry()
+    if isinstance(loaded, trimesh.PointCloud):
+        colors = np.asarray(loaded.colors)[:, :3] if len(loaded.colors) else None
+        return _points_view(path, np.asarray(loaded.vertices), colors)
+    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
+        raise MemoryFileError(f"{path}: no triangles and no points; expected either")
+    vertices, colors = np.asarray(loaded.vertices, np.float64), _vertex_colors(loaded)
+    surface = Surface(vertices, np.asarray(loaded.faces), colors)
+    memory = _memory(path, vertices, colors)
+    return RunView(path, memory, (), (), _no_frame, looks=(MESH, POINTS), surface=surface)
+
+
+def _vertex_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8]:
+    """(V, 3) of any mesh; of a texture, those at the vertices."""
+    visual: Any = mesh.visual
+    if visual.kind == "texture":
+        visual = visual.to_color()
+    if visual.kind is None:
+        return np.full((len(mesh.vertices), 3), GREY, np.uint8)
+    return np.asarray(visual.vertex_colors, np.uint8)[:, :3]
+
+
+def _open_las(path: Path) -> RunView:
+    import laspy
+
+    cloud = laspy.read(path)
+    colors = None
+    if "red" in cloud.point_format.dimension_names:
+        colors = np.stack([cloud.red, cloud.green, cloud.blue], axis=1)
+        # The standard has 16 bits; some software writes 8 into them.
+        colors = (colors >> 8 if colors.max(initial=0) > 255 else colors).astype(np.uint8)
+    return _points_view(path, np.asarray(cloud.xyz), colors)
+
+
+def _open_usd(path: Path) -> RunView:
+    from pxr import Usd, UsdGeom
+
+    places, colors = [], []
+    cache = UsdGeom.XformCache()
+    # The stage has to outlive its prims.
+    stage = Usd.Stage.Open(str(path))
+    for prim in stage.Traverse():
+        if not prim.IsA(UsdGeom.Points):
+            continue
+        local = np.asarray(UsdGeom.Points(prim).GetPointsAttr().Get(), np.float64).reshape(-1, 3)
+        matrix = np.array(cache.GetLocalToWorldTransform(prim))
+        places.append(local @ matrix[:3, :3] + matrix[3, :3])
+        color = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
+        linear = np.full((1, 3), GREY / 255) if color is None else np.asarray(color, np.float64)
+        colors.append(np.broadcast_to(_srgb(linear), local.shape))
+    if not places:
+        raise MemoryFileError(f"{path}: no UsdGeom.Points; expected them")
+    return _points_view(path, np.concatenate(places), np.concatenate(colors))
+
+
+def _srgb(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Linear light as bytes of sRGB."""
+    linear = np.clip(linear, 0, 1)
+    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.rint(255 * curved).astype(np.uint8)
+
+
+def _points_view(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) -> RunView:
+    return RunView(
+        path, _memory(path, positions, colors), (), (), _no_frame, looks=(POINTS, RENDERED)
+    )
+
+
+def _splat_view(path: Path, splats: Splats) -> RunView:
+    if not len(splats):
+        raise MemoryFileError(f"{path}: no Gaussians; expected some")
+    gaussians = shown_gaussians(splats)
+    memory = _memory(path, gaussians.centers, gaussians.colors(None))
+    return RunView(
+        path, memory, (), (), _no_frame,
+        looks=(SPLATS, POINTS), gaussians_of=lambda most: gaussians,
+    )  # fmt: skip
+
+
+def _memory(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) -> SpatialMemory:
+    import open3d as o3d
+
+    cloud = o3d.t.geometry.PointCloud()
+    if colors is None:
+        colors = np.full((len(positions), 3), GREY, np.uint8)
+    cloud.point.positions = o3d.core.Tensor(np.ascontiguousarray(positions, np.float64))
+    cloud.point.colors = o3d.core.Tensor(np.ascontiguousarray(colors, np.uint8))
+    try:
+        return SpatialMemory.from_point_cloud(cloud, name=path.name)
+    except GvError as error:
+        raise MemoryFileError(f"{path}: {error}") from None
+
+
+def _no_frame(name: str) -> None:
+    return None
+
+
+OPENERS: Mapping[str, Callable[[Path], RunView | None]] = {
+    ".ply": _open_ply,
+    ".spz": _open_spz,
+    **dict.fromkeys((".glb", ".obj"), _open_mesh),
+    **dict.fromkeys((".las", ".laz"), _open_las),
+    **dict.fromkeys((".usd", ".usda", ".usdc"), _open_usd),
+}
