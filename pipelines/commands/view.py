@@ -1,4 +1,4 @@
-"""``gvtools view``: a run in the browser, in Open3D's window, or as one picture."""
+"""``gvtools view``: a run or an exported file in the browser, in a window, or as one picture."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from gvtools.errors import OptionError
 if TYPE_CHECKING:
     from pipelines.console import Console
 
-SUMMARY = "look at a run: web page, Open3D window or picture; colours by what is known of a point"
+SUMMARY = "look at a run or an exported file: web page, Open3D window or picture"
 EXAMPLES = (
     "gvtools view runs/kitchen",
     "gvtools view runs/kitchen --screenshot kitchen.png --color source",
+    "gvtools view kitchen.spz",
 )
 # As viz.web.viewer and viz.run_view.point_colors have them, which are not loaded for the parser.
 LOCAL, PORT, MAX_POINTS = "127.0.0.1", 8080, 1_000_000
@@ -23,7 +24,13 @@ COLORS = ("color", "round", "source", "confidence", "views", "depth-error")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("run", type=Path, metavar="RUN_OR_MEMORY", help="a run, memory.npz or PLY")
+    parser.add_argument(
+        "run",
+        type=Path,
+        metavar="RUN_OR_FILE",
+        help="a run, memory.npz, or a file of gvtools export: splats and points (.ply, .spz, .las, "
+        ".laz, .usdc, .usda, .glb), meshes (.ply, .glb, .obj), recordings (.rrd, by rerun)",
+    )
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--web", action="store_true", help="serve a web page (default)")
     how.add_argument("--open3d", action="store_true", help="open Open3D's window instead")
@@ -58,10 +65,14 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: no run, an option that does not fit, no display.
     """
+    from pipelines.viewing.rerun import SUFFIX, open_recording
     from pipelines.viewing.serve import read_round, serve
     from pipelines.viewing.source import ViewSource
 
     _check(args)
+    if args.run.suffix.lower() == SUFFIX:
+        open_recording(args.run, host=args.host, port=args.port)
+        return
     source, mode = ViewSource(args.run, project=args.project), args.color or "color"
     if args.live or not (args.open3d or args.screenshot):
         try:

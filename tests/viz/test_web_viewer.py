@@ -17,6 +17,7 @@ import pytest
 from browser import Browser, free_port, open_browser
 from memory_scenes import camera
 from PIL import Image
+from web_page import PATIENCE, choose, close_notes, steady, wait
 
 from gvtools.memory.io.ply import write_ply
 from pipelines.viewing.source import ViewSource
@@ -25,16 +26,10 @@ from viz.run_view.view import TARGET
 
 pytest.importorskip("viser", reason="viser is not installed (extra web)")
 
-from viz.web.rendered import LONGEST
-
 from viz.web.frame import FIELD_OF_VIEW, PageFrame, home
 from viz.web.pictures import GAP, ROW_WIDTH
+from viz.web.rendered import LONGEST
 from viz.web.viewer import WebViewer
-
-# A page in software on a busy machine.
-PATIENCE = 60.0
-# Where the scene shows, free of the controls: the window is 1280 x 800, the controls on the right.
-SCENE = np.s_[60:460, 20:930]
 
 
 @pytest.fixture(scope="module")
@@ -54,49 +49,6 @@ def browser(viewer):
         # Whatever the tests did, nothing went wrong on the page and nothing left the machine.
         assert found.console_errors() == []
         assert found.foreign_requests() == []
-
-
-def wait(condition, patience=PATIENCE):
-    """What ``condition`` gives once it gives something."""
-    end = time.monotonic() + patience
-    while not (found := condition()):
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.1)
-    return found
-
-
-def close_notes(browser: Browser) -> None:
-    """Click away what the page says of a machine without a graphics card."""
-    for button in browser.driver.find_elements("css selector", ".mantine-Notification-closeButton"):
-        button.click()
-
-
-def choose(browser: Browser, shown: str, option: str) -> None:
-    """Open the menu that shows one text and click another."""
-    menus = browser.driver.find_elements("css selector", "input[role=combobox]")
-    next(m for m in menus if m.get_attribute("value") == shown).click()
-
-    def visible():
-        options = browser.driver.find_elements("css selector", "[role=option]")
-        return [o for o in options if o.is_displayed() and o.text == option]
-
-    wait(visible)[0].click()
-
-
-def steady(browser: Browser, differs_from=None):
-    """The scene once two looks at it agree, and it is another one than before."""
-
-    def look():
-        first = browser.picture()[SCENE]
-        time.sleep(0.3)
-        second = browser.picture()[SCENE]
-        if not np.array_equal(first, second):
-            return None
-        if differs_from is not None and np.array_equal(second, differs_from):
-            return None
-        return (second,)
-
-    return wait(look)[0]
 
 
 def painted(picture) -> int:
@@ -165,7 +117,7 @@ def test_a_click_on_a_camera_flies_there_and_shows_its_pictures(browser, viewer)
 @pytest.mark.slow
 def test_the_splatter_renders_the_viewers_own_view(browser, viewer):
     before = steady(browser)
-    choose(browser, "points", "splats")
+    choose(browser, "points", "rendered")
     steady(browser, before)
     client = next(iter(viewer.server.get_clients().values()))
     camera = viewer.frame.client_camera(client, longest=LONGEST)
@@ -180,7 +132,7 @@ def test_the_splatter_renders_the_viewers_own_view(browser, viewer):
         return np.abs(seen[60:400, 20:900].astype(int) - whole[60:400, 20:900]).mean() < 10
 
     wait(alike)
-    choose(browser, "splats", "points")
+    choose(browser, "rendered", "points")
 
 
 @pytest.mark.slow

@@ -66,9 +66,7 @@ class Open3dViewer:
         self._rgb = np.zeros((0, 3))
         self._fill()
         self.window = o3d.visualization.VisualizerWithKeyCallback()
-        if os.name == "posix" and not (
-            os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        ):
+        if not has_display():
             raise OptionError("--open3d: no display; expected X or Wayland; use --screenshot FILE")
         if not self.window.create_window(f"gvtools: {run.title}", WIDTH, HEIGHT):
             raise OptionError("--open3d: no window could be opened; use --screenshot FILE")
@@ -188,3 +186,9 @@ class Open3dViewer:
             f"round {self.round} of {self.run.last_round}: {counts.observed:,} observed, "
             f"{counts.generated:,} generated; {MODES[self.mode]}: {self._legend.text}{scale}"
         )
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return os.name != "posix" or bool(named)

@@ -1,0 +1,104 @@
+"""Containers and the conda recipe, held against what they are made from."""
+
+from __future__ import annotations
+
+import configparser
+import re
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+
+import gvtools
+from gvtools.system_libraries import LIBRARIES
+
+ROOT = Path(__file__).resolve().parents[1]
+# conda-forge's names where they are not PyPI's.
+CONDA = {
+    "torch": "pytorch",
+    "opencv-python-headless": "py-opencv",
+    "matplotlib": "matplotlib-base",
+}
+
+
+def setup() -> configparser.ConfigParser:
+    found = configparser.ConfigParser()
+    found.read(ROOT / "setup.cfg")
+    return found
+
+
+@pytest.fixture(scope="module", params=["cpu", "cuda"])
+def steps(request):
+    """Instructions of a Dockerfile in order, as (instruction, value)."""
+    parse = pytest.importorskip("dockerfile_parse", reason="dockerfile-parse is not installed")
+    file = ROOT / "containers" / f"{request.param}.Dockerfile"
+    parser = parse.DockerfileParser(path=str(file), fileobj=None)
+    return [(each["instruction"], each["value"]) for each in parser.structure]
+
+
+def of(steps, instruction: str) -> list[str]:
+    return [value for name, value in steps if name == instruction]
+
+
+def test_bases_are_pinned_and_one_for_both_stages(steps):
+    base = next(value for value in of(steps, "ARG") if value.startswith("BASE="))
+    name, _, tag = base.removeprefix("BASE=").rpartition(":")
+    assert name and re.match(r"\d+\.\d+", tag)
+    assert of(steps, "FROM") == ["${BASE} AS build", "${BASE}"]
+
+
+def test_what_is_copied_is_there_and_sent(steps):
+    allowed = [line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines()
+               if line.startswith("!")]  # fmt: skip
+    copied = {
+        source for value in of(steps, "COPY") if not value.startswith("--from")
+        for source in value.split()[:-1]
+    }  # fmt: skip
+    assert copied == set(allowed)
+    assert all((ROOT / source).exists() for source in copied)
+    # All that the wheel is made of.
+    packages = setup()["options.packages.find"]["include"].split()
+    assert all(any(fnmatch(name, pattern) for name in copied) for pattern in packages)
+
+
+def test_every_install_is_pinned_by_the_constraints(steps):
+    installs = [part for value in of(steps, "RUN") for part in value.split("&&")
+                if "pip install" in part]  # fmt: skip
+    assert len(installs) == 2
+    assert all("-c constraints.txt" in part for part in installs)
+    extras = next(v for v in of(steps, "ARG") if v.startswith("EXTRAS=")).removeprefix("EXTRAS=")
+    assert set(extras.split(",")) <= set(setup()["options.extras_require"])
+
+
+def test_the_system_libraries_are_all_there(steps):
+    last = [name for name, _ in steps].index("FROM", 3)
+    installed = " ".join(v for name, v in steps[last:] if name == "RUN" and "apt-get" in v).split()
+    assert set(LIBRARIES.values()) <= set(installed)
+
+
+def test_the_program_runs_as_nobody_in_particular(steps):
+    assert of(steps, "USER")[-1].isdecimal() and of(steps, "USER")[-1] != "0"
+    assert of(steps, "ENTRYPOINT") == ['["gvtools"]']
+    assert "root" not in of(steps, "USER")
+
+
+def test_torch_comes_from_its_own_index_and_nothing_else_does(steps):
+    (run,) = [value for value in of(steps, "RUN") if "TORCH_INDEX" in value]
+    assert "--no-deps" in run and run.split()[-1] == "torch"
+    assert any(
+        v.startswith("TORCH_INDEX=https://download.pytorch.org/whl/") for v in of(steps, "ARG")
+    )
+
+
+def test_the_conda_recipe_asks_for_what_the_package_does():
+    rattler = pytest.importorskip("rattler_build", reason="py-rattler-build is not installed")
+    (variant,) = rattler.Stage0Recipe.from_file(ROOT / "conda" / "recipe.yaml").render()
+    recipe = variant.recipe.to_dict()
+    assert recipe["package"] == {"name": "gvtools", "version": gvtools.__version__}
+    expected = {f"python {setup()['options']['python_requires']}"}
+    for line in setup()["options"]["install_requires"].split():
+        name, bounds = re.match(r"([\w-]+)(.*)", line).groups()
+        expected.add(f"{CONDA.get(name, name)} {bounds}")
+    assert set(recipe["requirements"]["run"]) == expected
+    scripts = setup()["options.entry_points"]["console_scripts"].split("\n")[1:]
+    assert recipe["build"]["python"]["entry_points"] == scripts

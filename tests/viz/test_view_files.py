@@ -1,0 +1,254 @@
+"""Files that ``gvtools export`` writes, as ``gvtools view`` opens them."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from box_project import write_box
+from command_line import refused
+from export_runs import export_run, saved_run
+from reference_gaussians import rotations
+
+from gvtools.errors import MemoryFileError
+from gvtools.memory.thinning import thinned
+from pipelines.cli import main
+from pipelines.export import splat, spz
+from pipelines.viewing.source import ViewSource
+from viz.run_view.view import MESH, POINTS, RENDERED, SPLATS, TARGET
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    scene = write_box(tmp_path_factory.mktemp("box"))
+    return saved_run(scene, tmp_path_factory.mktemp("fitted") / "run", fitted=True)
+
+
+@pytest.fixture(scope="module")
+def exported(run, tmp_path_factory):
+    """A file of each format that has one, by its name."""
+    folder = tmp_path_factory.mktemp("exported")
+
+    def export(name: str, form: str, *words: object) -> Path:
+        export_run(run.folder, "--format", form, "--out", folder / name, *words)
+        return folder / name
+
+    return export
+
+
+def lie_alike(shown, expected, edge):
+    """Whether points of a view are points of the memory, and all of its places are among them."""
+    from scipy.spatial import cKDTree
+
+    found = shown.memory.positions
+    assert cKDTree(expected).query(found)[0].max() < edge
+    assert cKDTree(found).query(expected)[0].max() < 2 * edge
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "package"),
+    [("a.ply", "ply", "open3d"), ("a.las", "las", "laspy"), ("a.laz", "las", "lazrs"),
+     ("a.usdc", "usd", "pxr"), ("a.usda", "usd", "pxr"), ("a.glb", "glb", "trimesh")],
+)  # fmt: skip
+def test_points_lie_where_they_were_in_their_colours(run, exported, name, form, package):
+    pytest.importorskip(package)
+    shown = ViewSource(exported(name, form)).read()
+    assert POINTS in shown.looks and RENDERED in shown.looks
+    rows = thinned(run.memory, None).rows
+    lie_alike(shown, run.memory.positions[rows], run.memory.voxel)
+    colors = run.memory.columns.colors[rows].astype(float).mean(axis=0)
+    there = shown.memory.columns.colors[: len(shown.memory)].astype(float).mean(axis=0)
+    np.testing.assert_allclose(there, colors, atol=6)
+
+
+@pytest.mark.parametrize("name", ["m.ply", "m.glb", "m.obj"])
+def test_meshes_have_their_triangles_and_colours(run, exported, name):
+    trimesh = pytest.importorskip("trimesh")
+    file = exported(name, "mesh")
+    shown = ViewSource(file).read()
+    assert shown.looks == (MESH, POINTS)
+    surface = shown.surface
+    plain = trimesh.load_scene(file, process=False).to_mesh()
+    assert surface.faces.shape == plain.faces.shape
+    np.testing.assert_allclose(surface.vertices, plain.vertices, atol=1e-6)
+    # They come from the run's own colours, none of which is grey.
+    low, high = (run.memory.columns.colors.min(axis=0), run.memory.columns.colors.max(axis=0))
+    assert ((surface.colors >= low - 2) & (surface.colors <= high + 2)).all()
+    assert np.ptp(surface.colors, axis=0).max() > 50
+    lie_alike(shown, surface.vertices, 4 * shown.memory.voxel)
+
+
+@pytest.mark.parametrize("name", ["s.ply", "s.spz"])
+def test_splats_are_those_of_the_export(run, exported, name):
+    gsply = pytest.importorskip("gsply")
+    form = "splat" if name.endswith("ply") else "spz"
+    shown = ViewSource(exported(name, form)).read()
+    assert shown.looks == (SPLATS, POINTS)
+    gaussians = shown.gaussians_of(10)
+    plain = gsply.plyread(exported("reference.ply", "splat"))
+    exact = form == "splat"
+    np.testing.assert_allclose(gaussians.centers, plain.means, atol=1e-6 if exact else 2e-3)
+    scales = np.exp(plain.scales)
+    axes = rotations(torch.from_numpy(np.asarray(plain.quats, np.float64))).numpy()
+    covariances = np.einsum("nij,nj,nkj->nik", axes, scales**2, axes)
+    size = np.abs(covariances).max()
+    shown_covariances = gaussians.covariances(1.0, largest=np.inf)
+    np.testing.assert_allclose(shown_covariances, covariances, atol=size * (1e-6 if exact else 0.1))
+    opacity = 1 / (1 + np.exp(-np.ravel(plain.opacities)))
+    np.testing.assert_allclose(gaussians.opacities[:, 0], opacity, atol=1e-6 if exact else 3e-3)
+    colors = np.clip(0.5 + 0.28209479177387814 * plain.sh0, 0, 1) * 255
+    np.testing.assert_allclose(gaussians.colors(None), colors, atol=0.51 if exact else 2.6)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_spz_is_read_as_gsply_reads_it(tmp_path, version):
+    gsply = pytest.importorskip("gsply")
+    rng, count, degree = np.random.default_rng(version), 200, 3
+    parts = (9, 1, 3, 3, 3 if version == 2 else 4, 45)
+    data = [rng.integers(0, 256, (count, width), np.uint8) for width in parts]
+    if version == 2:
+        # Of unit quaternions, as writers have them: x, y and z are no longer than 1 together.
+        data[4] = np.rint(127.5 + 127.5 * 0.55 * rng.uniform(-1, 1, (count, 3))).astype(np.uint8)
+    else:
+        # The three smallest are at most 1 / sqrt(2), and one may take all of it.
+        word = data[4].copy().view("<u4") & ~np.uint32(0b10000000010000000010000000)
+        data[4] = word.view(np.uint8).reshape(count, 4)
+    data[1] = np.clip(data[1], 1, 254)
+    header = struct.pack("<IIIBBBB", 0x5053474E, version, count, degree, 12, 0, 0)
+    file = tmp_path / "a.spz"
+    file.write_bytes(gzip.compress(header + b"".join(part.tobytes() for part in data)))
+    ours, plain = spz.read(file), gsply.read_spz(file)
+    turn = np.array([1, -1, -1])
+    np.testing.assert_allclose(ours.positions * turn, plain.means, atol=1e-4)
+    np.testing.assert_allclose(ours.log_scales, plain.scales, atol=1e-5)
+    np.testing.assert_allclose(ours.harmonics[:, 0], plain.sh0, atol=1e-5)
+    np.testing.assert_allclose(ours.logits, np.ravel(plain.opacities), atol=1e-3)
+    # Turned half around x: (w, x, y, z) becomes (-x, w, -z, y), up to its sign.
+    w, x, y, z = np.asarray(plain.quats, np.float64).T
+    turned = np.stack([-x, w, -z, y], axis=1)
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    assert np.abs(np.abs((turned * ours.quaternions).sum(axis=1)) - 1).max() < 1e-5
+    signs = np.array([-1, -1, 1, -1, 1, 1, -1, 1])[None, :, None]
+    np.testing.assert_allclose(ours.harmonics[:, 1:] * signs, plain.shN[:, :8], atol=1e-5)
+
+
+def test_a_splat_file_counted_from_an_origin_lies_in_the_world(tmp_path, exported):
+    file = exported("near.ply", "splat")
+    head, end, body = file.read_bytes().partition(b"end_header\n")
+    moved = tmp_path / "moved.ply"
+    moved.write_bytes(head + b"comment origin 431000.0 5650000.0 120.5\n" + end + body)
+    near, far = splat.read(file), splat.read(moved)
+    assert far.origin.tolist() == [431000.0, 5650000.0, 120.5]
+    np.testing.assert_array_equal(near.values, far.values)
+
+
+def test_damaged_files_are_named_in_one_line(exported, tmp_path, capsys):
+    for name, form in (("a.spz", "spz"), ("a.ply", "splat"), ("a.laz", "las"), ("m.glb", "mesh"),
+                       ("a.usdc", "usd")):  # fmt: skip
+        whole = exported(name, form).read_bytes()
+        for cut in (0, 10, len(whole) // 2):
+            file = tmp_path / f"{cut}{name}"
+            file.write_bytes(whole[:cut])
+            said = refused(capsys, "view", file)
+            assert str(file) in said, said
+    (tmp_path / "b.spz").write_bytes(
+        gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 9, 1, 0, 1, 0, 0))
+    )
+    assert "version 9" in refused(capsys, "view", tmp_path / "b.spz")
+    (tmp_path / "t.obj").write_text("# nothing\n")
+    assert "expected" in refused(capsys, "view", tmp_path / "t.obj")
+    assert "no such file" in refused(capsys, "view", tmp_path / "absent.spz")
+
+
+def test_a_package_that_is_not_there_is_named(exported, monkeypatch, capsys):
+    file = exported("a.las", "las")
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    said = refused(capsys, "view", file)
+    assert "laspy" in said and "gvtools[export]" in said
+
+
+def test_a_recording_goes_to_reruns_own_viewer(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "-run.rrd"
+    assert "no such file" in refused(capsys, "view", tmp_path / "absent.rrd")
+    file.write_bytes(b"RRF2")
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setenv("PATH", "")
+    assert "not installed" in refused(capsys, "view", file)
+    told = tmp_path / "told"
+    program = tmp_path / "rerun"
+    program.write_text(f'#!/bin/sh\necho "$@" > {told}\n')
+    program.chmod(0o755)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert main(["view", str(file), "--port", "9191"]) == 0
+    expected = f"{file} --bind 127.0.0.1 --web-viewer --web-viewer-port 9191"
+    assert told.read_text().split() == expected.split()
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert main(["view", str(file)]) == 0
+    assert told.read_text().split() == f"{file} --bind 127.0.0.1".split()
+    program.write_text("#!/bin/sh\nexit 3\n")
+    assert "status 3" in refused(capsys, "view", file)
+
+
+def test_a_runs_gaussians_are_those_of_its_export(run, exported):
+    shown = ViewSource(run.folder).read()
+    assert shown.looks == (POINTS, SPLATS, RENDERED)
+    gaussians = shown.gaussians_of(10**6)
+    file = splat.read(exported("whole.ply", "splat"))
+    np.testing.assert_allclose(gaussians.values, file.values, atol=1e-6)
+    fitted = len(run.appearance.gaussians)
+    assert not gaussians.rounds[:fitted].any()
+    generated = run.memory.columns.round[: len(run.memory)][run.memory.generated]
+    assert set(gaussians.rounds[fitted:].tolist()) == set(generated.tolist()) != {0}
+    assert any(camera.kind == TARGET for camera in shown.cameras)
+    # The fit stays whole, however few points are wanted.
+    assert len(shown.gaussians_of(20)) <= fitted + 20
+
+
+def test_colours_are_the_means_of_what_the_context_sees(run):
+    from viz.web.gaussians import context_cameras
+
+    shown = ViewSource(run.folder).read()
+    gaussians, cameras = shown.gaussians_of(10), context_cameras(shown)
+    assert cameras is not None and len(cameras) == 2
+    colors = gaussians.colors(cameras)
+    row = next(
+        i for i, place in enumerate(gaussians.centers[:500])
+        if all(_inside(camera, place) for camera in cameras)
+    )  # fmt: skip
+    means = []
+    for camera in cameras:
+        d = gaussians.centers[row] - camera.centers[0]
+        x, y, z = d / np.linalg.norm(d)
+        # Real spherical harmonics in the order of splat files.
+        basis = [0.2820948, -0.4886025 * y, 0.4886025 * z, -0.4886025 * x, 1.0925484 * x * y,
+                 -1.0925484 * y * z, 0.3153916 * (3 * z * z - 1), -1.0925484 * x * z,
+                 0.5462742 * (x * x - y * y)]  # fmt: skip
+        means.append(
+            np.maximum(0.5 + np.array(basis) @ gaussians.values[row, 11:].reshape(9, 3), 0)
+        )
+    expected = 255 * np.minimum(np.mean(means, axis=0), 1)
+    np.testing.assert_allclose(colors[row], expected, atol=0.6)
+    assert (colors != gaussians.colors(None)).any()
+
+
+def _inside(camera, place) -> bool:
+    xy, z = (values[0, 0] for values in camera.project(place[None]))
+    return bool(z > 0 and (xy > 0).all() and xy[0] < camera.width[0] and xy[1] < camera.height[0])
+
+
+def test_a_splat_file_without_what_it_needs_is_refused(exported, tmp_path):
+    with pytest.raises(MemoryFileError, match="without Gaussians"):
+        splat.read(exported("points.ply", "ply"))
+
+
+def test_names_of_files_say_nothing_to_the_file_system(exported):
+    assert (
+        os.path.basename(ViewSource(exported("a b'<i>.ply", "splat")).read().title) == "a b'<i>.ply"
+    )
