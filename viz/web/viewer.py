@@ -155,7 +155,7 @@ class WebViewer:
         with self._lock:
             self._look = look
             if look == SPLATS and not self._gaussians and self.run.gaussians_of is not None:
-                self._gaussians.set_gaussians(self.run.gaussians_of(self.budget), self.run)
+                self._gaussians.set_gaussians(self.run.gaussians_of(self.budget))
             self._points.set_visible(look == POINTS)
             self._gaussians.set_visible(look == SPLATS)
             self._rendered.set_on(look == RENDERED)
