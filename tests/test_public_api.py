@@ -38,6 +38,7 @@ DOCTESTED = (
     "gvtools.scenes.data_sets.spring",
     "gvtools.scenes.inspection",
     "gvtools.settings.base",
+    "gvtools.system_libraries",
     "gvtools.scenes.shards.index",
     "gvtools.training.drawn",
     "gvtools.training.mixture",

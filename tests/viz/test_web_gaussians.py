@@ -155,6 +155,20 @@ def test_a_mesh_is_on_the_page_where_it_is_in_the_file(run, tmp_path):
         viewer.stop()
 
 
+def test_a_damaged_fit_is_said_on_the_page(scene, tmp_path):
+    run = saved_run(scene, tmp_path / "run", fitted=True)
+    viewer = WebViewer(ViewSource(run.folder).read(), port=free_port())
+    try:
+        (run.folder / "round_000" / "appearance.npz").write_bytes(b"PK")
+        viewer._show_look(SPLATS)
+        assert "no splats: " in viewer._panel._note.content
+        assert "appearance.npz" in viewer._panel._note.content
+        viewer._show_look(POINTS)
+        assert all(node.visible for node in viewer._points._nodes.values())
+    finally:
+        viewer.stop()
+
+
 HOSTILE = "<img src=x onerror=window.hurt=1>\"'&amp;"
 
 

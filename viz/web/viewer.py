@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.errors import GvError
 from viz.run_view.detail import detail
 from viz.run_view.point_colors import MODES, Legend
 from viz.run_view.view import MESH, POINTS, RENDERED, SPLATS, RunView, ShownCamera
@@ -155,7 +156,10 @@ class WebViewer:
         with self._lock:
             self._look = look
             if look == SPLATS and not self._gaussians and self.run.gaussians_of is not None:
-                self._gaussians.set_gaussians(self.run.gaussians_of(self.budget))
+                try:
+                    self._gaussians.set_gaussians(self.run.gaussians_of(self.budget))
+                except GvError as error:
+                    self._panel.set_note(f"no splats: {error}")
             self._points.set_visible(look == POINTS)
             self._gaussians.set_visible(look == SPLATS)
             self._rendered.set_on(look == RENDERED)
