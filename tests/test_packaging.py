@@ -97,7 +97,7 @@ def test_the_conda_recipe_asks_for_what_the_package_does():
     assert recipe["package"] == {"name": "gvtools", "version": gvtools.__version__}
     expected = {f"python {setup()['options']['python_requires']}"}
     for line in setup()["options"]["install_requires"].split():
-        name, bounds = re.match(r"([\w-]+)(.*)", line).groups()
+        ((name, bounds),) = re.findall(r"([\w-]+)(.*)", line)
         expected.add(f"{CONDA.get(name, name)} {bounds}")
     assert set(recipe["requirements"]["run"]) == expected
     scripts = setup()["options.entry_points"]["console_scripts"].split("\n")[1:]

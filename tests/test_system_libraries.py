@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from command_line import refused
@@ -22,7 +23,7 @@ def bare(monkeypatch):
     """A machine without libGL and libusb."""
     load = ctypes.CDLL
 
-    def lacking(name: str, *words: object, **options: object) -> object:
+    def lacking(name: str, *words: Any, **options: Any) -> object:
         if name in ("libGL.so.1", "libusb-1.0.so.0"):
             raise OSError(f"{name}: cannot open shared object file: No such file or directory")
         return load(name, *words, **options)

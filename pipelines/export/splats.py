@@ -113,7 +113,7 @@ def splats_of(source: Source, options: ExportOptions) -> Splats:
         first = exposed(first, appearance.exposures, _photographs(memory))
     fitted = turned(first.values, first.frame.axes)
     parts, rest = [fitted], None
-    rounds = [np.zeros(len(fitted), np.int32)]
+    of_parts = [np.zeros(len(fitted), np.int32)]
     if options.max_points is not None:
         rest = options.max_points - len(fitted)
         if rest < 0:
@@ -126,9 +126,9 @@ def splats_of(source: Source, options: ExportOptions) -> Splats:
         points, came = of_points(source, ExportOptions(max_points=rest), among=made)
         points[:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)
         parts.append(points)
-        rounds.append(came)
+        of_parts.append(came)
     values, origin = _rounded(np.concatenate(parts), first.frame.origin)
-    return Splats(values, origin, len(fitted), len(appearance.others), np.concatenate(rounds))
+    return Splats(values, origin, len(fitted), len(appearance.others), np.concatenate(of_parts))
 
 
 def _rounded(

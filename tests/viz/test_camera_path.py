@@ -73,8 +73,8 @@ POSES = [
 ]
 
 
-def with_keys(viewer: WebViewer, poses=POSES, fov: float = 1.0) -> Client:
-    client = Client(viewer)
+def with_keys(viewer: WebViewer, poses=POSES, fov: float = 1.0) -> Any:
+    client: Any = Client(viewer)
     for pose in poses:
         client.stand(pose, fov)
         viewer.path.add(client)
@@ -194,10 +194,10 @@ def test_a_second_click_stops_the_preview(viewer):
         if len(client.seen) == 3:
             viewer.path.preview(client)
 
-    client.flush = flush  # type: ignore[method-assign]
+    client.flush = flush
     viewer.path.preview(client)
     assert len(client.seen) == 3
     viewer.path._frames.value = 2
-    client.flush = plain  # type: ignore[method-assign]
+    client.flush = plain
     viewer.path.preview(client)
     assert len(client.seen) == 5

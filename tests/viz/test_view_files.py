@@ -74,6 +74,7 @@ def test_meshes_have_their_triangles_and_colours(run, exported, name):
     shown = ViewSource(file).read()
     assert shown.looks == (MESH, POINTS)
     surface = shown.surface
+    assert surface is not None
     plain = trimesh.load_scene(file, process=False).to_mesh()
     assert surface.faces.shape == plain.faces.shape
     np.testing.assert_allclose(surface.vertices, plain.vertices, atol=1e-6)
@@ -90,6 +91,7 @@ def test_splats_are_those_of_the_export(run, exported, name):
     form = "splat" if name.endswith("ply") else "spz"
     shown = ViewSource(exported(name, form)).read()
     assert shown.looks == (SPLATS, POINTS)
+    assert shown.gaussians_of is not None
     gaussians = shown.gaussians_of(10)
     plain = gsply.plyread(exported("reference.ply", "splat"))
     exact = form == "splat"
@@ -199,6 +201,7 @@ def test_a_recording_goes_to_reruns_own_viewer(tmp_path, monkeypatch, capsys):
 def test_a_runs_gaussians_are_those_of_its_export(run, exported):
     shown = ViewSource(run.folder).read()
     assert shown.looks == (POINTS, SPLATS, RENDERED)
+    assert shown.gaussians_of is not None
     gaussians = shown.gaussians_of(10**6)
     file = splat.read(exported("whole.ply", "splat"))
     np.testing.assert_allclose(gaussians.values, file.values, atol=1e-6)

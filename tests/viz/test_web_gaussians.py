@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from box_project import write_box
@@ -139,18 +141,20 @@ def test_a_mesh_is_on_the_page_where_it_is_in_the_file(run, tmp_path):
     export_run(run.folder, "--format", "mesh", "--out", tmp_path / "mesh.ply")
     shown = ViewSource(tmp_path / "mesh.ply").read()
     viewer = WebViewer(shown, port=free_port())
+    mesh: Any = viewer._mesh
+    assert shown.surface is not None
     try:
-        assert viewer._mesh.visible and not any(n.visible for n in viewer._points._nodes.values())
+        assert mesh.visible and not any(n.visible for n in viewer._points._nodes.values())
         sent = trimesh.load_scene(
-            trimesh.util.wrap_as_stream(viewer._mesh.glb_data), file_type="glb"
+            trimesh.util.wrap_as_stream(mesh.glb_data), file_type="glb"
         ).to_mesh()
         world = sent.vertices / viewer.frame.scale + viewer.frame.origin
         np.testing.assert_allclose(world, shown.surface.vertices, atol=1e-5)
         assert len(sent.faces) == len(shown.surface.faces)
         viewer._show_look(POINTS)
-        assert not viewer._mesh.visible
+        assert not mesh.visible
         viewer._show_look(MESH)
-        assert viewer._mesh.visible
+        assert mesh.visible
     finally:
         viewer.stop()
 
@@ -184,7 +188,8 @@ def test_hostile_names_are_text_on_the_page(scene, tmp_path):
             wait(lambda: "observations after round" in browser.text())
             assert HOSTILE in browser.text()
             client = wait(lambda: next(iter(viewer.server.get_clients().values()), None))
-            viewer.path._name.value = HOSTILE
+            name: Any = viewer.path._name
+            name.value = HOSTILE
             viewer.path._for(client, viewer.path.save)
             wait(lambda: "expected letters" in browser.text())
             hurt = "return [window.hurt || 0, document.querySelectorAll('img[src=x]').length]"
