@@ -18,7 +18,11 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gvtools.capture.pairs import similar_pairs
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.capture import learned_matching
+from gvtools.capture.pairs import sift_descriptors, similar_pairs
 from gvtools.errors import ProjectError
 
 if TYPE_CHECKING:
@@ -26,8 +30,11 @@ if TYPE_CHECKING:
 
     import pycolmap
 
-# Up to this many pictures, every pair is matched.
-EXHAUSTIVE = 60
+    from gvtools.evaluation.pose_probe.features import FeatureMatcher
+
+# Up to this many pictures, every pair is matched; fewer with LightGlue, which takes a second a pair
+# on a processor.
+EXHAUSTIVE, EXHAUSTIVE_LEARNED = 60, 30
 # A frame of a video is matched with this many after it, and with those 16, 32, 64 and 128 later.
 SEQUENTIAL_OVERLAP = 10
 # Most features of a picture, and the longer side that it is reduced to before, pixels.
@@ -75,6 +82,7 @@ def find_cameras(
     work: Path,
     in_order: bool = False,
     masks: Path | None = None,
+    learned: FeatureMatcher | None = None,
     say: Say = lambda text: None,
 ) -> Mapped:
     """Find intrinsics and poses of pictures.
@@ -87,6 +95,7 @@ def find_cameras(
             then neighbours are matched, too, where there are too many pictures to match all pairs.
         masks: folder of masks as COLMAP has them, ``a.jpg.png`` for ``a.jpg``, black where no
             features are to be found; None for none.
+        learned: finds and matches features; None takes COLMAP's SIFT.
         say: is called with a line of text at each step.
 
     Raises:
@@ -99,9 +108,23 @@ def find_cameras(
         database = work / "database.db"
         names = [name for group in cameras for name in group]
         say(f"finding features in {len(names)} pictures")
-        for group in cameras:
-            _extract(database, images, group, masks=masks)
-        matching = _match(database, work, count=len(names), in_order=in_order, say=say)
+        if learned is None:
+            for group in cameras:
+                _extract(database, images, group, masks=masks)
+            matching = _match(database, work, count=len(names), in_order=in_order, say=say)
+        else:
+            pycolmap.Database.open(database).close()
+            for group in cameras:
+                pycolmap.import_images(
+                    database, images, pycolmap.CameraMode.SINGLE, image_names=list(group)
+                )
+            features = learned_matching.extract(images, names, learned, masks=masks, say=say)
+            learned_matching.write_keypoints(database, features)
+            described = {name: found.descriptors for name, found in features.items()}
+            chosen, matching = _chosen(described, EXHAUSTIVE_LEARNED, in_order=in_order)
+            say(f"matching {len(chosen)} pairs")
+            learned_matching.write_matches(database, features, chosen, matcher=learned, say=say)
+            pycolmap.verify_matches(database, _listed(chosen, work), _verification())
         pairs = _verified(database)
         if not pairs:
             raise ProjectError(
@@ -140,32 +163,63 @@ def _extract(database: Path, images: Path, names: Sequence[str], *, masks: Path 
 
 
 def _match(database: Path, work: Path, *, count: int, in_order: bool, say: Say) -> str:
-    """Match features of pairs of pictures; returns in words how the pairs were chosen."""
+    """Match SIFT of pairs of pictures; returns in words how the pairs were chosen."""
     import pycolmap
 
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
     if count <= EXHAUSTIVE:
         say(f"matching all {count * (count - 1) // 2} pairs")
-        pycolmap.match_exhaustive(database, verification_options=verification)
+        pycolmap.match_exhaustive(database, verification_options=_verification())
         return "all pairs"
-    pairs = set(similar_pairs(database))
-    how = f"each picture with the {len(pairs) * 2 // count} most similar"
+    pairs, how = _chosen(sift_descriptors(database), EXHAUSTIVE, in_order=in_order)
+    say(f"matching {len(pairs)} pairs")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = _listed(pairs, work)
+    pycolmap.match_image_pairs(
+        database, pairing_options=pairing, verification_options=_verification()
+    )
+    return how
+
+
+def _chosen(
+    described: Mapping[str, NDArray[np.float32]], exhaustive: int, *, in_order: bool
+) -> tuple[list[tuple[str, str]], str]:
+    """The pairs of pictures to match, and in words how they were chosen.
+
+    Args:
+        described: (N, D) descriptors of each picture by name.
+        exhaustive: up to how many pictures every pair is taken.
+        in_order: see ``find_cameras``.
+    """
+    names = sorted(described)
+    if len(names) <= exhaustive:
+        return list(combinations(names, 2)), "all pairs"
+    pairs = set(similar_pairs(described))
+    how = f"each picture with the {len(pairs) * 2 // len(names)} most similar"
     if in_order:
-        with pycolmap.Database.open(database) as opened:
-            names = sorted(image.name for image in opened.read_all_images())
         steps = {*range(1, SEQUENTIAL_OVERLAP + 1), *(2**k for k in range(4, 8))}
         pairs |= {
-            (names[i], names[i + step]) for i in range(count) for step in steps if i + step < count
+            (names[i], names[i + step])
+            for i in range(len(names))
+            for step in steps
+            if i + step < len(names)
         }
         how = f"neighbours in time, and {how}"
-    say(f"matching {len(pairs)} pairs")
+    return sorted(pairs), how
+
+
+def _listed(pairs: Sequence[tuple[str, str]], work: Path) -> Path:
+    """A file with the pairs, as COLMAP reads them."""
     file = work / "pairs.txt"
-    file.write_text("".join(f"{a} {b}\n" for a, b in sorted(pairs)), encoding="utf-8")
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = file
-    pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
-    return how
+    file.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+    return file
+
+
+def _verification() -> pycolmap.TwoViewGeometryOptions:
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = SEED
+    return options
 
 
 def _verified(database: Path) -> dict[tuple[str, str], int]:

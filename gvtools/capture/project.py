@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gvtools.capture import video
 from gvtools.capture.mapping import Mapped, find_cameras
@@ -21,6 +21,9 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.files import write_json
 from gvtools.scenes.photographs import named
 from gvtools.scenes.scene import Finding
+
+if TYPE_CHECKING:
+    from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
 
 REPORT = "capture.json"
 IMAGES, MODEL = "images", "sparse/0"
@@ -43,6 +46,7 @@ class CaptureReport:
         track_length: mean number of pictures that a point is seen in.
         explained: share of the verified matches that became points; low where a model is doubtful.
         mapping: "global" or "incremental".
+        features: "sift", "aliked" or "disk".
         matching: how pairs were chosen.
         other_models: pictures of further models that do not connect to this one.
         overlap: pairs of pictures, and their verified matches.
@@ -61,6 +65,7 @@ class CaptureReport:
     track_length: float
     explained: float
     mapping: str
+    features: str
     matching: str
     other_models: tuple[int, ...]
     overlap: tuple[tuple[str, str, int], ...]
@@ -82,6 +87,7 @@ def capture_photographs(
     frames: int | None = None,
     masks: Path | None = None,
     distance: tuple[str, str, float] | None = None,
+    learned: LightGlueMatcher | None = None,
     say: Say = lambda text: None,
 ) -> CaptureReport:
     """Find the cameras of a folder's photographs, or of a video's frames, and write a project.
@@ -92,6 +98,7 @@ def capture_photographs(
         frames: how many frames of a video to take; None goes by its motion.
         masks: folder of ``NAME.png``, black where nothing is to be matched; photographs alone.
         distance: names of two pictures and the metres between them.
+        learned: finds and matches features; None takes COLMAP's SIFT.
         say: told of each step.
 
     Raises:
@@ -122,12 +129,13 @@ def capture_photographs(
         copy_upright(photographs, work / IMAGES)
         mapped = find_cameras(
             work / IMAGES, _by_camera(photographs, one=is_video),
-            work=_made(work / "mapping"), in_order=is_video, masks=masks, say=say,
+            work=_made(work / "mapping"), in_order=is_video, masks=masks, learned=learned, say=say,
         )  # fmt: skip
         locations = {item.name: item.location for item in photographs if item.location}
         placement, met = place(mapped.model, locations=locations, distance=distance)
         findings += met
-        report = _report(photographs, mapped, placement, findings=findings)
+        features = "sift" if learned is None else learned.name
+        report = _report(photographs, mapped, placement, features=features, findings=findings)
         mapped.model.write_binary(str(_made(work / MODEL)))
         write_json(work / REPORT, report.to_dict())
         for spare in ("mapping", "frames"):
@@ -182,6 +190,7 @@ def _report(
     mapped: Mapped,
     placement: Placement,
     *,
+    features: str,
     findings: Sequence[Finding],
 ) -> CaptureReport:
     model = mapped.model
@@ -226,6 +235,7 @@ def _report(
         track_length=float(model.compute_mean_track_length()),
         explained=mapped.explained,
         mapping=mapped.how,
+        features=features,
         matching=mapped.matching,
         other_models=mapped.others,
         overlap=tuple((a, b, count) for (a, b), count in sorted(mapped.pairs.items())),

