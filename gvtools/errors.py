@@ -11,6 +11,23 @@ class ProjectError(GvError):
     """A project, a file of it, or an output folder is not what it has to be."""
 
 
+class UnposedError(ProjectError):
+    """An input holds pictures and no cameras of them, which ``gvtools capture`` finds.
+
+    Args:
+        path: of the input.
+        found: what it holds, for the message.
+        advice: what to do.
+
+    Attributes:
+        found: as given.
+    """
+
+    def __init__(self, path: object, found: str, advice: str) -> None:
+        super().__init__(f"{path}: {found}; {advice}")
+        self.found = found
+
+
 class OptionError(GvError):
     """An option, a selection or a configuration key is wrong."""
 

@@ -23,6 +23,15 @@ class Console:
         """One line on standard error, also with ``quiet``."""
         print(f"warning: {text}", file=sys.stderr, flush=True)
 
+    def ask(self, question: str) -> bool:
+        """Whether the user says yes; no without a terminal to ask on, and with ``quiet``."""
+        if not (self.interactive and sys.stdin.isatty()):
+            return False
+        try:
+            return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+        except EOFError:
+            return False
+
     def table(self, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
         """Aligned columns; None prints as a dash, floats with four significant digits."""
         if self.quiet:

@@ -6,8 +6,6 @@ from pathlib import Path
 
 from gvtools.errors import ProjectError
 
-SUFFIX = ".bag"
-
 
 def take_apart(bag: Path, folder: Path) -> float:
     """Write a recording's colour, and depth registered to it, as Redwood's layout has them.

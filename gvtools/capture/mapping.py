@@ -80,6 +80,7 @@ def find_cameras(
     cameras: Sequence[Sequence[str]],
     *,
     work: Path,
+    source: Path | None = None,
     in_order: bool = False,
     masks: Path | None = None,
     learned: FeatureMatcher | None = None,
@@ -91,6 +92,7 @@ def find_cameras(
         images: the folder of the pictures.
         cameras: names of the pictures that each camera took; they share its intrinsics.
         work: a folder without files yet, for COLMAP's database and models.
+        source: what messages name, where ``images`` are copies.
         in_order: the pictures follow a path in the order of their names, as frames of a video do;
             then neighbours are matched, too, where there are too many pictures to match all pairs.
         masks: folder of masks as COLMAP has them, ``a.jpg.png`` for ``a.jpg``, black where no
@@ -128,8 +130,8 @@ def find_cameras(
         pairs = _verified(database)
         if not pairs:
             raise ProjectError(
-                f"{images}: no two of the {len(names)} pictures show enough of the same; expected "
-                "neighbours that share at least half of what they show; take more pictures between "
+                f"{source or images}: no two of the {len(names)} pictures show enough of the same; "
+                "expected neighbours that share at least half of what they show; take more pictures between "
                 "these, and sharp ones"
             )
         say(f"finding cameras from {len(pairs)} pairs that overlap")
@@ -137,8 +139,8 @@ def find_cameras(
     if not found:
         best = max(pairs, key=lambda pair: pairs[pair])
         raise ProjectError(
-            f"{images}: {len(pairs)} pairs of pictures overlap (best {best[0]} and {best[1]}, "
-            f"{pairs[best]} matches), and no model comes of them; expected views from different "
+            f"{source or images}: {len(pairs)} pairs of pictures overlap (best {best[0]} and "
+            f"{best[1]}, {pairs[best]} matches), and no model comes of them; expected views from different "
             "places; take pictures while walking, not while turning on the spot"
         )
     how, models, share = found
@@ -264,7 +266,7 @@ def _map(
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.random_seed = SEED
     # COLMAP's default drops models of fewer than 10 pictures.
-    pipeline.min_model_size = 3
+    pipeline.min_model_size = 2
     models = _models(
         pycolmap.incremental_mapping, database, images, out=work / "incremental", options=pipeline
     )
@@ -323,13 +325,25 @@ def _settle(model: pycolmap.Reconstruction) -> None:
         return
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    pycolmap.bundle_adjustment(model, options)
+    _adjust(model, options)
     images = [image for image in model.images.values() if image.has_pose]
     counts = [sum(image.camera_id == camera for image in images) for camera in model.cameras]
     if min(counts) >= REFINED_FROM:
         options.refine_principal_point = True
-        pycolmap.bundle_adjustment(model, options)
+        _adjust(model, options)
     model.update_point_3d_errors()
+
+
+def _adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
+    """Bundle-adjust all registered pictures, silently, unlike pycolmap.bundle_adjustment."""
+    import pycolmap
+
+    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
 @contextmanager

@@ -38,6 +38,7 @@ class CaptureReport:
     """What a capture found.
 
     Attributes:
+        source: absolute path of the input.
         pictures: how many were tried.
         registered: names of those with a camera, in order.
         left_out: name and reason of each other one.
@@ -57,6 +58,7 @@ class CaptureReport:
         findings: what was met.
     """
 
+    source: str
     pictures: int
     registered: tuple[str, ...]
     left_out: dict[str, str]
@@ -129,13 +131,17 @@ def capture_photographs(
         copy_upright(photographs, work / IMAGES)
         mapped = find_cameras(
             work / IMAGES, _by_camera(photographs, one=is_video),
-            work=_made(work / "mapping"), in_order=is_video, masks=masks, learned=learned, say=say,
+            work=_made(work / "mapping"), source=source, in_order=is_video,
+            masks=masks, learned=learned, say=say,
         )  # fmt: skip
         locations = {item.name: item.location for item in photographs if item.location}
         placement, met = place(mapped.model, locations=locations, distance=distance)
         findings += met
         features = "sift" if learned is None else learned.name
-        report = _report(photographs, mapped, placement, features=features, findings=findings)
+        report = _report(
+            source, photographs, mapped=mapped, placement=placement, features=features,
+            findings=findings,
+        )  # fmt: skip
         mapped.model.write_binary(str(_made(work / MODEL)))
         write_json(work / REPORT, report.to_dict())
         for spare in ("mapping", "frames"):
@@ -186,10 +192,11 @@ def _by_camera(photographs: Sequence[Photograph], *, one: bool) -> list[list[str
 
 
 def _report(
+    source: Path,
     photographs: Sequence[Photograph],
+    *,
     mapped: Mapped,
     placement: Placement,
-    *,
     features: str,
     findings: Sequence[Finding],
 ) -> CaptureReport:
@@ -227,6 +234,7 @@ def _report(
         )
         met.append(Finding("warning", text))
     return CaptureReport(
+        source=str(source.resolve()),
         pictures=len(photographs),
         registered=tuple(registered),
         left_out=left_out,

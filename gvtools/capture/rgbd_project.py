@@ -47,6 +47,7 @@ class RgbdCaptureReport:
     """What the capture of an RGB-D recording found.
 
     Attributes:
+        source: absolute path of the input.
         pictures: frames with depth that were tried.
         registered: names of those with a pose, in order of time.
         left_out: file of the recording and reason of each other one.
@@ -66,6 +67,7 @@ class RgbdCaptureReport:
         findings: what was met.
     """
 
+    source: str
     pictures: int
     registered: tuple[str, ...]
     left_out: dict[str, str]
@@ -124,7 +126,7 @@ def capture_rgbd(
                 "--depth-intrinsics and --depth-unit, and record with slower motion"
             )
         names = _names(recording)
-        report = _report(scene, found, names, sources=recording)
+        report = _report(scene, found, names, source=source, sources=recording)
         _write(work, recording, resolved, found=found, names=names)
         write_json(work / REPORT, report.to_dict())
         shutil.rmtree(work / "recording", ignore_errors=True)
@@ -211,7 +213,7 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _report(
-    scene: Scene, found: Found, names: Sequence[str], *, sources: Recording
+    scene: Scene, found: Found, names: Sequence[str], *, source: Path, sources: Recording
 ) -> RgbdCaptureReport:
     kept = sorted(found.poses)
     files = [os.path.relpath(frame.color, sources.root) for frame in sources.frames]
@@ -225,6 +227,7 @@ def _report(
     camera = scene.views[0].camera
     centres = np.array([found.poses[number][:3, 3] for number in kept])
     return RgbdCaptureReport(
+        source=str(source.resolve()),
         pictures=len(scene),
         registered=tuple(names[number] for number in kept),
         left_out=left_out,

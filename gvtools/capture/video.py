@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,9 +86,14 @@ def _measure(
     """(N,) motion up to each frame, in widths, and (N,) sharpness of each."""
     import cv2
 
+    # What FFmpeg says of a damaged file is said by the errors here, in words that help.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
-        raise ProjectError(f"{path}: no video that OpenCV reads; convert it to H.264 in MP4")
+        raise ProjectError(
+            f"{path}: no video that OpenCV reads ({path.stat().st_size} bytes); it may have been "
+            "cut off: copy it again, or convert it to H.264 in MP4"
+        )
     moved, sharp = [0.0], []
     before: NDArray[Any] | None = None
     while True:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import OptionError, ProjectError, UnposedError
 from gvtools.scenes.colmap_files import find_model
 from gvtools.scenes.data_sets.address import FORM, is_address
 from gvtools.scenes.phones.polycam import POLYCAM
@@ -25,6 +26,8 @@ from gvtools.scenes.unposed import count_unposed
 
 PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")
+# A recording of a RealSense camera.
+BAG = ".bag"
 # ScanNet before Redwood: both have colour and depth folders.
 LAYOUTS = (SEVENSCENES, TUM, SCANNET, REDWOOD)
 # What apps export; nothing has to be said about how they are read.
@@ -58,6 +61,7 @@ def open_project(
 
     Raises:
         ProjectError: nothing there that can be read, or what is there is damaged.
+        UnposedError: pictures, a video or a recording without cameras.
         OptionError: an option of another kind of project.
         ShapeError: a pose with NaN, a scale or a mirror.
     """
@@ -78,8 +82,9 @@ def open_project(
     path = Path(path)
     if not path.exists():
         raise ProjectError(f"{path}: no such folder{_nearest(path)}")
-    if path.suffix.lower() in VIDEOS and path.is_file():
-        raise ProjectError(f"{path}: a video without cameras; {_capture(path)}")
+    if path.suffix.lower() in (*VIDEOS, BAG) and path.is_file():
+        kind = "a recording" if path.suffix.lower() == BAG else "a video"
+        raise UnposedError(path, f"{kind} without cameras", _capture(path))
     folder = find_model(path, number=model) if path.is_dir() else None
     if model is not None and folder is None:
         raise OptionError(f"{path}: a file; a model's number is of a COLMAP workspace")
@@ -112,11 +117,11 @@ def open_project(
                     "nor masks"
                 )
             return layout.read(path, options=rgbd)
-    raise ProjectError(_unknown(path))
+    raise _unknown(path)
 
 
 def _capture(path: Path) -> str:
-    return f"find the cameras first: gvtools capture {path} --out PROJECT"
+    return f"find the cameras first: gvtools capture {shlex.quote(str(path))} --out PROJECT"
 
 
 def is_project(folder: Path) -> bool:
@@ -137,20 +142,25 @@ def _nearest(path: Path) -> str:
     return f"; did you mean {path.parent / near[0]}?" if near else ""
 
 
-def _unknown(path: Path) -> str:
+def _unknown(path: Path) -> ProjectError:
     unposed = count_unposed(path)
     if unposed:
-        advice = f"find them first: gvtools capture {path} --out PROJECT"
-        return f"{path}: {unposed} RGB-D frames without poses; {advice}"
+        return UnposedError(path, f"{unposed} RGB-D frames without poses", _capture(path))
     entries = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
-    pictures = [name for name in entries if Path(name).suffix.lower() in PICTURES]
-    if len(pictures) > 1:
-        return f"{path}: {len(pictures)} pictures without cameras; {_capture(path)}"
-    held = f"holds {named(entries)}" if entries else "is empty"
     inside = [
         str(folder)
         for folder in sorted([*path.glob("*/"), *path.glob("dense/*/"), *path.glob("*.r3d")])
         if is_project(folder)
     ]
+    pictures = [name for name in entries if Path(name).suffix.lower() in PICTURES]
+    if not inside and all(entry.is_dir() for entry in path.iterdir() if _is_other(entry)):
+        pictures += [p.name for p in path.glob("*/*") if p.suffix.lower() in PICTURES]
+    if len(pictures) > 1:
+        return UnposedError(path, f"{len(pictures)} pictures without cameras", _capture(path))
+    held = f"holds {named(entries)}" if entries else "is empty"
     advice = f"did you mean {named(inside)}?" if inside else "give the project's folder"
-    return f"{path}: {held}; expected one of: {'; '.join(LOOKED_FOR)}; {advice}"
+    return ProjectError(f"{path}: {held}; expected one of: {'; '.join(LOOKED_FOR)}; {advice}")
+
+
+def _is_other(entry: Path) -> bool:
+    return entry.suffix.lower() not in PICTURES and not entry.name.startswith(".")

@@ -69,9 +69,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: nothing that can be used, or no place to write to.
     """
-    from gvtools.capture.bag import SUFFIX as BAG
     from gvtools.capture.project import capture_photographs
-    from gvtools.scenes.project import VIDEOS
+    from gvtools.scenes.project import BAG, VIDEOS
     from gvtools.scenes.unposed import count_unposed
 
     if not args.input.exists():

@@ -18,17 +18,26 @@ SUMMARY = "grow a memory from a posed project, round by round"
 EXAMPLES = (
     "gvtools reconstruct scan/ --context every:2 --targets every:2+1 --out runs/scan",
     "gvtools reconstruct colmap/ --targets orbit:24 --completer inpaint --out runs/orbit",
+    "gvtools reconstruct walk.mp4 --capture --out runs/walk",
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``reconstruct``."""
     parser.add_argument(
-        "project", type=Path, help="COLMAP, posed RGB-D, transforms.json or spec:NAME:SCENE"
+        "project",
+        type=Path,
+        help="COLMAP, posed RGB-D, transforms.json or spec:NAME:SCENE; pictures, a video or a "
+        "recording without cameras, with --capture",
     )
     add_run_arguments(parser, out_required=True)
     parser.add_argument(
         "--live", action="store_true", help="open the web viewer and follow the run"
+    )
+    parser.add_argument(
+        "--capture",
+        action="store_true",
+        help="where the input has no cameras, find them first, without asking: see gvtools capture",
     )
 
 
@@ -98,22 +107,23 @@ def _settings(args: argparse.Namespace) -> list[Settings]:
 
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run ``gvtools reconstruct``."""
-    from pipelines.commands.scene_arguments import open_scene, reading_of
+    from pipelines.commands.capture_first import open_or_capture
     from pipelines.reconstruction.run import reconstruct
     from pipelines.report.write import draw_run
     from pipelines.viewing.live import live_viewer
 
     config = config_from(args)
+    scene, reading = open_or_capture(args, console)
     watched = args.live and not args.dry_run
     with live_viewer(args.out, console) if watched else nullcontext():
         reconstruct(
-            open_scene(args.project, args),
+            scene,
             config,
             args.out,
             console=console,
             resume=args.resume,
             dry_run=args.dry_run,
-            reading=reading_of(args),
+            reading=reading,
             draw=draw_run,
         )
         copy_figures(args, args.out)

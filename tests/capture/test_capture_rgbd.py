@@ -182,7 +182,7 @@ def test_what_cannot_be_captured_is_refused(walked, recording, captured, tmp_pat
     assert "--frames: of photographs" in refused(
         capsys, "capture", recording, "--frames", 5, "--out", out
     )
-    assert "12 RGB-D frames without poses; find them first: gvtools capture" in refused(
+    assert "12 RGB-D frames without poses; find the cameras first: gvtools capture" in refused(
         capsys, "check", recording
     )
     photographs = tmp_path / "photographs"
