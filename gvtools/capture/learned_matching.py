@@ -19,7 +19,7 @@ from gvtools.scenes.images import check_size, read_image, read_mask
 # test with.
 MAX_SIDE = 1024
 # Keypoints of a picture, of the highest score.
-MAX_FEATURES = 2048
+MAX_FEATURES = 1024
 # Lines about progress come after so many pictures or pairs.
 EVERY = 100
 

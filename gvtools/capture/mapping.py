@@ -131,8 +131,15 @@ def find_cameras(
         if not pairs:
             raise ProjectError(
                 f"{source or images}: no two of the {len(names)} pictures show enough of the same; "
-                "expected neighbours that share at least half of what they show; take more pictures between "
-                "these, and sharp ones"
+                "expected neighbours that share at least half of what they show; take more "
+                "pictures between these, and sharp ones"
+            )
+        if _all_flat(database):
+            raise ProjectError(
+                f"{source or images}: {len(pairs)} pairs of pictures overlap, and each shows the "
+                "other's plane alone: the camera only turned or zoomed, or the scene is flat; "
+                "expected views from different places of something with depth; take pictures "
+                "while walking"
             )
         say(f"finding cameras from {len(pairs)} pairs that overlap")
         found = _map(database, images, work, pairs=pairs, say=say)
@@ -140,8 +147,8 @@ def find_cameras(
         best = max(pairs, key=lambda pair: pairs[pair])
         raise ProjectError(
             f"{source or images}: {len(pairs)} pairs of pictures overlap (best {best[0]} and "
-            f"{best[1]}, {pairs[best]} matches), and no model comes of them; expected views from different "
-            "places; take pictures while walking, not while turning on the spot"
+            f"{best[1]}, {pairs[best]} matches), and no model comes of them; expected views "
+            "from different places; take pictures while walking, not while turning on the spot"
         )
     how, models, share = found
     largest, *rest = sorted(models, key=lambda model: -model.num_reg_images())
@@ -237,6 +244,17 @@ def _verified(database: Path) -> dict[tuple[str, str], int]:
             a, b = pycolmap.pair_id_to_image_pair(number)
             found[names[a], names[b]] = int(count)
     return found
+
+
+def _all_flat(database: Path) -> bool:
+    """Whether a homography explains every pair, so that mapping would have no depth to go by."""
+    import pycolmap
+
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    flat = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
+    with pycolmap.Database.open(database) as opened:
+        _, geometries = opened.read_two_view_geometries()
+    return all(found.config in flat for found in geometries if len(found.inlier_matches))
 
 
 def _map(

@@ -31,6 +31,8 @@ JPEG_QUALITY = 97
 # Pictures are judged at this height, and one whose sharpness is below this share of the median's is
 # called blurred. [pixels]
 JUDGED_HEIGHT, BLURRED = 480, 0.15
+# Where the median itself is below this, all are called soft (photographs in focus: 100 and more).
+SOFT = 10.0
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 
 
@@ -151,6 +153,14 @@ def _oddities(found: Sequence[Photograph]) -> list[Finding]:
                 "warning",
                 f"{len(blurred)} of {len(found)} pictures are blurred beside the others "
                 f"({named(blurred)}); they are tried all the same",
+            )
+        )
+    if middle < SOFT:
+        findings.append(
+            Finding(
+                "warning",
+                f"most of the {len(found)} pictures have hardly any edges: blurred, dark, or of "
+                "bare walls",
             )
         )
     turned = [item.name for item in found if item.turned]

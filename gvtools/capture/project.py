@@ -129,11 +129,12 @@ def capture_photographs(
         photographs, met = find_photographs(folder)
         findings += met
         copy_upright(photographs, work / IMAGES)
-        mapped = find_cameras(
-            work / IMAGES, _by_camera(photographs, one=is_video),
-            work=_made(work / "mapping"), source=source, in_order=is_video,
-            masks=masks, learned=learned, say=say,
-        )  # fmt: skip
+        with _telling(findings):
+            mapped = find_cameras(
+                work / IMAGES, _by_camera(photographs, one=is_video),
+                work=_made(work / "mapping"), source=source, in_order=is_video,
+                masks=masks, learned=learned, say=say,
+            )  # fmt: skip
         locations = {item.name: item.location for item in photographs if item.location}
         placement, met = place(mapped.model, locations=locations, distance=distance)
         findings += met
@@ -147,6 +148,18 @@ def capture_photographs(
         for spare in ("mapping", "frames"):
             shutil.rmtree(work / spare, ignore_errors=True)
     return report
+
+
+@contextmanager
+def _telling(findings: Sequence[Finding]) -> Iterator[None]:
+    """Add the warnings so far to the error of what comes."""
+    try:
+        yield
+    except ProjectError as error:
+        warnings = [finding.message for finding in findings if finding.level == "warning"]
+        if not warnings:
+            raise
+        raise ProjectError(f"{error}; also: {'; '.join(warnings)}") from error
 
 
 @contextmanager

@@ -1,0 +1,137 @@
+"""``gvtools reconstruct`` of an input without cameras offers to find them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import refused
+from PIL import Image
+
+from gvtools.errors import OptionError, UnposedError
+from gvtools.procedural.room_sample import write_room
+from pipelines.cli import build_parser, main
+from pipelines.commands import capture
+from pipelines.commands.capture_first import open_or_capture
+from pipelines.console import Console
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("first") / "room"
+    write_room(folder, views=8, width=320, height=240)
+    return folder
+
+
+def arguments(*given: object) -> argparse.Namespace:
+    return build_parser().parse_args(["reconstruct", *(str(part) for part in given)])
+
+
+@pytest.fixture
+def captures(room: Path, monkeypatch: pytest.MonkeyPatch) -> list[argparse.Namespace]:
+    """What ``gvtools capture`` was asked for; it gives the room's own cameras here."""
+    asked = []
+
+    def run(args: argparse.Namespace, console: Console) -> None:
+        asked.append(args)
+        shutil.copytree(room, args.out)
+        report = {"source": str(args.input.resolve())}
+        (args.out / "capture.json").write_text(json.dumps(report))
+
+    monkeypatch.setattr(capture, "run", run)
+    return asked
+
+
+def on_terminal(monkeypatch: pytest.MonkeyPatch, answer: str) -> list[str]:
+    """A terminal with a user who gives one answer; returns what they are asked."""
+    questions = []
+
+    def read(question: str) -> str:
+        questions.append(question)
+        return answer
+
+    for stream in (sys.stdin, sys.stdout):
+        monkeypatch.setattr(stream, "isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", read)
+    return questions
+
+
+def test_without_a_terminal_one_line_gives_the_command(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos = tmp_path / "my photos"
+    shutil.copytree(room / "images", photos)
+    out = tmp_path / "runs" / "x"
+    line = refused(capsys, "reconstruct", photos, "--out", out)
+    assert "8 pictures without cameras" in line
+    assert f"gvtools capture '{photos}' --out {out}-project; or add --capture" in line
+    assert "a run would find them first" in refused(
+        capsys, "reconstruct", photos, "--out", out, "--dry-run", "--capture"
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["my photos"]
+    nested = tmp_path / "nested"
+    for part in ("a", "b"):
+        (nested / part).mkdir(parents=True)
+        Image.new("RGB", (8, 8)).save(nested / part / "1.png")
+    assert "2 pictures without cameras" in refused(capsys, "reconstruct", nested, "--out", out)
+    (tmp_path / "camera.bag").touch()
+    assert "a recording without cameras" in refused(
+        capsys, "reconstruct", tmp_path / "camera.bag", "--out", out
+    )
+
+
+def test_capture_comes_unasked_and_once(
+    room: Path, captures: list[argparse.Namespace], tmp_path: Path
+) -> None:
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    args = arguments(room / "images", "--out", tmp_path / "run", "--capture", "--masks", masks)
+    for _ in range(2):
+        scene, reading = open_or_capture(args, Console(quiet=True))
+        assert len(scene) == 8
+        assert reading == {"masks": str(masks)}
+        assert scene.root == tmp_path / "run-project"
+    assert [(call.input, call.out, call.masks) for call in captures] == [
+        (room / "images", tmp_path / "run-project", masks)
+    ]
+    with pytest.raises(OptionError, match="--images: of a COLMAP project"):
+        open_or_capture(
+            arguments(room / "images", "--out", tmp_path / "b", "--capture", "--images", masks),
+            Console(quiet=True),
+        )
+
+
+@pytest.mark.parametrize(("answer", "calls"), [("y", 1), ("Yes ", 1), ("", 0), ("n", 0)])
+def test_a_user_at_a_terminal_is_asked(
+    answer: str,
+    calls: int,
+    room: Path,
+    captures: list[argparse.Namespace],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    questions = on_terminal(monkeypatch, answer)
+    args = arguments(room / "images", "--out", tmp_path / "run")
+    if calls:
+        assert len(open_or_capture(args, Console())[0]) == 8
+    else:
+        with pytest.raises(UnposedError, match="8 pictures without cameras"):
+            open_or_capture(args, Console())
+    assert len(captures) == calls
+    (question,) = questions
+    assert "8 pictures without cameras. Capture now to" in question
+    assert question.endswith("? [y/N] ")
+
+
+@pytest.mark.slow
+def test_photographs_alone_become_a_run(tmp_path: Path) -> None:
+    room, out = tmp_path / "room", tmp_path / "run"
+    write_room(room, views=10, width=360, height=270)
+    options = ("--capture", "--refine", "0", "--rounds", "1", "--quiet")
+    assert main(["reconstruct", str(room / "images"), "--out", str(out), *options]) == 0
+    assert (out / "metrics.json").is_file()
+    assert (tmp_path / "run-project/capture.json").is_file()
