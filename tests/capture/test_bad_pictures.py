@@ -1,0 +1,139 @@
+"""Pictures that structure from motion cannot use, or not all of: what is said, what is kept."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from command_line import refused
+from PIL import Image, ImageFilter
+
+from gvtools.capture.mapping import find_cameras
+from gvtools.capture.photographs import copy_upright, find_photographs
+from gvtools.capture.project import capture_photographs
+from gvtools.errors import ProjectError
+from gvtools.procedural.room_sample import write_room
+
+
+@pytest.fixture(scope="module")
+def texture() -> Image.Image:
+    """A wall with corners of every size."""
+    rng = np.random.default_rng(0)
+    pixels = np.zeros((480, 960, 3))
+    for side in (60, 20, 8, 3):
+        noise = rng.uniform(0, 64, (-(-480 // side), -(-960 // side), 3))
+        pixels += cv2.resize(noise, (960, 480), interpolation=cv2.INTER_NEAREST)
+    return Image.fromarray(pixels.astype(np.uint8))
+
+
+def test_blurred_pictures_are_named(texture: Image.Image, tmp_path: Path) -> None:
+    for index in range(4):
+        part = texture.crop((40 * index, 0, 40 * index + 480, 360))
+        part.save(tmp_path / f"{index}.png")
+    (tmp_path / "3.png").unlink()
+    part.filter(ImageFilter.GaussianBlur(8)).save(tmp_path / "3.png")
+    said = [finding.message for finding in find_photographs(tmp_path)[1]]
+    assert said == [
+        "1 of 4 pictures are blurred beside the others (3.png); they are tried all the same"
+    ]
+    for index in range(4):
+        part.filter(ImageFilter.GaussianBlur(8 + index)).save(tmp_path / f"{index}.png")
+    (only,) = find_photographs(tmp_path)[1]
+    assert only.message.startswith("most of the 4 pictures have hardly any edges")
+
+
+def test_a_failure_says_what_was_met(texture: Image.Image, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for index in range(3):
+        noise = np.random.default_rng(index).integers(0, 255, (240, 320, 3), np.uint8)
+        Image.fromarray(noise).save(folder / f"{index}.png")
+    shutil.copy(folder / "0.png", folder / "again.png")
+    (folder / "half.jpg").write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(ProjectError) as raised:
+        capture_photographs(folder, tmp_path / "out")
+    line = str(raised.value)
+    assert line.startswith(f"{folder}: no two of the 3 pictures show enough of the same")
+    assert "1 of 5 pictures cannot be read: left out (half.jpg)" in line
+    assert "1 of 5 pictures are copies of others: left out (again.png)" in line
+    assert "\n" not in line
+
+
+def test_a_camera_that_only_turned_is_told(texture: Image.Image, tmp_path: Path) -> None:
+    images, K = tmp_path / "images", np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    images.mkdir()
+    for index in range(4):
+        angle = np.radians(4.0 * index - 6)
+        cos, sin = np.cos(angle), np.sin(angle)
+        turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+        # What a camera at the wall's centre of projection sees after a turn.
+        wall = np.array([[300.0, 0, 480], [0, 300, 240], [0, 0, 1]])
+        seen = cv2.warpPerspective(
+            np.asarray(texture), K @ turn @ np.linalg.inv(wall), (320, 240), flags=cv2.INTER_LINEAR
+        )
+        Image.fromarray(seen).save(images / f"{index}.png")
+    (tmp_path / "work").mkdir()
+    with pytest.raises(ProjectError, match=r"away: .*the camera only turned.* while walking"):
+        find_cameras(
+            images, [[f"{index}.png" for index in range(4)]],
+            work=tmp_path / "work", source=Path("away"),
+        )  # fmt: skip
+
+
+def test_a_video_that_was_cut_off(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "cut.mp4"
+    path.write_bytes(b"\0\0\0\x20ftypisom" + bytes(1000))
+    line = refused(capfd, "capture", path, "--out", tmp_path / "out")
+    assert "no video that OpenCV reads (1012 bytes); it may have been cut off" in line
+
+
+def test_exif_tells_focal_length_place_and_camera(texture: Image.Image, tmp_path: Path) -> None:
+    photos, images = tmp_path / "photos", tmp_path / "images"
+    photos.mkdir()
+    for name, orientation, focal in (("a", 1, 28), ("b", 6, 28), ("c", 1, 50)):
+        picture = texture.crop((0, 0, 400, 300))
+        exif = picture.getexif()
+        exif[0x010F], exif[0x0110], exif[0x0112] = "Maker", "Model", orientation
+        exif.get_ifd(0x8769)[0xA405] = focal
+        exif.get_ifd(0x8825).update(
+            {1: "S", 2: (33.0, 51.0, 30.0), 3: "E", 4: (151.0, 12.0, 36.0), 5: b"\0", 6: 58.5}
+        )
+        if orientation == 6:
+            picture = picture.transpose(Image.Transpose.ROTATE_90)
+        # Quality keeps the three files apart.
+        picture.save(photos / f"{name}.jpg", exif=exif, quality=80 + orientation + focal // 10)
+    found, _ = find_photographs(photos)
+    assert [item.size for item in found] == [(400, 300)] * 3
+    assert found[0].camera == found[1].camera != found[2].camera
+    assert found[0].location == pytest.approx((-33.858333, 151.21, 58.5))
+    copy_upright(found, images)
+    database = tmp_path / "database.db"
+    pycolmap.Database.open(database).close()
+    pycolmap.import_images(database, images, pycolmap.CameraMode.PER_IMAGE)
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            camera = opened.read_camera(image.camera_id)
+            focal = 50 if image.name == "c.jpg" else 28
+            assert camera.has_prior_focal_length
+            # The full frame of 35 mm film is 36 mm wide, 43.27 mm across.
+            assert camera.focal_length == pytest.approx(focal / 43.27 * 500, rel=0.05), image.name
+
+
+@pytest.mark.slow
+def test_of_two_places_the_larger_is_kept(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for seed, views in ((0, 6), (3, 4)):
+        room = tmp_path / f"room{seed}"
+        write_room(room, seed=seed, views=10, width=360, height=270)
+        for path in sorted((room / "images").iterdir())[:views]:
+            shutil.copy(path, folder / f"room{seed}_{path.name}")
+    report = capture_photographs(folder, tmp_path / "out")
+    assert {name[:5] for name in report.registered} == {"room0"}
+    assert len(report.registered) >= 5
+    left_out = {name for name in report.left_out if name.startswith("room3")}
+    assert left_out == {path.name for path in folder.glob("room3*")}
