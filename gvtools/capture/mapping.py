@@ -61,7 +61,7 @@ class Mapped:
     Attributes:
         model: the one with the most registered pictures; its scale is arbitrary.
         how: "global" or "incremental" mapping.
-        others: how many pictures each further model registered, most first.
+        others: the pictures that each further model registered, most first.
         matching: how pairs were chosen, in words.
         pairs: number of verified matches of each pair of pictures, by their names.
         explained: share of these matches that became points of the model, 0 to 1.
@@ -69,7 +69,7 @@ class Mapped:
 
     model: pycolmap.Reconstruction
     how: str
-    others: tuple[int, ...]
+    others: tuple[tuple[str, ...], ...]
     matching: str
     pairs: Mapping[tuple[str, str], int]
     explained: float
@@ -152,7 +152,10 @@ def find_cameras(
         )
     how, models, share = found
     largest, *rest = sorted(models, key=lambda model: -model.num_reg_images())
-    others = tuple(model.num_reg_images() for model in rest)
+    others = tuple(
+        tuple(sorted(image.name for image in model.images.values() if image.has_pose))
+        for model in rest
+    )
     return Mapped(largest, how, others, matching, pairs=pairs, explained=share)
 
 

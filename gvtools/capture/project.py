@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from gvtools.capture import video
 from gvtools.capture.mapping import Mapped, find_cameras
+from gvtools.capture.masks import complete_masks
 from gvtools.capture.photographs import Photograph, copy_upright, find_photographs
 from gvtools.capture.placement import Placement, place
 from gvtools.errors import OptionError, ProjectError
@@ -125,9 +126,17 @@ def capture_photographs(
                 f"{picked.motion:.1f} widths of the picture"
             )
             findings.append(Finding("info", text))
-            say(text)
+            if picked.lost:
+                text = (
+                    f"{source.name}: about {picked.lost} frames at its end cannot be read; copy "
+                    "the video again if it was cut off"
+                )
+                findings.append(Finding("warning", text))
         photographs, met = find_photographs(folder)
         findings += met
+        if masks is not None:
+            findings += complete_masks(photographs, masks, out=work / "masks")
+            masks = work / "masks"
         copy_upright(photographs, work / IMAGES)
         with _telling(findings):
             mapped = find_cameras(
@@ -145,7 +154,7 @@ def capture_photographs(
         )  # fmt: skip
         mapped.model.write_binary(str(_made(work / MODEL)))
         write_json(work / REPORT, report.to_dict())
-        for spare in ("mapping", "frames"):
+        for spare in ("mapping", "frames", "masks"):
             shutil.rmtree(work / spare, ignore_errors=True)
     return report
 
@@ -220,13 +229,20 @@ def _report(
     for pair in mapped.pairs:
         for name in pair:
             partners[name] = partners.get(name, 0) + 1
-    left_out = {
-        item.name: f"overlaps with {partners[item.name]} pictures, and no camera fits them"
-        if item.name in partners
-        else "overlaps with no other picture"
-        for item in photographs
-        if item.name not in there
-    }
+    left_out = {}
+    for item in photographs:
+        apart = [len(names) for names in mapped.others if item.name in names]
+        if item.name in there:
+            continue
+        if apart:
+            left_out[item.name] = (
+                f"in a further model of {apart[0]} pictures, which does not connect"
+            )
+        elif item.name in partners:
+            reason = f"overlaps with {partners[item.name]} pictures, and no camera fits them"
+            left_out[item.name] = reason
+        else:
+            left_out[item.name] = "overlaps with no other picture"
     met = list(findings)
     if left_out:
         met.append(
@@ -237,7 +253,7 @@ def _report(
             )
         )
     if mapped.others:
-        sizes = ", ".join(str(number) for number in mapped.others)
+        sizes = ", ".join(str(len(names)) for names in mapped.others)
         text = f"further models of {sizes} pictures do not connect to the largest: not kept"
         met.append(Finding("warning", text))
     if mapped.explained < DOUBTFUL:
@@ -258,7 +274,7 @@ def _report(
         mapping=mapped.how,
         features=features,
         matching=mapped.matching,
-        other_models=mapped.others,
+        other_models=tuple(len(names) for names in mapped.others),
         overlap=tuple((a, b, count) for (a, b), count in sorted(mapped.pairs.items())),
         cameras=tuple(
             {

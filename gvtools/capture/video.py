@@ -23,6 +23,8 @@ MOST = 300
 # A whole video with less motion than this share of the width shows the scene from one place.
 STANDS_STILL = 0.05
 JPEG_QUALITY = 97
+# Containers' counts of frames are not exact; this share may lack without a word.
+LOST = 0.05
 # Corners (Shi-Tomasi) that are tracked from frame to frame, at most.
 CORNERS = 200
 
@@ -35,11 +37,14 @@ class Picked:
         frames: numbers of the frames taken, from 0.
         total: how many frames it has.
         motion: of the whole video, in widths of the picture.
+        lost: how many frames the file announces beyond those that can be read; 0 where they are
+            fewer than LOST of all.
     """
 
     frames: tuple[int, ...]
     total: int
     motion: float
+    lost: int = 0
 
 
 def pick_frames(
@@ -62,7 +67,7 @@ def pick_frames(
     """
     if count is not None and count < 2:
         raise OptionError(f"--frames {count}; expected 2 or more")
-    moved, sharp = _measure(path, progress)
+    moved, sharp, announced = _measure(path, progress)
     total = float(moved[-1])
     if len(moved) < 2 or total < STANDS_STILL:
         raise ProjectError(
@@ -77,13 +82,14 @@ def pick_frames(
         rows = np.flatnonzero(piece == number)
         chosen.append(int(rows[np.argmax(sharp[rows])]))
     _write(path, folder, chosen)
-    return Picked(tuple(chosen), len(moved), total)
+    lost = announced - len(moved)
+    return Picked(tuple(chosen), len(moved), total, lost if lost > LOST * announced else 0)
 
 
 def _measure(
     path: Path, progress: Callable[[int], object]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N,) motion up to each frame, in widths, and (N,) sharpness of each."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    """(N,) motion up to each frame, in widths, (N,) sharpness of each, and N as announced."""
     import cv2
 
     # What FFmpeg says of a damaged file is said by the errors here, in words that help.
@@ -110,10 +116,11 @@ def _measure(
         before = grey
         if len(sharp) % 100 == 0:
             progress(len(sharp))
+    announced = int(max(0.0, video.get(cv2.CAP_PROP_FRAME_COUNT)))
     video.release()
     if not sharp:
         raise ProjectError(f"{path}: a video without a frame that can be read")
-    return np.array(moved), np.array(sharp)
+    return np.array(moved), np.array(sharp), announced
 
 
 def _motion(before: NDArray[Any], now: NDArray[Any]) -> float:

@@ -13,6 +13,7 @@ from command_line import refused
 from PIL import Image, ImageFilter
 
 from gvtools.capture.mapping import find_cameras
+from gvtools.capture.masks import complete_masks
 from gvtools.capture.photographs import copy_upright, find_photographs
 from gvtools.capture.project import capture_photographs
 from gvtools.errors import ProjectError
@@ -44,6 +45,28 @@ def test_blurred_pictures_are_named(texture: Image.Image, tmp_path: Path) -> Non
         part.filter(ImageFilter.GaussianBlur(8 + index)).save(tmp_path / f"{index}.png")
     (only,) = find_photographs(tmp_path)[1]
     assert only.message.startswith("most of the 4 pictures have hardly any edges")
+
+
+def test_masks_fit_their_pictures(tmp_path: Path) -> None:
+    photos, masks, out = tmp_path / "photos", tmp_path / "masks", tmp_path / "out"
+    for folder in (photos, masks):
+        folder.mkdir()
+    for index in range(3):
+        Image.new("RGB", (40, 30), (index, 0, 0)).save(photos / f"{index}.png")
+    found, _ = find_photographs(photos)
+    with pytest.raises(ProjectError, match=r"holds no mask of the 3 .* expected 0\.png\.png"):
+        complete_masks(found, masks, out=out)
+    mask = Image.new("L", (40, 30), 0)
+    mask.paste(1, (0, 0, 40, 10))
+    mask.save(masks / "1.png.png")
+    (finding,) = complete_masks(found, masks, out=out)
+    assert finding.message == "2 of 3 pictures have no mask (0.png, 2.png): used whole"
+    written = [np.asarray(Image.open(out / f"{index}.png.png")) > 0 for index in range(3)]
+    assert written[0].all() and written[2].all()
+    assert written[1][:10].all() and not written[1][10:].any()
+    mask.resize((20, 30)).save(masks / "2.png.png")
+    with pytest.raises(ProjectError, match=r"20x30 pixels; expected .* 40x30"):
+        complete_masks(found, masks, out=out)
 
 
 def test_a_failure_says_what_was_met(texture: Image.Image, tmp_path: Path) -> None:
@@ -135,5 +158,7 @@ def test_of_two_places_the_larger_is_kept(tmp_path: Path) -> None:
     report = capture_photographs(folder, tmp_path / "out")
     assert {name[:5] for name in report.registered} == {"room0"}
     assert len(report.registered) >= 5
+    assert report.other_models == (4,)
+    assert "in a further model of 4 pictures, which does not connect" in report.left_out.values()
     left_out = {name for name in report.left_out if name.startswith("room3")}
     assert left_out == {path.name for path in folder.glob("room3*")}
