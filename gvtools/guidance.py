@@ -13,7 +13,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import ShapeError
 
 # The fields of Guidance that hold a value for each pixel, in order.
-IMAGES = ("rgb", "depth", "valid", "confidence", "generated")
+IMAGES = ("rgb", "depth", "valid", "confidence", "generated", "scanned")
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,8 @@ class Guidance:
         valid: (V, H, W) bool, True where memory supports the pixel.
         confidence: (V, H, W) float32 >= 0; 0 where not valid.
         generated: (V, H, W) bool, True where the support is generated content.
+        scanned: (V, H, W) bool, True where it is a scan's alone, which no photograph saw; None is
+            nowhere.
     """
 
     cameras: Cameras
@@ -35,6 +37,11 @@ class Guidance:
     valid: NDArray[np.bool_]
     confidence: NDArray[np.float32]
     generated: NDArray[np.bool_]
+    scanned: NDArray[np.bool_] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.scanned is None:
+            object.__setattr__(self, "scanned", np.zeros_like(self.valid))
 
     def __len__(self) -> int:
         return len(self.rgb)

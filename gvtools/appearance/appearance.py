@@ -122,10 +122,10 @@ class Appearance:
 
 
 def applied(picture: Picture, guidance: Guidance, *, blend: Blend) -> Guidance:
-    """A guidance of one view with the Gaussians' colours where the memory observed.
+    """A guidance of one view with the Gaussians' colours where photographs saw what it shows.
 
     Depth, and what is valid, generated and how confident, stays the memory's.
     """
-    where = guidance.valid[0] & picture.solid
+    where = guidance.valid[0] & ~guidance.scanned[0] & picture.solid
     rgb = blended(picture.rgb, guidance.rgb[0], where, blend=blend)
     return replace(guidance, rgb=rgb[None])

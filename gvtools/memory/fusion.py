@@ -59,7 +59,9 @@ class FuseReport:
         return FuseReport(**numbers, dropped=dict(dropped))
 
 
-def fuse(store: Store, points: PointSet, *, round: int, generated: bool = False) -> FuseReport:
+def fuse(
+    store: Store, points: PointSet, *, round: int, generated: bool = False, scanned: bool = False
+) -> FuseReport:
     """Take one view's points in; see SpatialMemory.fuse."""
     _check(store, points, round)
     arrived = len(points)
@@ -87,7 +89,9 @@ def fuse(store: Store, points: PointSet, *, round: int, generated: bool = False)
     grid = points.free_depth if points.free_depth is not None else np.zeros((0, 0), np.float32)
     store.changes += 1
     store.observed_changes += not generated
-    view = store.views.row_for(SourceView(points.camera, int(round), bool(generated), grid))
+    view = store.views.row_for(
+        SourceView(points.camera, int(round), bool(generated), grid, bool(scanned))
+    )
     report = _fuse_columns(store, columns, view)
     return replace(
         report,
@@ -144,8 +148,9 @@ def _fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> FuseR
     )
     round_ = int(views.round[view])
     source = kernels.Source(
-        view, round_, bool(views.generated[view]), views.centers[view], views.centers
-    )
+        view, round_, bool(views.generated[view]), views.centers[view], views.centers,
+        views.scanned,
+    )  # fmt: skip
     old = kernels.SegmentTable(segments.start[: segments.count], segments.box[: segments.count])
     store.columns.count, added, agreed = kernels.fuse_blocks(
         batch, index.arrays, store.columns.arrays, len(store), source, _rules(store), old, out

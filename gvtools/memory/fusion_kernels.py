@@ -49,13 +49,17 @@ class Batch(NamedTuple):
 
 
 class Source(NamedTuple):
-    """The view that is fused: its row, round, kind and centre, and all views' ``centers``."""
+    """The view that is fused: its row, round, kind and centre.
+
+    Of all views, itself included, ``centers`` and whether they are ``scanned``.
+    """
 
     row: int
     round: int
     generated: bool
     center: NDArray[np.float64]
     centers: NDArray[np.float64]
+    scanned: NDArray[np.bool_]
 
 
 class FusionRules(NamedTuple):
@@ -94,9 +98,11 @@ class FusionOutput(NamedTuple):
 def _most_similar(head, p, spacing, source, columns):
     """The chain's observation seen from the most similar direction: (record, cosine, length).
 
-    Generated content never stands in for observed content: observed points pass it by.
+    Generated content never stands in for observed content: observed points pass it by. A scan's
+    and a camera's observations stand apart, too.
     """
     center, generated = source.center, source.generated
+    scanned = source.scanned[source.row]
     ax = center[0] - p[0]
     ay = center[1] - p[1]
     az = center[2] - p[2]
@@ -107,7 +113,9 @@ def _most_similar(head, p, spacing, source, columns):
     length = 0
     m = head
     while m != NO_RECORD:
-        if columns.generated[m] and not generated:
+        if (columns.generated[m] and not generated) or (
+            source.scanned[columns.view_row[m]] != scanned
+        ):
             m = columns.next[m]
             continue
         length += 1

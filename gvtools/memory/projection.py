@@ -4,7 +4,8 @@ Views near the target know best how it looks from there, so observations are spl
 nearest views first, and a later tier writes only pixels that are still open; segments whose
 rectangle holds no open pixel are not touched at all. Then what observed views of later tiers know
 to stand clearly in front is let through, unless a view of the first tier saw that space to be free.
-Last come generated views, in tiers of their own: they fill what is open still.
+Stations of scans come after all photographs, in tiers of their own, and generated views come last:
+they fill what is open still.
 
 Which segments go into which pixels is decided here; a back end (``Splatter``) does the splatting.
 """
@@ -102,6 +103,7 @@ class Observed:
     depth: NDArray[np.float32]
     valid: NDArray[np.bool_]
     confidence: NDArray[np.float32]
+    scanned: NDArray[np.bool_]
     scale: float
     tiers: int
     size: int
@@ -181,6 +183,7 @@ class _Projection:
             np.zeros(shape, np.bool_),
             np.zeros(shape, np.float32),
             np.zeros(shape, np.bool_),
+            np.zeros(shape, np.bool_),
         )
         self.scale, self.tiers, self.size = 0.0, 0, options.nearest_views
         self.tier = np.full(len(store.views), -1)
@@ -190,13 +193,16 @@ class _Projection:
         if self._find_segments(generated=False):
             self._splat_tiers()
             if self.options.occluders:
-                self._splat_occluders()
+                scanned = self.store.views.scanned[self.store.segments.view[self.seen]]
+                # Photographs first, as in the tiers.
+                for source in np.unique(scanned):
+                    self._splat_occluders(self.seen[scanned == source])
 
     def observed(self) -> Observed:
         """A copy of what is written so far."""
         t = self.target
         return Observed(
-            t.rgb.copy(), t.depth.copy(), t.valid.copy(), t.confidence.copy(),
+            t.rgb.copy(), t.depth.copy(), t.valid.copy(), t.confidence.copy(), t.scanned.copy(),
             self.scale, self.tiers, self.size,
         )  # fmt: skip
 
@@ -205,6 +211,7 @@ class _Projection:
         t = self.target
         t.rgb[:], t.depth[:] = observed.rgb, observed.depth
         t.valid[:], t.confidence[:] = observed.valid, observed.confidence
+        t.scanned[:] = observed.scanned
         self.tiers, self.size = observed.tiers, observed.size
         if observed.scale:
             self._set_scale(observed.scale)
@@ -221,6 +228,7 @@ class _Projection:
             t.valid[None],
             t.confidence[None],
             t.generated[None],
+            t.scanned[None],
         )
 
     def _set_scale(self, scale: float) -> None:
@@ -252,7 +260,7 @@ class _Projection:
         present = np.bincount(
             segments.view[self.seen], segments.length[self.seen], minlength=len(store.views)
         )
-        order = np.argsort(self.distance, kind="stable")
+        order = np.lexsort((self.distance, store.views.scanned))
         self.ranked = order[present[order] > 0]
         return True
 
@@ -273,17 +281,21 @@ class _Projection:
     def _splat_tiers(self) -> None:
         """Nearest views first, in tiers that double in size; each writes what is still open.
 
-        Generated views come in tiers of their own, after all observed ones.
+        Generated views come in tiers of their own, after all observed ones, and so do those of
+        scans after photographs.
         """
         target = self.target
         members = []
-        at, first = 0, self.tiers
-        while at < len(self.ranked):
-            members.append(self.ranked[at : at + self.size])
-            self.tier[members[-1]] = self.tiers
-            self.tiers += 1
-            at += self.size
-            self.size *= 2
+        first = self.tiers
+        scanned = self.store.views.scanned[self.ranked]
+        for ranked in (self.ranked[~scanned], self.ranked[scanned]):
+            at = 0
+            while at < len(ranked):
+                members.append(ranked[at : at + self.size])
+                self.tier[members[-1]] = self.tiers
+                self.tiers += 1
+                at += self.size
+                self.size *= 2
         view = self.store.segments.view[self.seen]
         for number, views in enumerate(members, first):
             open_ = ~target.valid
@@ -293,7 +305,8 @@ class _Projection:
                 if not open_.any():
                     return
                 chosen = culling.touching(target.rect, culling.summed_area(open_), chosen)
-            self._write(chosen, limit, open_, members=views, few=number > 0)
+            scanned = bool(self.store.views.scanned[views[0]])
+            self._write(chosen, limit, open_, members=views, few=number > 0, scanned=scanned)
 
     def _write(
         self,
@@ -303,8 +316,9 @@ class _Projection:
         *,
         members: NDArray[np.int64],
         few: bool,
+        scanned: bool,
     ) -> None:
-        """Splat and write the pixels ``open_``, which may be ``few``.
+        """Splat and write the pixels ``open_``, which may be ``few``; ``scanned`` is their source.
 
         The weight counts from the nearest of the views ``members``.
         """
@@ -314,19 +328,22 @@ class _Projection:
         self.splatter.splat(
             self.target, chosen, limit, weight=weight, writable=writable, blend=True
         )
-        made = bool(self.store.views.generated[members[0]])
-        self.splatter.resolve(self.target, open_, generated=made)
+        views, target = self.store.views, self.target
+        before = np.where(target.valid, target.depth, np.float32(0))
+        self.splatter.resolve(target, open_, generated=bool(views.generated[members[0]]))
+        # What is written has another depth than before.
+        target.scanned[open_ & target.valid & (target.depth != before)] = scanned
 
-    def _splat_occluders(self) -> None:
-        """Let through what unused observations know to stand clearly in front.
+    def _splat_occluders(self, seen: NDArray[np.int64]) -> None:
+        """Let through what unused observations, of one source, know to stand clearly in front.
 
         A view of the first tier may have looked past an object that only others saw. Where a
         first-tier view saw the object's place to be free, the object is noise or has moved.
         """
         store, target = self.store, self.target
         segments = store.segments
-        view = segments.view[self.seen]
-        later = self.seen[self.tier[view] != 0]
+        view = segments.view[seen]
+        later = seen[self.tier[view] != 0]
         if not len(later):
             return
         grids = store.observed_grids(np.flatnonzero(self.tier == 0))
@@ -353,7 +370,8 @@ class _Projection:
         if front.any():
             chosen = culling.touching(target.rect, culling.summed_area(front), chosen)
             limit = np.where(front, limit, np.float32(0))
-            self._write(chosen, limit, front, members=self.ranked, few=True)
+            scanned = bool(store.views.scanned[view[0]])
+            self._write(chosen, limit, front, members=self.ranked, few=True, scanned=scanned)
 
     def _lifted(self, depth: NDArray[np.float32], where: NDArray[np.bool_]) -> NDArray[np.float32]:
         """(N, 3) points of the pixels ``where`` (H, W), in the memory's frame."""

@@ -116,7 +116,9 @@ class SpatialMemory(Store):
         )  # fmt: skip
         return out
 
-    def fuse(self, points: PointSet, *, round: int, generated: bool = False) -> FuseReport:
+    def fuse(
+        self, points: PointSet, *, round: int, generated: bool = False, scanned: bool = False
+    ) -> FuseReport:
         """Take one view's points in.
 
         Args:
@@ -124,12 +126,14 @@ class SpatialMemory(Store):
             round: the round they belong to, 0 to 65535; not smaller than any round already there.
             generated: True for a completer's points: they enter neither voxels that hold observed
                 content nor space that an observed ray saw to be free.
+            scanned: True for points of a scan: they are observed, but shown only where no camera's
+                observations are, with which they never merge.
 
         Raises:
             OptionError: ``round`` lies before the last one or out of range.
             ShapeError: the points are in another frame.
         """
-        return fusion.fuse(self, points, round=round, generated=generated)
+        return fusion.fuse(self, points, round=round, generated=generated, scanned=scanned)
 
     def project(self, cameras: Cameras, *, options: SplatOptions | None = None) -> Guidance:
         """Project the memory into cameras of one size; see gvtools.memory.projection.project."""
@@ -178,15 +182,15 @@ class SpatialMemory(Store):
         """A memory of an Open3D point cloud: its points are fused, one observation a voxel.
 
         A cloud does not tell from where its points were seen: a camera in their midst stands for
-        it, once for each combination of ``round``, ``view`` and ``generated``. Observations that
+        it, once for each combination of ``round``, ``view`` and source. Observations that
         a memory keeps apart by direction therefore merge: ``save`` and ``load``, or ``to("cpu")``,
         copy a memory as it is.
 
         Args:
             cloud: with ``positions`` and ``colors`` (uint8, or float from 0 to 1), and where it
                 has them ``confidence`` (else 1), ``spacing`` (else the median distance between
-                neighbours), ``generated`` (else observed), ``round`` (else 0, and 1 for what was
-                generated) and ``view`` (else one).
+                neighbours), ``generated`` and ``scanned`` (else observed by a camera), ``round``
+                (else 0, and 1 for what was generated) and ``view`` (else one).
             voxel: edge of the voxels, scene units; None for the distance between neighbours.
             frame: that ``positions`` are in, as a memory's own ``cloud`` is in ``memory.frame``;
                 None for the world's.
@@ -230,15 +234,16 @@ class SpatialMemory(Store):
         column = {key: values.reshape(count, -1)[:, 0] for key, values in columns.items()}
         colors = to_uint8(columns["colors"], name)
         generated = column.get("generated", np.zeros(count)) != 0
+        scanned = column.get("scanned", np.zeros(count)) != 0
         round_ = column.get("round", generated).astype(np.int64)
         view = column.get("view", np.zeros(count)).astype(np.int64)
         spacing = column.get("spacing", np.full(count, distance)).astype(np.float32)
         confidence = column.get("confidence", np.ones(count)).astype(np.float32)
         pose = np.eye(4)
         pose[:3, 3] = -self.frame.to_world(columns["positions"].mean(axis=0, dtype=float)[None])[0]
-        keys = np.stack([round_, generated, view], axis=1)
+        keys = np.stack([round_, generated, scanned, view], axis=1)
         groups, group = np.unique(keys, axis=0, return_inverse=True)
-        for i, (number, made, row) in enumerate(groups.tolist()):
+        for i, (number, made, by_scan, row) in enumerate(groups.tolist()):
             label = f"{name} {row}" if "view" in column else name
             one = np.ones(1, np.int64)
             camera = Cameras(np.eye(3)[None], pose[None], one, one, (label,))
@@ -247,7 +252,7 @@ class SpatialMemory(Store):
                 columns["positions"][rows], colors[rows], confidence[rows],
                 spacing[rows], camera, self.frame, None, {},
             )  # fmt: skip
-            self.fuse(points, round=number, generated=bool(made))
+            self.fuse(points, round=number, generated=bool(made), scanned=bool(by_scan))
 
 
 def to_uint8(colors: NDArray[Any], name: str) -> NDArray[np.uint8]:

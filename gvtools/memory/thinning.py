@@ -23,7 +23,8 @@ class Thinned:
     """P points out of N observations.
 
     Attributes:
-        rows: (P,) int64, the observation that is kept: the most confident of its voxel.
+        rows: (P,) int64, the observation that is kept: the most confident of its voxel, a scan's
+            only where there is no other.
         group: (N,) int64, for each observation the point that stands for it; -1 where it was left
             out.
         edge: voxel edge of the thinning, scene units.
@@ -49,8 +50,8 @@ def thinned(
     """
     chosen = np.arange(len(store)) if among is None else np.flatnonzero(among)
     positions = store.columns.positions[chosen].astype(np.float64)
-    # The most confident first; of equals, the earlier observation.
-    order = np.argsort(-store.confidence[chosen], kind="stable")
+    # Scans last, and the most confident first; of equals, the earlier observation.
+    order = np.lexsort((-store.confidence[chosen], store.scanned[chosen]))
     level = store.columns.level[chosen]
     edge, corner = store.voxel, np.zeros(3)
     while True:

@@ -63,6 +63,7 @@ class _Report(BaseModel):
     points: int
     observed: int
     generated: int
+    scanned: int = 0
     voxels: int
     added: int
     merged: int

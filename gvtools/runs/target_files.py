@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 # Grey levels of valid_NAME.png.
 SUPPORT_OBSERVED = 255
+SUPPORT_SCANNED = 192
 SUPPORT_GENERATED = 128
 
 
@@ -47,10 +48,10 @@ def write_target(
 ) -> None:
     """Write the guidance of a target and its completion.
 
-    ``guidance_STEM.png`` (holes black), ``valid_STEM.png`` (guidance from observations 255, from
-    generated points 128, holes 0), ``generated_STEM.png`` (the completed picture), and
-    ``depth_STEM.npz`` with the keys guidance and completion (float32 z-depth, scene units, 0 =
-    none) and fused (bool).
+    ``guidance_STEM.png`` (holes black), ``valid_STEM.png`` (guidance from observations 255, from a
+    scan's alone 192, from generated points 128, holes 0), ``generated_STEM.png`` (the completed
+    picture), and ``depth_STEM.npz`` with the keys guidance and completion (float32 z-depth, scene
+    units, 0 = none) and fused (bool).
 
     Args:
         folder: of the round.
@@ -60,6 +61,7 @@ def write_target(
         fused: (H, W), the pixels that were fused.
     """
     support = np.where(guidance.generated[0], SUPPORT_GENERATED, SUPPORT_OBSERVED)
+    support = np.where(guidance.scanned[0], SUPPORT_SCANNED, support)
     support = np.where(guidance.valid[0], support, 0).astype(np.uint8)
     write_png(target_picture(folder, GUIDANCE, stem), to_bytes(guidance.rgb[0]))
     write_png(target_picture(folder, VALID, stem), support)
@@ -87,7 +89,7 @@ class TargetFiles:
         picture: (H, W, 3) uint8, completed; holes are black.
         depth: (H, W) float32 z-depth of the picture, brought to the memory's scale, scene units,
             0 = none.
-        observed: (H, W) bool, pixels that stand on observations.
+        observed: (H, W) bool, pixels that stand on observations, a scan's included.
         generated: (H, W) bool, pixels that a completer made, in this round or an earlier one.
     """
 
@@ -123,7 +125,7 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
             f"{folder}: the target {entry.get('name', '?')} cannot be read ({error!r}); expected a "
             "round of this version; run reconstruct again"
         ) from error
-    observed = support == SUPPORT_OBSERVED
+    observed = support >= SUPPORT_SCANNED
     aligned = depth * np.float32(scale) if scale is not None and scale == scale else depth
     return TargetFiles(
         str(entry["name"]), camera, picture, aligned, observed, ~observed & (depth > 0)

@@ -19,6 +19,7 @@ EXAMPLES = (
     "gvtools reconstruct scan/ --context every:2 --targets every:2+1 --out runs/scan",
     "gvtools reconstruct colmap/ --targets orbit:24 --completer inpaint --out runs/orbit",
     "gvtools reconstruct walk.mp4 --capture --out runs/walk",
+    "gvtools reconstruct photographs/ --cloud survey.laz --out runs/survey",
 )
 
 
@@ -77,6 +78,15 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
         metavar="MINUTES",
         help="train the generative core (--completer geoverse) so long to predict the context from "
         "itself, before the first targets (default 0: not at all)",
+    )
+    parser.add_argument(
+        "--cloud", metavar="FILE", help="start memory from a scan: PLY, LAS, LAZ, E57 or PCD"
+    )
+    parser.add_argument(
+        "--cloud-placement",
+        metavar="MATRIX",
+        help="similarity from the scan's frame to the photographs': estimate (default), identity, "
+        "a text file with a 4x4 matrix, or its numbers row by row with commas between",
     )
     parser.add_argument("--voxel", metavar="EDGE", help="auto, or scene units")
     parser.add_argument(
@@ -164,6 +174,11 @@ def config_from(args: argparse.Namespace) -> RunSettings:
         given["refine.seconds"] = args.refine
     if args.tune is not None:
         given["tune.minutes"] = args.tune
+    if args.cloud is not None:
+        given["scan.file"] = str(Path(args.cloud).resolve())
+    if args.cloud_placement is not None:
+        text = args.cloud_placement
+        given["scan.placement"] = str(Path(text).resolve()) if Path(text).is_file() else text
     if args.allow_overlap:
         given["allow_overlap"] = True
     return with_texts(with_values(config, given), texts)

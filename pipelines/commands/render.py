@@ -144,6 +144,9 @@ def _cameras(args: argparse.Namespace, memory: SpatialMemory) -> tuple[Cameras, 
                 f"--cameras {args.cameras}: a trajectory takes its camera from the memory's views, "
                 f"and {args.memory} is a PLY without any; give the run or its memory.npz"
             )
-        return read_trajectory(args.cameras, memory.views[0].camera), None
+        photographed = memory.views.photographed
+        if not photographed:
+            raise OptionError(f"{args.memory}: no photograph's view; give a project as --cameras")
+        return read_trajectory(args.cameras, photographed[0].camera), None
     scene = open_scene(args.cameras, args)
     return scene.cameras, scene

@@ -57,7 +57,8 @@ class DistinctCameras:
 
     Attributes:
         cameras: V cameras.
-        row_of_view: (views of the memory,) int64, which of the cameras each view has.
+        row_of_view: (views of the memory,) int64, which of the cameras each view has; -1 for a
+            scan's station, which has none.
         generated: names of those that a completer alone saw through, in order, with the pictures
             that the run kept.
     """
@@ -177,15 +178,16 @@ def distinct_cameras(memory: SpatialMemory, run: Path) -> DistinctCameras:
         ProjectError: no views, or two different observed cameras of one name.
     """
     cameras, made = memory.views.cameras, memory.views.generated
-    if cameras is None:
+    taken = np.flatnonzero(~memory.views.scanned)
+    if cameras is None or not len(taken):
         raise ProjectError("the memory has no views; nothing to export")
     first: list[int] = []  # for each camera kept the first view that has it
     names: list[str] = []
     rows_of_name: dict[str, list[int]] = {}
-    row_of_view = np.empty(len(cameras), np.int64)
+    row_of_view = np.full(len(cameras), -1, np.int64)
     used: set[str] = set()
     # Observed views come first and keep their names.
-    for i in np.argsort(made, kind="stable").tolist():
+    for i in taken[np.argsort(made[taken], kind="stable")].tolist():
         name = cameras.names[i]
         alike = rows_of_name.setdefault(name, [])
         row = next((row for row in alike if _same_camera(memory, first[row], i)), len(first))
@@ -207,7 +209,7 @@ def distinct_cameras(memory: SpatialMemory, run: Path) -> DistinctCameras:
     kept = Cameras(kept.K, kept.cam_from_world, kept.width, kept.height, tuple(names))
     pictures: dict[str, Path | None] = {}
     for i, row in enumerate(row_of_view.tolist()):
-        if made[first[row]]:
+        if row >= 0 and made[first[row]]:
             # Of several rounds' pictures the last.
             pictures[names[row]] = _picture(memory, i, run) or pictures.get(names[row])
     return DistinctCameras(kept, row_of_view, pictures)
@@ -241,6 +243,7 @@ def _tracks(
     """Point, view and pixel of each track element: one observation for each point and view."""
     view = row_of_view[memory.columns.view[: len(memory)]]
     order = np.argsort(-memory.confidence, kind="stable")
+    order = order[view[order] >= 0]
     pair = group[order] * np.int64(len(cameras)) + view[order]
     _, first = np.unique(pair, return_index=True)
     chosen = np.sort(order[first])

@@ -1,8 +1,8 @@
 """Points as LAS 1.4, or LAZ by the file's suffix: point format 7, colours of 16 bits.
 
 Coordinates are whole multiples of a step from an offset, so that a georeferenced scene keeps its
-precision. Each point says how far it is trusted, which round it came with and whether a completer
-made it; LAS's own flag "synthetic" says the last, too.
+precision. Each point says how far it is trusted, which round it came with, whether a completer made
+it (LAS's own flag "synthetic" says so, too) and whether it is of a scan.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
             laspy.ExtraBytesParams("spacing", "f4", "footprint of a pixel, units"),
             laspy.ExtraBytesParams("round", "u2", "that it came with"),
             laspy.ExtraBytesParams("generated", "u1", "1: made by a completer"),
+            laspy.ExtraBytesParams("scanned", "u1", "1: of a scan, no photograph"),
         ]
     )
     cloud = laspy.LasData(header)
@@ -57,6 +58,7 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
     cloud.synthetic[:] = columns.generated[rows]
     for name in ("confidence", "spacing", "round", "generated"):
         cloud[name] = getattr(columns, name)[rows]
+    cloud["scanned"] = memory.scanned[rows]
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
         cloud.write(file, do_compress=path.suffix.lower() == ".laz")
     return f"{told(points, memory)} in {path}, coordinates in steps of {step:g}"

@@ -76,9 +76,11 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
         recording.save(temporary)
         recording.send_recording_name(name)
         rounds, made = memory.columns.round[points.rows], memory.generated[points.rows]
+        scanned = memory.scanned[points.rows]
+        sources = {"observed": ~(made | scanned), "scanned": scanned, "generated": made}
         for number in memory.rounds:
             recording.set_time(TIMELINE, sequence=int(number))
-            for kind, of_kind in (("observed", ~made), ("generated", made)):
+            for kind, of_kind in sources.items():
                 rows = np.flatnonzero((rounds == number) & of_kind)
                 if len(rows):
                     recording.log(
@@ -131,6 +133,8 @@ def _shots(source: Source) -> Iterator[Shot]:
     scene = _scene(run)
     for view in source.memory.views:
         name = view.camera.names[0]
+        if view.scanned:
+            continue
         if view.generated:
             if run is None:
                 yield Shot(view.round, "generated", view.camera, None)

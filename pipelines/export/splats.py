@@ -1,6 +1,7 @@
 """The Gaussians of an export: those that the run fitted, and the memory's points beside them.
 
-Fitted Gaussians show what was observed, so of the memory only generated points join them. A memory
+Fitted Gaussians show what photographs saw, so of the memory only generated points join them, and
+those of a scan that no photograph's lie beside. A memory
 without a fit is shown by its points alone: each becomes a round Gaussian.
 """
 
@@ -87,7 +88,7 @@ class Splats:
         points = len(self) - self.fitted
         parts = [f"{self.fitted} fitted"] if self.fitted else []
         if points or not parts:
-            parts.append(f"{points} from {'generated ' if self.fitted else ''}points")
+            parts.append(f"{points} from {'further ' if self.fitted else ''}points")
         text = f"{len(self)} Gaussians ({', '.join(parts)})"
         if self.further:
             text += f", the first of {self.further + 1} fits"
@@ -121,9 +122,11 @@ def splats_of(source: Source, options: ExportOptions) -> Splats:
                 f"--max-points {options.max_points}: the run's fit has {len(fitted)} Gaussians, "
                 "which are kept whole; expected no less"
             )
-    made = memory.generated
-    if made.any() and not options.observed and rest != 0:
-        points, came = of_points(source, ExportOptions(max_points=rest), among=made)
+    further = unphotographed(memory)
+    if not options.observed:
+        further |= memory.generated
+    if further.any() and rest != 0:
+        points, came = of_points(source, ExportOptions(max_points=rest), among=further)
         points[:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)
         parts.append(points)
         of_parts.append(came)
@@ -151,9 +154,24 @@ def _rounded(
     return values, origin
 
 
+def unphotographed(memory: SpatialMemory) -> NDArray[np.bool_]:
+    """(N,) a scan's observations that have none of a photograph's within their spacing."""
+    scanned = memory.scanned
+    seen = ~(scanned | memory.generated)
+    if not scanned.any() or not seen.any():
+        return scanned.copy()
+    from scipy.spatial import KDTree
+
+    positions, rows = memory.columns.positions, np.flatnonzero(scanned)
+    away, _ = KDTree(positions[seen]).query(positions[rows], workers=-1)
+    alone = np.zeros(len(memory), np.bool_)
+    alone[rows[away > memory.columns.spacing[rows]]] = True
+    return alone
+
+
 def _photographs(memory: SpatialMemory) -> Cameras:
     """The cameras of the observed views."""
-    return concatenate([view.camera for view in memory.views if not view.generated])
+    return concatenate([view.camera for view in memory.views.photographed])
 
 
 def of_points(

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, OptionError
@@ -27,6 +28,8 @@ BLOCK_SIDE, ROOM, LEAST_BLOCKS = 16, 3, 64
 MOST_BLOCKS = 30_000
 # By what voxels grow until the scene has few enough blocks.
 WIDER = 1.25
+# Side of the pictures that show what a scanner saw around it [px].
+FACE = 1024
 # What Open3D says of a picture without depth.
 NOTHING = "No block is touched"
 # The signed distance is known so far from the surface, in voxels.
@@ -132,15 +135,32 @@ def _ordered(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleMesh:
 
 
 def _cameras(memory: SpatialMemory, *, observed: bool) -> Iterator[Cameras]:
-    """The cameras of the memory's views, each once."""
+    """The cameras of the memory's views, each once; all around where a scan has a station."""
     seen = set()
     for view in memory.views:
         camera = view.camera
+        if view.scanned:
+            yield from _around(camera.centers[0], camera.names[0])
+            continue
         arrays = (camera.K, camera.cam_from_world, camera.width, camera.height)
         key = tuple(array.tobytes() for array in arrays)
         if key not in seen and not (observed and view.generated):
             seen.add(key)
             yield camera
+
+
+def _around(center: NDArray[np.float64], name: str) -> Iterator[Cameras]:
+    """Six cameras that together see all around a place, (3,) in the world."""
+    half = FACE / 2
+    K = np.array([[[half, 0, half], [0, half, half], [0, 0, 1.0]]])
+    axes, size = np.eye(3), np.array([FACE])
+    for k in range(3):
+        for forward in (axes[k], -axes[k]):
+            right = axes[k - 1]
+            pose = np.eye(4)
+            pose[:3, :3] = right, np.cross(forward, right), forward
+            pose[:3, 3] = -pose[:3, :3] @ center
+            yield Cameras(K, pose[None], size, size, (f"{name} {forward.tolist()}",))
 
 
 def poisson_mesh(

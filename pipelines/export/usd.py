@@ -54,6 +54,8 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
          Vt.IntArray.FromNumpy(columns.round[rows].astype(np.int32))),
         ("generated", Sdf.ValueTypeNames.IntArray,
          Vt.IntArray.FromNumpy(columns.generated[rows].astype(np.int32))),
+        ("scanned", Sdf.ValueTypeNames.IntArray,
+         Vt.IntArray.FromNumpy(memory.scanned[rows].astype(np.int32))),
     ):  # fmt: skip
         primvars.CreatePrimvar(name, kind, UsdGeom.Tokens.vertex).Set(values)
     with replaced_when_written(path, suffix=path.suffix.lower()) as temporary:

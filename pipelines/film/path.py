@@ -36,7 +36,7 @@ def film_cameras(memory: SpatialMemory, path: str, *, width: int | None = None) 
         OptionError: another form, no observed views, or a width below 16.
         DegenerateError: no such path leads through these views.
     """
-    captured = [view.camera for view in memory.views if not view.generated]
+    captured = [view.camera for view in memory.views.photographed]
     if not captured:
         raise OptionError("a memory without observed views; give a run or its memory.npz")
     from gvtools.cameras import concatenate

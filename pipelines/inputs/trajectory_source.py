@@ -46,8 +46,11 @@ def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = Non
     if path.suffix.lower() == ".npz" or (path / "run.json").is_file():
         from gvtools.runs.memory_file import load_memory
 
-        cameras = load_memory(path).views.cameras
-        if cameras is None:
+        views = load_memory(path).views
+        cameras = views.cameras
+        # A scan's stations are no poses of a camera.
+        cameras = None if cameras is None else cameras[np.flatnonzero(~views.scanned)]
+        if cameras is None or not len(cameras):
             raise ProjectError(f"{path}: a memory without views; expected at least one")
         # A view that was fused twice is one pose.
         first = {name: row for row, name in reversed(list(enumerate(cameras.names)))}

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from gvtools.depth.source import DepthSource
     from gvtools.runs.poses import RunPoses
     from gvtools.scenes.scene import Scene
+    from pipelines.reconstruction.scan import PlacedScan
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.reconstruction.targets import Targets
 
@@ -49,6 +50,7 @@ class Plan:
         weights: files of networks that decide the result.
         evidence: the scene as it enters the memory, where that is smaller; None for ``scene``.
         poses: refined ones, which ``posed`` takes instead of the project's.
+        scan: that the memory starts from, placed.
     """
 
     scene: Scene
@@ -64,6 +66,7 @@ class Plan:
     weights: tuple[Path, ...] = ()
     evidence: Scene | None = None
     poses: RunPoses | None = None
+    scan: PlacedScan | None = None
 
     @property
     def derived(self) -> dict[str, Any]:
@@ -105,6 +108,7 @@ def make_plan(
     from gvtools.scenes.reduced import reduced
     from gvtools.scenes.selection import select
     from pipelines.reconstruction import poses
+    from pipelines.reconstruction.scan import check_scan
     from pipelines.reconstruction.targets import resolve_targets
     from pipelines.reconstruction.tuning import check_tuning
 
@@ -114,6 +118,7 @@ def make_plan(
             f"{scene.root}: {errors[0]}"
             + (f" (and {len(errors) - 1} more; see 'gvtools check')" if len(errors) > 1 else "")
         )
+    check_scan(settings.scan)
     config = _on_device(settings)
     if config.protocol == "paper" and config.completer != "geoverse":
         raise OptionError(
@@ -285,7 +290,7 @@ def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "project": scene.address,
         "reading": dict(reading),
-        "fingerprint": fingerprint([*files, *targets.files]),
+        "fingerprint": fingerprint([*files, *targets.files, *plan.config.scan.files()]),
         "cameras": array_digest(
             array for c in cameras for array in (c.K, c.cam_from_world, c.width, c.height)
         ),

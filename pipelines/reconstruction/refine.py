@@ -21,6 +21,7 @@ from pipelines.reconstruction.compile_kernels import compile_kernels
 from pipelines.reconstruction.fitting import Fitted, fit_appearance
 from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
 from pipelines.reconstruction.run import Draw, complete_run, say_results
+from pipelines.reconstruction.scan import placed_scan
 from pipelines.reconstruction.settings import RunSettings
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ def refine(
     earlier = _earlier(run, console)
     with folder_lock(place), folder_replaced_when_written(place) as folder:
         plan = plan.posed
+        plan = replace(plan, scan=placed_scan(plan, console))
         fitted = fit_appearance(plan, console, earlier=earlier)
         if fitted is None:
             raise ProjectError(

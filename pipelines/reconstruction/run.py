@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from gvtools.runs.layout import APPEARANCE, MEMORY, POSES, REPORT
 from pipelines.console import Console
 from pipelines.reconstruction.compile_kernels import compile_kernels
 from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
+from pipelines.reconstruction.scan import placed_scan
 
 if TYPE_CHECKING:
     from gvtools.completers.base import ContextView
@@ -67,6 +69,8 @@ def reconstruct(
         return out
     with directory.open_or_resume(identity, resume=resume) as done:
         plan = plan.posed
+        if not done:
+            plan = replace(plan, scan=placed_scan(plan, console))
         fitted = _fitted(plan, directory, done, console=console)
         drawn = complete_run(plan, directory, done, fitted=fitted, console=console, draw=draw)
         say_results(directory, drawn, console)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from pipelines.reconstruction import rounds
 from pipelines.reconstruction.depth_cache import DepthCache, warn_of_depth
 from pipelines.reconstruction.plan import Plan
 from pipelines.reconstruction.round_targets import RoundTargets
+from pipelines.reconstruction.scan import scan_line
 
 # Targets whose files are written at once.
 WRITERS = 2
@@ -39,14 +40,15 @@ def run_round(
     """Run round ``number``, write its files into ``folder``, and return its report, JSON-ready.
 
     Round 0 fuses the context views; later rounds complete and fuse their targets. In the report,
-    ``points``, ``observed`` and ``generated`` count observations in the memory after the round;
+    ``points``, ``observed`` (by cameras), ``scanned`` and ``generated`` count observations in the
+    memory after the round; ``scan`` tells of the scan that it starts from;
     ``added``, ``merged`` and ``rejected`` are those of FuseReport; ``coverage_*`` are mean shares
     of target pixels (0 to 1) that the memory projects to, None in round 0; ``bytes`` is its size.
     """
     memory, clock = targets.memory, rounds.Clock()
     start = time.perf_counter()
     voxels = memory.voxels
-    report: dict[str, Any] = {"dropped": {}, "depth": [], "views": []}
+    report: dict[str, Any] = {"dropped": {}, "depth": [], "views": [], "scan": None}
     report |= {"coverage_before": None, "coverage_after": None}
     if number == 0:
         total, entries = _lift_context(plan, memory, folder, clock=clock, console=console)
@@ -55,13 +57,14 @@ def run_round(
             plan, targets, number, context=context, folder=folder, clock=clock, console=console
         )
     report |= entries
-    generated = int(memory.generated.sum())
+    generated, scanned = int(memory.generated.sum()), int(memory.scanned.sum())
     return {
         "round": number,
         "points": len(memory),
         "voxels": memory.voxels,
         "voxels_added": memory.voxels - voxels,
-        "observed": len(memory) - generated,
+        "observed": len(memory) - generated - scanned,
+        "scanned": scanned,
         "generated": generated,
         "added": total.added,
         "merged": total.merged,
@@ -69,6 +72,7 @@ def run_round(
         "fuse": asdict(total),
         "dropped": report["dropped"],
         "depth": report["depth"],
+        "scan": report["scan"],
         "coverage_before": report["coverage_before"],
         "coverage_after": report["coverage_after"],
         "seconds": {**clock.seconds, "total": time.perf_counter() - start},
@@ -85,7 +89,7 @@ def _lift_context(
     clock: rounds.Clock,
     console: Console,
 ) -> tuple[FuseReport, dict[str, Any]]:
-    """Round 0: fuse the context views, with recorded, projected or computed depth.
+    """Round 0: fuse the scan, then the context views with recorded, projected or computed depth.
 
     A view whose depth would have to be computed takes the memory's projected depth if that matches
     its photograph on a share ``savings.depth_from_memory`` of its pixels.
@@ -111,6 +115,11 @@ def _lift_context(
             f"taking over the depth of {source.kept} of {len(plan.context)} context views, "
             "which an interrupted attempt at this run had computed"
         )
+    scanned, scan = FuseReport(), None
+    if plan.scan is not None:
+        with clock.stage("fuse"):
+            scanned, scan = plan.scan.fuse_into(memory)
+        console.line(scan_line(scan))
     total, dropped, depth = rounds.observe_context(
         scene, plan.context, source=source,
         memory=memory, config=plan.config, clock=clock, progress=console.track,
@@ -122,7 +131,7 @@ def _lift_context(
             f"{skipped} of {len(depth)} context views took their depth from the memory, which "
             "matches their photographs"
         )
-    return total, {"dropped": dropped, "depth": depth}
+    return replace(scanned, dropped={}) + total, {"dropped": dropped, "depth": depth, "scan": scan}
 
 
 def _complete(

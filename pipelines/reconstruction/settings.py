@@ -17,6 +17,7 @@ from gvtools.memory.splat.api import SplatOptions
 from gvtools.scenes.reduced import SMALLEST
 from gvtools.settings import Settings
 from gvtools.training.tune_options import TuneOptions
+from pipelines.reconstruction.scan import ScanOptions
 
 
 class FusionOptions(Settings):
@@ -172,3 +173,4 @@ class RunSettings(Settings):
     effort: EffortPolicy = EffortPolicy()
     refine: FitOptions = FitOptions()
     tune: TuneOptions = TuneOptions()
+    scan: ScanOptions = ScanOptions()

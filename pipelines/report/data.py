@@ -11,6 +11,7 @@ from gvtools.errors import GvError, ProjectError
 from gvtools.runs.context_depth import off_scale
 from gvtools.runs.run import Run, load_run
 from gvtools.settings import dotted
+from pipelines.reconstruction.scan import scan_line
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.report.measures import read_measures, report_poses
 from pipelines.report.sheets import contact_sheets
@@ -99,6 +100,7 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         ("targets", f"{len(record['targets'])} ({record['targets_kind']})"),
         ("rounds", str(done) if done == planned else f"{done} of {planned}"),
         ("completer", str(config["completer"])),
+        *([("scan", scan_line(reports[0]["scan"]))] if reports[0].get("scan") else []),
         ("voxel", f"{config['voxel']:g} scene units"),
         ("seed", str(config["seed"])),
         ("gvtools", str(record["versions"].get("gvtools", "?"))),

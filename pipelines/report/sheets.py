@@ -13,7 +13,7 @@ import numpy as np
 
 from gvtools.errors import GvError
 from gvtools.runs.layout import COMPLETION, GUIDANCE, VALID, round_folder
-from gvtools.runs.target_files import SUPPORT_OBSERVED, entry_camera, read_picture
+from gvtools.runs.target_files import SUPPORT_SCANNED, entry_camera, read_picture
 from gvtools.view_selection import nearest_views
 from viz.report.contact_sheet import TargetPictures, contact_row
 from viz.report.content import SheetRow, Sheets
@@ -123,12 +123,14 @@ def _pictures(
     hint, support, completion = (
         read_picture(folder, kind, entry["stem"]) for kind in (GUIDANCE, VALID, COMPLETION)
     )
+    scanned = support == SUPPORT_SCANNED
     frame = None if truth is None else truth.load()
     given = nearest(entry)
     return TargetPictures(
         name=str(entry["name"]),
         hint=hint,
-        observed=support == SUPPORT_OBSERVED,
+        observed=support >= SUPPORT_SCANNED,
+        scanned=scanned if scanned.any() else None,
         supported=support > 0,
         completion=completion,
         truth=None if frame is None else frame.rgb,

@@ -9,7 +9,8 @@ from gvtools.memory.io.ply import export_memory_ply, read_ply, write_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 
 COLUMNS = (
-    "x", "y", "z", "red", "green", "blue", "confidence", "spacing", "round", "view", "generated"
+    "x", "y", "z", "red", "green", "blue", "confidence", "spacing", "round", "view", "generated",
+    "scanned",
 )  # fmt: skip
 
 

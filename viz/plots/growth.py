@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from viz.plots.canvas import Rounds, check_rounds, chosen, figure_of, round_axis
 from viz.plots.palette import COLORS, HATCHES
@@ -57,19 +57,20 @@ def growth_text(rounds: Rounds) -> str:
         OptionError: no rounds.
     """
     check_rounds(rounds)
-    legend = "round  observations  # observed  + generated"
+    scanned = any(_scanned(entry) for entry in rounds)
+    legend = f"round  observations  # observed{'  : scanned' if scanned else ''}  + generated"
     head = legend.ljust(WIDTH - 18) + "coverage".rjust(18)
     room = WIDTH - 8 - 9 - 18
-    largest = max(1, max(entry["observed"] + entry["generated"] for entry in rounds))
+    largest = max(1, max(map(_total, rounds)))
     lines = [head]
     for entry in rounds:
-        total = entry["observed"] + entry["generated"]
-        length = round(room * total / largest)
-        # What is there at all is drawn at least once.
-        plus = min(
-            length, max(bool(entry["generated"]), round(room * entry["generated"] / largest))
-        )
-        bar = "#" * (length - plus) + "+" * plus
+        total = _total(entry)
+        length, marks = round(room * total / largest), ""
+        for mark, count in (("+", entry["generated"]), (":", _scanned(entry))):
+            # What is there at all is drawn at least once.
+            share = max(bool(count), round(room * count / largest))
+            marks = mark * min(length - len(marks), share) + marks
+        bar = "#" * (length - len(marks)) + marks
         covered = "-"
         if entry["coverage_after"] is not None:
             covered = f"{_share(entry['coverage_before'])} -> {_share(entry['coverage_after'])}"
@@ -85,6 +86,14 @@ def growth_text(rounds: Rounds) -> str:
     return "\n".join(lines)
 
 
+def _scanned(entry: Mapping[str, Any]) -> int:
+    return int(entry.get("scanned", 0))
+
+
+def _total(entry: Mapping[str, Any]) -> int:
+    return int(entry["observed"]) + _scanned(entry) + int(entry["generated"])
+
+
 def _new_voxels(rounds: Rounds) -> list[int]:
     totals = [0, *(entry["voxels"] for entry in rounds)]
     return [after - before for before, after in pairwise(totals)]
@@ -95,19 +104,23 @@ def stored_panel(axes: Axes, *, rounds: Rounds) -> None:
     round_axis(axes, rounds)
     at = range(len(rounds))
     observed = [entry["observed"] for entry in rounds]
-    generated = [entry["generated"] for entry in rounds]
     axes.bar(at, observed, color=COLORS["observed"], label="observed")
-    axes.bar(
-        at, generated, bottom=observed, color=COLORS["generated"], hatch=HATCHES["generated"],
-        edgecolor="white", linewidth=0, label="generated",
-    )  # fmt: skip
+    below = observed
+    further = {"scanned": [*map(_scanned, rounds)], "generated": [e["generated"] for e in rounds]}
+    for name, counts in further.items():
+        if name == "generated" or any(counts):
+            axes.bar(
+                at, counts, bottom=below, color=COLORS[name], hatch=HATCHES[name],
+                edgecolor="white", linewidth=0, label=name,
+            )  # fmt: skip
+            below = [a + b for a, b in zip(below, counts, strict=True)]
     voxels = [entry["voxels"] for entry in rounds]
     axes.plot(at, voxels, "o-", color=COLORS["voxels"], markersize=4, label="voxels")
     axes.set_title("stored after each round")
     axes.set_ylabel("observations, voxels")
     _engineering(axes)
-    axes.set_ylim(0, 1.22 * max(1, *(a + b for a, b in zip(observed, generated, strict=True))))
-    axes.legend(ncols=3, loc="upper left", frameon=False, fontsize="small")
+    axes.set_ylim(0, 1.22 * max(1, *map(_total, rounds)))
+    axes.legend(ncols=4, loc="upper left", frameon=False, fontsize="small")
 
 
 def fates_panel(axes: Axes, *, rounds: Rounds) -> None:

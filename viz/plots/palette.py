@@ -11,6 +11,7 @@ GREY = "#999999"
 COLORS = {
     "observed": BLUE,
     "generated": ORANGE,
+    "scanned": GREEN,
     "voxels": BLACK,
     "added": GREEN,
     "merged": SKY,
@@ -22,6 +23,13 @@ COLORS = {
     "complete": ORANGE,
     "align": PINK,
 }
-HATCHES = {"generated": "//", "rejected": "xx", "merged": "..", "complete": "//", "align": "xx"}
+HATCHES = {
+    "generated": "//",
+    "scanned": "..",
+    "rejected": "xx",
+    "merged": "..",
+    "complete": "//",
+    "align": "xx",
+}
 # Of anything that has no colour of its own.
 OTHERS = (GREY, RED, BLACK, YELLOW)

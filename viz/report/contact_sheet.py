@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import ShapeError
-from viz.plots.palette import BLUE, ORANGE
+from viz.plots.palette import BLUE, GREEN, ORANGE
 
 # Longer side of a thumbnail, pixels: twice what a phone shows of it, for its dense screen.
 SIDE = 320
@@ -21,8 +21,9 @@ QUALITY = 80
 # Mean absolute difference over the channels, of a range of 1, at which an error map is brightest.
 WORST = 0.25
 ERROR_MAP = "inferno"
-# Of the validity: what stands on observations, on what was generated before, on nothing.
-SUPPORT = {"observed": BLUE, "generated": ORANGE, "hole": "#1a1a1a"}
+# Of the validity: what stands on observations, on a scan's alone, on what was generated before, on
+# nothing.
+SUPPORT = {"observed": BLUE, "scanned": GREEN, "generated": ORANGE, "hole": "#1a1a1a"}
 
 
 @dataclass(frozen=True)
@@ -51,13 +52,14 @@ class TargetPictures:
     Attributes:
         name: of the target.
         hint: (H, W, 3) uint8, the memory's projection that the completer was given.
-        observed: (H, W) bool, pixels of the hint that stand on observations.
+        observed: (H, W) bool, pixels of the hint that stand on observations, a scan's included.
         supported: (H, W) bool, those that the memory supports at all.
         completion: (H, W, 3) uint8.
         truth: (H, W, 3) uint8; None where there is none.
         mask: (H, W) bool, where the truth counts; None is everywhere.
         context: (h, w, 3) uint8, the given view nearest to the target; None where it is not there.
         context_name: of that view.
+        scanned: (H, W) bool, those of the observed pixels that are a scan's alone; None: none are.
     """
 
     name: str
@@ -69,6 +71,7 @@ class TargetPictures:
     mask: NDArray[np.bool_] | None = None
     context: NDArray[np.uint8] | None = None
     context_name: str = ""
+    scanned: NDArray[np.bool_] | None = None
 
 
 def contact_row(pictures: TargetPictures, *, side: int = SIDE) -> list[Tile]:
@@ -88,9 +91,10 @@ def contact_row(pictures: TargetPictures, *, side: int = SIDE) -> list[Tile]:
         tiles.append(_tile("context", text, _photograph(pictures.context, side)))
     text = f"the memory projected into {name}"
     tiles.append(_tile("hint", text, _photograph(pictures.hint, side)))
-    validity = support_map(pictures.observed, pictures.supported)
+    validity = support_map(pictures.observed, pictures.supported, pictures.scanned)
+    scanned = "" if pictures.scanned is None else f"{pictures.scanned.mean():.0%} of it scanned, "
     text = (
-        f"validity of {name}: {pictures.observed.mean():.0%} observed, "
+        f"validity of {name}: {pictures.observed.mean():.0%} observed, {scanned}"
         f"{(pictures.supported & ~pictures.observed).mean():.0%} generated before"
     )
     tiles.append(_tile("validity", text, _flat_colours(validity, side)))
@@ -103,14 +107,21 @@ def contact_row(pictures: TargetPictures, *, side: int = SIDE) -> list[Tile]:
     return tiles
 
 
-def support_map(observed: NDArray[np.bool_], supported: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def support_map(
+    observed: NDArray[np.bool_],
+    supported: NDArray[np.bool_],
+    scanned: NDArray[np.bool_] | None = None,
+) -> NDArray[np.uint8]:
     """(H, W, 3): the colours of SUPPORT.
 
     Args:
         observed: (H, W), what stands on observations.
         supported: (H, W), what the memory supports, observed or generated.
+        scanned: (H, W), what of the observed is a scan's alone; None is nothing.
     """
-    which = np.where(observed, 0, np.where(supported, 1, 2))
+    which = np.where(observed, 0, np.where(supported, 2, 3))
+    if scanned is not None:
+        which[scanned] = 1
     colors = [[int(color[i : i + 2], 16) for i in (1, 3, 5)] for color in SUPPORT.values()]
     return np.array(colors, np.uint8)[which]
 

@@ -50,7 +50,11 @@ def _key_figures(report: RunReport) -> str:
     found = report.measures.figures
     cards = [
         ("observations", last["points"]),
-        ("of them generated", f"{last['generated'] / max(1, last['points']):.1%}"),
+        *(
+            (f"of them {source}", f"{last[source] / max(1, last['points']):.1%}")
+            for source in ("scanned", "generated")
+            if source == "generated" or last.get(source)
+        ),
         (
             "coverage before a round",
             f"{sum(covered) / len(covered):.1%}" if covered else None,

@@ -45,8 +45,10 @@ def growth(report: RunReport) -> str:
 
 def _round_table(report: RunReport) -> str:
     regions = REGIONS if is_measured(report.measures.views) else {}
+    scanned = any(entry.get("scanned") for entry in report.rounds)
+    sources = ("observed", "scanned", "generated") if scanned else ("observed", "generated")
     columns = [
-        "round", "targets", "voxels", "observed", "generated", "added", "merged", "rejected",
+        "round", "targets", "voxels", *sources, "added", "merged", "rejected",
         "coverage before", "coverage after", *(f"PSNR {where}, dB" for where in regions.values()),
         "seconds", "memory, MiB",
     ]  # fmt: skip
@@ -55,7 +57,7 @@ def _round_table(report: RunReport) -> str:
         mine = [view for view in report.measures.views if view["round"] == entry["round"]]
         rows.append([
             entry["round"], len(entry["views"]), entry["voxels"],
-            *(entry[name] for name in ("observed", "generated", "added", "merged", "rejected")),
+            *(entry[name] for name in (*sources, "added", "merged", "rejected")),
             _share(entry["coverage_before"]), _share(entry["coverage_after"]),
             *(_fixed(_mean(mine, f"psnr{region}"), 2) for region in regions),
             _fixed(entry["seconds"].get("total"), 2), f"{entry['bytes'] / 2**20:.1f}",

@@ -52,7 +52,7 @@ def detail(memory: SpatialMemory, budget: int) -> Detail:
     reach = float(np.abs(positions).max())
     edge = max(memory.voxel, reach / 2 ** (AXIS_BITS - 2))
     while True:
-        keys = (_cell_keys(positions, edge) << 1) | memory.generated
+        keys = (_cell_keys(positions, edge) << 2) | memory.generated | (memory.scanned << 1)
         _, first = np.unique(keys, return_index=True)
         # Cells that meet at the origin do not become one however large they are.
         if len(first) <= budget or edge > reach:

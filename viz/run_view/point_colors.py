@@ -25,7 +25,7 @@ TrueDepth = Callable[[str], "NDArray[np.float32] | None"]
 MODES = {
     "color": "colour",
     "round": "round",
-    "source": "observed / generated",
+    "source": "observed / scanned / generated",
     "confidence": "confidence",
     "views": "view count",
     "depth-error": "depth error",
@@ -170,12 +170,14 @@ def _by_round(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
 
 
 def _by_source(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
-    names = ("observed", "generated")
+    names = ("observed", "generated", "scanned")
     tint = np.array([_rgb(COLORS[name]) for name in names], np.float32)
     light = memory.columns.colors[rows] @ np.array([0.299, 0.587, 0.114], np.float32) / 255
-    kind = memory.views.generated[memory.columns.view[rows]].astype(np.int64)
+    view = memory.columns.view[rows]
+    kind = memory.views.generated[view] + 2 * memory.views.scanned[view].astype(np.int64)
     rgb = np.clip(tint[kind] * (0.45 + 0.75 * light)[:, None], 0, 255)
-    swatches = tuple((COLORS[name], name) for name in names)
+    shown = names if memory.views.scanned.any() else names[:2]
+    swatches = tuple((COLORS[name], name) for name in shown)
     return PointColors(rgb.round().astype(np.uint8), Legend("where a point comes from", swatches))
 
 

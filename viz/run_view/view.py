@@ -63,6 +63,17 @@ class Counts:
     observed: int
     generated: int
     voxels: int | None
+    scanned: int = 0
+
+    @property
+    def total(self) -> int:
+        """All observations."""
+        return self.observed + self.generated + self.scanned
+
+    def told(self) -> str:
+        """How many there are of each source, in words."""
+        scanned = f"{self.scanned:,} scanned, " if self.scanned else ""
+        return f"{self.observed:,} observed, {scanned}{self.generated:,} generated"
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +129,14 @@ class RunView:
         """
         if round < len(self.reports):
             report = self.reports[round]
-            return Counts(report["observed"], report["generated"], report["voxels"])
+            return Counts(
+                report["observed"], report["generated"], report["voxels"], report.get("scanned", 0)
+            )
         there = self.round_of_points() <= round
         generated = int((self.memory.generated & there).sum())
+        scanned = int((self.memory.scanned & there).sum())
         voxels = self.memory.voxels if round >= self.last_round else None
-        return Counts(int(there.sum()) - generated, generated, voxels)
+        return Counts(int(there.sum()) - generated - scanned, generated, voxels, scanned)
 
     def colors(self, mode: str, rows: NDArray[np.int64]) -> PointColors:
         """Colours of observations, those in ``rows`` (P,), see point_colors."""

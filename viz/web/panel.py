@@ -132,10 +132,9 @@ class Panel:
     def set_counts(self, run: RunView, number: int, drawn: int) -> None:
         """Say what the memory holds after a round, and how much of it is drawn."""
         counts = run.counts(number)
-        total = counts.observed + counts.generated
         lines = [
-            f"<b>{total:,}</b> observations after round {number}",
-            f"{counts.observed:,} observed, {counts.generated:,} generated",
+            f"<b>{counts.total:,}</b> observations after round {number}",
+            counts.told(),
         ]
         if counts.voxels is not None:
             lines.append(f"{counts.voxels:,} voxels")

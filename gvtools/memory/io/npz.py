@@ -121,6 +121,8 @@ def _arrays(memory: Store) -> dict[str, NDArray[Any]]:
     arrays["view_size"] = size
     arrays["view_round"] = views.round
     arrays["view_generated"] = views.generated
+    if views.scanned.any():
+        arrays["view_scanned"] = views.scanned
     grids = [row.free_depth for row in rows]
     arrays["grid_shape"] = np.array([g.shape for g in grids], np.int64).reshape(-1, 2)
     arrays["grid_depth"] = np.concatenate([np.zeros(0, np.float32), *(g.ravel() for g in grids)])
@@ -154,7 +156,8 @@ def _views(names: list[str], arrays: dict[str, NDArray[Any]]) -> list[SourceView
         grid = arrays["grid_depth"][at : at + height * width].reshape(height, width).copy()
         at += height * width
         generated = bool(arrays["view_generated"][i])
-        views.append(SourceView(camera, int(arrays["view_round"][i]), generated, grid))
+        scanned = "view_scanned" in arrays and bool(arrays["view_scanned"][i])
+        views.append(SourceView(camera, int(arrays["view_round"][i]), generated, grid, scanned))
     return views
 
 
@@ -209,6 +212,8 @@ def _check_consistency(arrays: dict[str, NDArray[Any]], views: int) -> None:
     for name, shape in columns.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")
+    if "view_scanned" in arrays and arrays["view_scanned"].shape != (views,):
+        raise ValueError(f"view_scanned has shape {arrays['view_scanned'].shape}, not ({views},)")
     rows = arrays["view"]
     if count and not (rows.min() >= 0 and rows.max() < views):
         raise ValueError("an observation names a view that is not there")

@@ -21,7 +21,7 @@ from gvtools.memory.thinning import thinned
 if TYPE_CHECKING:
     import open3d as o3d
 
-_TYPES = {
+TYPES = {
     "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4",
     "float": "<f4", "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2",
     "uint16": "<u2", "int32": "<i4", "uint32": "<u4", "float32": "<f4", "float64": "<f8",
@@ -83,8 +83,8 @@ def _parse_header(path: Path, text: str) -> tuple[int, np.dtype[np.void]]:
                 continue
             if words[2] == "0":
                 continue
-        elif words[0] == "property" and len(words) == 3 and words[1] in _TYPES and count >= 0:
-            columns.append((words[2], _TYPES[words[1]]))
+        elif words[0] == "property" and len(words) == 3 and words[1] in TYPES and count >= 0:
+            columns.append((words[2], TYPES[words[1]]))
             continue
         raise MemoryFileError(
             f"{path}: PLY header line {line!r}; expected one vertex element of scalar properties "
@@ -112,7 +112,7 @@ def read_point_cloud(path: Path) -> o3d.t.geometry.PointCloud:
     cloud = o3d.t.geometry.PointCloud()
     cloud.point.positions = tensor(np.stack([vertices[k].astype(np.float64) for k in "xyz"], 1))
     cloud.point.colors = tensor(np.stack([vertices[k] for k in ("red", "green", "blue")], 1))
-    for name in ("confidence", "spacing", "round", "view", "generated"):
+    for name in ("confidence", "spacing", "round", "view", "generated", "scanned"):
         if name in names:
             cloud.point[name] = tensor(vertices[name][:, None].copy())
     return cloud
@@ -121,7 +121,7 @@ def read_point_cloud(path: Path) -> o3d.t.geometry.PointCloud:
 def export_memory_ply(
     memory: Store, path: Path, *, max_points: int | None = None, observed: bool = False
 ) -> tuple[int, float]:
-    """Write the observations with colour, confidence, spacing, round, view and generated.
+    """Write the observations with colour, confidence, spacing, round, view, generated and scanned.
 
     x, y, z are in the input's world frame: float, or double where the origin is so far away that
     float would lose a tenth of a voxel.
@@ -154,7 +154,7 @@ def export_memory_ply(
         len(rows),
         [("x", coordinate), ("y", coordinate), ("z", coordinate), ("red", "u1"), ("green", "u1"),
          ("blue", "u1"), ("confidence", "<f4"), ("spacing", "<f4"), ("round", "<i4"),
-         ("view", "<i4"), ("generated", "u1")],
+         ("view", "<i4"), ("generated", "u1"), ("scanned", "u1")],
     )  # fmt: skip
     columns = memory.columns
     for k, (axis, color) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
@@ -162,5 +162,6 @@ def export_memory_ply(
         vertices[color] = columns.colors[rows, k]
     for name in ("confidence", "spacing", "round", "view", "generated"):
         vertices[name] = getattr(columns, name)[rows]
+    vertices["scanned"] = memory.scanned[rows]
     write_ply(path, vertices, comments=("gvtools memory, input world frame, scene units",))
     return len(rows), edge

@@ -63,6 +63,7 @@ class FrameBuffers:
         valid: (H, W) bool.
         confidence: (H, W) float32.
         generated: (H, W) bool.
+        scanned: (H, W) bool.
     """
 
     camera: Cameras
@@ -75,6 +76,7 @@ class FrameBuffers:
     valid: NDArray[np.bool_]
     confidence: NDArray[np.float32]
     generated: NDArray[np.bool_]
+    scanned: NDArray[np.bool_]
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -243,7 +243,9 @@ def project_one_pixel(store: Store, cameras: Cameras, *, open3d: bool = False) -
     confidence[valid] = store.confidence[rows]
     generated = np.zeros(shape, np.bool_)
     generated[valid] = store.generated[rows]
-    return Guidance(cameras, rgb, depth, valid, confidence, generated)
+    scanned = np.zeros(shape, np.bool_)
+    scanned[valid] = store.scanned[rows]
+    return Guidance(cameras, rgb, depth, valid, confidence, generated, scanned)
 
 
 def _nearest(store: Store, camera: Cameras) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

@@ -153,6 +153,11 @@ class Store:
         return self.columns.generated.view(np.bool_)
 
     @property
+    def scanned(self) -> NDArray[np.bool_]:
+        """(N,) bool: True if a scan brought the observation, see ``ViewTable.scanned``."""
+        return self.views.scanned[self.columns.view]
+
+    @property
     def nbytes(self) -> int:
         """Bytes of everything that is kept, without spare capacity."""
         grids = sum(self.views[i].free_depth.nbytes for i in range(len(self.views)))
@@ -164,10 +169,11 @@ class Store:
         return self.columns.count
 
     def __repr__(self) -> str:
-        generated = int(self.generated.sum())
+        generated, scanned = int(self.generated.sum()), int(self.scanned.sum())
+        apart = f"{generated:,} generated" + (f", {scanned:,} scanned" if scanned else "")
         where = "" if self.columns.device == "cpu" else f" on {self.columns.device}"
         return (
-            f"{type(self).__name__}({len(self):,} observations ({generated:,} generated) in "
+            f"{type(self).__name__}({len(self):,} observations ({apart}) in "
             f"{self.voxels:,} voxels of {self.voxel:g}, {len(self.views)} views, "
             f"rounds {self.rounds!r}, {self.nbytes / 2**20:.1f} MiB{where})"
         )

@@ -24,12 +24,14 @@ class SourceView:
         round: the round it was fused in.
         generated: True when a completer made it.
         free_depth: (h, w) float32, see PointSet; (0, 0) when unknown.
+        scanned: True for a station of a scan, which has no photograph.
     """
 
     camera: Cameras
     round: int
     generated: bool
     free_depth: NDArray[np.float32]
+    scanned: bool = False
 
 
 class ViewTable:
@@ -40,6 +42,7 @@ class ViewTable:
         self._views: list[SourceView] = []
         self.round: NDArray[np.int32] = np.zeros(0, np.int32)
         self.generated: NDArray[np.bool_] = np.zeros(0, np.bool_)
+        self.scanned: NDArray[np.bool_] = np.zeros(0, np.bool_)
         self.centers: NDArray[np.float64] = np.zeros((0, 3))
         self.cam_from_local: NDArray[np.float64] = np.zeros((0, 4, 4))
         for view in views:
@@ -59,6 +62,11 @@ class ViewTable:
         """All cameras, in the world frame; None when there are no views."""
         return concatenate([view.camera for view in self._views]) if self._views else None
 
+    @property
+    def photographed(self) -> list[SourceView]:
+        """The views that a camera took: neither generated nor a scan's."""
+        return [view for view in self._views if not (view.generated or view.scanned)]
+
     def row_for(self, view: SourceView) -> int:
         """The row of a view: the last one's where both are parts of one fusion, else a new one."""
         if not self._views or not _continues(self._views[-1], view):
@@ -76,6 +84,7 @@ class ViewTable:
         self._views.append(view)
         self.round = np.append(self.round, np.int32(view.round))
         self.generated = np.append(self.generated, view.generated)
+        self.scanned = np.append(self.scanned, view.scanned)
         self.centers = np.concatenate([self.centers, self.frame.from_world(view.camera.centers)])
         local = self.frame.cam_from_local(view.camera.cam_from_world)
         self.cam_from_local = np.concatenate([self.cam_from_local, local])
@@ -83,10 +92,11 @@ class ViewTable:
 
 
 def _continues(last: SourceView, view: SourceView) -> bool:
-    """Whether both are parts of one fusion: of one camera, round and kind."""
+    """Whether both are parts of one fusion: of one camera, round and source."""
     one, two = last.camera, view.camera
     return (
-        (last.round, last.generated, one.names) == (view.round, view.generated, two.names)
+        (last.round, last.generated, last.scanned) == (view.round, view.generated, view.scanned)
+        and one.names == two.names
         and np.array_equal(one.cam_from_world, two.cam_from_world)
         and np.array_equal(one.K, two.K)
         and (int(one.width[0]), int(one.height[0])) == (int(two.width[0]), int(two.height[0]))

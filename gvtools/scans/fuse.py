@@ -1,0 +1,98 @@
+"""A placed scan as observations of a memory."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
+from gvtools.memory.store.points import PointSet
+from gvtools.scans.placement import Placement
+from gvtools.scans.points import Scan
+
+# Nearest neighbours that tell how densely points lie.
+NEIGHBOURS = 8
+# A point so many times sparser than its neighbours is dust, or a mixed pixel at an edge.
+ISOLATED = 4.0
+# Views of scans are named so, apart from photographs.
+PREFIX = "scan"
+
+
+def fuse_scan(
+    memory: SpatialMemory, scan: Scan, placement: Placement, *, round: int = 0
+) -> FuseReport:
+    """Fuse a scan's points, station by station; they are ``scanned``, see ``SpatialMemory.fuse``.
+
+    Each point is as wide as its neighbours are apart, which decides its voxel and its footprint.
+
+    Args:
+        memory: is added to.
+        scan: in its own frame.
+        placement: of the scan in the memory's world.
+        round: that its points belong to.
+    """
+    # About the origins, where digits are not lost.
+    turn = placement.world_from_scan[:3, :3]
+    local = memory.frame.from_world(scan.positions @ turn.T + placement.apply(scan.origin))
+    spacing, isolated = point_spacing(local)
+    total = FuseReport()
+    for row, station in enumerate(scan.stations):
+        mine = scan.station == row
+        rows = np.flatnonzero(mine & ~isolated)
+        dropped = {"isolated": int((mine & isolated).sum())} if (mine & isolated).any() else {}
+        if not len(rows):
+            total = replace(total, dropped=dict(Counter(total.dropped) + Counter(dropped)))
+            continue
+        if station.center is None:
+            center = memory.frame.to_world(local[rows].mean(axis=0)[None])[0]
+        else:
+            center = placement.apply(np.array(station.center))
+        points = PointSet(
+            local[rows].astype(np.float32), scan.colors[rows],
+            np.ones(len(rows), np.float32), spacing[rows].astype(np.float32),
+            _camera(f"{PREFIX}/{scan.name}/{station.name}", center), memory.frame, None, {},
+        )  # fmt: skip
+        report = memory.fuse(points, round=round, scanned=True)
+        total += replace(report, dropped=dropped)
+    return total
+
+
+def point_spacing(
+    positions: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """How far apart points of a surface lie, from the density around each.
+
+    Returns:
+        (N,) distances, the unit of ``positions``: with the k-th neighbour at a distance r, points
+        are r sqrt(pi / (k - 1)) apart. (N,) bool, points that lie alone.
+
+    >>> grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
+    >>> round(float(np.median(point_spacing(grid)[0])), 1)
+    0.9
+    """
+    from scipy.spatial import KDTree
+
+    count = min(NEIGHBOURS, len(positions) - 1)
+    if count < 1:
+        return np.ones(len(positions)), np.zeros(len(positions), np.bool_)
+    away, rows = KDTree(positions).query(positions, count + 1, workers=-1)
+    radius = away[:, count]
+    # Unbiased where points lie at random: the last neighbour is on the rim.
+    spacing = radius * np.sqrt(np.pi / max(count - 1, 1))
+    around = np.median(radius[rows[:, 1:]], axis=1)
+    isolated = radius > ISOLATED * around
+    positive = spacing[spacing > 0]
+    least = float(positive.min()) if positive.size else 1.0
+    return np.maximum(spacing, least), isolated
+
+
+def _camera(name: str, center: NDArray[np.float64]) -> Cameras:
+    """Stands for a station: it has a place, and no picture."""
+    one = np.ones(1, np.int64)
+    pose = np.eye(4)
+    pose[:3, 3] = -center
+    return Cameras(np.eye(3)[None], pose[None], one, one, (name,))

@@ -1,0 +1,108 @@
+"""What scan files hold, before they are placed: points in chunks, and stations that saw them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Points that are read at once.
+CHUNK = 1 << 20
+# What files of gvtools call a completer's points: those are no scan's.
+GENERATED = "generated"
+
+
+@dataclass(frozen=True)
+class Station:
+    """Where a scanner stood.
+
+    Attributes:
+        name: of the scan.
+        center: x, y, z in the file's frame; None where the file does not tell.
+    """
+
+    name: str
+    center: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Some points of a file.
+
+    Attributes:
+        positions: (N, 3) float64, the file's frame and unit; may hold NaN.
+        colors: (N, 3), uint8, or uint16 where the file may mean 8 or 16 bits; None without.
+        intensity: (N,) float32, any unit; None without.
+        station: row of the file's stations.
+        dropped: points that the file itself marks as unusable, by reason.
+    """
+
+    positions: NDArray[np.float64]
+    colors: NDArray[np.uint8] | NDArray[np.uint16] | None = None
+    intensity: NDArray[np.float32] | None = None
+    station: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    def without(self, flags: NDArray[np.bool_], reason: str) -> Chunk:
+        """The points but for those with a flag (N,), which are counted by the reason."""
+        if not flags.any():
+            return self
+        keep = ~flags
+        return Chunk(
+            self.positions[keep],
+            None if self.colors is None else self.colors[keep],
+            None if self.intensity is None else self.intensity[keep],
+            self.station,
+            {**self.dropped, reason: int(flags.sum())},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ScanFile:
+    """A scan that was opened: its header is read and checked, its points are not.
+
+    Attributes:
+        path: the file.
+        count: points that it holds, the unusable ones included.
+        stations: at least one.
+        chunks: reads the points, from the first to the last.
+    """
+
+    path: Path
+    count: int
+    stations: tuple[Station, ...]
+    chunks: Callable[[], Iterator[Chunk]]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """N points of a scan, in its own frame and unit.
+
+    Attributes:
+        name: of the file.
+        origin: (3,) float64 that positions count from, so that georeferenced ones keep their
+            digits.
+        positions: (N, 3) float64 from ``origin``.
+        colors: (N, 3) uint8.
+        station: (N,) int32, rows of ``stations``.
+        stations: where they were scanned from.
+        colored_by: "colour", "intensity" (grey) or "nothing" (an even grey).
+        count: points in the file.
+        dropped: points that are not here, by reason.
+    """
+
+    name: str
+    origin: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    station: NDArray[np.int32]
+    stations: tuple[Station, ...]
+    colored_by: str
+    count: int
+    dropped: dict[str, int]
+
+    def __len__(self) -> int:
+        return len(self.positions)

@@ -1,0 +1,207 @@
+"""A scan of any known format, read within a bounded memory."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import GvError, MemoryFileError, OptionError
+from gvtools.scans.points import Chunk, Scan, ScanFile
+
+SUFFIXES = (".ply", ".las", ".laz", ".e57", ".pcd")
+# Points that are kept at once, 36 bytes each and as much again for work; more are thinned.
+MOST_POINTS = 8_000_000
+# Thinning begins with so many cells along the longest side.
+CELLS = 1 << 14
+# Shares of the points whose intensities become black and white, and the grey of what has none.
+DARK, BRIGHT, GREY = 0.01, 0.99, 128
+# Beyond it no unit is meant.
+FARTHEST = 1e15
+WRONG = (KeyboardInterrupt, SystemExit, GeneratorExit, MemoryError)
+
+
+def open_scan(path: Path) -> ScanFile:
+    """The scan in a file, its header read and checked against the file's size.
+
+    Args:
+        path: PLY, LAS, LAZ, E57 or PCD, told by its suffix.
+
+    Raises:
+        OptionError: another suffix, or a package that the format needs is not installed.
+        MemoryFileError: absent, damaged, truncated, or without points.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise OptionError(f"{path}: expected a scan that ends with {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise MemoryFileError(f"{path}: no such file; expected a scan")
+    with _one_line(path):
+        if suffix == ".ply":
+            from gvtools.scans.ply import open_ply as open_
+        elif suffix == ".pcd":
+            from gvtools.scans.pcd import open_pcd as open_
+        elif suffix == ".e57":
+            from gvtools.scans.e57 import open_e57 as open_
+        else:
+            from gvtools.scans.las import open_las as open_
+        file = open_(path)
+    if not file.count:
+        raise MemoryFileError(f"{path}: no points in it; expected a scan")
+    return file
+
+
+def read_scan(path: Path, *, most: int = MOST_POINTS) -> Scan:
+    """The points of a scan, at most ``most``: beyond it one of each cell of a grid.
+
+    Args:
+        path: see ``open_scan``.
+        most: at least 2.
+
+    Raises:
+        OptionError: see ``open_scan``.
+        MemoryFileError: see there, or no point has finite coordinates.
+    """
+    file = open_scan(path)
+    reading = _Reading(most)
+    with _one_line(path):
+        for chunk in file.chunks():
+            reading.add(chunk)
+    held = reading.whole()
+    if held is None:
+        raise MemoryFileError(f"{path}: none of its {file.count} points is usable; expected some")
+    colors, colored_by = _colors(held)
+    return Scan(
+        path.name, reading.origin, held["positions"], colors, held["station"], file.stations,
+        colored_by, file.count, dict(reading.dropped),
+    )  # fmt: skip
+
+
+@contextmanager
+def _one_line(path: Path) -> Iterator[None]:
+    """What any reader complains of, in one line.
+
+    Raises:
+        OptionError: a package is not installed.
+        MemoryFileError: anything else.
+    """
+    try:
+        yield
+    except (GvError, *WRONG):
+        raise
+    except ImportError as error:
+        raise OptionError(_absent(path, str(error))) from None
+    except BaseException as error:  # readers in Rust raise panics, which are no Exceptions
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        # laspy has an error of its own where no decompressor is installed.
+        if "backend" in reason.lower() and "No LazBackend" in reason:
+            raise OptionError(_absent(path, reason)) from None
+        raise MemoryFileError(
+            f"{path}: cannot be read ({reason}); the file is damaged, or of a kind that is not "
+            "known; save it again"
+        ) from None
+
+
+def _absent(path: Path, reason: str) -> str:
+    return (
+        f"{path}: a package that reads {path.suffix.upper()[1:]} is not installed ({reason}); run "
+        "'pip install \"gvtools[scan]\"'"
+    )
+
+
+class _Reading:
+    """The points that were read so far, thinned whenever they become too many."""
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.dropped: Counter[str] = Counter()
+        self.origin = np.zeros(3)
+        self._parts: list[dict[str, NDArray[Any]]] = []
+        self._held = 0
+        self._cells = 0.0
+
+    def add(self, chunk: Chunk) -> None:
+        """Take points in."""
+        self.dropped.update(chunk.dropped)
+        usable = (np.abs(chunk.positions) < FARTHEST).all(axis=1)
+        if not usable.all():
+            self.dropped["no finite coordinates"] += int((~usable).sum())
+        positions = chunk.positions[usable]
+        if not len(positions):
+            return
+        if not self._parts:
+            self.origin = np.round(np.median(positions, axis=0))
+        count = len(positions)
+        colors, intensity = chunk.colors, chunk.intensity
+        part = {
+            "positions": positions - self.origin,
+            "station": np.full(count, chunk.station, np.int32),
+            # 1 where they are known.
+            "with_color": np.full(count, colors is not None),
+            "colors": np.zeros((count, 3), np.uint8) if colors is None else colors[usable],
+            "intensity": np.zeros(count, np.float32) if intensity is None else intensity[usable],
+        }
+        self._parts.append(part)
+        self._held += count
+        if self._held > self.most:
+            self._thin()
+
+    def whole(self) -> dict[str, NDArray[Any]] | None:
+        """All points, by column; None without any."""
+        if not self._parts:
+            return None
+        names = self._parts[0]
+        # Station by station a scan may have colours of other types.
+        return {name: np.concatenate([part[name] for part in self._parts]) for name in names}
+
+    def _thin(self) -> None:
+        """Leave one point of each cell, of cells that grow until half as many points are left."""
+        held = self.whole()
+        assert held is not None
+        positions = held["positions"]
+        low, extent = positions.min(axis=0), float(np.ptp(positions, axis=0).max())
+        edge = max(self._cells, extent / CELLS)
+        while True:
+            cells = np.floor((positions - low) / edge).astype(np.int64)
+            keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+            _, first = np.unique(keys, return_index=True)
+            if len(first) <= max(self.most // 2, 1):
+                break
+            edge *= max(1.1, float(np.sqrt(len(first) / (self.most // 2))))
+        self.dropped["thinned out"] += len(positions) - len(first)
+        first.sort()
+        self._cells = edge
+        self._parts = [{name: column[first] for name, column in held.items()}]
+        self._held = len(first)
+
+
+def _colors(held: dict[str, NDArray[Any]]) -> tuple[NDArray[np.uint8], str]:
+    """(N, 3) colours, and what they are made from; black ones throughout were not recorded."""
+    colors = held["colors"]
+    if colors.any():
+        if colors.dtype == np.uint16:
+            # LAS means 16 bits; some programs write 8.
+            eight = int(colors.max()) <= 255
+            colors = (colors if eight else colors >> 8).astype(np.uint8)
+        rgb, by = colors, "colour"
+        if held["with_color"].all():
+            return rgb, by
+    else:
+        rgb, by = np.zeros((len(colors), 3), np.uint8), "nothing"
+    bare = ~held["with_color"] if by == "colour" else np.ones(len(rgb), np.bool_)
+    intensity = np.nan_to_num(held["intensity"][bare])
+    low, high = np.quantile(intensity, (DARK, BRIGHT))
+    if high > low:
+        share = np.clip((intensity - low) / (high - low), 0, 1)
+        grey = np.rint(255 * share).astype(np.uint8)
+        by = "intensity" if by == "nothing" else by
+    else:
+        grey = np.full(len(intensity), GREY, np.uint8)
+    rgb = rgb.copy()
+    rgb[bare] = grey[:, None]
+    return rgb, by

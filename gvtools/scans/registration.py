@@ -1,0 +1,295 @@
+"""The similarity between a scan and what photographs saw, estimated from their shapes.
+
+Features of both surfaces (FPFH, R. B. Rusu et al., "Fast Point Feature Histograms for 3D
+registration", ICRA 2009) are matched for several scales, each set of matches gives a similarity by
+LO-RANSAC (pycolmap), and the best are refined by ICP with scale (Open3D). What is not clearly
+supported in the end is refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import DegenerateError
+from gvtools.scans.placement import Placement
+
+if TYPE_CHECKING:
+    import open3d as o3d
+
+Float64 = NDArray[np.float64]
+
+# Points of a surface that features are computed of, about, and most that fitness is counted on.
+POINTS, COUNTED = 6000, 20_000
+# Fewer tell no shape.
+FEWEST = 300
+# In cells: radii of normals and features, the error of a match, and the steps of ICP.
+NORMALS, FEATURES, MATCH, STEPS = 2.0, 5.0, 1.5, (2.0, 1.0, 0.5)
+# A placement fits a point within this share of a cell.
+TOLERANCE = 1 / 3
+# Scales that are tried around the ratio of the extents, where the unit is not the same.
+SCALES = tuple(2.0 ** (k / 2) for k in range(-5, 6))
+# Of the placements by features so many are refined.
+REFINED = 4
+# A runner-up with this share of the fitness, more than so many cells away, makes both doubtful.
+RIVAL, APART = 0.85, 3.0
+# Normals and features look at this many neighbours at most.
+NEIGHBOURS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Points of a surface.
+
+    Attributes:
+        positions: (N, 3) float64.
+        seen_from: (N, 3) float64, for each a place that it was seen from; None if unknown.
+    """
+
+    positions: Float64
+    seen_from: Float64 | None = None
+
+
+def register(
+    scan: Surface, photographed: Surface, *, least: float, metric: bool, seed: int = 0
+) -> Placement:
+    """The similarity from a scan's frame to the photographs' world.
+
+    Args:
+        scan: in the file's frame.
+        photographed: in the world.
+        least: smallest fitness that is accepted, 0 to 1.
+        metric: whether both units are metres, most likely: that scale is tried first.
+        seed: of sampling.
+
+    Raises:
+        DegenerateError: too few points, no placement that enough points support, or two.
+    """
+    for name, surface in (("scan", scan), ("photographs", photographed)):
+        if len(surface.positions) < FEWEST:
+            raise DegenerateError(
+                f"{len(surface.positions)} points of the {name} to place the scan by; expected "
+                f"{FEWEST}; give its placement"
+            )
+    task = _Task(scan, photographed, seed=seed)
+    there = task.judged(task.of_world(np.eye(4)), "as it is")
+    if _support(there) >= least:
+        return there
+    found = task.candidates((1.0,) if metric else ())
+    if not found or _support(found[0]) < least:
+        found = sorted([*found, *task.candidates(task.scales())], key=_support, reverse=True)
+    if not found or _support(found[0]) < least:
+        best = f"the best fits {_support(found[0]):.0%}" if found else "none was found"
+        raise DegenerateError(
+            f"no placement of the scan is supported: {best} of the points within "
+            f"{task.tolerance:.3g}, expected {least:.0%}; give its placement, or views that see "
+            "more of what was scanned"
+        )
+    best = found[0]
+    for other in found[1:]:
+        if _support(other) > RIVAL * _support(best) and task.apart(best, other) > APART * task.cell:
+            raise DegenerateError(
+                f"two placements of the scan fit about alike ({_support(best):.2f} and "
+                f"{_support(other):.2f}, {task.apart(best, other):.3g} apart); give its placement"
+            )
+    return best
+
+
+def _support(placement: Placement) -> float:
+    """The better of both fitnesses: one may have seen far more than the other."""
+    assert placement.fitness is not None and placement.scan_fitness is not None
+    return max(placement.fitness, placement.scan_fitness)
+
+
+class _Task:
+    """A scan and what was photographed, each about its own middle; cells are in world units."""
+
+    def __init__(self, scan: Surface, photographed: Surface, *, seed: int) -> None:
+        self.seed = seed
+        self.scan_middle = np.median(scan.positions, axis=0)
+        self.middle = np.median(photographed.positions, axis=0)
+        self.scan = _moved(scan, self.scan_middle)
+        self.target = _moved(photographed, self.middle)
+        self.cell = _cell(self.target.positions)
+        self.tolerance = TOLERANCE * self.cell
+        rng = np.random.default_rng(seed)
+        self.source_sample = _sample(self.scan.positions, rng)
+        self.target_sample = _sample(self.target.positions, rng)
+        self._target = _Features(self.target, self.cell, outward=False)
+
+    def of_world(self, world_from_scan: Float64) -> Float64:
+        """A placement of whole coordinates as one of those about the middles."""
+        local = world_from_scan.copy()
+        local[:3, 3] += world_from_scan[:3, :3] @ self.scan_middle - self.middle
+        return local
+
+    def _to_world(self, local: Float64) -> Float64:
+        world = local.copy()
+        world[:3, 3] += self.middle - local[:3, :3] @ self.scan_middle
+        return world
+
+    def scales(self) -> tuple[float, ...]:
+        """Scales to try, world units per unit of the scan."""
+        ratio = _extent(self.target.positions) / _extent(self.scan.positions)
+        return tuple(ratio * scale for scale in SCALES)
+
+    def candidates(self, scales: tuple[float, ...]) -> list[Placement]:
+        """The best placements by features for some scales, refined, the best first."""
+        rough: list[tuple[float, Float64]] = []
+        for scale in scales:
+            for outward in (False, True) if self.scan.seen_from is None else (False,):
+                placed = self._by_features(scale, outward=outward)
+                if placed is not None:
+                    rough.append((self._fitness(placed, self.cell)[0], placed))
+        rough.sort(key=lambda entry: -entry[0])
+        refined = [self.judged(self._refined(placed), "estimated") for _, placed in rough[:REFINED]]
+        return sorted(refined, key=_support, reverse=True)
+
+    def _by_features(self, scale: float, *, outward: bool) -> Float64 | None:
+        """A placement by matched features at about one scale; None where none is found."""
+        import pycolmap
+
+        source = _Features(self.scan, self.cell / scale, outward=outward)
+        if len(source.points) < FEWEST // 3 or len(source.points) > 5 * POINTS:
+            return None
+        ours, theirs = source.matches(self._target)
+        if len(ours) < 10:
+            return None
+        options = pycolmap.RANSACOptions()
+        options.max_error = MATCH * self.cell
+        options.random_seed = self.seed
+        fit = pycolmap.estimate_sim3d_robust(
+            source.points[ours], self._target.points[theirs], options
+        )
+        if fit is None or not 0.5 < fit.scale / scale < 2:
+            return None
+        return np.vstack([fit.matrix(), [0, 0, 0, 1]])
+
+    def _refined(self, placed: Float64) -> Float64:
+        """ICP with scale, in ever smaller reach."""
+        import open3d as o3d
+
+        registration = o3d.pipelines.registration
+        method = registration.TransformationEstimationPointToPoint(with_scaling=True)
+        # From the photographs to the scan, which is mostly the larger: each of their points has a
+        # partner there, and not the other way round.
+        inverse = np.linalg.inv(placed)
+        scale = float(np.cbrt(np.linalg.det(placed[:3, :3])))
+        source = _cloud(self.target_sample)
+        target = _cloud(self.scan.positions)
+        for step in STEPS:
+            result = registration.registration_icp(
+                source, target, step * self.cell / scale, inverse, method
+            )
+            inverse = np.asarray(result.transformation)
+        return np.linalg.inv(inverse)
+
+    def judged(self, placed: Float64, how: str) -> Placement:
+        """A placement with its support."""
+        fitness, scan_fitness, rmse = self._fitness(placed, self.tolerance)
+        return Placement(self._to_world(placed), how, fitness, scan_fitness, rmse, self.tolerance)
+
+    def _fitness(self, placed: Float64, tolerance: float) -> tuple[float, float, float]:
+        """Shares of the photographs' and of the scan's points with a partner, and their rmse."""
+        scale = float(np.cbrt(np.linalg.det(placed[:3, :3])))
+        inverse = np.linalg.inv(placed)
+        back = self.target_sample @ inverse[:3, :3].T + inverse[:3, 3]
+        near = scale * _distances(back, self.scan.positions)
+        inside = near <= tolerance
+        rmse = float(np.sqrt((near[inside] ** 2).mean())) if inside.any() else float("nan")
+        moved = self.source_sample @ placed[:3, :3].T + placed[:3, 3]
+        share = float((_distances(moved, self.target.positions) <= tolerance).mean())
+        return float(inside.mean()), share, rmse
+
+    def apart(self, one: Placement, other: Placement) -> float:
+        """How far two placements put the scan's points apart, the median in world units."""
+        points = self.source_sample + self.scan_middle
+        return float(np.median(np.linalg.norm(one.apply(points) - other.apply(points), axis=1)))
+
+
+class _Features:
+    """A surface's points, one a cell, with their features."""
+
+    def __init__(self, surface: Surface, cell: float, *, outward: bool) -> None:
+        import open3d as o3d
+
+        whole = _cloud(surface.positions)
+        if surface.seen_from is not None:
+            # Averaged along with the points.
+            whole.normals = o3d.utility.Vector3dVector(surface.seen_from)
+        cloud = whole.voxel_down_sample(cell)
+        self.points = np.asarray(cloud.points).copy()
+        seen_from = np.asarray(cloud.normals).copy()
+        self._features: o3d.pipelines.registration.Feature | None = None
+        if not FEWEST // 3 <= len(self.points) <= 5 * POINTS:
+            return
+        Param = o3d.geometry.KDTreeSearchParamHybrid
+        cloud.normals = o3d.utility.Vector3dVector()
+        cloud.estimate_normals(Param(NORMALS * cell, NEIGHBOURS // 3))
+        normals = np.asarray(cloud.normals)
+        # Without viewpoints: a room is seen from its middle, an object from around it.
+        towards = (seen_from if len(seen_from) else np.zeros(3)) - self.points
+        turned = (normals * towards).sum(axis=1) < 0
+        normals[turned != outward] *= -1
+        cloud.normals = o3d.utility.Vector3dVector(normals)
+        self._features = o3d.pipelines.registration.compute_fpfh_feature(
+            cloud, Param(FEATURES * cell, NEIGHBOURS)
+        )
+
+    def matches(self, other: _Features) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows of both that are most alike, in both directions."""
+        import open3d as o3d
+
+        if self._features is None or other._features is None:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        pairs = np.asarray(
+            o3d.pipelines.registration.correspondences_from_features(
+                self._features, other._features, mutual_filter=True
+            )
+        )
+        return pairs[:, 0].astype(np.int64), pairs[:, 1].astype(np.int64)
+
+
+def _moved(surface: Surface, middle: Float64) -> Surface:
+    seen = surface.seen_from
+    return Surface(surface.positions - middle, None if seen is None else seen - middle)
+
+
+def _cell(positions: Float64) -> float:
+    """Edge of the cells of which about POINTS hold a point."""
+    edge = _extent(positions) / 50
+    for _ in range(8):
+        cells = np.unique(np.floor(positions / edge).astype(np.int64), axis=0)
+        ratio = len(cells) / min(POINTS, len(positions) / 2)
+        if 0.7 < ratio < 1.4:
+            break
+        # Surfaces: the cells go with the square.
+        edge *= float(np.sqrt(ratio))
+    return edge
+
+
+def _extent(positions: Float64) -> float:
+    """The diagonal of the box around most points."""
+    return float(np.linalg.norm(np.ptp(np.percentile(positions, [2, 98], axis=0), axis=0))) or 1.0
+
+
+def _sample(positions: Float64, rng: np.random.Generator) -> Float64:
+    if len(positions) <= COUNTED:
+        return positions
+    return positions[rng.choice(len(positions), COUNTED, replace=False)]
+
+
+def _cloud(positions: Float64) -> o3d.geometry.PointCloud:
+    import open3d as o3d
+
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(positions))
+
+
+def _distances(positions: Float64, others: Float64) -> Float64:
+    """(N,) distance of each point to the nearest of others."""
+    from scipy.spatial import KDTree
+
+    return KDTree(others).query(positions, workers=-1)[0]
