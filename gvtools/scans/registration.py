@@ -22,16 +22,21 @@ if TYPE_CHECKING:
 
 Float64 = NDArray[np.float64]
 
-# Points of a surface that features are computed of, about, and most that fitness is counted on.
-POINTS, COUNTED = 6000, 20_000
+# Points of a surface that features are computed of, about; most that it is known by; and most that
+# ICP and fitness look for partners of.
+POINTS, KNOWN, COUNTED = 6000, 250_000, 8000
 # Fewer tell no shape.
 FEWEST = 300
 # In cells: radii of normals and features, the error of a match, and the steps of ICP.
 NORMALS, FEATURES, MATCH, STEPS = 2.0, 5.0, 1.5, (2.0, 1.0, 0.5)
 # A placement fits a point within this share of a cell.
 TOLERANCE = 1 / 3
-# Scales that are tried around the ratio of the extents, where the unit is not the same.
-SCALES = tuple(2.0 ** (k / 2) for k in range(-5, 6))
+# Scales that are tried around the ratio of the extents, the likeliest first.
+SCALES = tuple(2.0 ** (k / 2) for k in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5))
+# Random samples of matches, at most: with one true match in thirty, one sample hits on average.
+TRIALS = 30_000
+# A placement that so many points support needs no other scale beside it.
+CLEAR = 0.8
 # Of the placements by features so many are refined.
 REFINED = 4
 # A runner-up with this share of the fitness, more than so many cells away, makes both doubtful.
@@ -108,16 +113,23 @@ class _Task:
     """A scan and what was photographed, each about its own middle; cells are in world units."""
 
     def __init__(self, scan: Surface, photographed: Surface, *, seed: int) -> None:
+        from scipy.spatial import KDTree
+
         self.seed = seed
+        rng = np.random.default_rng(seed)
+        scan, photographed = _known(scan, rng), _known(photographed, rng)
         self.scan_middle = np.median(scan.positions, axis=0)
         self.middle = np.median(photographed.positions, axis=0)
         self.scan = _moved(scan, self.scan_middle)
         self.target = _moved(photographed, self.middle)
         self.cell = _cell(self.target.positions)
         self.tolerance = TOLERANCE * self.cell
-        rng = np.random.default_rng(seed)
-        self.source_sample = _sample(self.scan.positions, rng)
-        self.target_sample = _sample(self.target.positions, rng)
+        self.source_sample = self.scan.positions[_rows(self.scan, COUNTED, rng)]
+        self.target_sample = self.target.positions[_rows(self.target, COUNTED, rng)]
+        self._scan_tree, self._target_tree = (
+            KDTree(self.scan.positions),
+            KDTree(self.target.positions),
+        )
         self._target = _Features(self.target, self.cell, outward=False)
 
     def of_world(self, world_from_scan: Float64) -> Float64:
@@ -143,10 +155,16 @@ class _Task:
             for outward in (False, True) if self.scan.seen_from is None else (False,):
                 placed = self._by_features(scale, outward=outward)
                 if placed is not None:
-                    rough.append((self._fitness(placed, self.cell)[0], placed))
+                    rough.append((max(self._fitness(placed, self.cell)[:2]), placed))
+            # Within a whole cell much fits by chance.
+            if any(fitness > CLEAR and self._clear(placed) for fitness, placed in rough):
+                break
         rough.sort(key=lambda entry: -entry[0])
         refined = [self.judged(self._refined(placed), "estimated") for _, placed in rough[:REFINED]]
         return sorted(refined, key=_support, reverse=True)
+
+    def _clear(self, placed: Float64) -> bool:
+        return _support(self.judged(self._refined(placed), "estimated")) >= CLEAR
 
     def _by_features(self, scale: float, *, outward: bool) -> Float64 | None:
         """A placement by matched features at about one scale; None where none is found."""
@@ -161,12 +179,13 @@ class _Task:
         options = pycolmap.RANSACOptions()
         options.max_error = MATCH * self.cell
         options.random_seed = self.seed
+        options.max_num_trials = TRIALS
         fit = pycolmap.estimate_sim3d_robust(
             source.points[ours], self._target.points[theirs], options
         )
-        if fit is None or not 0.5 < fit.scale / scale < 2:
+        if fit is None or not 0.5 < fit["tgt_from_src"].scale / scale < 2:
             return None
-        return np.vstack([fit.matrix(), [0, 0, 0, 1]])
+        return np.vstack([fit["tgt_from_src"].matrix(), [0, 0, 0, 1]])
 
     def _refined(self, placed: Float64) -> Float64:
         """ICP with scale, in ever smaller reach."""
@@ -178,8 +197,7 @@ class _Task:
         # partner there, and not the other way round.
         inverse = np.linalg.inv(placed)
         scale = float(np.cbrt(np.linalg.det(placed[:3, :3])))
-        source = _cloud(self.target_sample)
-        target = _cloud(self.scan.positions)
+        source, target = _cloud(self.target_sample), _cloud(self.scan.positions)
         for step in STEPS:
             result = registration.registration_icp(
                 source, target, step * self.cell / scale, inverse, method
@@ -197,11 +215,11 @@ class _Task:
         scale = float(np.cbrt(np.linalg.det(placed[:3, :3])))
         inverse = np.linalg.inv(placed)
         back = self.target_sample @ inverse[:3, :3].T + inverse[:3, 3]
-        near = scale * _distances(back, self.scan.positions)
+        near = scale * self._scan_tree.query(back, workers=-1)[0]
         inside = near <= tolerance
         rmse = float(np.sqrt((near[inside] ** 2).mean())) if inside.any() else float("nan")
         moved = self.source_sample @ placed[:3, :3].T + placed[:3, 3]
-        share = float((_distances(moved, self.target.positions) <= tolerance).mean())
+        share = float((self._target_tree.query(moved, workers=-1)[0] <= tolerance).mean())
         return float(inside.mean()), share, rmse
 
     def apart(self, one: Placement, other: Placement) -> float:
@@ -247,7 +265,7 @@ class _Features:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
         pairs = np.asarray(
             o3d.pipelines.registration.correspondences_from_features(
-                self._features, other._features, mutual_filter=True
+                self._features, other._features, mutual_filter=True, mutual_consistency_ratio=0.0
             )
         )
         return pairs[:, 0].astype(np.int64), pairs[:, 1].astype(np.int64)
@@ -276,20 +294,18 @@ def _extent(positions: Float64) -> float:
     return float(np.linalg.norm(np.ptp(np.percentile(positions, [2, 98], axis=0), axis=0))) or 1.0
 
 
-def _sample(positions: Float64, rng: np.random.Generator) -> Float64:
-    if len(positions) <= COUNTED:
-        return positions
-    return positions[rng.choice(len(positions), COUNTED, replace=False)]
+def _known(surface: Surface, rng: np.random.Generator) -> Surface:
+    rows, seen = _rows(surface, KNOWN, rng), surface.seen_from
+    return Surface(surface.positions[rows], None if seen is None else seen[rows])
+
+
+def _rows(surface: Surface, most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Rows of at most so many points."""
+    count = len(surface.positions)
+    return rng.choice(count, most, replace=False) if count > most else np.arange(count)
 
 
 def _cloud(positions: Float64) -> o3d.geometry.PointCloud:
     import open3d as o3d
 
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(positions))
-
-
-def _distances(positions: Float64, others: Float64) -> Float64:
-    """(N,) distance of each point to the nearest of others."""
-    from scipy.spatial import KDTree
-
-    return KDTree(others).query(positions, workers=-1)[0]

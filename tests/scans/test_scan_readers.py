@@ -1,0 +1,241 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scan_files import FAR, surface, write_e57, write_las
+from scipy.spatial.transform import Rotation
+
+from gvtools.errors import GvError, MemoryFileError, OptionError
+from gvtools.scans.read import open_scan, read_scan
+
+
+def same(path, positions, colors, *, atol=1e-6):
+    """Whether a file is read as these points, in their order."""
+    scan = read_scan(path)
+    np.testing.assert_allclose(scan.positions + scan.origin, positions, atol=atol)
+    if colors is not None:
+        np.testing.assert_array_equal(scan.colors, colors)
+        assert scan.colored_by == "colour"
+    assert scan.count == len(positions)
+    return scan
+
+
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_ply_of_every_encoding_with_faces_behind_the_points(tmp_path, text, order):
+    plyfile = pytest.importorskip("plyfile")
+    positions, colors = surface(500)
+    positions = positions + FAR
+    vertex = np.zeros(500, [("x", "f8"), ("nx", "f4"), ("y", "f8"), ("z", "f8"), ("red", "u1"),
+                            ("green", "u1"), ("blue", "u1")])  # fmt: skip
+    for k, (axis, color) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+        vertex[axis], vertex[color] = positions[:, k], colors[:, k]
+    faces = np.array([([0, 1, 2],)], dtype=[("vertex_indices", "O")])
+    elements = [plyfile.PlyElement.describe(vertex, "vertex")]
+    elements.append(plyfile.PlyElement.describe(faces, "face"))
+    path = tmp_path / "scan.ply"
+    plyfile.PlyData(elements, text=text, byte_order=order).write(str(path))
+    same(path, positions, colors)
+
+
+@pytest.mark.parametrize("options", [{"write_ascii": True}, {}, {"compressed": True}])
+def test_pcd_of_every_encoding(tmp_path, options):
+    o3d = pytest.importorskip("open3d")
+    positions, colors = surface(500)
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(positions.astype(np.float32)))
+    cloud.point.colors = o3d.core.Tensor(colors)
+    path = tmp_path / "scan.pcd"
+    assert o3d.t.io.write_point_cloud(str(path), cloud, **options)
+    same(path, positions, colors, atol=1e-5)
+
+
+def test_pcd_keeps_double_coordinates_and_colours_packed_as_float(tmp_path):
+    positions, colors = surface(50)
+    table = np.zeros(50, [("x", "f8"), ("y", "f8"), ("z", "f8"), ("gap", "u1", 4), ("rgb", "f4")])
+    for k, axis in enumerate("xyz"):
+        table[axis] = positions[:, k] + FAR[k]
+    packed = colors.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    table["rgb"] = packed.astype(np.uint32).view(np.float32)
+    lines = ["# .PCD v0.7", "VERSION 0.7", "FIELDS x y z _ rgb", "SIZE 8 8 8 1 4",
+             "TYPE F F F U F", "COUNT 1 1 1 4 1", "WIDTH 25", "HEIGHT 2",
+             "VIEWPOINT 0 0 0 1 0 0 0", "POINTS 50", "DATA binary", ""]  # fmt: skip
+    path = tmp_path / "scan.pcd"
+    path.write_bytes("\n".join(lines).encode() + table.tobytes())
+    same(path, positions + FAR, colors)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_las_with_colours_of_8_and_16_bits_keeps_far_coordinates(tmp_path, suffix, bits):
+    positions, colors = surface(500)
+    path = write_las(tmp_path / f"scan{suffix}", positions + FAR, colors, bits=bits)
+    scan = same(path, positions + FAR, colors, atol=6e-5)
+    assert np.abs(scan.positions).max() < 10
+
+
+def test_las_without_colour_is_grey_by_intensity_and_loses_noise(tmp_path):
+    positions, _ = surface(400)
+    kinds = np.where(np.arange(400) < 10, 7, 2)
+    withheld = np.arange(400) >= 390
+    path = write_las(
+        tmp_path / "scan.las", positions, None, intensity=np.arange(400) * 10,
+        classification=kinds, withheld=withheld,
+    )  # fmt: skip
+    scan = read_scan(path)
+    assert (len(scan), scan.colored_by) == (380, "intensity")
+    assert scan.dropped == {"withheld or noise": 20}
+    assert (np.diff(scan.colors[:, 0].astype(int)) >= 0).all()
+    assert scan.colors[0, 0] == 0 and scan.colors[-1, 0] == 255
+
+
+def test_what_a_completer_made_is_no_scan(tmp_path):
+    from memory_scenes import camera, points
+
+    from gvtools.memory.spatial_memory import SpatialMemory
+
+    memory = SpatialMemory(0.1)
+    memory.fuse(points(surface(50)[0], source=camera()), round=0)
+    memory.fuse(points(surface(50)[0] + 20, source=camera(name="b")), round=1, generated=True)
+    from gvtools.memory.io.ply import export_memory_ply
+
+    export_memory_ply(memory, tmp_path / "memory.ply")
+    scan = read_scan(tmp_path / "memory.ply")
+    assert scan.dropped == {"generated": int(memory.generated.sum())}
+    assert len(scan) == int((~memory.generated).sum())
+
+
+def test_e57_of_several_scans_cartesian_and_spherical_with_their_poses(tmp_path):
+    pytest.importorskip("pye57")
+    positions, colors = surface(600)
+    turn = Rotation.from_euler("zyx", [0.7, 0.2, -0.1])
+    place = FAR + np.array([1, 2, 1])
+    own = turn.inv().apply(positions[:300] + FAR - place)
+    first = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), own.T, strict=True))
+    rgb = zip(("colorRed", "colorGreen", "colorBlue"), colors[:300].T, strict=True)
+    first |= {name: values.astype(np.int64) * 257 for name, values in rgb}
+    first["cartesianInvalidState"] = (np.arange(300) < 7) * 2
+    first["pose"] = (np.roll(turn.as_quat(), 1), place)
+    own = positions[300:] - [0.5, 0.5, 1.5]
+    ranges = np.linalg.norm(own, axis=1)
+    second = {
+        "sphericalRange": ranges,
+        "sphericalAzimuth": np.arctan2(own[:, 1], own[:, 0]),
+        "sphericalElevation": np.arcsin(own[:, 2] / ranges),
+        "intensity": np.arange(300.0),
+        "pose": ([1, 0, 0, 0], FAR + np.array([0.5, 0.5, 1.5])),
+    }
+    path = write_e57(tmp_path / "scan.e57", [first, second])
+    scan = read_scan(path)
+    assert scan.dropped == {"invalid": 7}
+    np.testing.assert_allclose(scan.positions + scan.origin, (positions + FAR)[7:], atol=1e-7)
+    np.testing.assert_array_equal(scan.colors[:293], colors[7:300])
+    # The second station has intensity alone: it is grey.
+    assert (np.ptp(scan.colors[293:], axis=1) == 0).all() and np.ptp(scan.colors[293:, 0]) == 255
+    np.testing.assert_array_equal(scan.station, [0] * 293 + [1] * 300)
+    assert [station.name for station in scan.stations] == ["station 0", "station 1"]
+    np.testing.assert_allclose(scan.stations[1].center, FAR + np.array([0.5, 0.5, 1.5]))
+
+
+def test_more_points_than_are_kept_are_thinned_evenly(tmp_path):
+    positions, colors = surface(20_000)
+    path = write_las(tmp_path / "scan.las", positions, colors)
+    scan = read_scan(path, most=3000)
+    assert 1000 < len(scan) <= 3000 and scan.dropped == {"thinned out": 20_000 - len(scan)}
+    # Every part of the surface keeps points.
+    from scipy.spatial import KDTree
+
+    away, _ = KDTree(scan.positions + scan.origin).query(positions)
+    assert away.max() < 0.2
+
+
+def damaged(path, change):
+    data = bytearray(path.read_bytes())
+    change(data)
+    path.write_bytes(data)
+    return path
+
+
+def refused(path):
+    """The one line by which a file is refused."""
+    with pytest.raises(GvError) as found:
+        read_scan(path)
+    message = str(found.value)
+    assert str(path) in message and "\n" not in message
+    return message
+
+
+def huge_las(data):
+    # Number of points: the last header field before those of returns, 64 bits in LAS 1.4.
+    data[247:255] = (1 << 60).to_bytes(8, "little")
+
+
+def test_a_count_beyond_the_file_is_refused_before_anything_is_allocated(tmp_path):
+    positions, colors = surface(300)
+    for suffix in (".las", ".laz"):
+        path = write_las(tmp_path / f"scan{suffix}", positions, colors)
+        assert "truncated or damaged" in refused(damaged(path, huge_las))
+    ply = tmp_path / "scan.ply"
+    for kind in ("ascii", "binary_little_endian"):
+        lines = ["ply", f"format {kind} 1.0", "element vertex 999999999999"]
+        lines += [f"property float {axis}" for axis in "xyz"]
+        ply.write_bytes(("\n".join([*lines, "end_header", "1 2 3", "4 5 6", ""])).encode())
+        assert "its header says 999999999999 points" in refused(ply)
+    pcd = tmp_path / "scan.pcd"
+    for kind in ("ascii", "binary", "binary_compressed"):
+        lines = ["FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "WIDTH 999999999", "HEIGHT 1",
+                 "POINTS 999999999", f"DATA {kind}", ""]  # fmt: skip
+        pcd.write_bytes("\n".join(lines).encode() + b"1 2 3 4 5 6 7 8 9")
+        refused(pcd)
+
+
+def test_e57_with_a_count_beyond_its_bytes_is_refused(tmp_path, monkeypatch):
+    pye57 = pytest.importorskip("pye57")
+    positions, _ = surface(300)
+    columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), positions.T, strict=True))
+    path = write_e57(tmp_path / "scan.e57", [columns])
+    # Pages carry checksums: a crafted count cannot be patched in without writing them anew.
+    monkeypatch.setattr(pye57.ScanHeader, "point_count", property(lambda self: 1 << 40))
+    assert "scans say" in refused(path)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz", ".e57", ".ply", ".pcd"])
+def test_cut_and_flipped_files_end_in_one_line(tmp_path, suffix):
+    positions, colors = surface(2000)
+    path = tmp_path / f"scan{suffix}"
+    if suffix == ".e57":
+        pytest.importorskip("pye57")
+        columns = zip(("cartesianX", "cartesianY", "cartesianZ"), positions.T, strict=True)
+        write_e57(path, [dict(columns)])
+    elif suffix in (".las", ".laz"):
+        write_las(path, positions, colors)
+    else:
+        import open3d as o3d
+
+        cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(positions.astype(np.float32)))
+        o3d.t.io.write_point_cloud(str(path), cloud, compressed=suffix == ".pcd")
+    whole = path.read_bytes()
+    for share in (0, 0.01, 0.3, 0.9):
+        path.write_bytes(whole[: int(share * len(whole))])
+        refused(path)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        data = bytearray(whole)
+        for at in rng.integers(0, min(len(data), 600), 3):
+            data[at] = rng.integers(0, 256)
+        path.write_bytes(data)
+        # What still reads holds as many points as the file says, no more.
+        try:
+            assert len(read_scan(path)) <= 2000
+        except GvError as error:
+            assert "\n" not in str(error)
+
+
+def test_unknown_suffixes_missing_files_and_missing_packages_are_named(tmp_path, monkeypatch):
+    with pytest.raises(OptionError, match=r"ends with \.ply, \.las"):
+        open_scan(tmp_path / "scan.xyz")
+    with pytest.raises(MemoryFileError, match="no such file"):
+        open_scan(tmp_path / "scan.laz")
+    path = write_las(tmp_path / "scan.las", surface(10)[0], None)
+    monkeypatch.setitem(__import__("sys").modules, "laspy", None)
+    with pytest.raises(OptionError, match=r"gvtools\[scan\]"):
+        open_scan(path)
