@@ -30,6 +30,8 @@ DOCTESTED = (
     "gvtools.evaluation.splits",
     "gvtools.evaluation.picture_matching",
     "gvtools.evaluation.trajectories",
+    "gvtools.scans.fuse",
+    "gvtools.scans.placement",
     "gvtools.scenes.data_sets.address",
     "gvtools.scenes.data_sets.drawn",
     "gvtools.scenes.data_sets.mvsnet_cameras",

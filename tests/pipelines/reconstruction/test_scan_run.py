@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scan_files import FAR, write_las
+from tiny_scan import FOCAL, HEIGHT, WIDTH, render, world_from_cam, write_scan
+
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.runs.run import load_run
+from pipelines.cli import main
+
+SCALE = 2.0
+
+
+def far_scan(path: Path) -> Path:
+    """What a scanner at the last view's place sees, twice as large and far away; no colours."""
+    positions = []
+    for index in (4, 5):
+        pose = world_from_cam(index)
+        _, depth = render(pose)
+        row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        rays = [(column - WIDTH / 2) / FOCAL, (row - HEIGHT / 2) / FOCAL, np.ones_like(row)]
+        positions.append((np.stack(rays, -1) * depth[..., None]).reshape(-1, 3) + pose[:3, 3])
+    count = sum(map(len, positions))
+    return write_las(
+        path, SCALE * np.concatenate(positions) + FAR, None, intensity=np.arange(count) % 999
+    )
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> Path:
+    """A folder with a project, a scan, and runs with and without it."""
+    root = tmp_path_factory.mktemp("scanned")
+    project, scan = write_scan(root / "project"), far_scan(root / "scan.laz")
+    matrix = np.diag([1 / SCALE] * 3 + [1.0])
+    matrix[:3, 3] = -FAR / SCALE
+    np.savetxt(root / "placement.txt", matrix, fmt="%.17g")
+    options = ["--context", "first:1", "--targets", "range:4-5", "--refine", "0", "--quiet"]
+    given = ["--cloud", str(scan), "--cloud-placement", str(root / "placement.txt")]
+    for name, more in (("with", given), ("without", [])):
+        out = ["--out", str(root / name)]
+        assert main(["reconstruct", str(project), *options, *out, *more]) == 0
+    return root
+
+
+def test_a_run_begins_with_the_scan_and_counts_it_apart(runs):
+    run = load_run(runs / "with")
+    first = run.rounds[0]
+    memory = SpatialMemory.load(runs / "with" / "memory.npz")
+    kept = memory.scanned & (memory.columns.round == 0)
+    assert first["scanned"] == int(kept.sum()) > 0
+    assert first["observed"] + first["scanned"] == first["points"]
+    assert first["scan"]["stations"] == 1 and first["scan"]["colored_by"] == "intensity"
+    assert first["scan"]["placement"]["scale"] == pytest.approx(1 / SCALE)
+    covered = [load_run(runs / name).rounds[1]["coverage_before"] for name in ("with", "without")]
+    assert covered[0] > 0.95 > covered[1] + 0.2
+    # In its place: the depth that the target has.
+    figures = json.loads((runs / "with" / "metrics.json").read_text())
+    assert figures["depth_rel_valid"] < 0.01
+
+
+def test_pages_and_pictures_name_what_is_scanned(runs):
+    page = (runs / "with" / "report.html").read_text()
+    assert "of them scanned" in page and "scan.laz" in page
+    assert "of them scanned" not in (runs / "without" / "report.html").read_text()
+    from PIL import Image
+
+    levels = set()
+    for path in (runs / "with" / "round_001").glob("valid_*.png"):
+        levels |= set(np.unique(np.asarray(Image.open(path))).tolist())
+    assert 192 in levels
+
+
+def test_exports_keep_it_apart_and_make_no_camera_of_a_station(runs, tmp_path):
+    laspy, pycolmap = pytest.importorskip("laspy"), pytest.importorskip("pycolmap")
+    for form, name in (("las", "a.las"), ("colmap", "model"), ("splat", "a.splat.ply")):
+        out = tmp_path / name
+        assert main(["export", str(runs / "with"), "--format", form, "--out", str(out)]) == 0
+    cloud = laspy.read(tmp_path / "a.las")
+    assert 0 < int(np.asarray(cloud["scanned"]).sum()) < len(cloud)
+    model = pycolmap.Reconstruction(str(tmp_path / "model" / "sparse" / "0"))
+    assert not [image.name for image in model.images.values() if "scan" in image.name]
+
+
+def test_viewers_tell_the_three_sources(runs):
+    from pipelines.viewing.source import ViewSource
+
+    shown = ViewSource(runs / "with").read()
+    counts = shown.counts(0)
+    assert counts.scanned > 0 and f"{counts.scanned:,} scanned" in counts.told()
+    assert not [camera.name for camera in shown.cameras if camera.name.startswith("scan/")]
+    legend = shown.colors("source", np.arange(10)).legend
+    assert [name for _, name in legend.swatches] == ["observed", "generated", "scanned"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--cloud", "{root}/scan.laz"], "placement"),
+        (["--cloud", "{root}/none.laz"], "no such file"),
+        (["--cloud", "{root}/scan.laz", "--cloud-placement", "1,2"], "2 numbers"),
+        (["--cloud-placement", "identity"], "without a scan"),
+    ],
+)
+def test_what_cannot_be_placed_is_refused_in_one_line(runs, tmp_path, capsys, options, said):
+    options = [option.format(root=runs) for option in options]
+    project, out = str(runs / "project"), str(tmp_path / "out")
+    status = main(
+        ["reconstruct", project, "--context", "first:1", "--refine", "0", "--out", out, *options]
+    )
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert status == 2 and said in lines[-1] and not (tmp_path / "out" / "memory.npz").exists()
