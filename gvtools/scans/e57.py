@@ -15,7 +15,10 @@ from gvtools.scans.points import CHUNK, Chunk, ScanFile, Station
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
-INVALID = {CARTESIAN: "cartesianInvalidState", SPHERICAL: "sphericalInvalidState"}
+INVALID: dict[tuple[str, ...], str] = {
+    CARTESIAN: "cartesianInvalidState",
+    SPHERICAL: "sphericalInvalidState",
+}
 INTENSITY = "intensity"
 # Quaternions are unit to this.
 UNIT = 1e-3

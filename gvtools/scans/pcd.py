@@ -162,7 +162,7 @@ def _checked(given: dict[str, list[str]], offset: int) -> _Header:
     """
     names = given["FIELDS"]
     counts = [int(count) for count in given.get("COUNT", ["1"] * len(names))]
-    columns = []
+    columns: list[tuple[Any, ...]] = []
     for name, kind, size, count in zip(names, given["TYPE"], given["SIZE"], counts, strict=True):
         if not 1 <= count <= 4096:
             raise ValueError(f"COUNT {count}")

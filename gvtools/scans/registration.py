@@ -31,6 +31,8 @@ FEWEST = 300
 NORMALS, FEATURES, MATCH, STEPS = 2.0, 5.0, 1.5, (2.0, 1.0, 0.5)
 # A placement fits a point within this share of a cell.
 TOLERANCE = 1 / 3
+# Steps of ICP for the placement that is taken.
+POLISHING = 200
 # Scales that are tried around the ratio of the extents, the likeliest first.
 SCALES = tuple(2.0 ** (k / 2) for k in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5))
 # Random samples of matches, at most: with one true match in thirty, one sample hits on average.
@@ -93,7 +95,7 @@ def register(
             f"{task.tolerance:.3g}, expected {least:.0%}; give its placement, or views that see "
             "more of what was scanned"
         )
-    best = found[0]
+    best = task.polished(found[0])
     for other in found[1:]:
         if _support(other) > RIVAL * _support(best) and task.apart(best, other) > APART * task.cell:
             raise DegenerateError(
@@ -187,7 +189,15 @@ class _Task:
             return None
         return np.vstack([fit["tgt_from_src"].matrix(), [0, 0, 0, 1]])
 
-    def _refined(self, placed: Float64) -> Float64:
+    def polished(self, placement: Placement) -> Placement:
+        """A placement after more steps of ICP: its scale is found slowly."""
+        local = self.of_world(placement.world_from_scan)
+        local = self._refined(local, reach=(STEPS[-1], TOLERANCE), steps=POLISHING)
+        return self.judged(local, placement.how)
+
+    def _refined(
+        self, placed: Float64, reach: tuple[float, ...] = STEPS, steps: int = 30
+    ) -> Float64:
         """ICP with scale, in ever smaller reach."""
         import open3d as o3d
 
@@ -198,9 +208,10 @@ class _Task:
         inverse = np.linalg.inv(placed)
         scale = float(np.cbrt(np.linalg.det(placed[:3, :3])))
         source, target = _cloud(self.target_sample), _cloud(self.scan.positions)
-        for step in STEPS:
+        ends = registration.ICPConvergenceCriteria(1e-9, 1e-9, steps)
+        for step in reach:
             result = registration.registration_icp(
-                source, target, step * self.cell / scale, inverse, method
+                source, target, step * self.cell / scale, inverse, method, ends
             )
             inverse = np.asarray(result.transformation)
         return np.linalg.inv(inverse)
