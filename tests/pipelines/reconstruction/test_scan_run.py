@@ -35,6 +35,7 @@ def runs(tmp_path_factory) -> Path:
     """A folder with a project, a scan, and runs with and without it."""
     root = tmp_path_factory.mktemp("scanned")
     project, scan = write_scan(root / "project"), far_scan(root / "scan.laz")
+    write_las(root / "few.las", np.eye(20, 3), None)
     matrix = np.diag([1 / SCALE] * 3 + [1.0])
     matrix[:3, 3] = -FAR / SCALE
     np.savetxt(root / "placement.txt", matrix, fmt="%.17g")
@@ -99,7 +100,7 @@ def test_viewers_tell_the_three_sources(runs):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--cloud", "{root}/scan.laz"], "placement"),
+        (["--cloud", "{root}/few.las"], "20 points of the scan"),
         (["--cloud", "{root}/none.laz"], "no such file"),
         (["--cloud", "{root}/scan.laz", "--cloud-placement", "1,2"], "2 numbers"),
         (["--cloud-placement", "identity"], "without a scan"),
