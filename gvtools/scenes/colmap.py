@@ -20,7 +20,7 @@ from gvtools.scenes.photographs import (
     mask_findings,
     named,
 )
-from gvtools.scenes.scene import Finding, Scene
+from gvtools.scenes.scene import Finding, Scene, natural_key
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 
@@ -33,6 +33,8 @@ def read_colmap(
     model: int | None = None,
 ) -> Scene:
     """A COLMAP project with every view in an undistorted pinhole camera.
+
+    Pictures that see too much for one camera become several views, see ``faces``.
 
     The model is looked for in ``sparse/N``, ``sparse``, ``root`` itself and ``sparse_txt``, the
     pictures in ``images`` beside it. Masks follow COLMAP's layout (``masks/NAME.png`` for the image
@@ -49,8 +51,8 @@ def read_colmap(
         The scene, in the model's frame and scale.
 
     Raises:
-        ProjectError: no model, a damaged one, no registered image, no pictures, or a spherical
-            camera. Unreadable pictures and wrong sizes are error findings, and raise when loaded.
+        ProjectError: no model, a damaged one, no registered image, or no pictures. Unreadable
+            pictures and wrong sizes are error findings, and raise when loaded.
     """
     root = Path(root)
     folder = find_model(root, number=model)
@@ -59,7 +61,7 @@ def read_colmap(
             f"{root}: no COLMAP model; expected cameras.bin or cameras.txt in sparse/0, in sparse "
             "or in the folder itself"
         )
-    loaded = load_model(folder)
+    loaded = load_model(folder, faces=True)
     homes = _homes(root, folder)
     image_folder = _image_folder(images, homes, folder)
     beside = image_folder.parent
@@ -71,7 +73,13 @@ def read_colmap(
     photographs, ids = _photographs(
         loaded, image_folder, mask_folder, depth_folder=depth_folder, findings=findings
     )
-    points, dropped = sparse_points(loaded, {key: i for i, key in enumerate(ids)})
+    row = {photograph.name: number for number, photograph in enumerate(photographs)}
+    rows = {
+        image.image_id: [row[lens.name(image.name)] for lens in loaded.views[image.camera_id]]
+        for image in loaded.images
+        if image.image_id in ids
+    }
+    points, dropped = sparse_points(loaded, rows)
     lenses = [photograph.lens for photograph in photographs]
     findings += dropped + lens_findings(lenses)
     findings += header_findings([(item.image, item.lens.source_size) for item in photographs])
@@ -112,8 +120,9 @@ def _photographs(
     *,
     depth_folder: Path | None,
     findings: list[Finding],
-) -> tuple[list[Photograph], list[int]]:
-    photographs, ids, absent, unmasked = [], [], [], 0
+) -> tuple[list[Photograph], set[int]]:
+    """The photographs in natural order of their names, and the ids of the images on disk."""
+    photographs, ids, absent, unmasked = list[Photograph](), set[int](), list[str](), 0
     for image in model.images:
         path = image_folder / image.name
         if not path.is_file():
@@ -125,18 +134,19 @@ def _photographs(
             mask = None
         depth = None if depth_folder is None else _depth_file(depth_folder, image.name)
         reader = read_depth_map if depth is not None and depth.suffix == ".bin" else read_depth
-        photographs.append(
+        photographs += [
             Photograph(
-                image.name,
+                lens.name(image.name),
                 path,
-                model.lenses[image.camera_id],
-                image.cam_from_world,
+                lens,
+                lens.pose(image.cam_from_world),
                 mask,
                 depth,
                 reader,
             )
-        )
-        ids.append(image.image_id)
+            for lens in model.views[image.camera_id]
+        ]
+        ids.add(image.image_id)
     if not photographs:
         raise ProjectError(
             f"{image_folder}: none of the model's {len(model.images)} registered images is there "
@@ -151,7 +161,7 @@ def _photographs(
             )
         )
     findings += mask_findings(unmasked, mask_folder)
-    return photographs, ids
+    return sorted(photographs, key=lambda item: natural_key(item.name)), ids
 
 
 def _depth_file(folder: Path, name: str) -> Path | None:
@@ -191,7 +201,7 @@ def _registered_findings(image_folder: Path, model: ColmapModel) -> list[Finding
         for name in files:
             if name.lower().endswith(IMAGE_SUFFIXES):
                 others += (relative / name).as_posix() not in known
-    models = Counter(lens.model for lens in model.lenses.values())
+    models = Counter(views[0].model for views in model.views.values())
     cameras = ", ".join(f"{count} {name}" for name, count in sorted(models.items()))
     line = f"{len(known)} of {others + len(known)} pictures registered; cameras: {cameras}"
     return [Finding("warning" if others > len(known) else "info", line)]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import rigid_transform
 from gvtools.errors import ProjectError
 from gvtools.scenes.colmap_files import ModelFiles, check_cameras, model_files, text_names
+from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.photographs import rotation_findings
 from gvtools.scenes.scene import Finding, SparsePoints, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
@@ -55,23 +56,34 @@ class ColmapModel:
     Attributes:
         files: where it was read.
         images: registered images, in natural order of their names.
-        lenses: for each camera that a registered image uses, its way to a pinhole camera.
+        views: for each camera that a registered image uses, its ways to a pinhole camera.
         reconstruction: pycolmap's own object.
         findings: what was met.
     """
 
     files: ModelFiles
     images: tuple[RegisteredImage, ...]
-    lenses: dict[int, Undistortion]
+    views: dict[int, tuple[Undistortion, ...]]
     reconstruction: pycolmap.Reconstruction
     findings: tuple[Finding, ...]
 
+    @property
+    def lenses(self) -> dict[int, Undistortion]:
+        """The one way of each camera of a model that was loaded without faces."""
+        return {key: lens for key, (lens,) in self.views.items()}
 
-def load_model(folder: Path) -> ColmapModel:
+
+def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
     """The model in ``folder``, binary or text, classic or with rigs and frames.
 
+    Args:
+        folder: holds its files.
+        faces: cameras that see too much for one pinhole camera become several views, see
+            ``faces``; without, each camera is one.
+
     Raises:
-        ProjectError: damaged, incomplete, without registered image, or with a spherical camera.
+        ProjectError: damaged, incomplete, without registered image, or with a spherical camera
+            and without faces.
         ShapeError: a pose with NaN.
     """
     files = model_files(folder)
@@ -98,16 +110,16 @@ def load_model(folder: Path) -> ColmapModel:
     unused = sorted(set(reconstruction.cameras) - used)
     if unused:
         findings.append(Finding("info", f"{len(unused)} cameras of the model are used by no image"))
-    lenses = {
-        key: undistortion(
-            reconstruction.cameras[key].model_name,
-            reconstruction.cameras[key].params,
-            (reconstruction.cameras[key].width, reconstruction.cameras[key].height),
-            what=f"{folder}, camera {key}",
-        )
-        for key in sorted(used)
-    }
-    return ColmapModel(files, images, lenses, reconstruction, tuple(findings))
+    views: dict[int, tuple[Undistortion, ...]] = {}
+    for key in sorted(used):
+        camera = reconstruction.cameras[key]
+        size = camera.width, camera.height
+        what = f"{folder}, camera {key}"
+        if faces:
+            views[key] = perspective_views(camera.model_name, camera.params, size, what=what)
+        else:
+            views[key] = (undistortion(camera.model_name, camera.params, size, what=what),)
+    return ColmapModel(files, images, views, reconstruction, tuple(findings))
 
 
 def _read(files: ModelFiles) -> pycolmap.Reconstruction:
@@ -175,13 +187,14 @@ def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def sparse_points(
-    model: ColmapModel, view_of_image: dict[int, int]
+    model: ColmapModel, views_of_image: dict[int, list[int]]
 ) -> tuple[SparsePoints | None, list[Finding]]:
     """The model's points with their tracks in the views' pinhole pixels.
 
     Args:
         model: a loaded model.
-        view_of_image: for the model's image ids, the views' indices.
+        views_of_image: for the model's image ids, the indices of their views, in the order of
+            the camera's ``views``.
 
     Returns:
         The points ordered by id (None when the model has none), and what was dropped.
@@ -193,7 +206,7 @@ def sparse_points(
     if not len(points):
         return None, [Finding("info", "the model has no sparse points")]
     ids = np.array(sorted(points), np.uint64)
-    tracks = [_observations(model, image, view_of_image, ids=ids) for image in model.images]
+    tracks = [_observations(model, image, views_of_image, ids=ids) for image in model.images]
     point = np.concatenate([track[0] for track in tracks])
     view = np.concatenate([track[1] for track in tracks])
     xy = np.concatenate([track[2] for track in tracks])
@@ -233,17 +246,16 @@ def sparse_points(
 def _observations(
     model: ColmapModel,
     image: RegisteredImage,
-    view_of_image: dict[int, int],
+    views_of_image: dict[int, list[int]],
     *,
     ids: NDArray[np.uint64],
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
     """Point index, view index and pinhole pixels of all that one image saw."""
-    if image.image_id not in view_of_image:
+    if image.image_id not in views_of_image:
         return np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2))
     seen = model.reconstruction.images[image.image_id].get_observation_points2D()
     keys = np.fromiter((point.point3D_id for point in seen), np.uint64, len(seen))
     xy = np.array([point.xy for point in seen], np.float64).reshape(-1, 2)
-    view = np.full(len(seen), view_of_image[image.image_id], np.int32)
     point_index = np.minimum(np.searchsorted(ids, keys), len(ids) - 1).astype(np.int32)
     strange = int((ids[point_index] != keys).sum())
     if strange:
@@ -251,4 +263,8 @@ def _observations(
             f"{model.files.folder}: {strange} detections of image {image.name} name points that "
             "points3D does not hold; expected files of one model; export the model again"
         )
-    return point_index, view, model.lenses[image.camera_id].points(xy)
+    rows = views_of_image[image.image_id]
+    places = np.stack([lens.points(xy) for lens in model.views[image.camera_id]])
+    # Faces meet at their sides: the first that shows a detection takes it.
+    shown = np.isfinite(places).all(-1).argmax(0)
+    return point_index, np.array(rows, np.int32)[shown], places[shown, np.arange(len(xy))]

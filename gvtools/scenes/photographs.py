@@ -105,7 +105,7 @@ class Photograph:
         depth = self.read_depth(self.depth)
         if self.registration is None:
             depth = fit_depth(depth, *self.lens.source_size, path=self.depth)
-            return np.ascontiguousarray(self.lens.nearest(depth))
+            return np.ascontiguousarray(self.lens.depth(depth))
         from gvtools.scenes.registration import register_depth
 
         width, height = self.lens.size
@@ -153,7 +153,7 @@ def header_findings(pictures: Sequence[tuple[Path, tuple[int, int]]]) -> list[Fi
     """
     findings: list[Finding] = []
     headers: list[ImageHeader] = []
-    for path, expected in pictures:
+    for path, expected in dict.fromkeys(pictures):
         try:
             header = read_header(path)
             check_size(
@@ -220,7 +220,8 @@ def lens_findings(lenses: Sequence[Undistortion]) -> list[Finding]:
     for lens in lenses:
         if not lens.untouched:
             (w, h), (width, height) = lens.source_size, lens.size
-            counts[f"{lens.model} {w}x{h} undistorted to PINHOLE {width}x{height}"] += 1
+            way = "cut into" if lens.name("") else "undistorted to"
+            counts[f"{lens.model} {w}x{h} {way} PINHOLE {width}x{height}"] += 1
     for line, count in sorted(counts.items()):
         findings.append(Finding("info", f"{line} ({count} views)"))
     sizes = sorted({lens.size for lens in lenses})

@@ -3,16 +3,20 @@
 A selection is one of ``all``, ``every:K``, ``every:K+OFFSET``, ``first:N``, ``last:N``,
 ``range:A-B`` (indices from 0, both ends included), ``not:SPEC``, image names with commas between
 them, or ``@file`` with one name a line. Where names have commas, the longest that fits is taken.
+
+Several views of one picture (``room@front.jpg``, ``room@left.jpg``, see ``faces``) count as one, so
+that a split never stands between them; ``room.jpg`` names all of them.
 """
 
 from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gvtools.errors import OptionError
+from gvtools.scenes.faces import picture_of
 
 GRAMMAR = "all, every:K, every:K+OFFSET, first:N, last:N, range:A-B, not:SPEC, names, or @file"
 _KEYWORDS = ("every", "first", "last", "range", "not")
@@ -35,27 +39,34 @@ def select(names: Sequence[str], spec: str) -> tuple[str, ...]:
     Raises:
         OptionError: an unknown form or name, or a selection of nothing.
     """
-    chosen = _chosen(names, spec.strip(), spec)
+    pictures: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        pictures.setdefault(picture_of(name), []).append(i)
+    chosen = _chosen(names, pictures, spec.strip(), whole=spec)
     if not chosen:
         raise OptionError(f"selection {spec!r}: none of {len(names)} views; expected at least one")
     return tuple(names[i] for i in sorted(chosen))
 
 
-def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
-    count = len(names)
+def _chosen(
+    names: Sequence[str], pictures: Mapping[str, list[int]], spec: str, *, whole: str
+) -> set[int]:
+    """Numbers of views; ``pictures`` holds those of each picture."""
+    everything = set(range(len(names)))
     if spec == "all":
-        return set(range(count))
+        return everything
+    index = {**pictures, **{name: [i] for i, name in enumerate(names)}}
     if spec.startswith("@"):
-        return _by_name(names, _lines(Path(spec[1:])), f"{spec[1:]}")
+        return _by_name(index, _lines(Path(spec[1:])), f"{spec[1:]}")
     # Views' own names win over a form that looks like them.
-    if spec in names:
-        return {names.index(spec)}
+    if spec in index:
+        return set(index[spec])
     keyword, colon, rest = spec.partition(":")
     if keyword == "not" and colon:
-        return set(range(count)) - _chosen(names, rest.strip(), whole)
-    listed = _listed(names, spec)
-    if not colon or not set(names).isdisjoint(listed):
-        return _by_name(names, listed, f"selection {whole!r}")
+        return everything - _chosen(names, pictures, rest.strip(), whole=whole)
+    listed = _listed(tuple(index), spec)
+    if not colon or not index.keys().isdisjoint(listed):
+        return _by_name(index, listed, f"selection {whole!r}")
     if keyword not in _FORMS:
         near = difflib.get_close_matches(keyword, _KEYWORDS, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"expected {GRAMMAR}"
@@ -64,7 +75,9 @@ def _chosen(names: Sequence[str], spec: str, whole: str) -> set[int]:
     if match is None:
         raise OptionError(f"selection {whole!r}: {rest!r} after {keyword!r}; expected {GRAMMAR}")
     numbers = [int(group) for group in match.groups(default="0")]
-    return _counted(keyword, numbers, count, whole=whole)
+    rows = list(pictures.values())
+    counted = _counted(keyword, numbers, len(rows), whole=whole)
+    return {i for number in counted for i in rows[number]}
 
 
 def _counted(keyword: str, numbers: list[int], count: int, *, whole: str) -> set[int]:
@@ -87,16 +100,15 @@ def _counted(keyword: str, numbers: list[int], count: int, *, whole: str) -> set
     return set(range(number)) if keyword == "first" else set(range(count - number, count))
 
 
-def _by_name(names: Sequence[str], listed: Sequence[str], what: str) -> set[int]:
-    index = {name: i for i, name in enumerate(names)}
+def _by_name(index: Mapping[str, list[int]], listed: Sequence[str], what: str) -> set[int]:
     wanted = [name for name in listed if name]
     unknown = [name for name in wanted if name not in index]
     if unknown:
-        near = difflib.get_close_matches(unknown[0], [*names, *_EXAMPLES], n=1, cutoff=0.4)
+        near = difflib.get_close_matches(unknown[0], [*index, *_EXAMPLES], n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"expected {GRAMMAR}"
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
-        raise OptionError(f"{what}: no view named {unknown[0]!r}{more} among {len(names)}; {hint}")
-    return {index[name] for name in wanted}
+        raise OptionError(f"{what}: no view named {unknown[0]!r}{more} among {len(index)}; {hint}")
+    return {i for name in wanted for i in index[name]}
 
 
 def _listed(names: Sequence[str], spec: str) -> list[str]:
@@ -124,11 +136,13 @@ def _lines(path: Path) -> list[str]:
 def check_disjoint(context: Sequence[str], targets: Sequence[str]) -> None:
     """Refuse targets that are context as well, since their figures would be of seen pictures.
 
+    Views of one picture count as one: its faces may overlap.
+
     Raises:
         OptionError: the two overlap.
     """
-    seen = set(context)
-    both = [name for name in targets if name in seen]
+    seen = {picture_of(name) for name in context}
+    both = [name for name in targets if picture_of(name) in seen]
     if both:
         raise OptionError(
             f"context and targets overlap in {len(both)} views ({len(context)} context, "

@@ -14,6 +14,7 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import BaseModel, Field, ValidationError
 
 from gvtools.errors import ProjectError
+from gvtools.scenes.faces import PANORAMA
 from gvtools.scenes.images import read_header
 
 # nerfstudio's names; the fisheye ones share one model, the others the polynomial one.
@@ -86,6 +87,8 @@ class FrameKeys(BaseModel):
             size[0] / 2 if self.cx is None else self.cx,
             size[1] / 2 if self.cy is None else self.cy,
         )
+        if self.camera_model == PANORAMA:
+            return LensParameters(PANORAMA, (float(size[0]), float(size[1])), size)
         shared: tuple[float, ...] = (*self._focal(size[0], what), *center)
         named = self.camera_model
         if named in FISHEYE or (not named and self.is_fisheye):
@@ -94,9 +97,9 @@ class FrameKeys(BaseModel):
             )
         if named not in PERSPECTIVE:
             raise ProjectError(
-                f"{what}: the camera model {named} has no pinhole image; expected one of "
-                f"{', '.join(name for name in (*PERSPECTIVE, *FISHEYE) if name)}; render "
-                "perspective views first"
+                f"{what}: the camera model {named} is not read; expected one of "
+                f"{', '.join(name for name in (*PERSPECTIVE, *FISHEYE, PANORAMA) if name)}; "
+                "render perspective views first"
             )
         if self.k4:
             raise ProjectError(

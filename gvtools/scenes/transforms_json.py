@@ -18,6 +18,7 @@ import numpy as np
 from gvtools.cameras import Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
+from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.images import read_depth
 from gvtools.scenes.photographs import (
     Photograph,
@@ -30,7 +31,7 @@ from gvtools.scenes.photographs import (
 )
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.transforms_frame import FrameKeys, LensParameters, frame_keys
-from gvtools.scenes.undistort import Undistortion, undistortion
+from gvtools.scenes.undistort import Undistortion
 
 FILE = "transforms.json"
 EXPORTER = "gvtools"  # the value of ``exported_by`` in files written here
@@ -42,7 +43,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     """The project of a ``transforms.json``.
 
     Intrinsics may be shared or stand in each frame, as ``fl_x`` or as ``camera_angle_x``.
-    Distorted cameras become pinhole cameras; depth (``depth_file_path``, times
+    Distorted cameras become pinhole cameras, panoramas and wide fisheyes several (``faces``); depth (``depth_file_path``, times
     ``depth_unit_scale_factor``, 1e-3 when absent) and masks (``mask_path``, black = ignore) go
     through the same mapping. Views are named by their path below the deepest folder they share.
 
@@ -55,8 +56,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
         The scene, in the file's world frame and scale.
 
     Raises:
-        ProjectError: no such file or folder, malformed, without frames on disk, or a spherical
-            camera.
+        ProjectError: no such file or folder, malformed, or without frames on disk.
         ShapeError: a pose with NaN, a scale or a mirror.
     """
     path = Path(path)
@@ -102,8 +102,8 @@ def _photographs(
 
     ``files`` holds each frame's name and picture; ``findings`` is added to.
     """
-    lenses: dict[LensParameters, Undistortion] = {}
-    photographs, absent, defects, unmasked = [], [], [], 0
+    lenses: dict[LensParameters, tuple[Undistortion, ...]] = {}
+    photographs, absent, defects, unmasked = list[Photograph](), [], [], 0
     for i, (frame, (name, file)) in enumerate(zip(data["frames"], files, strict=True)):
         what = f"{path}, frame {i} ({name})"
         if not os.path.isfile(file):
@@ -112,7 +112,7 @@ def _photographs(
         keys = frame_keys(frame, data, what=what)
         cam_from_world, defect = _pose(keys, what)
         defects.append(defect)
-        lens = _lens(keys, file, lenses, what=what)
+        views = _views(keys, file, lenses, what=what)
         mask = _beside(path.parent, keys.mask_path)
         depth = _beside(path.parent, keys.depth_file_path)
         lost = [item.name for item in (mask, depth) if item and not os.path.isfile(item)]
@@ -121,17 +121,18 @@ def _photographs(
         if mask is None and masks is not None:
             mask = masks / f"{name}.png"
             unmasked += not os.path.isfile(mask)
-        photographs.append(
+        photographs += [
             Photograph(
-                name,
+                lens.name(name),
                 file,
                 lens,
-                cam_from_world,
+                lens.pose(cam_from_world),
                 mask if mask and os.path.isfile(mask) else None,
                 depth if depth and os.path.isfile(depth) else None,
                 partial(read_depth, unit=keys.depth_unit_scale_factor),
             )
-        )
+            for lens in views
+        ]
     findings += mask_findings(unmasked, masks)
     return photographs, absent, defects
 
@@ -145,7 +146,7 @@ def read_transforms_cameras(path: Path) -> Cameras:
         path: the file.
 
     Returns:
-        One camera a frame, in the order of names as ``read_transforms`` has it.
+        One camera a perspective view of a frame, in the order of names as ``read_transforms`` has it.
 
     Raises:
         ProjectError: no such file, malformed, or a camera whose picture's size nothing tells.
@@ -155,20 +156,17 @@ def read_transforms_cameras(path: Path) -> Cameras:
     frames = data["frames"]
     files = [_picture(path.parent, frame, f"{path}, frame {i}") for i, frame in enumerate(frames)]
     names = _names(files)
-    lenses: dict[LensParameters, Undistortion] = {}
-    K, poses, sizes = [], [], []
-    order = sorted(range(len(frames)), key=lambda i: natural_key(names[i]))
-    for i in order:
+    lenses: dict[LensParameters, tuple[Undistortion, ...]] = {}
+    found = []
+    for i, frame in enumerate(frames):
         what = f"{path}, frame {i} ({names[i]})"
-        keys = frame_keys(frames[i], data, what=what)
-        lens = _lens(keys, files[i], lenses, what=what)
-        K.append(lens.K)
-        poses.append(_pose(keys, what)[0])
-        sizes.append(lens.size)
-    width, height = np.array(sizes).T
-    return Cameras(
-        np.array(K), np.array(poses), width, height, tuple(names[i] for i in order)
-    )  # fmt: skip
+        keys = frame_keys(frame, data, what=what)
+        pose = _pose(keys, what)[0]
+        for lens in _views(keys, files[i], lenses, what=what):
+            found.append((lens.name(names[i]), lens.K, lens.pose(pose), *lens.size))
+    found.sort(key=lambda camera: natural_key(camera[0]))
+    names, K, poses, width, height = zip(*found, strict=True)
+    return Cameras(np.array(K), np.array(poses), np.array(width), np.array(height), names)
 
 
 def write_transforms(
@@ -272,13 +270,17 @@ def _pose(keys: FrameKeys, what: str) -> tuple[np.ndarray, float]:
     return invert_rigid(pose @ OPENCV_FROM_OPENGL), defect
 
 
-def _lens(
-    keys: FrameKeys, file: Path, lenses: dict[LensParameters, Undistortion], *, what: str
-) -> Undistortion:
-    """A frame's lens, one object for all frames that share it; ``lenses`` is added to."""
+def _views(
+    keys: FrameKeys,
+    file: Path,
+    lenses: dict[LensParameters, tuple[Undistortion, ...]],
+    *,
+    what: str,
+) -> tuple[Undistortion, ...]:
+    """A frame's perspective views, the same for all frames of its lens; ``lenses`` is added to."""
     params = keys.lens(file, what=what)
     if params not in lenses:
-        lenses[params] = undistortion(params.model, params.values, params.size, what=what)
+        lenses[params] = perspective_views(params.model, params.values, params.size, what=what)
     return lenses[params]
 
 

@@ -58,6 +58,18 @@ class Undistortion:
         """COLMAP's name of the recorded camera's model."""
         return str(self.source.model_name)
 
+    def name(self, picture: str) -> str:
+        """The view's name, from the picture's."""
+        return picture
+
+    def pose(self, cam_from_world: ArrayLike) -> NDArray[np.float64]:
+        """(4, 4) cam_from_world of the pinhole camera, from the recorded camera's."""
+        return np.asarray(cam_from_world, np.float64)
+
+    def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(h, w) recorded depth as (H, W) z-depth of the pinhole camera, by nearest pixel."""
+        return self.nearest(depth)
+
     def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(h, w, 3) uint8 recorded picture as (H, W, 3) uint8 of the pinhole camera, bilinear."""
         import pycolmap
@@ -141,30 +153,17 @@ def undistortion(
     """
     import pycolmap
 
-    if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
-        raise ProjectError(
-            f"{what}: unknown camera model {model!r}; expected one of COLMAP's: "
-            + ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
-        )
-    width, height = (int(value) for value in size)
-    values = [float(value) for value in params]
-    camera = pycolmap.Camera(model=model, width=width, height=height, params=values)
+    camera = camera_of(model, params, size, what=what)
     if not camera.is_perspective():
         raise ProjectError(
             f"{what}: the camera model {model} is spherical and has no pinhole image; expected a "
-            "perspective model; render perspective views of the panoramas first"
-        )
-    wrong = _impossible(camera)
-    if wrong:
-        raise ProjectError(
-            f"{what}: {model} {width}x{height} with parameters {values} {wrong}; "
-            f"expected {camera.params_info}; solve or export the model again"
+            "perspective model; give the panoramas as a COLMAP or transforms.json project"
         )
     if camera.is_perspective_pinhole() and camera.is_undistorted():
         target = pycolmap.Camera(
             model="PINHOLE",
-            width=width,
-            height=height,
+            width=camera.width,
+            height=camera.height,
             params=[
                 camera.focal_length_x,
                 camera.focal_length_y,
@@ -176,8 +175,47 @@ def undistortion(
     try:
         target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     except (ValueError, RuntimeError) as error:
-        raise ProjectError(f"{what}: {model} {values} cannot be undistorted ({error})") from None
+        raise ProjectError(
+            f"{what}: {model} {list(params)} cannot be undistorted ({error})"
+        ) from None
     return Undistortion(camera, target, False)
+
+
+def camera_of(
+    model: str,
+    params: Sequence[float] | NDArray[np.float64],
+    size: tuple[int, int],
+    *,
+    what: str,
+) -> pycolmap.Camera:
+    """A camera of COLMAP from its model's name and parameters, checked.
+
+    Args:
+        model: one of COLMAP's camera models.
+        params: its parameters, in COLMAP's order.
+        size: width and height, pixels.
+        what: where the camera was read, for the message.
+
+    Raises:
+        ProjectError: an unknown model, or impossible parameters.
+    """
+    import pycolmap
+
+    if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
+        raise ProjectError(
+            f"{what}: unknown camera model {model!r}; expected one of COLMAP's: "
+            + ", ".join(name for name in pycolmap.CameraModelId.__members__ if name != "INVALID")
+        )
+    width, height = (int(value) for value in size)
+    values = [float(value) for value in params]
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=values)
+    wrong = _impossible(camera)
+    if wrong:
+        raise ProjectError(
+            f"{what}: {model} {width}x{height} with parameters {values} {wrong}; "
+            f"expected {camera.params_info}; solve or export the model again"
+        )
+    return camera
 
 
 def _impossible(camera: pycolmap.Camera) -> str:
@@ -188,6 +226,6 @@ def _impossible(camera: pycolmap.Camera) -> str:
         return "holds NaN or infinity"
     if min(camera.width, camera.height) < 1 or max(camera.width, camera.height) > 1_000_000:
         return "has an impossible size"
-    if min(camera.focal_length_x, camera.focal_length_y) <= 0:
+    if camera.is_perspective() and min(camera.focal_length_x, camera.focal_length_y) <= 0:
         return "has a focal length that is not positive"
     return ""

@@ -61,7 +61,7 @@ def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = Non
         from gvtools.cameras import invert_rigid
         from gvtools.scenes.colmap_model import load_model
 
-        images = load_model(model).images
+        images = load_model(model, faces=True).images
         poses = invert_rigid(np.array([image.cam_from_world for image in images]))
         return Trajectory(poses, tuple(image.name for image in images))
     from gvtools.scenes.project import open_project

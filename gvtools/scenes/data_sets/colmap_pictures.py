@@ -72,10 +72,10 @@ def colmap_scene(
         root, pictures, poses="cam_from_world", metric=metric, findings=model.findings
     )
     index = {name: i for i, name in enumerate(scene.names)}
-    view_of_image = {
-        image.image_id: index[image.name] for image in model.images if image.name in index
+    views_of_image = {
+        image.image_id: [index[image.name]] for image in model.images if image.name in index
     }
-    points, findings = sparse_points(model, view_of_image)
+    points, findings = sparse_points(model, views_of_image)
     if points is not None:
         points = _resized(points, model, scene)
     return replace(scene, points=points, findings=(*scene.findings, *findings), kind="colmap")
