@@ -38,6 +38,7 @@ DOCTESTED = (
     "gvtools.scenes.data_sets.posed_pictures",
     "gvtools.scenes.data_sets.spec",
     "gvtools.scenes.data_sets.spring",
+    "gvtools.scenes.faces",
     "gvtools.scenes.inspection",
     "gvtools.settings.base",
     "gvtools.system_libraries",

@@ -18,11 +18,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from gvtools.capture import learned_matching
-from gvtools.capture.pairs import sift_descriptors, similar_pairs
+from gvtools.capture.matching import SEED, all_flat, match_pictures, verified
 from gvtools.errors import ProjectError
 
 if TYPE_CHECKING:
@@ -30,15 +26,9 @@ if TYPE_CHECKING:
 
     import pycolmap
 
+    from gvtools.capture.panoramas import FaceRig
     from gvtools.evaluation.pose_probe.features import FeatureMatcher
 
-# Up to this many pictures, every pair is matched; fewer with LightGlue, which takes a second a pair
-# on a processor.
-EXHAUSTIVE, EXHAUSTIVE_LEARNED = 60, 30
-# A frame of a video is matched with this many after it, and with those 16, 32, 64 and 128 later.
-SEQUENTIAL_OVERLAP = 10
-# Most features of a picture, and the longer side that it is reduced to before, pixels.
-MAX_FEATURES, MAX_SIDE = 8192, 1600
 # Where a smaller share of the verified matches became points of the global model, it is compared
 # with an incremental one.
 ENOUGH = 0.9
@@ -49,7 +39,9 @@ LEAST_POINTS = 30
 # Principal points are refined where every camera took at least this many pictures; fewer do not
 # determine them.
 REFINED_FROM = 8
-SEED = 1
+# Detections that a point misses by more are dropped [px]: lenses of 180 degrees and more have no
+# finite projection near 90 degrees off the axis.
+LOST = 64.0
 
 Say = Callable[[str], object]
 
@@ -84,6 +76,8 @@ def find_cameras(
     in_order: bool = False,
     masks: Path | None = None,
     learned: FeatureMatcher | None = None,
+    rigs: Sequence[FaceRig] = (),
+    fisheye: str = "",
     say: Say = lambda text: None,
 ) -> Mapped:
     """Find intrinsics and poses of pictures.
@@ -98,6 +92,9 @@ def find_cameras(
         masks: folder of masks as COLMAP has them, ``a.jpg.png`` for ``a.jpg``, black where no
             features are to be found; None for none.
         learned: finds and matches features; None takes COLMAP's SIFT.
+        rigs: faces of panoramas, whose names ``cameras`` holds face by face; their intrinsics and
+            turns are given and stay.
+        fisheye: parameters of OPENCV_FISHEYE to start from, of pictures by such a lens.
         say: is called with a line of text at each step.
 
     Raises:
@@ -107,34 +104,19 @@ def find_cameras(
 
     with _quiet():
         pycolmap.set_random_seed(SEED)
-        database = work / "database.db"
-        names = [name for group in cameras for name in group]
-        say(f"finding features in {len(names)} pictures")
-        if learned is None:
-            for group in cameras:
-                _extract(database, images, group, masks=masks)
-            matching = _match(database, work, count=len(names), in_order=in_order, say=say)
-        else:
-            pycolmap.Database.open(database).close()
-            for group in cameras:
-                pycolmap.import_images(
-                    database, images, pycolmap.CameraMode.SINGLE, image_names=list(group)
-                )
-            features = learned_matching.extract(images, names, learned, masks=masks, say=say)
-            learned_matching.write_keypoints(database, features)
-            described = {name: found.descriptors for name, found in features.items()}
-            chosen, matching = _chosen(described, EXHAUSTIVE_LEARNED, in_order=in_order)
-            say(f"matching {len(chosen)} pairs")
-            learned_matching.write_matches(database, features, chosen, matcher=learned, say=say)
-            pycolmap.verify_matches(database, _listed(chosen, work), _verification())
-        pairs = _verified(database)
+        say(f"finding features in {sum(map(len, cameras))} pictures")
+        database, matching = match_pictures(
+            images, cameras, work=work, in_order=in_order, masks=masks, learned=learned,
+            rigs=rigs, fisheye=fisheye, say=say,
+        )  # fmt: skip
+        pairs = verified(database)
         if not pairs:
             raise ProjectError(
-                f"{source or images}: no two of the {len(names)} pictures show enough of the same; "
-                "expected neighbours that share at least half of what they show; take more "
-                "pictures between these, and sharp ones"
+                f"{source or images}: no two of the {sum(map(len, cameras))} pictures show enough "
+                "of the same; expected neighbours that share at least half of what they show; "
+                "take more pictures between these, and sharp ones"
             )
-        if _all_flat(database):
+        if all_flat(database):
             raise ProjectError(
                 f"{source or images}: {len(pairs)} pairs of pictures overlap, and each shows the "
                 "other's plane alone: the camera only turned or zoomed, or the scene is flat; "
@@ -142,7 +124,7 @@ def find_cameras(
                 "while walking"
             )
         say(f"finding cameras from {len(pairs)} pairs that overlap")
-        found = _map(database, images, work, pairs=pairs, say=say)
+        found = _map(database, images, work, pairs=pairs, refine=not rigs, say=say)
     if not found:
         best = max(pairs, key=lambda pair: pairs[pair])
         raise ProjectError(
@@ -159,111 +141,18 @@ def find_cameras(
     return Mapped(largest, how, others, matching, pairs=pairs, explained=share)
 
 
-def _extract(database: Path, images: Path, names: Sequence[str], *, masks: Path | None) -> None:
-    import pycolmap
-
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = MAX_SIDE
-    options.sift.max_num_features = MAX_FEATURES
-    reader = pycolmap.ImageReaderOptions()
-    if masks is not None:
-        reader.mask_path = masks
-    pycolmap.extract_features(
-        database, images, image_names=list(names), camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reader, extraction_options=options, device=pycolmap.Device.auto,
-    )  # fmt: skip
-
-
-def _match(database: Path, work: Path, *, count: int, in_order: bool, say: Say) -> str:
-    """Match SIFT of pairs of pictures; returns in words how the pairs were chosen."""
-    import pycolmap
-
-    if count <= EXHAUSTIVE:
-        say(f"matching all {count * (count - 1) // 2} pairs")
-        pycolmap.match_exhaustive(database, verification_options=_verification())
-        return "all pairs"
-    pairs, how = _chosen(sift_descriptors(database), EXHAUSTIVE, in_order=in_order)
-    say(f"matching {len(pairs)} pairs")
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = _listed(pairs, work)
-    pycolmap.match_image_pairs(
-        database, pairing_options=pairing, verification_options=_verification()
-    )
-    return how
-
-
-def _chosen(
-    described: Mapping[str, NDArray[np.float32]], exhaustive: int, *, in_order: bool
-) -> tuple[list[tuple[str, str]], str]:
-    """The pairs of pictures to match, and in words how they were chosen.
-
-    Args:
-        described: (N, D) descriptors of each picture by name.
-        exhaustive: up to how many pictures every pair is taken.
-        in_order: see ``find_cameras``.
-    """
-    names = sorted(described)
-    if len(names) <= exhaustive:
-        return list(combinations(names, 2)), "all pairs"
-    pairs = set(similar_pairs(described))
-    how = f"each picture with the {len(pairs) * 2 // len(names)} most similar"
-    if in_order:
-        steps = {*range(1, SEQUENTIAL_OVERLAP + 1), *(2**k for k in range(4, 8))}
-        pairs |= {
-            (names[i], names[i + step])
-            for i in range(len(names))
-            for step in steps
-            if i + step < len(names)
-        }
-        how = f"neighbours in time, and {how}"
-    return sorted(pairs), how
-
-
-def _listed(pairs: Sequence[tuple[str, str]], work: Path) -> Path:
-    """A file with the pairs, as COLMAP reads them."""
-    file = work / "pairs.txt"
-    file.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
-    return file
-
-
-def _verification() -> pycolmap.TwoViewGeometryOptions:
-    import pycolmap
-
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = SEED
-    return options
-
-
-def _verified(database: Path) -> dict[tuple[str, str], int]:
-    """Pairs of pictures that overlap, with the number of their verified matches."""
-    import pycolmap
-
-    with pycolmap.Database.open(database) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        numbers, counts = opened.read_two_view_geometry_num_inliers()
-    found = {}
-    for number, count in zip(numbers, counts, strict=True):
-        if count > 0:
-            a, b = pycolmap.pair_id_to_image_pair(number)
-            found[names[a], names[b]] = int(count)
-    return found
-
-
-def _all_flat(database: Path) -> bool:
-    """Whether a homography explains every pair, so that mapping would have no depth to go by."""
-    import pycolmap
-
-    kinds = pycolmap.TwoViewGeometryConfiguration
-    flat = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
-    with pycolmap.Database.open(database) as opened:
-        _, geometries = opened.read_two_view_geometries()
-    return all(found.config in flat for found in geometries if len(found.inlier_matches))
-
-
 def _map(
-    database: Path, images: Path, work: Path, *, pairs: Mapping[tuple[str, str], int], say: Say
+    database: Path,
+    images: Path,
+    work: Path,
+    *,
+    pairs: Mapping[tuple[str, str], int],
+    refine: bool,
+    say: Say,
 ) -> tuple[str, list[pycolmap.Reconstruction], float] | None:
     """The better of global and incremental mapping; None where neither gives a model.
+
+    ``refine`` says whether intrinsics are open; those of faces are not, nor are their turns.
 
     Returns:
         "global" or "incremental", its models, and ``explained`` of the largest of them.
@@ -272,10 +161,14 @@ def _map(
 
     settings = pycolmap.GlobalPipelineOptions()
     settings.random_seed = SEED
+    if not refine:
+        settings.mapper.refine_sensor_from_rig = False
+        _fix_cameras(settings.mapper.bundle_adjustment)
     best = None
     models = _models(
-        pycolmap.global_mapping, database, images, out=work / "global", options=settings
-    )
+        pycolmap.global_mapping, database, images, out=work / "global", options=settings,
+        refine=refine,
+    )  # fmt: skip
     if models:
         share = explained(_largest(models), pairs)
         best = "global", models, share
@@ -288,9 +181,14 @@ def _map(
     pipeline.random_seed = SEED
     # COLMAP's default drops models of fewer than 10 pictures.
     pipeline.min_model_size = 2
+    if not refine:
+        pipeline.ba_refine_focal_length = False
+        pipeline.ba_refine_extra_params = False
+        pipeline.ba_refine_sensor_from_rig = False
     models = _models(
-        pycolmap.incremental_mapping, database, images, out=work / "incremental", options=pipeline
-    )
+        pycolmap.incremental_mapping, database, images, out=work / "incremental",
+        options=pipeline, refine=refine,
+    )  # fmt: skip
     if models:
         share = explained(_largest(models), pairs)
         if best is None or share > best[2]:
@@ -321,7 +219,7 @@ def explained(model: pycolmap.Reconstruction, pairs: Mapping[tuple[str, str], in
 
 
 def _models(
-    mapping: Any, database: Path, images: Path, *, out: Path, options: Any
+    mapping: Any, database: Path, images: Path, *, out: Path, options: Any, refine: bool
 ) -> list[pycolmap.Reconstruction]:
     """The models with at least two pictures that a mapping makes; none if it fails."""
     out.mkdir()
@@ -331,28 +229,43 @@ def _models(
         return []
     models = [model for model in found.values() if model.num_reg_images() >= 2]
     for model in models:
-        _settle(model)
+        _settle(model, refine=refine)
     return [model for model in models if model.num_reg_images() >= 2]
 
 
-def _settle(model: pycolmap.Reconstruction) -> None:
+def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
     """Deregister pictures that see too few points, then bundle-adjust the rest once more."""
     import pycolmap
 
-    for image in list(model.images.values()):
-        if image.has_pose and image.num_points3D < LEAST_POINTS:
-            model.deregister_frame(image.frame_id)
+    # By frame: of one panorama all faces are registered or none.
+    seen: Counter[int] = Counter()
+    for image in model.images.values():
+        if image.has_pose:
+            seen[image.frame_id] += image.num_points3D
+    for frame, count in seen.items():
+        if count < LEAST_POINTS:
+            model.deregister_frame(frame)
     if model.num_reg_images() < 2:
         return
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
+    if not refine:
+        _fix_cameras(options)
     _adjust(model, options)
     images = [image for image in model.images.values() if image.has_pose]
     counts = [sum(image.camera_id == camera for image in images) for camera in model.cameras]
-    if min(counts) >= REFINED_FROM:
+    if refine and min(counts) >= REFINED_FROM:
         options.refine_principal_point = True
         _adjust(model, options)
+    pycolmap.ObservationManager(model).filter_all_points3D(LOST, 0.0)
     model.update_point_3d_errors()
+
+
+def _fix_cameras(options: pycolmap.BundleAdjustmentOptions) -> None:
+    """Keep intrinsics, and how the cameras of a rig are turned."""
+    options.refine_focal_length = False
+    options.refine_extra_params = False
+    options.refine_sensor_from_rig = False
 
 
 def _adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
+from gvtools.scenes.faces import face_name
 from gvtools.scenes.scene import Finding
 
 if TYPE_CHECKING:
@@ -86,7 +87,8 @@ def place(
 
 
 def _found(model: pycolmap.Reconstruction, name: str) -> NDArray[np.float64] | None:
-    image = model.find_image_with_name(name)
+    # All faces of a panorama are at its place.
+    image = model.find_image_with_name(name) or model.find_image_with_name(face_name(name, "front"))
     return None if image is None or not image.has_pose else np.asarray(image.projection_center())
 
 
@@ -108,7 +110,11 @@ def _by_gps(
         return None, [Finding("info", text)]
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = GPS_ERROR, SEED
-    moved = pycolmap.align_reconstruction_to_locations(model, names, east, LEAST_PLACED, options)
+    fronts = [
+        name if model.find_image_with_name(name) is not None else face_name(name, "front")
+        for name in names
+    ]
+    moved = pycolmap.align_reconstruction_to_locations(model, fronts, east, LEAST_PLACED, options)
     if moved is None:
         text = f"GPS of {len(names)} pictures contradicts the cameras that were found: not used"
         return None, [Finding("warning", text)]
@@ -130,7 +136,8 @@ def _level(model: pycolmap.Reconstruction) -> None:
     images = [image for image in model.images.values() if image.has_pose]
     rotations = np.stack([image.cam_from_world().rotation.matrix() for image in images])
     centres = np.stack([image.projection_center() for image in images])
-    # Row 1 of cam_from_world is the camera's y axis, which points down.
+    # Row 1 of cam_from_world is the camera's y axis, which points down; of a panorama's upper and
+    # lower faces it does not, and the two cancel.
     up = -rotations[:, 1].mean(axis=0)
     if np.linalg.norm(up) < 1e-3:
         return

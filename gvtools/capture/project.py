@@ -9,17 +9,26 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.capture import video
 from gvtools.capture.mapping import Mapped, find_cameras
 from gvtools.capture.masks import complete_masks
+from gvtools.capture.panoramas import (
+    fisheye_params,
+    lens_of,
+    panorama_pairs,
+    rename_faces,
+    write_faces,
+)
 from gvtools.capture.photographs import Photograph, copy_upright, find_photographs
 from gvtools.capture.placement import Placement, place
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import write_json
+from gvtools.scenes.faces import picture_of
 from gvtools.scenes.photographs import named
 from gvtools.scenes.scene import Finding
 
@@ -91,6 +100,7 @@ def capture_photographs(
     masks: Path | None = None,
     distance: tuple[str, str, float] | None = None,
     learned: LightGlueMatcher | None = None,
+    lens: str = "auto",
     say: Say = lambda text: None,
 ) -> CaptureReport:
     """Find the cameras of a folder's photographs, or of a video's frames, and write a project.
@@ -102,6 +112,8 @@ def capture_photographs(
         masks: folder of ``NAME.png``, black where nothing is to be matched; photographs alone.
         distance: names of two pictures and the metres between them.
         learned: finds and matches features; None takes COLMAP's SIFT.
+        lens: "perspective", "equirectangular" (panoramas, which are cut into faces), "fisheye", or
+            "auto", which looks at the pictures.
         say: told of each step.
 
     Raises:
@@ -135,14 +147,12 @@ def capture_photographs(
         photographs, met = find_photographs(folder)
         findings += met
         if masks is not None:
-            findings += complete_masks(photographs, masks, out=work / "masks")
-            masks = work / "masks"
-        copy_upright(photographs, work / IMAGES)
+            findings += complete_masks(photographs, masks, out=work / "whole_masks")
+            masks = work / "whole_masks"
         with _telling(findings):
-            mapped = find_cameras(
-                work / IMAGES, _by_camera(photographs, one=is_video),
-                work=_made(work / "mapping"), source=source, in_order=is_video,
-                masks=masks, learned=learned, say=say,
+            mapped = _map(
+                photographs, work, source=source, lens=lens_of(photographs, lens),
+                is_video=is_video, masks=masks, learned=learned, say=say,
             )  # fmt: skip
         locations = {item.name: item.location for item in photographs if item.location}
         placement, met = place(mapped.model, locations=locations, distance=distance)
@@ -154,9 +164,42 @@ def capture_photographs(
         )  # fmt: skip
         mapped.model.write_binary(str(_made(work / MODEL)))
         write_json(work / REPORT, report.to_dict())
-        for spare in ("mapping", "frames", "masks"):
+        for spare in ("mapping", "frames", "whole_masks"):
             shutil.rmtree(work / spare, ignore_errors=True)
     return report
+
+
+def _map(
+    photographs: Sequence[Photograph],
+    work: Path,
+    *,
+    source: Path,
+    lens: str,
+    is_video: bool,
+    masks: Path | None,
+    learned: LightGlueMatcher | None,
+    say: Say,
+) -> Mapped:
+    """Write the pictures of the project, and find their cameras."""
+    find = partial(
+        find_cameras, work / IMAGES, work=_made(work / "mapping"), source=source,
+        in_order=is_video, learned=learned, say=say,
+    )  # fmt: skip
+    if lens != "equirectangular":
+        copy_upright(photographs, work / IMAGES)
+        fisheye = fisheye_params(photographs) if lens == "fisheye" else ""
+        if fisheye:
+            say("pictures of a fisheye lens: mapped as OPENCV_FISHEYE")
+        return find(_by_camera(photographs, one=is_video), masks=masks, fisheye=fisheye)
+    say(f"cutting {len(photographs)} panoramas into faces")
+    face_masks = work / "masks"
+    rigs = write_faces(photographs, work / IMAGES, masks=masks, face_masks=face_masks)
+    mapped = find(
+        [rig.names(face) for rig in rigs for face in rig.faces],
+        masks=None if masks is None else face_masks, rigs=rigs,
+    )  # fmt: skip
+    rename_faces(mapped.model, rigs, images=work / IMAGES, face_masks=face_masks)
+    return replace(mapped, pairs=panorama_pairs(mapped.pairs))
 
 
 @contextmanager
@@ -223,7 +266,7 @@ def _report(
     findings: Sequence[Finding],
 ) -> CaptureReport:
     model = mapped.model
-    there = {image.name for image in model.images.values() if image.has_pose}
+    there = {picture_of(image.name) for image in model.images.values() if image.has_pose}
     registered = [item.name for item in photographs if item.name in there]
     partners: dict[str, int] = {}
     for pair in mapped.pairs:

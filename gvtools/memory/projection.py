@@ -305,8 +305,8 @@ class _Projection:
                 if not open_.any():
                     return
                 chosen = culling.touching(target.rect, culling.summed_area(open_), chosen)
-            scanned = bool(self.store.views.scanned[views[0]])
-            self._write(chosen, limit, open_, members=views, few=number > 0, scanned=scanned)
+            of_scan = bool(self.store.views.scanned[views[0]])
+            self._write(chosen, limit, open_, members=views, few=number > 0, scanned=of_scan)
 
     def _write(
         self,

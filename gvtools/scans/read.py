@@ -138,7 +138,7 @@ class _Reading:
             self.origin = np.round(np.median(positions, axis=0))
         count = len(positions)
         colors, intensity = chunk.colors, chunk.intensity
-        part = {
+        part: dict[str, NDArray[Any]] = {
             "positions": positions - self.origin,
             "station": np.full(count, chunk.station, np.int32),
             # 1 where they are known.

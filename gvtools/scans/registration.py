@@ -9,7 +9,7 @@ supported in the end is refused.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,9 +89,9 @@ def register(
     if not found or _support(found[0]) < least:
         found = sorted([*found, *task.candidates(task.scales())], key=_support, reverse=True)
     if not found or _support(found[0]) < least:
-        best = f"the best fits {_support(found[0]):.0%}" if found else "none was found"
+        why = f"the best fits {_support(found[0]):.0%}" if found else "none was found"
         raise DegenerateError(
-            f"no placement of the scan is supported: {best} of the points within "
+            f"no placement of the scan is supported: {why} of the points within "
             f"{task.tolerance:.3g}, expected {least:.0%}; give its placement, or views that see "
             "more of what was scanned"
         )
@@ -182,12 +182,15 @@ class _Task:
         options.max_error = MATCH * self.cell
         options.random_seed = self.seed
         options.max_num_trials = TRIALS
-        fit = pycolmap.estimate_sim3d_robust(
+        fit: Any = pycolmap.estimate_sim3d_robust(
             source.points[ours], self._target.points[theirs], options
         )
-        if fit is None or not 0.5 < fit["tgt_from_src"].scale / scale < 2:
+        if fit is None:
             return None
-        return np.vstack([fit["tgt_from_src"].matrix(), [0, 0, 0, 1]])
+        similarity = fit["tgt_from_src"]
+        if not 0.5 < similarity.scale / scale < 2:
+            return None
+        return np.vstack([similarity.matrix(), [0, 0, 0, 1]])
 
     def polished(self, placement: Placement) -> Placement:
         """A placement after more steps of ICP: its scale is found slowly."""

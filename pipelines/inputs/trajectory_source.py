@@ -49,7 +49,7 @@ def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = Non
         views = load_memory(path).views
         cameras = views.cameras
         # A scan's stations are no poses of a camera.
-        cameras = None if cameras is None else cameras[np.flatnonzero(~views.scanned)]
+        cameras = None if cameras is None else cameras[np.flatnonzero(~views.scanned).tolist()]
         if cameras is None or not len(cameras):
             raise ProjectError(f"{path}: a memory without views; expected at least one")
         # A view that was fused twice is one pose.

@@ -37,7 +37,7 @@ def test_a_scan_in_another_frame_and_unit_is_placed_by_its_shape(stations):
     found = register(
         Surface(to_scan(scanned), viewpoints), seen(photographed), least=0.5, metric=False
     )
-    assert found.how == "estimated" and found.fitness > 0.7
+    assert found.how == "estimated" and found.fitness is not None and found.fitness > 0.7
     assert found.scale == pytest.approx(0.4, rel=0.01)
     np.testing.assert_allclose(found.apply(to_scan(scanned)), scanned, atol=0.03)
 
@@ -67,11 +67,13 @@ def test_a_given_similarity_is_read_from_numbers_and_files(tmp_path):
     numbers = ",".join(map(repr, truth[:3].ravel().tolist()))
     for text in (str(path), numbers):
         placement = given_placement(text)
+        assert placement is not None
         np.testing.assert_allclose(placement.world_from_scan, truth, rtol=1e-15)
         # Far coordinates keep their digits.
         np.testing.assert_allclose(placement.apply(FAR[None] + 1e-6)[0] - [1, 2, 3], 0, atol=1e-6)
     assert given_placement("estimate") is None
-    assert given_placement("identity").scale == 1
+    identity = given_placement("identity")
+    assert identity is not None and identity.scale == 1
 
 
 @pytest.mark.parametrize(

@@ -133,7 +133,9 @@ def test_e57_of_several_scans_cartesian_and_spherical_with_their_poses(tmp_path)
     assert (np.ptp(scan.colors[293:], axis=1) == 0).all() and np.ptp(scan.colors[293:, 0]) == 255
     np.testing.assert_array_equal(scan.station, [0] * 293 + [1] * 300)
     assert [station.name for station in scan.stations] == ["station 0", "station 1"]
-    np.testing.assert_allclose(scan.stations[1].center, FAR + np.array([0.5, 0.5, 1.5]))
+    center = scan.stations[1].center
+    assert center is not None
+    np.testing.assert_allclose(center, FAR + np.array([0.5, 0.5, 1.5]))
 
 
 def test_more_points_than_are_kept_are_thinned_evenly(tmp_path):

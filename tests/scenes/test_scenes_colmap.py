@@ -180,17 +180,6 @@ def test_masks_and_images_may_be_given(tmp_path):
     assert (frame.depth == 2.5).all()
 
 
-def test_spherical_camera_is_refused_by_name(tmp_path):
-    folder = tmp_path / "sparse"
-    folder.mkdir()
-    (tmp_path / "images").mkdir()
-    (folder / "cameras.txt").write_text("1 EQUIRECTANGULAR 200 100 200 100\n")
-    (folder / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
-    (folder / "points3D.txt").write_text("")
-    with pytest.raises(ProjectError, match="EQUIRECTANGULAR is spherical"):
-        read_colmap(tmp_path)
-
-
 def test_fisheye_without_coefficients_is_still_undistorted(tmp_path):
     # pycolmap calls such a camera undistorted, but its projection is no pinhole's.
     workspace(tmp_path, "OPENCV_FISHEYE", camera_params=[60.0, 60, 48, 36, 0, 0, 0, 0])

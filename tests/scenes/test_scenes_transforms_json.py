@@ -164,7 +164,7 @@ def test_masks_are_given_and_missed_as_those_of_colmap(tmp_path):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR has no pinhole image"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "expected twice as wide as high"),
         ({"k4": 0.1}, "k4 = 0.1 of a perspective camera"),
         ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix is no matrix"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "frame 0"),

@@ -123,7 +123,8 @@ def test_targets_with_alike_names_have_files_of_their_own():
 
 def test_points_of_held_out_views_are_used_and_said_so_or_left_out(tmp_path):
     scan = write_colmap_scan(tmp_path / "scan", views=4, points=10)
-    scene, said = open_project(scan), []
+    scene = open_project(scan)
+    said: list[str] = []
     settings = {"context": "first:3", "targets": "last:1", "depth": "plane-sweep"}
     plan = make_plan(scene, RunSettings(**settings), say=said.append)
     assert plan.scene.points is not None

@@ -1,0 +1,216 @@
+"""Features of pictures, their matches and the verification of these, in COLMAP's database.
+
+COLMAP's SIFT, or learned features that LightGlue matches (``learned_matching``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.capture import learned_matching
+from gvtools.capture.pairs import sift_descriptors, similar_pairs
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from gvtools.capture.panoramas import FaceRig
+    from gvtools.evaluation.pose_probe.features import FeatureMatcher
+
+# Up to this many pictures, every pair is matched; fewer with LightGlue, which takes a second a pair
+# on a processor.
+EXHAUSTIVE, EXHAUSTIVE_LEARNED = 60, 30
+# A frame of a video is matched with this many after it, and with those 16, 32, 64 and 128 later.
+SEQUENTIAL_OVERLAP = 10
+# Most features of a picture, and the longer side that it is reduced to before, pixels.
+MAX_FEATURES, MAX_SIDE = 8192, 1600
+SEED = 1
+
+Say = Callable[[str], object]
+
+
+def match_pictures(
+    images: Path,
+    cameras: Sequence[Sequence[str]],
+    *,
+    work: Path,
+    in_order: bool,
+    masks: Path | None,
+    learned: FeatureMatcher | None,
+    rigs: Sequence[FaceRig],
+    fisheye: str,
+    say: Say,
+) -> tuple[Path, str]:
+    """Fill a database with features and verified matches; see ``mapping.find_cameras``.
+
+    Returns:
+        The database, and in words how pairs were chosen.
+    """
+    import pycolmap
+
+    database = work / "database.db"
+    given = {
+        rig.names(face)[0]: ("PINHOLE", face.target.params_to_string())
+        for rig in rigs
+        for face in rig.faces
+    }
+    if fisheye:
+        given = {group[0]: ("OPENCV_FISHEYE", fisheye) for group in cameras}
+    if learned is not None:
+        pycolmap.Database.open(database).close()
+    for group in cameras:
+        reader = pycolmap.ImageReaderOptions()
+        if group[0] in given:
+            reader.camera_model, reader.camera_params = given[group[0]]
+        if learned is None:
+            _extract(database, images, group, masks=masks, reader=reader)
+        else:
+            pycolmap.import_images(
+                database, images, pycolmap.CameraMode.SINGLE, image_names=list(group),
+                options=reader,
+            )  # fmt: skip
+    if rigs:
+        with pycolmap.Database.open(database) as opened:
+            pycolmap.apply_rig_config([rig.config() for rig in rigs], opened)
+    if learned is None:
+        count = sum(map(len, cameras))
+        options = pycolmap.FeatureMatchingOptions()
+        options.skip_image_pairs_in_same_frame = bool(rigs)
+        how = _match(database, work, options=options, count=count, in_order=in_order, say=say)
+        return database, how
+    names = [name for group in cameras for name in group]
+    features = learned_matching.extract(images, names, learned, masks=masks, say=say)
+    learned_matching.write_keypoints(database, features)
+    described = {name: found.descriptors for name, found in features.items()}
+    chosen, how = _chosen(described, EXHAUSTIVE_LEARNED, in_order=in_order)
+    if rigs:
+        with pycolmap.Database.open(database) as opened:
+            frame = {image.name: image.frame_id for image in opened.read_all_images()}
+        chosen = [(a, b) for a, b in chosen if frame[a] != frame[b]]
+    say(f"matching {len(chosen)} pairs")
+    learned_matching.write_matches(database, features, chosen, matcher=learned, say=say)
+    pycolmap.verify_matches(database, _listed(chosen, work), _verification())
+    return database, how
+
+
+def _extract(
+    database: Path,
+    images: Path,
+    names: Sequence[str],
+    *,
+    masks: Path | None,
+    reader: pycolmap.ImageReaderOptions,
+) -> None:
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = MAX_SIDE
+    options.sift.max_num_features = MAX_FEATURES
+    if masks is not None:
+        reader.mask_path = masks
+    pycolmap.extract_features(
+        database, images, image_names=list(names), camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader, extraction_options=options, device=pycolmap.Device.auto,
+    )  # fmt: skip
+
+
+def _match(
+    database: Path,
+    work: Path,
+    *,
+    options: pycolmap.FeatureMatchingOptions,
+    count: int,
+    in_order: bool,
+    say: Say,
+) -> str:
+    """Match SIFT of pairs of pictures; returns in words how the pairs were chosen."""
+    import pycolmap
+
+    if count <= EXHAUSTIVE:
+        say(f"matching all {count * (count - 1) // 2} pairs")
+        pycolmap.match_exhaustive(
+            database, matching_options=options, verification_options=_verification()
+        )
+        return "all pairs"
+    pairs, how = _chosen(sift_descriptors(database), EXHAUSTIVE, in_order=in_order)
+    say(f"matching {len(pairs)} pairs")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = _listed(pairs, work)
+    pycolmap.match_image_pairs(
+        database, matching_options=options, pairing_options=pairing,
+        verification_options=_verification(),
+    )  # fmt: skip
+    return how
+
+
+def _chosen(
+    described: Mapping[str, NDArray[np.float32]], exhaustive: int, *, in_order: bool
+) -> tuple[list[tuple[str, str]], str]:
+    """The pairs of pictures to match, and in words how they were chosen.
+
+    Args:
+        described: (N, D) descriptors of each picture by name.
+        exhaustive: up to how many pictures every pair is taken.
+        in_order: see ``mapping.find_cameras``.
+    """
+    names = sorted(described)
+    if len(names) <= exhaustive:
+        return list(combinations(names, 2)), "all pairs"
+    pairs = set(similar_pairs(described))
+    how = f"each picture with the {len(pairs) * 2 // len(names)} most similar"
+    if in_order:
+        steps = {*range(1, SEQUENTIAL_OVERLAP + 1), *(2**k for k in range(4, 8))}
+        pairs |= {
+            (names[i], names[i + step])
+            for i in range(len(names))
+            for step in steps
+            if i + step < len(names)
+        }
+        how = f"neighbours in time, and {how}"
+    return sorted(pairs), how
+
+
+def _listed(pairs: Sequence[tuple[str, str]], work: Path) -> Path:
+    """A file with the pairs, as COLMAP reads them."""
+    file = work / "pairs.txt"
+    file.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
+    return file
+
+
+def _verification() -> pycolmap.TwoViewGeometryOptions:
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = SEED
+    return options
+
+
+def verified(database: Path) -> dict[tuple[str, str], int]:
+    """Pairs of pictures that overlap, with the number of their verified matches."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        numbers, counts = opened.read_two_view_geometry_num_inliers()
+    found = {}
+    for number, count in zip(numbers, counts, strict=True):
+        if count > 0:
+            a, b = pycolmap.pair_id_to_image_pair(number)
+            found[names[a], names[b]] = int(count)
+    return found
+
+
+def all_flat(database: Path) -> bool:
+    """Whether a homography explains every pair, so that mapping would have no depth to go by."""
+    import pycolmap
+
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    flat = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
+    with pycolmap.Database.open(database) as opened:
+        _, geometries = opened.read_two_view_geometries()
+    return all(found.config in flat for found in geometries if len(found.inlier_matches))

@@ -1,0 +1,252 @@
+# mypy: no-check-untyped-defs
+"""Panoramas and wide fisheyes as perspective views; the pictures are functions of direction."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.faces import (
+    DIRECTIONS,
+    face_name,
+    face_rotation,
+    perspective_views,
+    picture_of,
+)
+from gvtools.scenes.project import open_project
+from gvtools.scenes.selection import check_disjoint, select
+
+W, H = 256, 128
+FISHEYE = [60.0, 60.0, 100.0, 100.0, 0.02, -0.01, 0.0, 0.0]
+FISHEYE_SIZE = (200, 200)
+
+
+def colour(directions):
+    """(..., 3) uint8 of unit directions, smooth and different everywhere."""
+    return np.rint(127.5 + 100 * directions).astype(np.uint8)
+
+
+def panorama_directions():
+    """By the textbook: longitude to the right of the middle, latitude up from it."""
+    longitude = ((np.arange(W) + 0.5) / W - 0.5) * 2 * math.pi
+    latitude = (0.5 - (np.arange(H) + 0.5) / H)[:, None] * math.pi
+    across = np.cos(latitude)
+    return np.stack(
+        [across * np.sin(longitude), np.broadcast_to(-np.sin(latitude), (H, W)),
+         across * np.cos(longitude)], -1,
+    )  # fmt: skip
+
+
+def fisheye_directions():
+    """Each pixel's direction, by inverting the polynomial on a table; and its angle."""
+    x = (np.arange(200) + 0.5 - 100) / 60
+    x, y = np.meshgrid(x, x)
+    table = np.linspace(0, 2.4, 20001)
+    theta = np.interp(np.hypot(x, y), table * (1 + 0.02 * table**2 - 0.01 * table**4), table)
+    turn = np.arctan2(y, x)
+    flat = np.sin(theta)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), np.cos(theta)], -1), theta
+
+
+def directions_of(face):
+    """Unit directions of a face's pixels in the picture's camera, by its K and turn alone."""
+    width, height = face.size
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(face.K).T @ face.rotation
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def test_faces_look_where_their_names_say():
+    ahead = {name: face_rotation(name)[2] for name in DIRECTIONS}
+    expected = {
+        "front": [0, 0, 1], "right": [1, 0, 0], "back": [0, 0, -1], "left": [-1, 0, 0],
+        "up": [0, -1, 0], "down": [0, 1, 0],
+    }  # fmt: skip
+    for name, direction in expected.items():
+        np.testing.assert_array_equal(ahead[name], direction)
+        np.testing.assert_allclose(np.linalg.det(face_rotation(name)), 1)
+        if name in ("front", "right", "back", "left"):
+            np.testing.assert_array_equal(face_rotation(name)[1], [0, 1, 0])
+
+
+def test_faces_of_a_panorama_show_what_lies_in_their_directions():
+    faces = perspective_views("EQUIRECTANGULAR", [W, H], (W, H), what="test")
+    assert [face.face for face in faces] == list(DIRECTIONS)
+    picture = colour(panorama_directions())
+    distance = 2 + panorama_directions()[..., 1].astype(np.float32)
+    for face in faces:
+        directions = directions_of(face)
+        error = face.image(picture).astype(float) - colour(directions)
+        assert np.abs(error).max() <= 3
+        assert face.inside is None
+        z = (2 + directions[..., 1]) * (directions @ face.rotation[2])
+        np.testing.assert_allclose(face.depth(distance), z, atol=0.03)
+
+
+def test_a_panorama_is_averaged_where_a_face_is_coarser():
+    # One pixel of ten bright: a sample without averaging would be 0 or 255 at the poles.
+    picture = np.zeros((H, W, 3), np.uint8)
+    picture[:, ::2] = 255
+    up = perspective_views("EQUIRECTANGULAR", [W, H], (W, H), what="test")[4]
+    middle = up.image(picture)[28:54, 28:54, 0].astype(float)
+    assert abs(middle.mean() - 127.5) < 6
+    assert middle.std() < 45
+
+
+def test_faces_of_a_fisheye_beyond_90_degrees():
+    faces = perspective_views("OPENCV_FISHEYE", FISHEYE, FISHEYE_SIZE, what="test")
+    assert {face.face for face in faces} == {"front", "right", "left", "up", "down"}
+    directions, theta = fisheye_directions()
+    edge = theta[100, -1]
+    assert edge > math.radians(95)
+    picture = colour(directions)
+    depth = np.where(directions[..., 2] > 0, 3 * directions[..., 2], 0).astype(np.float32)
+    for face in faces:
+        shown = directions_of(face)
+        angle = np.arccos(np.clip(shown[..., 2], -1, 1))
+        inside = np.ones(shown.shape[:2], bool) if face.inside is None else face.inside
+        # The corners of the picture, outside of its image circle, are no part of any face.
+        np.testing.assert_array_equal(inside[angle < edge - 0.02], True)
+        np.testing.assert_array_equal(inside[angle > edge + 0.02], False)
+        error = face.image(picture).astype(float) - colour(shown)
+        assert np.abs(error[inside]).max() <= 4
+        z = 3 * (shown @ face.rotation[2])
+        recorded = angle < math.radians(80)
+        np.testing.assert_allclose(face.depth(depth)[recorded], z[recorded], rtol=1e-3)
+        assert (face.depth(depth)[angle > math.radians(91)] == 0).all()
+
+
+def test_points_land_in_the_face_that_shows_them():
+    faces = perspective_views("OPENCV_FISHEYE", FISHEYE, FISHEYE_SIZE, what="test")
+    camera = faces[0].source
+    rays = np.random.default_rng(0).normal(size=(50, 3))
+    rays[:, 2] = np.abs(rays[:, 2]) + 0.2
+    xy = np.array([camera.img_from_cam(ray) for ray in rays])
+    places = np.stack([face.points(xy) for face in faces])
+    found = np.isfinite(places).all(-1)
+    inside = np.all((xy >= 0) & (xy < 200), axis=1)
+    assert (found.sum(0)[inside] >= 1).all()
+    for face, row, seen in zip(faces, places, found, strict=True):
+        local = rays[seen] @ face.rotation.T
+        flat = local @ face.K.T
+        np.testing.assert_allclose(row[seen], flat[:, :2] / flat[:, 2:], atol=1e-3)
+
+
+def test_narrow_fisheyes_stay_one_view():
+    (lens,) = perspective_views("OPENCV_FISHEYE", [130.0, 130, 100, 100, 0, 0, 0, 0],
+                                FISHEYE_SIZE, what="test")  # fmt: skip
+    assert lens.name("a.png") == "a.png"
+
+
+def test_half_a_panorama_is_refused():
+    with pytest.raises(ProjectError, match="panorama of 200x80; expected twice as wide"):
+        perspective_views("EQUIRECTANGULAR", [200, 80], (200, 80), what="test")
+
+
+@pytest.fixture
+def project(tmp_path):
+    """Three panoramas, the second turned by 30 degrees about the vertical, with masks and depth."""
+    turn = math.radians(30)
+    poses = [np.eye(4) for _ in range(3)]
+    poses[1][:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0],
+                        [-math.sin(turn), 0, math.cos(turn)]]  # fmt: skip
+    for i, pose in enumerate(poses):
+        pose[0, 3] = i
+        Image.fromarray(colour(panorama_directions())).save(tmp_path / f"p{i}.png")
+        np.save(tmp_path / f"p{i}.npy", np.full((H, W), 2.0, np.float32))
+    mask = np.full((H, W), 255, np.uint8)
+    mask[-20:] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    frames = [
+        {
+            "file_path": f"p{i}.png",
+            "depth_file_path": f"p{i}.npy",
+            "mask_path": "mask.png",
+            "transform_matrix": pose.tolist(),
+        }
+        for i, pose in enumerate(poses)
+    ]
+    told = {"camera_model": "EQUIRECTANGULAR", "depth_unit_scale_factor": 1.0, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(told))
+    return tmp_path
+
+
+def test_transforms_of_panoramas_are_read(project):
+    scene = open_project(project)
+    assert len(scene) == 18
+    assert scene.names[0] == "p0@back.png"
+    front = scene["p1@front.png"]
+    assert front.has_depth
+    # The OpenGL camera looks along -z of its own frame; the picture's middle is ahead of it.
+    ahead = front.camera.world_from_cam[0, :3, 2]
+    np.testing.assert_allclose(ahead, [-0.5, 0, -math.cos(math.radians(30))], atol=1e-12)
+    np.testing.assert_allclose(front.camera.centers[0], [1, 0, 0], atol=1e-12)
+    right = scene["p1@right.png"].camera.world_from_cam[0, :3, 2]
+    np.testing.assert_allclose(right, front.camera.world_from_cam[0, :3, 0], atol=1e-12)
+    down = scene["p1@down.png"].load()
+    middle = down.mask.shape[0] // 2
+    assert not down.mask[middle, middle]
+    frame = front.load()
+    assert frame.mask.all()
+    half = frame.depth.shape[0] // 2
+    np.testing.assert_allclose(frame.depth[half, half], 2, rtol=1e-3)
+    np.testing.assert_allclose(frame.depth[0, 0], 2 / math.sqrt(3), rtol=0.02)
+
+
+def test_splits_count_pictures(project):
+    names = open_project(project).names
+    held = select(names, "every:2")
+    assert {picture_of(name) for name in held} == {"p0.png", "p2.png"}
+    assert len(held) == 12
+    given = select(names, "not:every:2")
+    check_disjoint(given, held)
+    assert select(names, "p1.png") == given
+    assert select(names, "p1@up.png") == ("p1@up.png",)
+    with pytest.raises(OptionError, match="overlap"):
+        check_disjoint(["p1@up.png"], ["p1@down.png"])
+    with pytest.raises(OptionError, match="there are 3"):
+        select(names, "first:4")
+
+
+def test_a_colmap_model_of_panoramas_keeps_its_tracks(tmp_path):
+    camera = pycolmap.Camera(camera_id=1, model="EQUIRECTANGULAR", width=W, height=H, params=[W, H])
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    points = np.random.default_rng(1).normal(size=(40, 3)) * 4
+    (tmp_path / "images").mkdir()
+    centres = ([0.0, 0, 0], [0.3, 0.1, 0.2])
+    for number, centre in enumerate(centres, start=1):
+        xy = np.array([camera.img_from_cam(point - centre) for point in points])
+        image = pycolmap.Image(name=f"p{number}.png", keypoints=xy, camera_id=1, image_id=number)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), -np.array(centre))
+        model.add_image_with_trivial_frame(image, pose)
+        Image.fromarray(colour(panorama_directions())).save(tmp_path / "images" / image.name)
+    for row, point in enumerate(points):
+        track = pycolmap.Track()
+        for number in (1, 2):
+            track.add_element(number, row)
+        model.add_point3D(point, track)
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    model.write(tmp_path / "sparse" / "0")
+    scene = open_project(tmp_path)
+    assert len(scene) == 12
+    found = scene.points
+    assert len(found.xy) == 80
+    for view, point, xy in zip(found.view_index, found.point_index, found.xy, strict=True):
+        projected, depth = scene.views[view].camera.project(found.positions[point][None])
+        assert depth[0, 0] > 0
+        np.testing.assert_allclose(projected[0, 0], xy, atol=1e-3)
+
+
+def test_names():
+    assert face_name("a/b.c.png", "up") == "a/b.c@up.png"
+    assert face_name("a.b/c", "up") == "a.b/c@up"
+    for name in ("a/b.c.png", "a.b/c", ".hidden"):
+        assert picture_of(face_name(name, "left")) == name
+    assert picture_of("me@work.png") == "me@work.png"
