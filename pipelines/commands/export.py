@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pipelines.console import Console
     from pipelines.export.source import ExportOptions
 
+SMALLEST_TEXTURE, LARGEST_TEXTURE = 64, 4096
 SUMMARY = "write a run as point cloud, splats, mesh, cameras or recording, in the input's frame"
 EXAMPLES = (
     "gvtools export runs/kitchen --format splat --out kitchen.ply",
@@ -58,6 +59,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--max-triangles", type=int, metavar="N", help="mesh: simplify to at most N triangles"
+    )
+    parser.add_argument(
+        "--texture",
+        type=int,
+        metavar="SIDE",
+        help=f"mesh (.glb, .obj): colours from the run's photographs, in a picture of SIDE x SIDE "
+        f"({SMALLEST_TEXTURE} to {LARGEST_TEXTURE}); one triangle for 80 of its pixels, unless "
+        "--max-triangles says otherwise",
     )
     parser.add_argument(
         "--images",
@@ -114,6 +123,8 @@ def _options(args: argparse.Namespace, form: ExportFormat) -> ExportOptions:
             )
         if name in ("max_points", "max_triangles") and value < 1:
             raise OptionError(f"{option} {value}; expected 1 or more")
+        if name == "texture" and not SMALLEST_TEXTURE <= value <= LARGEST_TEXTURE:
+            raise OptionError(f"{option} {value}; expected {SMALLEST_TEXTURE} to {LARGEST_TEXTURE}")
         if name == "voxel" and not 0 < value < float("inf"):
             raise OptionError(f"{option} {value}; expected a number above 0")
     return ExportOptions(**given)

@@ -22,7 +22,7 @@ from gvtools.errors import OptionError
 
 # What every point format takes, and what a mesh takes beside it.
 POINTS = ("max_points", "observed")
-MESH = ("observed", "method", "voxel", "max_triangles")
+MESH = ("observed", "method", "voxel", "max_triangles", "texture")
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ _ALL = (
                  {".ply": b"ply"}, POINTS),
     ExportFormat("spz", "pipelines.export.spz", "3D Gaussians, compressed",
                  {".spz": b"\x1f\x8b"}, POINTS),
-    ExportFormat("mesh", "pipelines.export.mesh", "triangles with vertex colours",
+    ExportFormat("mesh", "pipelines.export.mesh", "triangles with vertex colours or a texture",
                  {".ply": b"ply", ".glb": b"glTF", ".obj": b"# gvtools"}, MESH, ("trimesh",)),
     ExportFormat("las", "pipelines.export.las", "point cloud for GIS",
                  {".las": b"LASF", ".laz": b"LASF"}, POINTS, ("laspy", "lazrs")),

@@ -1,7 +1,8 @@
-"""A mesh with vertex colours, as PLY, glTF binary or OBJ, in the input's world frame."""
+"""A mesh with vertex colours or a texture, as PLY, glTF binary or OBJ, in the world frame."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,12 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.cameras import Cameras
+from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written, write_text
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.runs.layout import RECORD
+from gvtools.runs.run import load_run
 from pipelines.export.glb import write_scene
 from pipelines.export.simplify import simplified
 from pipelines.export.source import ExportOptions, Source
 from pipelines.export.surfaces import mesh_voxel, poisson_mesh, tsdf_mesh
+from pipelines.export.texture import TEXELS, Texture, textured
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -31,45 +37,90 @@ class Triangles:
         vertices: (V, 3) float64, world frame, scene units.
         faces: (F, 3) int32, rows of ``vertices``, against the clock as seen from outside.
         colors: (V, 3) uint8.
+        texture: where triangles have their colours in a picture; their vertices are their own,
+            in order.
     """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
     colors: NDArray[np.uint8]
+    texture: Texture | None = None
 
     @classmethod
-    def of(cls, mesh: o3d.t.geometry.TriangleMesh, frame: LocalFrame) -> Triangles:
+    def of(
+        cls, mesh: o3d.t.geometry.TriangleMesh, frame: LocalFrame, texture: Texture | None = None
+    ) -> Triangles:
         """Of Open3D's mesh, whose positions are in a frame."""
-        colors = np.clip(mesh.vertex.colors.numpy(), 0, 1)
-        return cls(
-            frame.to_world(mesh.vertex.positions.numpy()),
-            mesh.triangle.indices.numpy().astype(np.int32),
-            np.rint(colors * 255).astype(np.uint8),
-        )
+        positions = frame.to_world(mesh.vertex.positions.numpy())
+        colors = np.rint(np.clip(mesh.vertex.colors.numpy(), 0, 1) * 255).astype(np.uint8)
+        faces = mesh.triangle.indices.numpy().astype(np.int32)
+        if texture is None:
+            return cls(positions, faces, colors)
+        own = np.arange(faces.size, dtype=np.int32).reshape(-1, 3)
+        return cls(positions[faces.ravel()], own, colors[faces.ravel()], texture)
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
     """Write a mesh.
 
     Raises:
+        OptionError: a texture for a file that has none, without a run, or too small.
         DegenerateError: no triangle came out.
-        ProjectError: the file cannot be written.
+        ProjectError: the project cannot be read, or the file be written.
     """
-    memory = source.memory
+    memory, size = source.memory, options.texture
+    if size is not None:
+        _check_texture(source, path)
     method = options.method or "tsdf"
     voxel = mesh_voxel(memory) if options.voxel is None else options.voxel
     mesh = METHODS[method](memory, voxel, observed=bool(options.observed))
     made = len(mesh.triangle.indices)
-    if options.max_triangles is not None:
-        mesh = simplified(mesh, options.max_triangles)
-    triangles = Triangles.of(mesh, memory.frame)
+    most = options.max_triangles
+    if size is not None and most is None:
+        most = size**2 // TEXELS
+    if most is not None:
+        mesh = simplified(mesh, most)
+    texture = None if size is None else textured(mesh, _photographs(source), size)
+    triangles = Triangles.of(mesh, memory.frame, texture)
     SAVERS[path.suffix.lower()](triangles, path)
     count = len(triangles.faces)
     fewer = f", simplified from {made}" if count < made else ""
+    colors = "" if size is None else f", a texture of {size} x {size}"
     return (
-        f"{count} triangles{fewer}, {len(triangles.vertices)} vertices ({method}, voxels of "
-        f"{voxel:.4g}) in {path}"
+        f"{count} triangles{fewer}, {len(mesh.vertex.positions)} vertices{colors} ({method}, "
+        f"voxels of {voxel:.4g}) in {path}"
     )
+
+
+def _check_texture(source: Source, path: Path) -> None:
+    if path.suffix.lower() == ".ply":
+        raise OptionError(f"--texture: {path} is a PLY, which has none; give a .glb or .obj file")
+    if not (source.path / RECORD).is_file():
+        raise OptionError(
+            f"--texture: {source.path} is no run; expected a run's folder, whose project has the "
+            "photographs"
+        )
+    for suffix in (".mtl", ".png"):
+        other = path.with_name(_material(path) + suffix)
+        if path.suffix.lower() == ".obj" and other.exists() and not path.exists():
+            raise OptionError(
+                f"{other}: is there already and would be replaced; give another --out"
+            )
+
+
+def _photographs(source: Source) -> Iterator[tuple[Cameras, NDArray[np.uint8]]]:
+    """Cameras of the observed views in the memory's frame, and their photographs.
+
+    Raises:
+        ProjectError: the project, or a photograph, cannot be read any more.
+    """
+    scene = load_run(source.path).scenes[0]
+    for view in source.memory.views:
+        if view.generated:
+            continue
+        picture = scene[view.camera.names[0]].load().rgb
+        camera = source.memory.frame.seen_from(view.camera)
+        yield camera.resized(picture.shape[1], picture.shape[0]), picture
 
 
 def _save_ply(triangles: Triangles, path: Path) -> None:
@@ -92,13 +143,44 @@ def _save_obj(triangles: Triangles, path: Path) -> None:
     from trimesh.exchange.obj import export_obj
 
     header = "gvtools mesh, input world frame, scene units"
-    write_text(path, export_obj(_trimesh(triangles, triangles.vertices), header=header))
+    name = _material(path)
+    mesh = _trimesh(triangles, triangles.vertices, material=name)
+    if triangles.texture is None:
+        write_text(path, export_obj(mesh, header=header))
+        return
+    text, beside = export_obj(mesh, header=header, return_texture=True, mtl_name=f"{name}.mtl")
+    for name, content in beside.items():
+        with replaced_when_written(path.with_name(name)) as temporary:
+            temporary.write_bytes(content)
+    write_text(path, text)
 
 
-def _trimesh(triangles: Triangles, vertices: NDArray[np.floating]) -> object:
+def _material(path: Path) -> str:
+    """Name of an OBJ's material and of the files beside it; OBJ ends names at a space."""
+    return "_".join(path.stem.split())
+
+
+def _trimesh(
+    triangles: Triangles, vertices: NDArray[np.floating], *, material: str = NODE
+) -> object:
     import trimesh
 
-    return trimesh.Trimesh(vertices, triangles.faces, vertex_colors=triangles.colors, process=False)
+    if triangles.texture is None:
+        return trimesh.Trimesh(
+            vertices, triangles.faces, vertex_colors=triangles.colors, process=False
+        )
+    from PIL import Image
+
+    visuals = trimesh.visual.TextureVisuals(
+        uv=triangles.texture.uv.reshape(-1, 2),
+        material=trimesh.visual.material.PBRMaterial(
+            name=material,
+            baseColorTexture=Image.fromarray(triangles.texture.image),
+            metallicFactor=0.0,
+            roughnessFactor=1.0,
+        ),
+    )
+    return trimesh.Trimesh(vertices, triangles.faces, visual=visuals, process=False)
 
 
 SAVERS = {".ply": _save_ply, ".glb": _save_glb, ".obj": _save_obj}

@@ -30,6 +30,7 @@ class ExportOptions:
         method: that makes a mesh, ``tsdf`` or ``poisson``.
         voxel: edge of the voxels that a mesh is made in, scene units.
         max_triangles: simplify a mesh to at most so many.
+        texture: side of the picture that a mesh's colours are in, texels.
     """
 
     max_points: int | None = None
@@ -38,6 +39,7 @@ class ExportOptions:
     method: str | None = None
     voxel: float | None = None
     max_triangles: int | None = None
+    texture: int | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pycolmap
 import pytest
-from box_project import VOXEL, fused, write_box
+from box_project import VOXEL, fused
 from PIL import Image
 
 from gvtools.cameras import Cameras
@@ -29,11 +29,6 @@ def parsed(*words: object) -> argparse.Namespace:
 
 def run(*words: object) -> None:
     export.run(parsed(*words), Console(quiet=True))
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_box(tmp_path_factory.mktemp("box"))
 
 
 @pytest.fixture

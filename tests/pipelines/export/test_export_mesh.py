@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import open3d as o3d
 import pytest
-from box_project import VOXEL, write_box
-from export_runs import export_run, saved_run
+from box_project import VOXEL
+from export_runs import export_run
 
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -19,16 +19,6 @@ from pipelines.export.surfaces import tsdf_mesh
 trimesh = pytest.importorskip("trimesh")
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_box(tmp_path_factory.mktemp("box"))
-
-
-@pytest.fixture(scope="module")
-def run(scene, tmp_path_factory):
-    return saved_run(scene, tmp_path_factory.mktemp("bare") / "run", fitted=False)
 
 
 def seen(vertices, faces, view):
@@ -46,15 +36,17 @@ def seen(vertices, faces, view):
 
 
 @pytest.mark.parametrize("method", ["tsdf", "poisson"])
-def test_trimesh_reads_the_walls(scene, run, tmp_path, method):
-    export_run(run.folder, "--format", "mesh", "--out", tmp_path / "out.ply", "--method", method)
+def test_trimesh_reads_the_walls(scene, bare_run, tmp_path, method):
+    export_run(
+        bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.ply", "--method", method
+    )
     mesh = trimesh.load(tmp_path / "out.ply", process=False)
     view = scene.views[1]  # not in the memory
     frame = view.load()
     depth = seen(mesh.vertices, mesh.faces, view)
-    known = run.memory.project(view.camera).valid[0] & np.isfinite(depth)
+    known = bare_run.memory.project(view.camera).valid[0] & np.isfinite(depth)
     assert known.mean() > 0.7
-    assert np.median(np.abs(depth - frame.depth)[known]) < 0.3 * run.memory.voxel
+    assert np.median(np.abs(depth - frame.depth)[known]) < 0.3 * bare_run.memory.voxel
     # Vertices have the walls' colours: each as the pixel that it projects to.
     xy, z = (values[0] for values in view.camera.project(mesh.vertices))
     column, row = np.floor(xy).astype(int).T
@@ -66,18 +58,18 @@ def test_trimesh_reads_the_walls(scene, run, tmp_path, method):
     assert np.corrcoef(colors.ravel(), shown.ravel())[0, 1] > 0.8
 
 
-def test_triangles_face_the_cameras(scene, run, tmp_path):
-    export_run(run.folder, "--format", "mesh", "--out", tmp_path / "out.ply")
+def test_triangles_face_the_cameras(scene, bare_run, tmp_path):
+    export_run(bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.ply")
     mesh = trimesh.load(tmp_path / "out.ply", process=False)
     away = mesh.triangles_center - scene.views[0].camera.centers[0]
     assert ((mesh.face_normals * away).sum(axis=1) < 0).mean() > 0.95
 
 
-def test_all_suffixes_hold_one_mesh(run, tmp_path):
+def test_all_suffixes_hold_one_mesh(bare_run, tmp_path):
     read = []
     for suffix in (".ply", ".obj", ".glb"):
         out = tmp_path / f"out{suffix}"
-        export_run(run.folder, "--format", "mesh", "--out", out)
+        export_run(bare_run.folder, "--format", "mesh", "--out", out)
         read.append(trimesh.load(out, process=False, force="mesh"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.glb", "out.obj", "out.ply"]
     for mesh in read[1:]:
@@ -90,7 +82,7 @@ def test_all_suffixes_hold_one_mesh(run, tmp_path):
         assert apart.max() <= 1
     # Open3D reads the PLY as well, and an export may be replaced by another.
     assert len(o3d.io.read_triangle_mesh(str(tmp_path / "out.ply")).triangles) == len(read[0].faces)
-    export_run(run.folder, "--format", "mesh", "--out", tmp_path / "out.obj", "--voxel", 0.1)
+    export_run(bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.obj", "--voxel", 0.1)
     assert len(trimesh.load(tmp_path / "out.obj", force="mesh").faces) < len(read[0].faces) / 2
 
 
@@ -116,9 +108,9 @@ def test_a_mesh_far_from_the_origin_keeps_its_digits(scene, tmp_path):
         np.testing.assert_allclose(two, one, atol=2e-3)
 
 
-def test_observed_leaves_out_generated_views_and_points(scene, run):
-    edge = 2 * run.memory.voxel
-    whole, observed = (tsdf_mesh(run.memory, edge, observed=each) for each in (False, True))
+def test_observed_leaves_out_generated_views_and_points(scene, bare_run):
+    edge = 2 * bare_run.memory.voxel
+    whole, observed = (tsdf_mesh(bare_run.memory, edge, observed=each) for each in (False, True))
     view = scene.views[4]  # the generated one
     hit = [
         np.isfinite(seen(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), view)).mean()
@@ -128,8 +120,8 @@ def test_observed_leaves_out_generated_views_and_points(scene, run):
 
 
 @pytest.mark.parametrize("share", [0.5, 0.02])
-def test_simplified_meshes_keep_number_place_and_colours(scene, run, share):
-    mesh = tsdf_mesh(run.memory, run.memory.voxel)
+def test_simplified_meshes_keep_number_place_and_colours(scene, bare_run, share):
+    mesh = tsdf_mesh(bare_run.memory, bare_run.memory.voxel)
     most = int(share * len(mesh.triangle.indices))
     fewer = simplified(mesh, most)
     assert 0.3 * most < len(fewer.triangle.indices) <= most
@@ -140,12 +132,12 @@ def test_simplified_meshes_keep_number_place_and_colours(scene, run, share):
     ]
     both = np.isfinite(depths[0]) & np.isfinite(depths[1])
     assert both.mean() > 0.7
-    assert np.median(np.abs(depths[0][both] - depths[1][both])) < run.memory.voxel
+    assert np.median(np.abs(depths[0][both] - depths[1][both])) < bare_run.memory.voxel
     assert fewer.vertex.colors.numpy().std() > 0.05
 
 
-def test_triangles_without_area_do_not_stop_the_simplification(run):
-    mesh = tsdf_mesh(run.memory, run.memory.voxel)
+def test_triangles_without_area_do_not_stop_the_simplification(bare_run):
+    mesh = tsdf_mesh(bare_run.memory, bare_run.memory.voxel)
     faces = mesh.triangle.indices.numpy()
     flat = faces[:500].copy()
     flat[:, 2] = flat[:, 1]
@@ -153,16 +145,20 @@ def test_triangles_without_area_do_not_stop_the_simplification(run):
     assert 0 < len(simplified(mesh, 400).triangle.indices) <= 400
 
 
-def test_voxels_that_would_fill_the_memory_are_refused_or_widened(run, tmp_path, monkeypatch):
+def test_voxels_that_would_fill_the_memory_are_refused_or_widened(bare_run, tmp_path, monkeypatch):
     monkeypatch.setattr(surfaces, "MOST_BLOCKS", 20)
     with pytest.raises(OptionError, match=r"--voxel 0.02: the scene has \d+ blocks"):
-        export_run(run.folder, "--format", "mesh", "--out", tmp_path / "out.ply", "--voxel", 0.02)
+        export_run(
+            bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.ply", "--voxel", 0.02
+        )
     assert not (tmp_path / "out.ply").exists()
-    export_run(run.folder, "--format", "mesh", "--out", tmp_path / "out.ply")
+    export_run(bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.ply")
     assert len(trimesh.load(tmp_path / "out.ply").faces)
 
 
-def test_voxels_larger_than_the_scene_leave_no_triangle(run, tmp_path):
+def test_voxels_larger_than_the_scene_leave_no_triangle(bare_run, tmp_path):
     with pytest.raises(DegenerateError, match="no triangle"):
-        export_run(run.folder, "--format", "mesh", "--out", tmp_path / "out.ply", "--voxel", 1e6)
+        export_run(
+            bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.ply", "--voxel", 1e6
+        )
     assert not (tmp_path / "out.ply").exists()

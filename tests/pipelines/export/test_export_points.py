@@ -4,24 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from box_project import fused, write_box
-from export_runs import export_run, saved_run
+from box_project import fused
+from export_runs import export_run
 
 from gvtools.errors import OptionError
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thinned
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_box(tmp_path_factory.mktemp("box"))
-
-
-@pytest.fixture(scope="module")
-def run(scene, tmp_path_factory):
-    return saved_run(scene, tmp_path_factory.mktemp("bare") / "run", fitted=False)
 
 
 @pytest.fixture
@@ -35,13 +25,13 @@ def far(scene, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_laspy_reads_points_colours_and_what_is_known_of_each(run, tmp_path, suffix):
+def test_laspy_reads_points_colours_and_what_is_known_of_each(bare_run, tmp_path, suffix):
     laspy = pytest.importorskip("laspy")
     pytest.importorskip("lazrs")
     out = tmp_path / f"out{suffix}"
-    export_run(run.folder, "--format", "las", "--out", out)
+    export_run(bare_run.folder, "--format", "las", "--out", out)
     cloud = laspy.read(out)
-    memory, rows = run.memory, thinned(run.memory, None).rows
+    memory, rows = bare_run.memory, thinned(bare_run.memory, None).rows
     assert cloud.header.version == "1.4" and cloud.header.are_points_compressed == (
         suffix == ".laz"
     )
@@ -68,18 +58,18 @@ def test_las_keeps_its_steps_far_from_the_origin(far, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".usdc", ".usda"])
-def test_pxr_reads_the_points(run, tmp_path, suffix):
+def test_pxr_reads_the_points(bare_run, tmp_path, suffix):
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
 
     out = tmp_path / f"out{suffix}"
-    export_run(run.folder, "--format", "usd", "--out", out)
+    export_run(bare_run.folder, "--format", "usd", "--out", out)
     assert sorted(tmp_path.iterdir()) == [out]
     stage = Usd.Stage.Open(str(out))
     (cloud,) = (UsdGeom.Points(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Points))
     world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(cloud.GetPrim()))
     local = np.array(cloud.GetPointsAttr().Get(), np.float64)
-    memory, rows = run.memory, thinned(run.memory, None).rows
+    memory, rows = bare_run.memory, thinned(bare_run.memory, None).rows
     np.testing.assert_allclose(
         local @ world[:3, :3] + world[3, :3], memory.positions[rows], atol=1e-5
     )
@@ -107,13 +97,13 @@ def test_usd_moves_far_points_by_a_double_translation(far, tmp_path):
 
 
 @pytest.mark.parametrize("form", ["ply", "las", "glb"])
-def test_observed_leaves_out_what_was_generated(run, tmp_path, form):
+def test_observed_leaves_out_what_was_generated(bare_run, tmp_path, form):
     trimesh = pytest.importorskip("trimesh")
     laspy = pytest.importorskip("laspy")
     pytest.importorskip("lazrs")
     out = tmp_path / f"out.{form}"
-    export_run(run.folder, "--format", form, "--out", out, "--observed")
-    memory = run.memory
+    export_run(bare_run.folder, "--format", form, "--out", out, "--observed")
+    memory = bare_run.memory
     if form == "ply":
         count, expected = len(trimesh.load(out).vertices), int((~memory.generated).sum())
     else:
@@ -138,8 +128,8 @@ def test_nothing_observed_is_said(scene, tmp_path):
         assert not (tmp_path / name).exists()
 
 
-def test_thinning_some_observations_counts_no_others(run):
-    memory = run.memory
+def test_thinning_some_observations_counts_no_others(bare_run):
+    memory = bare_run.memory
     among = memory.generated
     kept = thinned(memory, 100, among=among)
     assert among[kept.rows].all() and 10 < len(kept.rows) <= 100

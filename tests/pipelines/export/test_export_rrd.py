@@ -10,24 +10,12 @@ from box_project import fused, write_box
 from export_runs import export_run
 from PIL import Image
 
-import gvtools
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thinned
 
 pytest.importorskip("rerun")
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A run of two rounds after the context's."""
-    folder = tmp_path_factory.mktemp("box")
-    write_box(folder)
-    settings = {"rounds": 2, "views_per_round": 1, "voxel": 0.03, "refine.seconds": 0}
-    return gvtools.reconstruct(
-        folder, folder / "run", context="every:3", targets="every:3+1", settings=settings
-    )
 
 
 def chunks(path):
@@ -50,9 +38,9 @@ def points(path):
     }
 
 
-def test_points_come_with_their_rounds(run, tmp_path):
-    export_run(run.path, "--format", "rrd", "--out", tmp_path / "out.rrd")
-    memory = run.memory
+def test_points_come_with_their_rounds(reconstructed_run, tmp_path):
+    export_run(reconstructed_run.path, "--format", "rrd", "--out", tmp_path / "out.rrd")
+    memory = reconstructed_run.memory
     rows = thinned(memory, None).rows
     rounds, made = memory.columns.round[rows], memory.generated[rows]
     found = points(tmp_path / "out.rrd")
@@ -69,8 +57,8 @@ def test_points_come_with_their_rounds(run, tmp_path):
         np.testing.assert_allclose(read, positions, atol=1e-5)
 
 
-def test_cameras_stand_where_they_stood_with_their_pictures(run, tmp_path):
-    export_run(run.path, "--format", "rrd", "--out", tmp_path / "out.rrd")
+def test_cameras_stand_where_they_stood_with_their_pictures(reconstructed_run, tmp_path):
+    export_run(reconstructed_run.path, "--format", "rrd", "--out", tmp_path / "out.rrd")
     found = {
         entity.split("/")[-1].replace("\\", ""): (entity, columns)
         for entity, columns in chunks(tmp_path / "out.rrd")
@@ -81,9 +69,9 @@ def test_cameras_stand_where_they_stood_with_their_pictures(run, tmp_path):
         for entity, columns in chunks(tmp_path / "out.rrd")
         if "EncodedImage:blob" in columns
     }
-    scene, truths = run.scenes
-    targets = [view.name for view in run.views]
-    assert sorted(found) == sorted([*run.context, *targets]) and targets
+    scene, truths = reconstructed_run.scenes
+    targets = [view.name for view in reconstructed_run.views]
+    assert sorted(found) == sorted([*reconstructed_run.context, *targets]) and targets
     for name, (entity, columns) in found.items():
         view = (truths if name in targets else scene)[name]
         kind = "generated" if name in targets else "context"
@@ -98,8 +86,10 @@ def test_cameras_stand_where_they_stood_with_their_pictures(run, tmp_path):
         assert np.abs(picture - wanted).mean() < 12
 
 
-def test_an_earlier_round_has_no_later_cameras(run, tmp_path):
-    export_run(run.path, "--format", "rrd", "--out", tmp_path / "out.rrd", "--round", 0)
+def test_an_earlier_round_has_no_later_cameras(reconstructed_run, tmp_path):
+    export_run(
+        reconstructed_run.path, "--format", "rrd", "--out", tmp_path / "out.rrd", "--round", 0
+    )
     entities = [entity for entity, _ in chunks(tmp_path / "out.rrd")]
     assert entities and not any("generated" in entity for entity in entities)
 

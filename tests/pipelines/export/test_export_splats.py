@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from box_project import fused, write_box
-from export_runs import export_run, saved_run
+from box_project import fused
+from export_runs import export_run
 from plain_splats import draw, read_splats
 from plyfile import PlyData
 from reference_gaussians import rotations
@@ -23,21 +23,6 @@ from pipelines.rendering.figures import render_view
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_box(tmp_path_factory.mktemp("box"))
-
-
-@pytest.fixture(scope="module")
-def run(scene, tmp_path_factory):
-    return saved_run(scene, tmp_path_factory.mktemp("fitted") / "run", fitted=True)
-
-
-@pytest.fixture(scope="module")
-def bare(scene, tmp_path_factory):
-    return saved_run(scene, tmp_path_factory.mktemp("bare") / "run", fitted=False)
-
-
 def psnr(one: np.ndarray, two: np.ndarray) -> float:
     return float(-10 * np.log10(np.square(one - two).mean()))
 
@@ -47,20 +32,22 @@ def drawn(splats, camera):
     return draw(splats, camera.cam_from_world[0], camera.K[0], size=size)
 
 
-def losses(scene, run, file):
+def losses(scene, fitted_run, file):
     """What the file's pictures lose to ``gvtools render`` in two photographs [dB]."""
-    splats, appearance = read_splats(file), load_appearance(run.folder)
+    splats, appearance = read_splats(file), load_appearance(fitted_run.folder)
     lost = []
     for row in (0, 1):
         view = scene.views[row]
         truth = view.load().rgb / 255
-        shown, _ = render_view(run.memory, view.camera, SplatOptions(), appearance=appearance)
+        shown, _ = render_view(
+            fitted_run.memory, view.camera, SplatOptions(), appearance=appearance
+        )
         lost.append(psnr(shown.rgb[0], truth) - psnr(drawn(splats, view.camera), truth))
     return lost
 
 
-def test_the_ply_has_inrias_properties_in_order(run, tmp_path):
-    export_run(run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
+def test_the_ply_has_inrias_properties_in_order(fitted_run, tmp_path):
+    export_run(fitted_run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
     vertex = PlyData.read(tmp_path / "out.ply")["vertex"]
     names = [each.name for each in vertex.properties]
     assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -70,59 +57,61 @@ def test_the_ply_has_inrias_properties_in_order(run, tmp_path):
     assert {each.val_dtype for each in vertex.properties} == {"f4"}
 
 
-def test_gsply_reads_fitted_and_generated_gaussians(run, tmp_path):
+def test_gsply_reads_fitted_and_generated_gaussians(fitted_run, tmp_path):
     gsply = pytest.importorskip("gsply")
-    export_run(run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
+    export_run(fitted_run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
     read = gsply.plyread(tmp_path / "out.ply")
-    made = thinned(run.memory, None, among=run.memory.generated).rows
-    gaussians = run.appearance.gaussians
+    made = thinned(fitted_run.memory, None, among=fitted_run.memory.generated).rows
+    gaussians = fitted_run.appearance.gaussians
     fitted = len(gaussians)
     assert len(read.means) == fitted + len(made) and len(made) > 100
     world = gaussians.frame.to_world(gaussians.values[:, :3])
     np.testing.assert_allclose(read.means[:fitted], world, atol=1e-5)
-    np.testing.assert_allclose(read.means[fitted:], run.memory.positions[made], atol=1e-5)
+    np.testing.assert_allclose(read.means[fitted:], fitted_run.memory.positions[made], atol=1e-5)
     np.testing.assert_allclose(read.scales[:fitted], gaussians.values[:, 3:6], atol=1e-6)
     np.testing.assert_allclose(np.ravel(read.opacities)[:fitted], 3, atol=1e-6)
     # Those of the memory: round, of the voxels' size, without harmonics, opaque.
     np.testing.assert_allclose(np.ptp(read.scales[fitted:], axis=1), 0, atol=1e-6)
-    assert (np.exp(read.scales[fitted:, 0]) < 2 * run.memory.voxel).all()
+    assert (np.exp(read.scales[fitted:, 0]) < 2 * fitted_run.memory.voxel).all()
     assert not read.shN[fitted:].any()
     colors = 0.5 + 0.28209479177387814 * read.sh0[fitted:]
-    np.testing.assert_allclose(colors * 255, run.memory.columns.colors[made], atol=1e-2)
-    export_run(run.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--observed")
+    np.testing.assert_allclose(colors * 255, fitted_run.memory.columns.colors[made], atol=1e-2)
+    export_run(fitted_run.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--observed")
     assert len(gsply.plyread(tmp_path / "out.ply").means) == fitted
 
 
-def test_another_rasteriser_shows_what_render_shows(scene, run, tmp_path):
-    export_run(run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
-    assert max(losses(scene, run, tmp_path / "out.ply")) < 1
+def test_another_rasteriser_shows_what_render_shows(scene, fitted_run, tmp_path):
+    export_run(fitted_run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
+    assert max(losses(scene, fitted_run, tmp_path / "out.ply")) < 1
 
 
-def test_exposures_are_in_the_colours(scene, run, tmp_path):
+def test_exposures_are_in_the_colours(scene, fitted_run, tmp_path):
     # All cameras of the box stand in one place, so that directions tell but a part of it.
-    export_run(run.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--observed")
+    export_run(fitted_run.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--observed")
     splats = read_splats(tmp_path / "out.ply")
-    plain = replace(run.appearance, exposures=None)
+    plain = replace(fitted_run.appearance, exposures=None)
     for row in (0, 1):
         camera = scene.views[row].camera
-        wanted = run.appearance.picture(camera).rgb
+        wanted = fitted_run.appearance.picture(camera).rgb
         assert psnr(drawn(splats, camera), wanted) > psnr(plain.picture(camera).rgb, wanted) + 0.5
 
 
-def test_a_memory_without_a_fit_shows_its_points(scene, bare, tmp_path):
-    export_run(bare.folder, "--format", "splat", "--out", tmp_path / "out.ply")
+def test_a_memory_without_a_fit_shows_its_points(scene, bare_run, tmp_path):
+    export_run(bare_run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
     splats = read_splats(tmp_path / "out.ply")
-    assert len(splats["positions"]) == bare.memory.voxels
+    assert len(splats["positions"]) == bare_run.memory.voxels
     assert splats["harmonics"].shape[1] == 1
     # More confidence, more opacity.
-    rows = thinned(bare.memory, None).rows
-    order = np.argsort(bare.memory.confidence[rows])
+    rows = thinned(bare_run.memory, None).rows
+    order = np.argsort(bare_run.memory.confidence[rows])
     assert (np.diff(splats["opacities"][order]) >= -1e-6).all()
     camera = scene.views[1].camera
-    shown = bare.memory.project(camera)
+    shown = bare_run.memory.project(camera)
     both = shown.valid[0]
     assert psnr(drawn(splats, camera)[both], shown.rgb[0][both]) > 28
-    export_run(bare.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--max-points", 300)
+    export_run(
+        bare_run.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--max-points", 300
+    )
     assert 50 < len(read_splats(tmp_path / "out.ply")["positions"]) <= 300
 
 
@@ -140,10 +129,10 @@ def test_far_from_the_origin_positions_count_from_a_point_that_the_header_names(
     np.testing.assert_allclose(xyz + (origin - ORIGIN), near[rows], atol=1e-5)
 
 
-def test_gsply_reads_the_spz_as_the_ply(run, tmp_path):
+def test_gsply_reads_the_spz_as_the_ply(fitted_run, tmp_path):
     gsply = pytest.importorskip("gsply")
     for form, name in (("splat", "out.ply"), ("spz", "out.spz")):
-        export_run(run.folder, "--format", form, "--out", tmp_path / name)
+        export_run(fitted_run.folder, "--format", form, "--out", tmp_path / name)
     ply, spz = gsply.plyread(tmp_path / "out.ply"), gsply.read_spz(tmp_path / "out.spz")
     assert len(spz.means) == len(ply.means)
     flip = np.array([1, -1, -1])
@@ -166,20 +155,32 @@ def test_gsply_reads_the_spz_as_the_ply(run, tmp_path):
     assert np.corrcoef((spz.shN * signs).ravel(), ply.shN.ravel())[0, 1] > 0.3
 
 
-def test_equal_exports_are_equal_files(run, tmp_path):
+def test_equal_exports_are_equal_files(fitted_run, tmp_path):
     for name in ("a.spz", "b.spz"):
-        export_run(run.folder, "--format", "spz", "--out", tmp_path / name)
+        export_run(fitted_run.folder, "--format", "spz", "--out", tmp_path / name)
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
 
 
-def test_fitted_gaussians_are_not_thinned(run, tmp_path):
-    count = len(run.appearance.gaussians)
+def test_fitted_gaussians_are_not_thinned(fitted_run, tmp_path):
+    count = len(fitted_run.appearance.gaussians)
     with pytest.raises(OptionError, match=f"the run's fit has {count} Gaussians"):
         export_run(
-            run.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--max-points", 10
+            fitted_run.folder,
+            "--format",
+            "splat",
+            "--out",
+            tmp_path / "out.ply",
+            "--max-points",
+            10,
         )
     export_run(
-        run.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--max-points", count + 40
+        fitted_run.folder,
+        "--format",
+        "splat",
+        "--out",
+        tmp_path / "out.ply",
+        "--max-points",
+        count + 40,
     )
     read = len(read_splats(tmp_path / "out.ply")["positions"])
     assert count < read <= count + 40
