@@ -2,7 +2,7 @@
 
 Each two triangles share a square of the picture, in a few sizes. Unwrappers make prettier charts,
 but a mesh of noisy depth defeats them: Open3D's UVAtlas refuses its edges of three triangles, and
-xatlas takes minutes for 50 000 triangles.
+xatlas takes 20 s for 50 000 triangles and is one more package.
 """
 
 from __future__ import annotations
