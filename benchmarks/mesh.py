@@ -145,7 +145,7 @@ def measured(
         errors.append(error[known])
         depths.append(view.depth[known])
         edges.append(_edges(view.depth)[known])
-        level = psnr(surface.colors(hit), view.rgb, mask=np.isfinite(hit["t_hit"]))
+        level = psnr(surface.colors(hit) / 255, view.rgb, mask=np.isfinite(hit["t_hit"]))
         levels += [] if level is None else [level]
         if pictures is not None:
             _draw(pictures / f"{Path(view.name).stem}.png", view, np.where(known, error, np.nan))
