@@ -28,6 +28,7 @@ import open3d as o3d
 import trimesh
 from numpy.typing import NDArray
 
+from gvtools.errors import ProjectError
 from gvtools.evaluation.images import psnr
 from gvtools.files import write_json
 from gvtools.runs.run import load_run
@@ -57,7 +58,7 @@ class Surface:
     """A mesh that rays meet. Positions count from its middle, where float32 is fine enough."""
 
     def __init__(self, path: Path) -> None:
-        self.mesh = trimesh.load(path, process=False, force="mesh")
+        self.mesh: Any = trimesh.load(path, process=False, force="mesh")
         self.middle = self.mesh.bounds.mean(axis=0)
         self.rays = o3d.t.geometry.RaycastingScene()
         self.rays.add_triangles(
@@ -124,10 +125,14 @@ def held_out(folder: Path) -> list[Held]:
     """The run's targets with their recorded pictures and depth, at the poses the run has."""
     run = load_run(folder)
     truths = run.scenes[1]
+    if truths is None:
+        raise ProjectError(f"{folder}: its targets have no recorded views; make them a selection")
     views = []
     for name in run.record["targets"]:
         view = truths[name]
         frame = view.load()
+        if frame.depth is None:
+            raise ProjectError(f"{name}: no depth; expected an RGB-D project")
         camera = view.camera
         views.append(Held(name, frame.rgb, frame.depth, camera.K[0], camera.cam_from_world[0]))
     return views
