@@ -58,7 +58,8 @@ class Surface:
     """A mesh that rays meet. Positions count from its middle, where float32 is fine enough."""
 
     def __init__(self, path: Path) -> None:
-        self.mesh: Any = trimesh.load(path, process=False, force="mesh")
+        loaded: Any = trimesh.load(path, process=False, force="mesh")
+        self.mesh = loaded
         self.middle = self.mesh.bounds.mean(axis=0)
         self.rays = o3d.t.geometry.RaycastingScene()
         self.rays.add_triangles(
