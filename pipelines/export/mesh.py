@@ -115,9 +115,7 @@ def _photographs(source: Source) -> Iterator[tuple[Cameras, NDArray[np.uint8]]]:
         ProjectError: the project, or a photograph, cannot be read any more.
     """
     scene = load_run(source.path).scenes[0]
-    for view in source.memory.views:
-        if view.generated:
-            continue
+    for view in source.memory.views.photographed:
         picture = scene[view.camera.names[0]].load().rgb
         camera = source.memory.frame.seen_from(view.camera)
         yield camera.resized(picture.shape[1], picture.shape[0]), picture
