@@ -114,85 +114,14 @@ def test_a_browser_draws_them_as_a_plain_rasteriser_does(viewer, run, scene, tmp
         assert [e for e in browser.console_errors() if "Computed radius is NaN" not in e] == []
     size = (int(camera.width[0]), int(camera.height[0]))
     assert size == (round(canvas["width"]), round(canvas["height"]))
-    expected = draw(file, camera.cam_from_world[0], camera.K[0], size=size)
+    pose, K = camera.cam_from_world[0], camera.K[0]
+    expected = draw(file, pose, K, size=size)
+    # White Gaussians show the share of light that all stop; the page behind them is white.
+    white = {**file, "harmonics": np.full((len(file["positions"]), 1, 3), 0.5 / 0.28209479)}
+    expected += 1 - draw(white, pose, K, size=size)
     whole = np.rint(255 * np.clip(expected, 0, 1)).astype(np.uint8)[SCENE]
     Image.fromarray(np.concatenate([seen, whole])).save(tmp_path / "seen.png")
-    # Where the plain one is not black from lack of Gaussians.
-    there = whole.max(axis=2) > 20
+    # Where there are Gaussians.
+    there = whole.min(axis=2) < 200
     assert there.mean() > 0.5
     assert np.abs(seen[there].astype(float) - whole[there]).mean() < 8
-
-
-def test_thin_and_huge_gaussians_stay_within_half_precision():
-    values = np.zeros((3, 38), np.float32)
-    values[:, 6] = 1
-    values[:, 3:6] = np.log([[1e-6, 0.01, 0.02], [0.1, 0.1, 1e9], [1e-3, 1e-3, 1e-3]])
-    shown = ShownGaussians(values, np.zeros(3), np.zeros(3, np.int32))
-    halves = shown.covariances(MAGNIFIED, largest=LARGEST).astype(np.float16)
-    assert np.isfinite(halves).all()
-    diagonal = np.sqrt(np.diagonal(halves.astype(float), axis1=1, axis2=2)) / MAGNIFIED
-    np.testing.assert_allclose(diagonal[2], 1e-3, rtol=0.02)
-    np.testing.assert_allclose(diagonal[0], [0.02 * THINNEST, 0.01, 0.02], rtol=0.02)
-    assert diagonal[1, 2] == pytest.approx(LARGEST / MAGNIFIED, rel=1e-3)
-
-
-def test_a_mesh_is_on_the_page_where_it_is_in_the_file(run, tmp_path):
-    trimesh = pytest.importorskip("trimesh")
-    export_run(run.folder, "--format", "mesh", "--out", tmp_path / "mesh.ply")
-    shown = ViewSource(tmp_path / "mesh.ply").read()
-    viewer = WebViewer(shown, port=free_port())
-    mesh: Any = viewer._mesh
-    assert shown.surface is not None
-    try:
-        assert mesh.visible and not any(n.visible for n in viewer._points._nodes.values())
-        sent = trimesh.load_scene(
-            trimesh.util.wrap_as_stream(mesh.glb_data), file_type="glb"
-        ).to_mesh()
-        world = sent.vertices / viewer.frame.scale + viewer.frame.origin
-        np.testing.assert_allclose(world, shown.surface.vertices, atol=1e-5)
-        assert len(sent.faces) == len(shown.surface.faces)
-        viewer._show_look(POINTS)
-        assert not mesh.visible
-        viewer._show_look(MESH)
-        assert mesh.visible
-    finally:
-        viewer.stop()
-
-
-def test_a_damaged_fit_is_said_on_the_page(scene, tmp_path):
-    run = saved_run(scene, tmp_path / "run", fitted=True)
-    viewer = WebViewer(ViewSource(run.folder).read(), port=free_port())
-    try:
-        (run.folder / "round_000" / "appearance.npz").write_bytes(b"PK")
-        viewer._show_look(SPLATS)
-        assert "no splats: " in viewer._panel._note.content
-        assert "appearance.npz" in viewer._panel._note.content
-        viewer._show_look(POINTS)
-        assert all(node.visible for node in viewer._points._nodes.values())
-    finally:
-        viewer.stop()
-
-
-HOSTILE = "<img src=x onerror=window.hurt=1>\"'&amp;"
-
-
-@pytest.mark.slow
-def test_hostile_names_are_text_on_the_page(scene, tmp_path):
-    run = saved_run(scene, tmp_path / HOSTILE, fitted=False)
-    export_run(run.folder, "--format", "splat", "--out", tmp_path / f"{HOSTILE}.ply")
-    viewer = WebViewer(ViewSource(tmp_path / f"{HOSTILE}.ply").read(), port=free_port())
-    viewer.set_note(HOSTILE)
-    try:
-        with open_browser() as browser:
-            browser.driver.get(viewer.url)
-            wait(lambda: "observations after round" in browser.text())
-            assert HOSTILE in browser.text()
-            client = wait(lambda: next(iter(viewer.server.get_clients().values()), None))
-            name: Any = viewer.path._name
-            name.value = HOSTILE
-            viewer.path._for(client, viewer.path.save)
-            wait(lambda: "expected letters" in browser.text())
-            hurt = "return [window.hurt || 0, document.querySelectorAll('img[src=x]').length]"
-            assert browser.driver.execute_script(hurt) == [0, 0]
-    finally:
-        viewer.stop()
