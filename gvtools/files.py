@@ -108,6 +108,18 @@ def _discard(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """The same file under another name, or a copy of it on another disk.
+
+    A hard link: both names are ordinary files that survive copying to another machine. To write
+    *into* one of them changes the other; to replace it does not.
+    """
+    try:
+        os.link(source.resolve(), target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
 def check_parent(path: Path) -> None:
     """Before a long computation: whether its result can be written to ``path`` in the end.
 

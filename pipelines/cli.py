@@ -21,6 +21,8 @@ COMMANDS = {
     "check": "pipelines.commands.check",
     "reconstruct": "pipelines.commands.reconstruct",
     "refine": "pipelines.commands.refine",
+    "split": "pipelines.commands.split",
+    "merge": "pipelines.commands.merge",
     "render": "pipelines.commands.render",
     "tradeoff": "pipelines.commands.tradeoff",
     "evaluate": "pipelines.commands.evaluate",

@@ -24,7 +24,7 @@ from gvtools.capture.project import REPORT, replaced_folder
 from gvtools.capture.rgbd_frames import RgbdFrames
 from gvtools.capture.rgbd_poses import Found, find_poses
 from gvtools.errors import ProjectError
-from gvtools.files import write_json
+from gvtools.files import link_or_copy, write_json
 from gvtools.scenes.photographs import named
 from gvtools.scenes.rgbd import SIDECAR, resolve_options, rgbd_scene
 from gvtools.scenes.rgbd_recording import Recording, RgbdOptions
@@ -175,8 +175,8 @@ def _write(
         frame = recording.frames[number]
         assert frame.depth is not None
         stem = names[number][: names[number].rindex(".color.")]
-        _link(frame.color, work / names[number])
-        _link(frame.depth, work / f"{stem}.depth.png")
+        link_or_copy(frame.color, work / names[number])
+        link_or_copy(frame.depth, work / f"{stem}.depth.png")
         _save(work / f"{stem}.pose.txt", pose)
     color_K = recording.color_K if options.color_K is None else np.asarray(options.color_K)
     _save(work / INTRINSICS, np.asarray(color_K)[:3, :3])
@@ -202,14 +202,6 @@ def _write(
 def _save(path: Path, matrix: Float64) -> None:
     """A matrix with all digits of float64."""
     np.savetxt(path, matrix, fmt="%.17g")
-
-
-def _link(source: Path, target: Path) -> None:
-    """The same file under another name, or a copy of it on another disk."""
-    try:
-        os.link(source.resolve(), target)
-    except OSError:
-        shutil.copyfile(source, target)
 
 
 def _report(

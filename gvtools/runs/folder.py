@@ -103,7 +103,7 @@ class RunDirectory:
         record = {**identity, "versions": versions()}
         # Options and versions of an unfinished attempt are the same: reuse its context depth.
         same = self._record() == json.loads(json.dumps(record))
-        self._drop_partial(but=self._part(0) if same else None)
+        self._drop_partial(but=self.unfinished_round(0) if same else None)
         if not resumes:
             if not same:
                 write_json(self.path / RECORD, record)
@@ -167,8 +167,8 @@ class RunDirectory:
         """The folder of round ``number``."""
         return round_folder(self.path, number)
 
-    def _part(self, number: int) -> Path:
-        """Where round ``number`` is written."""
+    def unfinished_round(self, number: int) -> Path:
+        """Where round ``number`` is written; context depth that lies there is taken over."""
         return self.path / f".round_{number:03d}.part"
 
     def round_memory(self, number: int) -> Path:
@@ -213,7 +213,7 @@ class RunDirectory:
         Raises:
             ProjectError: the disk is full or the folder cannot be written; earlier rounds stand.
         """
-        part = self._part(number)
+        part = self.unfinished_round(number)
         try:
             part.mkdir(parents=True, exist_ok=True)
             _clear(part)

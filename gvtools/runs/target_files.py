@@ -51,7 +51,7 @@ def write_target(
     ``guidance_STEM.png`` (holes black), ``valid_STEM.png`` (guidance from observations 255, from a
     scan's alone 192, from generated points 128, holes 0), ``generated_STEM.png`` (the completed
     picture), and ``depth_STEM.npz`` with the keys guidance and completion (float32 z-depth, scene
-    units, 0 = none) and fused (bool).
+    units, 0 = none), fused (bool) and confidence (of the completion, float32, 0 to 1).
 
     Args:
         folder: of the round.
@@ -71,6 +71,7 @@ def write_target(
         guidance=guidance.depth[0],
         completion=completion.depth[0],
         fused=fused,
+        confidence=completion.confidence[0],
     )
 
 
@@ -91,6 +92,7 @@ class TargetFiles:
             0 = none.
         observed: (H, W) bool, pixels that stand on observations, a scan's included.
         generated: (H, W) bool, pixels that a completer made, in this round or an earlier one.
+        confidence: (H, W) float32 of the completion, 0 to 1; None of runs that did not keep it.
     """
 
     name: str
@@ -99,6 +101,7 @@ class TargetFiles:
     depth: NDArray[np.float32]
     observed: NDArray[np.bool_]
     generated: NDArray[np.bool_]
+    confidence: NDArray[np.float32] | None = None
 
 
 def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
@@ -119,6 +122,7 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
         file = inside(folder.parent, target_depth(folder, stem))
         with np.load(file, allow_pickle=False) as stored:
             depth = stored["completion"]
+            confidence = stored.get("confidence")
         scale = entry["scale"]["scale"]
     except (OSError, EOFError, BadZipFile, ValueError, KeyError, TypeError) as error:
         raise ProjectError(
@@ -128,7 +132,7 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
     observed = support >= SUPPORT_SCANNED
     aligned = depth * np.float32(scale) if scale is not None and scale == scale else depth
     return TargetFiles(
-        str(entry["name"]), camera, picture, aligned, observed, ~observed & (depth > 0)
+        str(entry["name"]), camera, picture, aligned, observed, ~observed & (depth > 0), confidence
     )
 
 

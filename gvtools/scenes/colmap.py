@@ -22,6 +22,8 @@ from gvtools.scenes.photographs import (
 )
 from gvtools.scenes.scene import Finding, Scene, natural_key
 
+# Middle and side lengths of a chunk of Hierarchical-3DGS, world frame, scene units.
+CHUNK_BOX = ("center.txt", "extent.txt")
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 
 
@@ -37,9 +39,10 @@ def read_colmap(
     Pictures that see too much for one camera become several views, see ``faces``.
 
     The model is looked for in ``sparse/N``, ``sparse``, ``root`` itself and ``sparse_txt``, the
-    pictures in ``images`` beside it. Masks follow COLMAP's layout (``masks/NAME.png`` for the image
-    NAME, black = ignore). Depth comes from ``stereo/depth_maps`` (geometric before photometric); it
-    is z-depth of the recorded camera, which in a dense workspace is the undistorted one already.
+    pictures in ``images`` beside it, those of a chunk of Hierarchical-3DGS (``chunks/NAME``) in
+    ``rectified/images``. Masks follow COLMAP's layout (``masks/NAME.png`` for the image NAME, black
+    = ignore). Depth comes from ``stereo/depth_maps`` (geometric before photometric); it is z-depth
+    of the recorded camera, which in a dense workspace is the undistorted one already.
 
     Args:
         root: the workspace or the model folder.
@@ -94,7 +97,14 @@ def _homes(root: Path, folder: Path) -> list[Path]:
     homes = [root, folder, folder.parent]
     if folder.parent.name in ("sparse", "sparse_txt"):
         homes.append(folder.parent.parent)
+    # A chunk of Hierarchical-3DGS: all chunks share the pictures.
+    homes += [home.resolve().parents[1] / "rectified" for home in homes if is_chunk(home)]
     return list(dict.fromkeys(path.resolve() for path in homes))
+
+
+def is_chunk(folder: Path) -> bool:
+    """Whether a folder is a chunk of Hierarchical-3DGS: a part of a model, with its box."""
+    return all((folder / name).is_file() for name in CHUNK_BOX)
 
 
 def _image_folder(given: Path | None, homes: list[Path], folder: Path) -> Path:

@@ -1,0 +1,1 @@
+"""A project split into blocks that are reconstructed each by itself, and their runs merged."""

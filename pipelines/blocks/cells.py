@@ -1,0 +1,145 @@
+"""Where a project is cut: cells by camera centres, and what views see of each cell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import OptionError
+from gvtools.scenes.blocks import Cell
+
+if TYPE_CHECKING:
+    from gvtools.scenes.scene import Scene
+
+Float64 = NDArray[np.float64]
+
+# Views of a block when their number decides how many blocks there are.
+VIEWS_PER_BLOCK = 150
+# Points that stand for what a view sees.
+SAMPLES = 400
+# Nearest views of each owner that help, whatever they see: depth is found by them.
+NEAREST = 4
+
+
+def cut_cells(centers: Float64, count: int) -> dict[str, Cell]:
+    """Cells with about as many camera centres each, by name.
+
+    Space is halved again and again across the longest side of the centres that it holds, as
+    Hierarchical-3DGS cuts it by axis-parallel planes. A name tells the first and the second half of
+    the way that leads to the cell: "0_1".
+
+    Args:
+        centers: (V, 3), world frame.
+        count: how many cells.
+
+    Raises:
+        OptionError: more cells than distinct places.
+
+    >>> places = np.array([[0, 0, 0], [1, 0, 0], [5, 0, 0], [5, 1, 0]], float)
+    >>> {name: cell.holds(places).tolist() for name, cell in cut_cells(places, 2).items()}
+    {'0_0': [True, True, False, False], '1_0': [False, False, True, True]}
+    """
+    if not 1 <= count <= len(centers):
+        raise OptionError(
+            f"{count} blocks of {len(centers)} context views; expected 1 to {len(centers)}"
+        )
+    leaves = _halved(centers, Cell.everywhere(), count, path="")
+    half = (max(len(path) for path, _ in leaves) + 1) // 2
+    return {
+        f"{int(path[:half] or '0', 2)}_{int(path[half:] or '0', 2)}": cell
+        for path, cell in ((path.ljust(2 * half, "0"), cell) for path, cell in leaves)
+    }
+
+
+def _halved(centers: Float64, cell: Cell, count: int, *, path: str) -> list[tuple[str, Cell]]:
+    """The cells that ``count`` blocks of the centres in a cell make, with the way to each."""
+    if count == 1:
+        return [(path, cell)]
+    inside = centers[cell.holds(centers)]
+    first = count // 2
+    for axis in np.argsort(-np.ptp(inside, axis=0), kind="stable").tolist():
+        place = _gap(inside[:, axis], round(len(inside) * first / count))
+        if place is None:
+            continue
+        low, high = cell.cut(axis, place)
+        below = int(low.holds(centers).sum())
+        if below >= first and len(inside) - below >= count - first:
+            return [
+                *_halved(centers, low, first, path=f"{path}0"),
+                *_halved(centers, high, count - first, path=f"{path}1"),
+            ]
+    raise OptionError(
+        f"{len(inside)} cameras stand at too few places for {count} blocks; expected one place a "
+        "block at least; give a smaller --blocks"
+    )
+
+
+def _gap(values: Float64, rank: int) -> float | None:
+    """The middle of the gap nearest to a rank of the values; None where all are equal."""
+    ordered = np.sort(values)
+    gaps = np.flatnonzero(np.diff(ordered) > 0) + 1
+    if not len(gaps):
+        return None
+    at = gaps[int(np.abs(gaps - rank).argmin())]
+    return float((ordered[at - 1] + ordered[at]) / 2)
+
+
+def seen_points(scene: Scene, names: Sequence[str]) -> dict[str, Float64]:
+    """Some points (N, 3), world frame, that stand for what each view sees.
+
+    Of its depth map or its sparse points; without either of the middle of its frustum, as deep as
+    the cameras spread.
+    """
+    rows = {name: row for row, name in enumerate(scene.names)}
+    points = scene.points
+    tracks = [] if points is None else points.rows_of_views(len(scene))
+    spread = float(np.linalg.norm(np.ptp(scene.subset(names).cameras.centers, axis=0)))
+    out = {}
+    for name in names:
+        view = scene[name]
+        seen = np.zeros((0, 3))
+        if points is not None:
+            mine = np.unique(points.point_index[tracks[rows[name]]])
+            seen = points.positions[mine[:: max(1, len(mine) // SAMPLES)]]
+        if not len(seen):
+            depth = view.load().depth if view.has_depth else None
+            if depth is None or not (depth > 0).any():
+                size = int(view.camera.height[0]), int(view.camera.width[0])
+                depth = np.full(size, max(spread, 1e-9) / 2)
+            row, column = np.nonzero(depth > 0)
+            some = slice(None, None, max(1, len(row) // SAMPLES))
+            row, column = row[some], column[some]
+            rays = view.camera.rays(0)[row, column] * depth[row, column, None]
+            pose = view.camera.world_from_cam[0]
+            seen = rays @ pose[:3, :3].T + pose[:3, 3]
+        out[name] = seen
+    return out
+
+
+def helpers_of(
+    cell: Cell, owners: Sequence[str], seen: Mapping[str, Float64], *,
+    near: Mapping[str, Sequence[str]], overlap: float,
+) -> tuple[str, ...]:  # fmt: skip
+    """The views of other cells that help a block.
+
+    Args:
+        cell: the block's.
+        owners: its own views.
+        seen: see ``seen_points``, of all context views.
+        near: of each view the nearest others.
+        overlap: 0 to 1; a view helps where at least the share ``1 - overlap`` of what it sees lies
+            in the cell. At 0 none does, nor does a nearest view.
+    """
+    if overlap == 0:
+        return ()
+    own = set(owners)
+    chosen = {other for name in owners for other in near[name]} - own
+    chosen |= {
+        name
+        for name, points in seen.items()
+        if name not in own and cell.holds(points).mean() >= 1 - overlap and cell.holds(points).any()
+    }
+    return tuple(sorted(chosen))

@@ -1,0 +1,213 @@
+"""The runs of blocks made one: every view observed once, in the order that one run has.
+
+A memory's observations are means of what several views saw, so memories cannot be added: views of
+two blocks that merged in neither would have merged in one. What decides the observations is kept
+instead, and they are made again by the very code of a run: the whole project's views in the order
+of their names, at the whole project's voxel edge and frame, with the poses and the computed depth
+of the block that owns each view. With recorded depth, and poses that no block moved, the result is
+that of a run of the whole project to the bit. What is dear (depth, fitting, completion) is not
+repeated.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gvtools.cameras import Cameras, concatenate
+from gvtools.errors import ProjectError
+from gvtools.files import link_or_copy
+from gvtools.runs.context_depth import context_depth_files
+from gvtools.runs.folder import RunDirectory
+from gvtools.runs.layout import APPEARANCE, POSES, round_folder
+from gvtools.runs.poses import RunPoses
+from gvtools.runs.run import RunTarget
+from gvtools.scenes.reading import open_recorded
+from gvtools.settings import dotted, with_values
+from pipelines.blocks.appearance import BlockAppearance, joined
+from pipelines.blocks.completions import BlockCompletions
+from pipelines.blocks.runs import BlockRun, read_runs
+from pipelines.reconstruction.compile_kernels import compile_kernels
+from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
+from pipelines.reconstruction.run import Draw, complete_run, say_results
+from pipelines.reconstruction.settings import RunSettings
+from pipelines.reconstruction.targets import Targets
+
+if TYPE_CHECKING:
+    from gvtools.scenes.scene import Scene
+    from pipelines.console import Console
+    from pipelines.reconstruction.fitting import Fitted
+
+
+def merge(
+    paths: Sequence[Path],
+    out: Path,
+    *,
+    blocks: Path | None = None,
+    project: Path | None = None,
+    resume: bool = False,
+    console: Console,
+    draw: Draw | None = None,
+) -> Path:
+    """Merge the runs of all blocks of a split project.
+
+    Args:
+        paths: the runs' folders.
+        out: the merged run's folder.
+        blocks: where the split lies now; None: where it lay.
+        project: where the whole project lies now; None: where it lay.
+        resume: continue a merge after its last complete round.
+        console: where progress and figures go.
+        draw: see ``pipelines.reconstruction.run.reconstruct``.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        GvError: runs that do not belong together, a project that is gone, or a folder that cannot
+            be written.
+    """
+    runs = read_runs(paths, blocks=blocks)
+    first = runs[0].block
+    scene = open_recorded(first.project, first.reading, moved=project)
+    plan, targets = _plan(scene, runs, console)
+    compile_kernels(plan.config, console)
+    describe(plan, console)
+    identity = run_identity(plan, first.reading)
+    identity["blocks"] = [
+        {"name": item.block.name, "run": str(item.run.path.resolve())} for item in runs
+    ]
+    directory = RunDirectory(out)
+    with directory.open_or_resume(identity, resume=resume) as done:
+        plan = plan.posed
+        if not done:
+            _take_depth(plan, runs, directory)
+        fitted = _fitted(plan, runs)
+        plan = replace(plan, completer=BlockCompletions(targets))
+        drawn = complete_run(plan, directory, done, fitted=fitted, console=console, draw=draw)
+    say_results(directory, drawn, console)
+    return out
+
+
+def _plan(
+    scene: Scene, runs: Sequence[BlockRun], console: Console
+) -> tuple[Plan, dict[str, RunTarget]]:
+    """The plan of the merged run, and the blocks' targets by their names in it."""
+    context = tuple(sorted(name for item in runs for name in item.block.owners))
+    targets = _named_targets(runs)
+    held_out = runs[0].held_out
+    names = tuple(sorted(targets)) if held_out else tuple(targets)
+    settings = with_values(RunSettings(), dotted(runs[0].run.record["settings"])).replaced(
+        context=_selection(context), targets=_selection(names) if held_out else "interpolate:1"
+    )
+    # What completes, and what is tuned for it, did so in the blocks.
+    asked = with_values(settings, {"completer": "none", "tune.minutes": 0.0})
+    with tempfile.TemporaryDirectory() as folder:
+        poses = _poses(runs, context, names if held_out else ("",))
+        if poses is not None:
+            poses.save(Path(folder) / POSES)
+        plan = make_plan(scene, asked, say=console.line, round_0=Path(folder))
+    cameras = plan.targets
+    if not held_out and names:
+        kind = str(runs[0].run.record["targets_kind"])
+        moved = concatenate([targets[name].camera for name in names])
+        named = Cameras(moved.K, moved.cam_from_world, moved.width, moved.height, names)
+        cameras = Targets(named, (None,) * len(names), kind)
+        if plan.poses is not None:
+            plan = replace(plan, poses=RunPoses(plan.poses.context, moved.cam_from_world))
+    schedule = _schedule(targets, names)
+    config = plan.config.replaced(completer=settings.completer, rounds=len(schedule))
+    return replace(
+        plan, settings=settings, config=config, targets=cameras, schedule=schedule
+    ), targets
+
+
+def _selection(names: Sequence[str]) -> str:
+    return ",".join(names)
+
+
+def _named_targets(runs: Sequence[BlockRun]) -> dict[str, RunTarget]:
+    """The targets that stay, block by block; a block's name before those that are no views."""
+    out = {}
+    for item in runs:
+        for target in item.targets:
+            name = target.name if item.held_out else f"{item.block.name}/{target.name}"
+            out[name] = target
+    if not out:
+        raise ProjectError(
+            "no target of the runs stands in its own block; expected some; give the blocks' runs "
+            "--targets"
+        )
+    return out
+
+
+def _schedule(targets: dict[str, RunTarget], names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """Rows of the targets by the rounds that their blocks had them in."""
+    row = {name: number for number, name in enumerate(names)}
+    rounds = sorted({target.round for target in targets.values()})
+    return tuple(
+        tuple(row[name] for name in names if targets[name].round == number) for number in rounds
+    )
+
+
+def _poses(
+    runs: Sequence[BlockRun], context: Sequence[str], targets: Sequence[str]
+) -> RunPoses | None:
+    """The poses of the merged run; None where they are the project's."""
+    if not (runs[0].block.refined or any(item.moved for item in runs)):
+        return None
+    found = {name: pose for item in runs for name, pose in item.poses.items()}
+    for item in runs:
+        cameras = {target.name: target.camera.cam_from_world[0] for target in item.targets}
+        found |= {name: cameras.get(name, item.block.poses[name]) for name in item.block.targets}
+    return RunPoses(
+        np.array([found[name] for name in context]),
+        np.array([found.get(name, np.eye(4)) for name in targets]),
+    )
+
+
+def _take_depth(plan: Plan, runs: Sequence[BlockRun], directory: RunDirectory) -> None:
+    """Put the depth that blocks computed for their own views where round 0 looks for it."""
+    place = directory.unfinished_round(0)
+    wanted = context_depth_files(place, plan.context)
+    for item in runs:
+        folder = round_folder(item.run.path, 0)
+        for name, path in context_depth_files(folder, item.run.context).items():
+            if name not in item.block.owners or not path.is_file() or wanted[name].exists():
+                continue
+            place.mkdir(parents=True, exist_ok=True)
+            try:
+                for ending in (".png", ".npz"):
+                    link_or_copy(path.with_suffix(ending), wanted[name].with_suffix(ending))
+            except (OSError, shutil.Error) as error:
+                raise ProjectError(
+                    f"{path}: cannot be taken over ({error}); free some space and add --resume"
+                ) from error
+
+
+def _fitted(plan: Plan, runs: Sequence[BlockRun]) -> Fitted | None:
+    """The joined Gaussians; None where a block has none."""
+    from pipelines.reconstruction.fitting import Fitted
+    from pipelines.reconstruction.voxel_edge import grid_frame
+
+    files = [round_folder(item.run.path, 0) / APPEARANCE for item in runs]
+    if not all(file.exists() for file in files):
+        return None
+    found = [Fitted.load(file).on(plan.config.device) for file in files]
+    parts = [
+        BlockAppearance(item.block, item.run.context, fitted.appearance)
+        for item, fitted in zip(runs, found, strict=True)
+    ]
+    appearance = joined(parts, grid_frame(plan.scene, plan.context))
+    return Fitted(
+        appearance,
+        plan.poses,
+        spread=any(fitted.spread for fitted in found),
+        steps=min(fitted.steps for fitted in found),
+    )
