@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -100,16 +100,17 @@ def _plan(
 ) -> tuple[Plan, dict[str, RunTarget]]:
     """The plan of the merged run, and the blocks' targets by their names in it."""
     context = tuple(sorted(name for item in runs for name in item.block.owners))
-    targets = _named_targets(runs)
-    held_out = runs[0].held_out
+    # A block without held-out views has some path for its targets.
+    held_out = any(item.held_out for item in runs)
+    targets = _named_targets(runs, held_out=held_out)
     names = tuple(sorted(targets)) if held_out else tuple(targets)
     settings = with_values(RunSettings(), dotted(runs[0].run.record["settings"])).replaced(
-        context=_selection(context), targets=_selection(names) if held_out else "interpolate:1"
+        context=_selection(context), targets=_selection(names) if held_out else "interpolate:2"
     )
     # What completes, and what is tuned for it, did so in the blocks.
     asked = with_values(settings, {"completer": "none", "tune.minutes": 0.0})
     with tempfile.TemporaryDirectory() as folder:
-        poses = _poses(runs, context, names if held_out else ("",))
+        poses = _poses(runs, context, names if held_out else ("", ""), targets=targets)
         if poses is not None:
             poses.save(Path(folder) / POSES)
         plan = make_plan(scene, asked, say=console.line, round_0=Path(folder))
@@ -132,19 +133,13 @@ def _selection(names: Sequence[str]) -> str:
     return ",".join(names)
 
 
-def _named_targets(runs: Sequence[BlockRun]) -> dict[str, RunTarget]:
+def _named_targets(runs: Sequence[BlockRun], *, held_out: bool) -> dict[str, RunTarget]:
     """The targets that stay, block by block; a block's name before those that are no views."""
-    out = {}
-    for item in runs:
-        for target in item.targets:
-            name = target.name if item.held_out else f"{item.block.name}/{target.name}"
-            out[name] = target
-    if not out:
-        raise ProjectError(
-            "no target of the runs stands in its own block; expected some; give the blocks' runs "
-            "--targets"
-        )
-    return out
+    return {
+        target.name if held_out else f"{item.block.name}/{target.name}": target
+        for item in runs
+        for target in item.targets(held_out=held_out)
+    }
 
 
 def _schedule(targets: dict[str, RunTarget], names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
@@ -157,18 +152,24 @@ def _schedule(targets: dict[str, RunTarget], names: Sequence[str]) -> tuple[tupl
 
 
 def _poses(
-    runs: Sequence[BlockRun], context: Sequence[str], targets: Sequence[str]
+    runs: Sequence[BlockRun],
+    context: Sequence[str],
+    names: Sequence[str],
+    *,
+    targets: Mapping[str, RunTarget],
 ) -> RunPoses | None:
-    """The poses of the merged run; None where they are the project's."""
+    """The poses of context and targets of the merged run; None where they are the project's."""
     if not (runs[0].block.refined or any(item.moved for item in runs)):
         return None
     found = {name: pose for item in runs for name, pose in item.poses.items()}
-    for item in runs:
-        cameras = {target.name: target.camera.cam_from_world[0] for target in item.targets}
-        found |= {name: cameras.get(name, item.block.poses[name]) for name in item.block.targets}
+    found |= {name: pose for item in runs if not item.moved for name, pose in item.held.items()}
+    for name in names:
+        if name not in found:
+            camera = targets[name].camera.cam_from_world[0] if name in targets else np.eye(4)
+            found[name] = camera
     return RunPoses(
         np.array([found[name] for name in context]),
-        np.array([found.get(name, np.eye(4)) for name in targets]),
+        np.array([found[name] for name in names]).reshape(-1, 4, 4),
     )
 
 

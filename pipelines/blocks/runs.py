@@ -42,20 +42,32 @@ class BlockRun:
         return {name: found[name] for name in self.block.owners}
 
     @property
+    def held(self) -> dict[str, np.ndarray]:
+        """(4, 4) cam_from_world of the views that the block holds out."""
+        return {name: self.block.poses[name] for name in self.block.targets}
+
+    @property
     def moved(self) -> bool:
         """Whether the run refined poses of its own."""
         return refined_poses_of(self.run.path) is not None
 
-    @property
-    def targets(self) -> list[RunTarget]:
-        """The run's targets whose cameras stand in the block's cell, or that it holds."""
+    def targets(self, *, held_out: bool) -> list[RunTarget]:
+        """The run's targets that are the block's own.
+
+        Args:
+            held_out: those that the block holds; otherwise those of a path in its cell.
+        """
         held = set(self.block.targets)
+        if held_out != self.held_out:
+            return []
         return [
             target
             for target in self.run.views
-            if target.name in held
-            or (not self.held_out and self.block.cell.holds(target.camera.centers).all())
+            if (target.name in held if held_out else self._inside(target))
         ]
+
+    def _inside(self, target: RunTarget) -> bool:
+        return bool(self.block.cell.holds(target.camera.centers).all())
 
     @property
     def held_out(self) -> bool:
@@ -123,12 +135,6 @@ def _check_alike(runs: Sequence[BlockRun]) -> None:
         raise OptionError(
             f"{runs[0].run.path}: its generated points count as observed ones (protocol paper); "
             "expected them apart, since a merge observes again; reconstruct without"
-        )
-    kinds = {item.held_out for item in runs}
-    if len(kinds) > 1:
-        raise OptionError(
-            "runs with held-out views and with others as targets; expected one kind; give "
-            "--targets alike"
         )
 
 
