@@ -27,7 +27,8 @@ from pipelines.reconstruction import run
 from pipelines.reconstruction.settings import RunSettings
 
 QUIET = Console(quiet=True)
-CONTEXT, TARGETS = "not:every:4+3", "every:4+3"
+# The last view sees what no other does.
+CONTEXT, TARGETS = "not:every:6+3", "every:6+3"
 SETTINGS = {"profile": "fast", "memory.observations_per_voxel": 3}
 
 
