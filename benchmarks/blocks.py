@@ -81,17 +81,15 @@ def main() -> None:
         seam = np.zeros(known.shape, bool)
         seam[known] = near
         all_pixels = np.ones(known.shape, bool)
-        figures = [psnr(run, truth, where) for where in (all_pixels, seam)
-                   for run in (target, others[target.name])] if seam.any() else None  # fmt: skip
+        pair = (target, others[target.name])
+        figures = [psnr(item, truth, all_pixels) for item in pair]
+        figures += [psnr(item, truth, seam) if seam.any() else np.nan for item in pair]
         across = sum(share >= ACROSS for share in shares) > 1
-        if figures:
-            rows.append([across, seam.mean(), *figures])
-            print(
-                target.name, "across" if across else "inside", *(f"{x:.3f}" for x in rows[-1][1:])
-            )
+        rows.append([across, seam.mean(), *figures])
+        print(target.name, "across" if across else "inside", *(f"{x:.3f}" for x in rows[-1][1:]))
     table = np.array(rows, float)
     for name, some in (("all views", table), ("views across seams", table[table[:, 0] > 0])):
-        mean = some[:, 2:].mean(axis=0)
+        mean = np.nanmean(some[:, 2:], axis=0)
         print(
             f"{name} ({len(some)}): PSNR {mean[0]:.3f} whole, {mean[1]:.3f} merged; near seams "
             f"{mean[2]:.3f} whole, {mean[3]:.3f} merged"

@@ -32,6 +32,7 @@ DOCTESTED = (
     "gvtools.evaluation.trajectories",
     "gvtools.scans.fuse",
     "gvtools.scans.placement",
+    "gvtools.scenes.blocks",
     "gvtools.scenes.data_sets.address",
     "gvtools.scenes.data_sets.drawn",
     "gvtools.scenes.data_sets.mvsnet_cameras",
@@ -47,6 +48,8 @@ DOCTESTED = (
     "gvtools.training.mixture",
     "gvtools.training.tune_options",
     "gvtools.trajectory_files",
+    "pipelines.blocks.appearance",
+    "pipelines.blocks.cells",
     "pipelines.data_sets.log_histogram",
 )
 
