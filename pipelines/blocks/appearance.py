@@ -107,9 +107,11 @@ def _in_cell(
 ) -> NDArray[np.float32]:
     """The Gaussians in a block's cell, in a frame, dimmed by what their photographs' gains rise."""
     world = gaussians.frame.to_world(gaussians.values[:, :LOG_SCALE])
-    values = gaussians.values[block.cell.holds(world)]
-    out = turned(values, frame.axes.T @ gaussians.frame.axes)
-    out[:, :LOG_SCALE] = frame.from_world(world[block.cell.holds(world)])
+    inside = block.cell.holds(world)
+    if not inside.any():
+        return gaussians.values[:0]
+    out = turned(gaussians.values[inside], frame.axes.T @ gaussians.frame.axes)
+    out[:, :LOG_SCALE] = frame.from_world(world[inside])
     scale = np.exp(-gain)
     sh = out[:, SH:].reshape(len(out), -1, 3) * scale
     # Colours are 0.5 + their harmonics; it is the whole that is dimmed.

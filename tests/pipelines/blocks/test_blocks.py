@@ -135,6 +135,7 @@ def test_a_block_is_read_like_the_project_and_survives_a_copy(walk: Path, tmp_pa
     assert set(alone.names) == {*block.context, *block.targets}
     for name in alone.names:
         one, two = scene[name].load(), alone[name].load()
+        assert one.depth is not None and two.depth is not None
         assert np.array_equal(one.rgb, two.rgb) and np.array_equal(one.depth, two.depth)
         assert np.allclose(scene[name].camera.K, alone[name].camera.K, rtol=0, atol=1e-12)
         if name in block.poses and not block.refined:
@@ -191,7 +192,8 @@ def test_cells_fill_space_and_share_cameras_evenly(count: int) -> None:
     cells = cut_cells(points, count)
     assert len(cells) == count
     anywhere = np.random.default_rng(9).normal(size=(500, 3)) * 50
-    assert (sum(cell.holds(anywhere).astype(int) for cell in cells.values()) == 1).all()
+    holding = np.sum([cell.holds(anywhere) for cell in cells.values()], axis=0)
+    assert (holding == 1).all()
     held = [int(cell.holds(points).sum()) for cell in cells.values()]
     assert max(held) - min(held) <= 2 and sum(held) == 40
 

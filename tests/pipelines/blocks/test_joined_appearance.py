@@ -75,5 +75,8 @@ def test_only_the_gaussians_of_the_own_cell_stay() -> None:
     merged = joined([part(0, left, gain=1.0), part(1, right, gain=1.0)], LocalFrame.at())
     x = np.sort(merged.gaussians.values[:, 0])
     assert np.allclose(x, np.sort(whole().values[:, 0]), atol=1e-5)
+    nothing = Cell(np.full(3, 50.0), np.full(3, 60.0))
+    assert len(joined([part(0, left, gain=1.0), part(1, nothing, gain=1.0)], LocalFrame.at())
+               .gaussians) < 300  # fmt: skip
     with_one = joined([part(0, left, gain=1.0)], LocalFrame.at())
     assert (with_one.gaussians.values[:, 0] < 0.1 + 1e-5).all()
