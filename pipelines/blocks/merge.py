@@ -36,6 +36,7 @@ from pipelines.blocks.runs import BlockRun, read_runs
 from pipelines.reconstruction.compile_kernels import compile_kernels
 from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
 from pipelines.reconstruction.run import Draw, complete_run, say_results
+from pipelines.reconstruction.scan import placed_scan
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.reconstruction.targets import Targets
 
@@ -87,6 +88,7 @@ def merge(
     with directory.open_or_resume(identity, resume=resume) as done:
         plan = plan.posed
         if not done:
+            plan = replace(plan, scan=placed_scan(plan, console))
             _take_depth(plan, runs, directory)
         fitted = _fitted(plan, runs)
         plan = replace(plan, completer=BlockCompletions(targets))
