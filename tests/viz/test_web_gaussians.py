@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from box_project import write_box
@@ -14,12 +12,11 @@ from plain_splats import draw, read_splats
 from web_page import SCENE, close_notes, steady, wait
 
 from pipelines.viewing.source import ViewSource
-from viz.run_view.gaussians import THINNEST, ShownGaussians
-from viz.run_view.view import MESH, POINTS, SPLATS
+from viz.run_view.view import POINTS, SPLATS
 
 pytest.importorskip("viser", reason="viser is not installed (extra web)")
 
-from viz.web.gaussians import LARGEST, MAGNIFIED
+from viz.web.gaussians import MAGNIFIED
 from viz.web.viewer import WebViewer
 
 
