@@ -81,7 +81,7 @@ def given_placement(text: str) -> Placement | None:
         OptionError: none of them, or no similarity.
         ProjectError: a file that holds no such matrix.
 
-    >>> given_placement("2,0,0,5, 0,2,0,0, 0,0,2,0").scale
+    >>> round(given_placement("2,0,0,5, 0,2,0,0, 0,0,2,0").scale, 6)
     2.0
     >>> given_placement("1,0,0,5, 0,1,0,0, 0,0,-1,0")
     Traceback (most recent call last):
