@@ -130,7 +130,7 @@ def _run(case: Case, project: Path, budget: int, out: Path) -> dict[str, Any]:
     appearance = out / stem / "round_000" / "appearance.npz"
     count = figures["observations"]
     if appearance.exists():
-        with np.load(appearance) as data:
+        with np.load(appearance, allow_pickle=False) as data:
             count = len(data["values"])
     kept = appearance if appearance.exists() else out / stem / "memory.npz"
     return {

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
+from gvtools.untrusted import read_text
 
 Float64 = NDArray[np.float64]
 
@@ -134,7 +135,7 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
     """Line numbers and words of the lines that hold data."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise ProjectError(f"{path}: cannot be read as a trajectory ({reason})") from error
@@ -155,7 +156,7 @@ def _numbers(words: list[str], count: int, *, where: str) -> Float64:
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
-        raise ProjectError(f"{where}: {error}; expected {count} numbers") from None
+        raise ProjectError(f"{where}: {str(error)[:200]}; expected {count} numbers") from None
     if not np.isfinite(values).all():
         raise ProjectError(f"{where}: NaN or infinity; remove the line or mend it")
     return values

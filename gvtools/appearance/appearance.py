@@ -18,6 +18,7 @@ from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError
 from gvtools.guidance import Guidance
+from gvtools.untrusted import load_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,22 +50,27 @@ class Appearance:
         """
         loaded = Gaussians.load(path)
         try:
-            with np.load(path) as data:
-                ends = np.cumsum(data["counts"])[:-1]
-                first, *others = (
-                    Gaussians(values, frame=loaded.frame)
-                    for values in np.split(loaded.values, ends)
-                )
-                blend = Blend(*data["blend"].tolist())
-                exposures = Exposures(data["poses"], data["log_gains"], float(data["depth"]))
-                count = len(exposures.poses)
-                shapes = exposures.poses.shape, exposures.log_gains.shape
-                if shapes != ((count, 4, 4), (count, 3)):
-                    raise ValueError(f"exposures of shapes {shapes}")
-                return cls(
-                    first, float(data["near"]), blend, others=tuple(others),
-                    exposures=exposures if count else None,
-                )  # fmt: skip
+            data = load_arrays(path)
+            counts = data["counts"]
+            if counts.ndim != 1 or counts.min(initial=0) < 0 or counts.sum() != len(loaded):
+                raise ValueError(f"counts {counts} of {len(loaded)} Gaussians")
+            first, *others = (
+                Gaussians(values, frame=loaded.frame)
+                for values in np.split(loaded.values, np.cumsum(counts)[:-1])
+            )
+            numbers = ("near", "blend", "poses", "log_gains", "depth")
+            if not all(np.isfinite(data[name]).all() for name in numbers):
+                raise ValueError("NaN or infinity")
+            blend = Blend(*data["blend"].tolist())
+            exposures = Exposures(data["poses"], data["log_gains"], float(data["depth"]))
+            count = len(exposures.poses)
+            shapes = exposures.poses.shape, exposures.log_gains.shape
+            if shapes != ((count, 4, 4), (count, 3)):
+                raise ValueError(f"exposures of shapes {shapes}")
+            return cls(
+                first, float(data["near"]), blend, others=tuple(others),
+                exposures=exposures if count else None,
+            )  # fmt: skip
         except UNREADABLE as error:
             raise MemoryFileError(f"{path}: no readable appearance ({error})") from None
 

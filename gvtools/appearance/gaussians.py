@@ -20,6 +20,7 @@ from gvtools.appearance.splat.project_kernels import (
 )
 from gvtools.errors import MemoryFileError, ShapeError
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.untrusted import load_arrays
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -118,10 +119,13 @@ class Gaussians:
             MemoryFileError: missing, damaged, or of another kind.
         """
         try:
-            with np.load(path) as data:
-                arrays: dict[str, Any] = {name: data[name] for name in data.files}
+            arrays: dict[str, Any] = load_arrays(path)
             values = arrays["values"]
-            if values.ndim != 2 or values.shape[1] != VALUES or not np.isfinite(values).all():
+            if (
+                values.ndim != 2
+                or values.shape[1] != VALUES
+                or not np.isfinite(values.astype(np.float32)).all()
+            ):
                 raise ValueError(f"values {values.shape}")
             return cls(values, frame=LocalFrame.at(arrays["origin"], arrays["axes"]))
         except (*UNREADABLE, ShapeError) as error:

@@ -17,9 +17,11 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from gvtools.errors import ProjectError
+from gvtools.scenes.images import UNREADABLE
 from gvtools.scenes.photographs import named
 from gvtools.scenes.project import PICTURES
 from gvtools.scenes.scene import Finding, natural_key
+from gvtools.untrusted import open_picture, read_bytes
 
 # EXIF tags (Exif 2.32) and the sub-folders that hold them.
 EXIF_FOLDER, GPS_FOLDER = 0x8769, 0x8825
@@ -33,7 +35,6 @@ JPEG_QUALITY = 97
 JUDGED_HEIGHT, BLURRED = 480, 0.15
 # Where the median itself is below this, all are called soft (photographs in focus: 100 and more).
 SOFT = 10.0
-UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def find_photographs(folder: Path) -> tuple[list[Photograph], list[Finding]]:
     digests: set[bytes] = set()
     for path in paths:
         name = path.relative_to(folder).as_posix()
-        digest = hashlib.sha256(path.read_bytes()).digest()
+        digest = hashlib.sha256(read_bytes(path)).digest()
         if digest in digests:
             copies.append(name)
             continue
@@ -103,7 +104,7 @@ def find_photographs(folder: Path) -> tuple[list[Photograph], list[Finding]]:
 
 
 def _look_at(path: Path, name: str) -> Photograph:
-    with Image.open(path) as image:
+    with open_picture(path) as image:
         exif = image.getexif()
         more, gps = exif.get_ifd(EXIF_FOLDER), exif.get_ifd(GPS_FOLDER)
         turned = int(exif.get(ORIENTATION, 1) or 1) > 1

@@ -15,6 +15,7 @@ from pydantic import Field
 
 from gvtools.errors import OptionError
 from gvtools.evaluation.splits import SpecRecord, SplitRule
+from gvtools.untrusted import parse_yaml
 
 Aspect = Literal[
     "pixels", "mask", "ssim", "lpips_net", "poses_from", "pose_unit", "reprojection", "met3r",
@@ -211,11 +212,17 @@ def parse_benchmark(text: str) -> Benchmark:
     """A benchmark from its YAML.
 
     Raises:
-        ValueError: a key that is unknown or absent, or a row without all figures.
+        OptionError: no YAML, a key that is unknown or absent, or a row without all figures.
     """
-    import yaml
+    try:
+        return _benchmark(parse_yaml(text))
+    except KeyError as error:
+        raise OptionError(f"benchmark: no key {error}; expected protocol, figures ...") from None
+    except (ValueError, TypeError, AttributeError, IndexError) as error:
+        raise OptionError(f"benchmark: {error}") from None
 
-    data = yaml.safe_load(text)
+
+def _benchmark(data: dict[str, Any]) -> Benchmark:
     protocol, published = data.pop("protocol"), data.pop("published")
     if "context" in protocol:
         protocol["views"] = [protocol["context"]]

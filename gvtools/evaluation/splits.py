@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -13,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.protocol import protocol_split
+from gvtools.untrusted import read_json
 
 Numbers = Annotated[tuple[int, ...], Field(strict=False)]
 
@@ -164,6 +164,6 @@ def _from_file(
 
 def _json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return read_json(path)
     except (OSError, ValueError) as error:
         raise ProjectError(f"{path}: unreadable ({error}); expected the released file") from None

@@ -6,7 +6,6 @@ larger than the machine's memory, as a published video model is. Here a tensor's
 
 from __future__ import annotations
 
-import json
 import pickle
 import re
 import warnings
@@ -18,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gvtools.errors import CheckpointError
+from gvtools.untrusted import archive, named_file, parse_json, read_json, regular
 
 INDEX = ".safetensors.index.json"
 STORED_TYPES = {
@@ -82,7 +82,12 @@ class TensorFiles:
                 )
             if found and pattern == f"*{INDEX}":
                 index = _read_index(found[0])
-                return cls({name: (place / file, name) for name, file in index.items()})
+                return cls(
+                    {
+                        name: (named_file(place, file, where=str(found[0])), name)
+                        for name, file in index.items()
+                    }
+                )
             if found:
                 return cls.find(found[0])
         raise CheckpointError(f"{place}: no *.safetensors; expected a network's weights there")
@@ -118,7 +123,7 @@ class TensorFiles:
         path = self.places[name][0]
         start, empty = self._entry(name)
         content = torch.empty(empty.nbytes, dtype=torch.uint8)
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             file.seek(start)
             if file.readinto(memoryview(content.numpy())) != len(content):  # type: ignore[arg-type]
                 raise CheckpointError(f"{path}: ends within {name}; download it again")
@@ -137,11 +142,13 @@ def _read_header(path: Path) -> dict[str, _Entry]:
     """What a safetensors file holds: the header's length, the header in JSON, tensors' bytes."""
     _check_is_whole(path)
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             length = int.from_bytes(file.read(8), "little")
             if length > _LARGEST_HEADER:
                 raise ValueError("no header")
-            stored = json.loads(file.read(length))
+            if length > path.stat().st_size:
+                raise ValueError(f"a header of {length} bytes")
+            stored = parse_json(file.read(length))
         stored.pop("__metadata__", None)
         header, parts = {}, []
         for name, value in stored.items():
@@ -150,7 +157,7 @@ def _read_header(path: Path) -> dict[str, _Entry]:
                 raise ValueError(f"{name} is {value['dtype']}, which is not known here")
             dtype = STORED_TYPES[value["dtype"]]
             empty = torch.empty(value["shape"], dtype=dtype, device="meta")
-            if start < 0 or end - start != empty.nbytes:
+            if not isinstance(start, int) or start < 0 or end - start != empty.nbytes:
                 raise ValueError(f"{name} has {end - start} bytes for {value['shape']}")
             header[name] = _Entry(8 + length + start, empty)
             parts.append((start, end))
@@ -173,7 +180,10 @@ def _read_header(path: Path) -> dict[str, _Entry]:
 
 def _read_index(path: Path) -> dict[str, str]:
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8"))["weight_map"])
+        index = dict(read_json(path)["weight_map"])
+        if not all(isinstance(file, str) for file in index.values()):
+            raise ValueError("a file's name that is no text")
+        return index
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CheckpointError(
             f"{path}: cannot be read ({error}); expected an index of safetensors files"
@@ -231,6 +241,9 @@ def read_pickled(path: Path, *, legacy: bool = False) -> dict[str, Any]:
         with warnings.catch_warnings():
             # About the protocol and deprecated classes of damaged files; what follows says more.
             warnings.simplefilter("ignore")
+            if zipped:
+                with archive(path):
+                    pass  # its members claim what they may
             content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
     except pickle.UnpicklingError as error:
         raise CheckpointError(f"{path}: {_refused(error)}; nothing of it was run") from None
@@ -254,7 +267,7 @@ def _check_is_whole(path: Path) -> bytes:
         CheckpointError: it is absent, empty, or git's placeholder.
     """
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             start = file.read(len(_PLACEHOLDER))
     except FileNotFoundError:
         raise CheckpointError(f"no {path}; download it, see gvtools weights list") from None

@@ -21,6 +21,7 @@ from gvtools.depth.source import DepthMap
 from gvtools.files import replaced_when_written
 from gvtools.runs.layout import context_depth, target_stems
 from gvtools.runs.target_files import write_png
+from gvtools.untrusted import load_arrays
 
 # Errors of a damaged file.
 UNREADABLE = (OSError, EOFError, ValueError, KeyError, BadZipFile, zlib.error)
@@ -44,9 +45,13 @@ def read_context_depth(path: Path, size: tuple[int, ...]) -> tuple[DepthMap, str
     Raises:
         Exception: one of UNREADABLE, also for depth of another size.
     """
-    with np.load(path, allow_pickle=False) as stored:
-        depth_map = DepthMap(stored["depth"], stored["confidence"], str(stored["source"]))
-        failed = str(stored["failed"])
+    stored = load_arrays(path, "depth", "confidence", "source", "failed")
+    for name in ("depth", "confidence"):
+        array = stored[name]
+        if array.dtype != np.float32 or not np.isfinite(array).all() or (array < 0).any():
+            raise ValueError(f"{name} of type {array.dtype}, or not finite, or negative")
+    depth_map = DepthMap(stored["depth"], stored["confidence"], str(stored["source"]))
+    failed = str(stored["failed"])
     if depth_map.depth.shape != size:
         raise ValueError(f"depth of {depth_map.depth.shape}, picture of {size}")
     return depth_map, failed

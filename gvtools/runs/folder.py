@@ -22,6 +22,7 @@ from gvtools.files import replaced_when_written, write_json, write_text
 from gvtools.runs.folder_lock import folder_lock
 from gvtools.runs.identity import versions
 from gvtools.runs.layout import MEMORY, METRICS, RECORD, REPORT, ROUNDS, round_folder
+from gvtools.untrusted import read_json
 
 # Files and folders that are still being written.
 PARTIAL = ".*.part"
@@ -121,7 +122,7 @@ class RunDirectory:
     def _record(self) -> Any:
         """What the run's record holds; None where it cannot be read."""
         try:
-            return json.loads((self.path / RECORD).read_text(encoding="utf-8"))
+            return read_json(self.path / RECORD)
         except (OSError, ValueError):
             return None
 
@@ -156,7 +157,7 @@ class RunDirectory:
             if not path.exists():
                 return out
             try:
-                out.append(json.loads(path.read_text(encoding="utf-8")))
+                out.append(read_json(path))
             except (OSError, ValueError) as error:
                 raise ProjectError(
                     f"{path}: no readable report ({error}); remove this round's folder and add "

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance.gaussians import UNREADABLE
-from gvtools.cameras import Cameras
-from gvtools.errors import MemoryFileError
+from gvtools.cameras import Cameras, rigid_transform
+from gvtools.errors import MemoryFileError, ShapeError
 from gvtools.runs.layout import APPEARANCE, POSES, round_folder
 from gvtools.scenes.scene import Scene
+from gvtools.untrusted import load_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,16 +48,29 @@ class RunPoses:
             MemoryFileError: damaged.
         """
         try:
-            with np.load(path) as data:
-                if "context_poses" not in data:
-                    return None
-                poses = cls(data["context_poses"], data["target_poses"])
-        except UNREADABLE as error:
+            data = load_arrays(path)
+            if "context_poses" not in data:
+                return None
+            poses = cls(*(_rigid(data[name], name) for name in ("context_poses", "target_poses")))
+        except (*UNREADABLE, ShapeError) as error:
             raise MemoryFileError(
                 f"{path}: expected refined poses; found none: {error}; start the run again with "
                 "another --out"
             ) from error
         return poses
+
+
+def _rigid(poses: NDArray[Any], name: str) -> NDArray[np.float64]:
+    """(N, 4, 4) finite poses, as they are.
+
+    Raises:
+        ValueError: something else.
+    """
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or poses.dtype != np.float64:
+        raise ValueError(f"{name} of shape {poses.shape} and type {poses.dtype}")
+    for pose in poses:
+        rigid_transform(pose, what=name)
+    return poses
 
 
 def refined_poses_of(run: Path) -> RunPoses | None:
@@ -74,7 +88,16 @@ def refined_poses_of(run: Path) -> RunPoses | None:
 
 
 def with_poses(scene: Scene, names: Sequence[str], poses: NDArray[np.float64]) -> Scene:
-    """A scene with other poses (V, 4, 4) of some views."""
+    """A scene with other poses (V, 4, 4) of some views.
+
+    Raises:
+        MemoryFileError: there are not as many poses as names.
+    """
+    if len(names) != len(poses):
+        raise MemoryFileError(
+            f"{len(poses)} refined poses of {len(names)} views; expected one each; start the run "
+            "again with another --out"
+        )
     moved = dict(zip(names, poses, strict=True))
     views = tuple(
         replace(view, camera=posed(view.camera, moved[view.name][None]))

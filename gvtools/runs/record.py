@@ -7,11 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, Field, ValidationError
+import numpy as np
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from gvtools.errors import ProjectError
+from gvtools.cameras import rigid_transform
+from gvtools.errors import ProjectError, ShapeError
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import RECORD, REPORT, round_folder
+from gvtools.untrusted import read_json
 
 Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -38,13 +41,25 @@ class _Settings(BaseModel):
     completer: str
     voxel: float
     seed: int
+    max_side: int | None = None
 
 
 class _Camera(BaseModel):
     K: Annotated[list[Row3], Field(min_length=3, max_length=3)]
     cam_from_world: Annotated[list[Row4], Field(min_length=4, max_length=4)]
-    width: int
-    height: int
+    width: Annotated[int, Field(gt=0, lt=2**31)]
+    height: Annotated[int, Field(gt=0, lt=2**31)]
+
+    @model_validator(mode="after")
+    def _usable(self) -> _Camera:
+        finite = np.isfinite(self.K).all() and self.K[0][0] > 0 and self.K[1][1] > 0
+        if not finite:
+            raise ValueError("impossible intrinsics")
+        try:
+            rigid_transform(self.cam_from_world, what="cam_from_world")
+        except ShapeError as error:
+            raise ValueError(str(error)) from None
+        return self
 
 
 class _View(BaseModel):
@@ -85,7 +100,7 @@ def read_record(path: Path) -> dict[str, Any]:
     if not file.is_file():
         raise ProjectError(f"{path}: holds no {RECORD}; expected the folder of a run")
     try:
-        record: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        record: dict[str, Any] = read_json(file)
         _Record.model_validate(record)
         _Settings.model_validate(resolved_settings(record))
     except ValidationError as error:

@@ -129,7 +129,13 @@ class Run:
 
         max_side = self.settings.get("max_side")
         project, reading = self.record["project"], self.record["reading"]
-        scene = reduced(open_recorded(project, reading, moved=self.project), max_side)
+        try:
+            scene = reduced(open_recorded(project, reading, moved=self.project), max_side)
+        except (TypeError, ValueError, AttributeError, KeyError, OverflowError) as error:
+            raise ProjectError(
+                f"{self.path}: its record says of the project what cannot be read ({error}); "
+                "expected the record of a run; run reconstruct again"
+            ) from error
         other = self.record["targets_project"]
         truths = scene if self.record["targets_kind"] == "hold-out" else None
         if other is not None:

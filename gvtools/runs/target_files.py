@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.errors import ProjectError
+from gvtools.errors import ProjectError, ShapeError
 from gvtools.guidance import Guidance
 from gvtools.runs.layout import (
     AFTER,
@@ -28,6 +26,8 @@ from gvtools.runs.layout import (
     target_picture,
     target_stems,
 )
+from gvtools.scenes.images import UNREADABLE
+from gvtools.untrusted import load_arrays, open_picture, read_json
 
 if TYPE_CHECKING:
     from gvtools.completers.base import Completion
@@ -120,17 +120,26 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
         picture = read_picture(folder, COMPLETION, stem)
         support = read_picture(folder, VALID, stem)
         file = inside(folder.parent, target_depth(folder, stem))
-        with np.load(file, allow_pickle=False) as stored:
-            depth = stored["completion"]
-            confidence = stored.get("confidence")
+        stored = load_arrays(file)
+        depth, confidence = stored["completion"], stored.get("confidence")
         scale = entry["scale"]["scale"]
-    except (OSError, EOFError, BadZipFile, ValueError, KeyError, TypeError) as error:
+        scale = np.float32(1 if scale is None or scale != scale else scale)
+        shapes = {depth.shape, support.shape, picture.shape[:2]}
+        if shapes != {(int(camera.height[0]), int(camera.width[0]))} or picture.shape[2:] != (3,):
+            raise ValueError(f"pictures and depth of shapes {sorted(shapes)}")
+        if depth.dtype != np.float32 or not np.isfinite(depth).all() or (depth < 0).any():
+            raise ValueError(f"depth of type {depth.dtype}, or not finite, or negative")
+        if confidence is not None and confidence.shape != depth.shape:
+            raise ValueError(f"confidence of shape {confidence.shape}")
+        if not 0 < scale < np.inf:
+            raise ValueError(f"a scale of {scale}")
+    except (*UNREADABLE, ShapeError) as error:
         raise ProjectError(
             f"{folder}: the target {entry.get('name', '?')} cannot be read ({error!r}); expected a "
             "round of this version; run reconstruct again"
         ) from error
     observed = support >= SUPPORT_SCANNED
-    aligned = depth * np.float32(scale) if scale is not None and scale == scale else depth
+    aligned = depth * scale
     return TargetFiles(
         str(entry["name"]), camera, picture, aligned, observed, ~observed & (depth > 0), confidence
     )
@@ -143,9 +152,7 @@ def read_picture(folder: Path, kind: str, stem: str) -> NDArray[np.uint8]:
         ProjectError: it lies outside the run's folder.
         OSError: it is absent or damaged.
     """
-    from PIL import Image
-
-    with Image.open(inside(folder.parent, target_picture(folder, kind, stem))) as image:
+    with open_picture(inside(folder.parent, target_picture(folder, kind, stem))) as image:
         return np.asarray(image)
 
 
@@ -174,7 +181,7 @@ def completed_picture(run: Path, number: int, name: str) -> Path | None:
     """
     folder = round_folder(run, number)
     try:
-        views = json.loads((folder / REPORT).read_text(encoding="utf-8"))["views"]
+        views = read_json(folder / REPORT)["views"]
         stem = str(next(view["stem"] for view in views if view["name"] == name))
     except (OSError, ValueError, KeyError, TypeError, StopIteration):
         (stem,) = target_stems((name,))

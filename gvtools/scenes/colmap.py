@@ -21,6 +21,7 @@ from gvtools.scenes.photographs import (
     named,
 )
 from gvtools.scenes.scene import Finding, Scene, natural_key
+from gvtools.untrusted import is_file, named_file
 
 # Middle and side lengths of a chunk of Hierarchical-3DGS, world frame, scene units.
 CHUNK_BOX = ("center.txt", "extent.txt")
@@ -134,12 +135,14 @@ def _photographs(
     """The photographs in natural order of their names, and the ids of the images on disk."""
     photographs, ids, absent, unmasked = list[Photograph](), set[int](), list[str](), 0
     for image in model.images:
-        path = image_folder / image.name
-        if not path.is_file():
+        path = named_file(image_folder, image.name, where=f"{model.files.folder}, an image")
+        if not is_file(path):
             absent.append(image.name)
             continue
-        mask = None if mask_folder is None else mask_folder / f"{image.name}.png"
-        if mask is not None and not mask.is_file():
+        mask = None
+        if mask_folder is not None:
+            mask = named_file(mask_folder, f"{image.name}.png", where=f"{mask_folder}, a mask")
+        if mask is not None and not is_file(mask):
             unmasked += 1
             mask = None
         depth = None if depth_folder is None else _depth_file(depth_folder, image.name)
@@ -176,12 +179,11 @@ def _photographs(
 
 def _depth_file(folder: Path, name: str) -> Path | None:
     found = depth_map_path(folder, name)
-    if found is not None:
-        return found[0]
+    path = None if found is None else found[0]
     for suffix in (".npy", ".npz"):
-        if (folder / f"{name}{suffix}").is_file():
-            return folder / f"{name}{suffix}"
-    return None
+        if path is None and is_file(folder / f"{name}{suffix}"):
+            path = folder / f"{name}{suffix}"
+    return None if path is None else named_file(folder, path, where=f"{folder}, a depth map")
 
 
 def _depth_findings(photographs: list[Photograph]) -> list[Finding]:

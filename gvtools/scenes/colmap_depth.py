@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.files import replaced_when_written
+from gvtools.untrusted import is_file, regular
 
 KINDS = ("geometric", "photometric")  # the first that exists is read
 _HEAD = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
@@ -19,7 +20,7 @@ def depth_map_path(folder: Path, name: str) -> tuple[Path, str] | None:
     """The depth map of the image called ``name`` and its kind; None when there is none."""
     for kind in KINDS:
         path = folder / f"{name}.{kind}.bin"
-        if path.is_file():
+        if is_file(path):
             return path, kind
     return None
 
@@ -35,7 +36,7 @@ def depth_map_size(path: Path) -> tuple[int, int]:
 
 def _head(path: Path) -> tuple[int, int, int]:
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             head = _HEAD.match(file.read(64))
         size = path.stat().st_size
     except OSError as error:
@@ -61,7 +62,7 @@ def read_depth_map(path: Path) -> NDArray[np.float32]:
         ProjectError: no depth map, or its size is not what its head says.
     """
     width, height, start = _head(path)
-    values = np.fromfile(path, "<f4", offset=start).reshape(height, width)
+    values = np.fromfile(regular(path), "<f4", offset=start).reshape(height, width)
     return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
 
 

@@ -7,11 +7,13 @@ not notice that a binary file ends early.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import ProjectError
+from gvtools.untrusted import read_bytes, read_text, regular
 
 if TYPE_CHECKING:
     import pycolmap
@@ -101,8 +103,9 @@ def model_files(folder: Path) -> ModelFiles:
             size, count = path.stat().st_size, _count(path)
             if size < 8 or count * LEAST_BYTES[stem] + 8 > size:
                 raise _damaged(path, f"{count} records that its head names cannot be in it")
-        for stem in ("images", "points3D"):
-            _check_records(folder / f"{stem}.bin")
+        for stem in (*REQUIRED, *rigged):
+            if stem != "cameras":
+                _check_records(folder / f"{stem}.bin")
     else:
         _check_points(folder / "points3D.txt")
     return ModelFiles(folder, suffix, _siblings(folder))
@@ -121,25 +124,55 @@ def check_cameras(folder: Path, model: pycolmap.Reconstruction) -> None:
 
 
 def _check_records(path: Path) -> None:
-    """Walk images.bin or points3D.bin by the counts in each record."""
-    data = path.read_bytes()
-    offset = 8
+    """Walk a file by the counts in each record."""
+    data = read_bytes(path)
+    offset, record_end = 8, _RECORD_ENDS[path.stem]
     try:
         for _ in range(_count(path)):
-            if path.stem == "images":
-                name_end = data.index(b"\0", offset + 64)
-                offset = name_end + 9 + 24 * struct.unpack_from("<Q", data, name_end + 1)[0]
-            else:
-                offset += 51 + 8 * struct.unpack_from("<Q", data, offset + 43)[0]
+            offset = record_end(data, offset)
+            if offset > len(data):
+                break
     except (struct.error, ValueError):
         offset = -1
     if offset != len(data):
         raise _damaged(path, "its records take another number")
 
 
+def _image_end(data: bytes, at: int) -> int:
+    name_end = data.index(b"\0", at + 64)
+    return name_end + 9 + 24 * int(struct.unpack_from("<Q", data, name_end + 1)[0])
+
+
+def _point_end(data: bytes, at: int) -> int:
+    return at + 51 + 8 * int(struct.unpack_from("<Q", data, at + 43)[0])
+
+
+def _rig_end(data: bytes, at: int) -> int:
+    """Its id, and its sensors: the first is the reference, the others may have a pose to it."""
+    sensors = int(struct.unpack_from("<I", data, at + 4)[0])
+    at += 8 + (8 if sensors else 0)
+    for _ in range(sensors - 1):
+        if at >= len(data):
+            break
+        at += 9 + (56 if struct.unpack_from("<B", data, at + 8)[0] else 0)
+    return at
+
+
+def _frame_end(data: bytes, at: int) -> int:
+    return at + 68 + 16 * int(struct.unpack_from("<I", data, at + 64)[0])
+
+
+_RECORD_ENDS: dict[str, Callable[[bytes, int], int]] = {
+    "images": _image_end,
+    "points3D": _point_end,
+    "rigs": _rig_end,
+    "frames": _frame_end,
+}
+
+
 def _check_points(path: Path) -> None:
     """Refuse a line of points3D.txt that lacks a number: pycolmap would read the rest shifted."""
-    for at, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for at, line in enumerate(read_text(path, errors="replace").splitlines(), 1):
         words = 0 if line.startswith("#") else len(line.split())
         if words and (words < 8 or words % 2):
             raise ProjectError(
@@ -185,7 +218,7 @@ def _count_images(folder: Path) -> int:
 
 def _count(path: Path) -> int:
     """The count of records that a binary file begins with."""
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         head = file.read(8)
     return int(struct.unpack("<Q", head)[0]) if len(head) == 8 else 0
 
@@ -198,7 +231,7 @@ def text_names(folder: Path) -> dict[int, str]:
     """
     path = folder / "images.txt"
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
     except UnicodeDecodeError as error:
         raise ProjectError(f"{path}: no text in UTF-8 ({error.reason})") from None
     # An image has two lines, the second of which may be empty; empty ones before it do not count.

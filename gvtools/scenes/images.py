@@ -6,6 +6,7 @@ turned picture would no longer fit its camera.
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,18 @@ from PIL import Image
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Frame
+from gvtools.untrusted import load_array, load_arrays, open_picture, regular
 
 DEPTH_SATURATED = 65535  # "no reading" of Kinect-like 16-bit depth, besides 0
 OPAQUE_FROM = 128  # an alpha at or above this counts as part of the picture
 
 _EXIF_ORIENTATION = 0x0112
-_UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+# What Pillow's decoders stumble upon in damaged files, they raise as it comes.
+UNREADABLE = (
+    OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError, struct.error,
+    KeyError, IndexError, TypeError, OverflowError, ZeroDivisionError, RuntimeError, MemoryError,
+    AttributeError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -53,12 +60,12 @@ def read_header(path: Path) -> ImageHeader:
         ProjectError: absent, or no picture.
     """
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             # Other formats are decoded whole when asked for EXIF.
             exif = image.getexif() if image.format in ("JPEG", "MPO") else {}
             orientation = int(exif.get(_EXIF_ORIENTATION, 1) or 1)
             return ImageHeader(image.width, image.height, image.mode, orientation)
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise _unreadable(path, error) from None
 
 
@@ -72,9 +79,9 @@ def read_image(path: Path) -> Frame:
         ProjectError: absent, truncated, no picture, or neither 8 nor 16 bits a channel.
     """
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             return _decode(image, path)
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise _unreadable(path, error) from None
 
 
@@ -102,10 +109,10 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
         ProjectError: absent, truncated or no picture.
     """
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             pixels = np.asarray(image if image.mode.startswith("I") else image.convert("L"))
             return pixels > 0
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise _unreadable(path, error) from None
 
 
@@ -136,7 +143,8 @@ def read_depth(
             f"{path}: depth of shape {raw.shape} and type {raw.dtype}; expected (height, width) "
             "numbers"
         )
-    depth = raw.astype(np.float32) * np.float32(unit)
+    with np.errstate(all="ignore"):  # what overflows is no reading
+        depth = raw.astype(np.float32) * np.float32(unit)
     valid = np.isfinite(depth) & (depth > 0)
     if raw.dtype.kind in "ui":
         valid &= raw != DEPTH_SATURATED
@@ -147,29 +155,25 @@ def read_depth(
 
 def _load_depth_image(path: Path) -> NDArray[Any]:
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             if not image.mode.startswith("I") and image.mode != "F":
                 raise ProjectError(
                     f"{path}: a depth map with 8 bits a channel ({image.mode}); expected 16-bit "
                     "grey; export raw depth instead of a preview"
                 )
             return np.asarray(image)
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise _unreadable(path, error) from None
 
 
 def _load_array(path: Path) -> NDArray[Any]:
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return loaded
-        with loaded:
-            if "depth" not in loaded:
-                raise ProjectError(
-                    f"{path}: holds the keys {sorted(loaded)}; expected the key 'depth'"
-                )
-            return np.asarray(loaded["depth"])
-    except _UNREADABLE as error:
+        with regular(path).open("rb") as file:
+            packed = file.read(2) == b"PK"
+        return load_arrays(path, "depth")["depth"] if packed else load_array(path)
+    except KeyError as error:
+        raise ProjectError(f"{path}: {error.args[0]}; expected the key 'depth'") from None
+    except UNREADABLE as error:
         raise _unreadable(path, error) from None
 
 
@@ -183,6 +187,8 @@ def resize_nearest(array: NDArray[Any], width: int, height: int) -> NDArray[Any]
 def same_aspect(size: tuple[int, int], expected: tuple[int, int]) -> bool:
     """Whether ``size`` is ``expected`` (both width, height) scaled and rounded to whole pixels."""
     (w, h), (width, height) = size, expected
+    if min(w, h, width, height) < 1:
+        return False
     return abs(h - height * w / width) <= 1 and abs(w - width * h / height) <= max(1, width / w)
 
 

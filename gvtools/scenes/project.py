@@ -82,6 +82,8 @@ def open_project(
     path = Path(path)
     if not path.exists():
         raise ProjectError(f"{path}: no such folder{_nearest(path)}")
+    if not path.is_dir() and not path.is_file():
+        raise ProjectError(f"{path}: neither a folder nor a file; expected one of them")
     if path.suffix.lower() in (*VIDEOS, BAG) and path.is_file():
         kind = "a recording" if path.suffix.lower() == BAG else "a video"
         raise UnposedError(path, f"{kind} without cameras", _capture(path))

@@ -26,6 +26,7 @@ from gvtools.scenes.rgbd_recording import (
     pinhole,
 )
 from gvtools.scenes.scene import Finding
+from gvtools.untrusted import read_bytes, read_text
 
 Float64 = NDArray[np.float64]
 
@@ -80,7 +81,9 @@ def intrinsics(root: Path, options: RgbdOptions) -> tuple[Float64, list[Finding]
         ProjectError: a malformed file.
     """
     cameras = sorted(
-        path for path in root.glob("*.json") if b"intrinsic_matrix" in path.read_bytes()
+        path
+        for path in root.glob("*.json")
+        if path.is_file() and b"intrinsic_matrix" in read_bytes(path)
     )
     if cameras:
         return open3d_intrinsics(cameras[0]), [Finding("info", f"intrinsics: {cameras[0].name}")]
@@ -100,7 +103,7 @@ def read_log(path: Path) -> tuple[list[int], list[Float64]]:
         ProjectError: unreadable, or not of that form.
     """
     try:
-        rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+        rows = [line.split() for line in read_text(path).splitlines()]
         rows = [row for row in rows if row]
         for at, row in enumerate(rows):
             if len(row) != (3 if at % 5 == 0 else 4):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.photographs import named
 from gvtools.scenes.scene import Finding, natural_key
 from gvtools.settings import Settings
+from gvtools.untrusted import read_json, read_text
 
 Float64 = NDArray[np.float64]
 Matrix = Annotated[list[list[float]], BeforeValidator(lambda value: np.asarray(value).tolist())]
@@ -148,9 +148,9 @@ def open3d_intrinsics(path: Path) -> Float64:
         ProjectError: no such JSON.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]
+        values = read_json(path)["intrinsic_matrix"]
         return np.array(values, np.float64).reshape(3, 3).T
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise ProjectError(
             f"{path}: {type(error).__name__} ({error}); expected Open3D's form with "
             "'intrinsic_matrix' as nine numbers, column by column"
@@ -165,7 +165,7 @@ def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
     """
     expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
     try:
-        text = path.read_text(encoding="utf-8").replace(",", " ")
+        text = read_text(path).replace(",", " ")
         matrix = np.loadtxt(text.splitlines(), np.float64, ndmin=2)
     except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0]

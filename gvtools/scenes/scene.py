@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
-from gvtools.errors import ProjectError
+from gvtools.errors import ProjectError, printable
+from gvtools.untrusted import number_key
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +83,10 @@ class Finding:
 
     level: str
     message: str
+
+    def __post_init__(self) -> None:
+        # Names and values of files are part of it.
+        object.__setattr__(self, "message", printable(self.message))
 
 
 @dataclass(frozen=True)
@@ -161,4 +166,4 @@ class Scene:
 def natural_key(name: str) -> tuple[object, ...]:
     """Sort key under which img2 stands before img10."""
     parts = re.split(r"(\d+)", name)
-    return tuple(int(part) if part.isdecimal() else part.lower() for part in parts), name
+    return tuple(number_key(part) if part.isdecimal() else part.lower() for part in parts), name

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from gvtools.errors import OptionError
 from gvtools.scenes.faces import picture_of
+from gvtools.untrusted import read_text
 
 GRAMMAR = "all, every:K, every:K+OFFSET, first:N, last:N, range:A-B, not:SPEC, names, or @file"
 _KEYWORDS = ("every", "first", "last", "range", "not")
@@ -125,7 +126,7 @@ def _listed(names: Sequence[str], spec: str) -> list[str]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise OptionError(
             f"@{path}: unreadable ({error}); expected a text file with one view name a line"

@@ -26,7 +26,7 @@ OF_A_FRAME = ("transform_matrix", "mask_path", "depth_file_path")
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]
-Pixels = Annotated[Number, Field(ge=1, le=1_000_000, multiple_of=1)]
+Pixels = Annotated[Number, Field(ge=1, le=200_000, multiple_of=1)]
 Angle = Annotated[Number, Field(gt=0, lt=math.pi)]
 
 

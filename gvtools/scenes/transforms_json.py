@@ -32,6 +32,7 @@ from gvtools.scenes.photographs import (
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.transforms_frame import FrameKeys, LensParameters, frame_keys
 from gvtools.scenes.undistort import Undistortion
+from gvtools.untrusted import named_file, read_json
 
 FILE = "transforms.json"
 EXPORTER = "gvtools"  # the value of ``exported_by`` in files written here
@@ -68,10 +69,14 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     files = [_picture(path.parent, frame, f"{path}, frame {i}") for i, frame in enumerate(frames)]
     names = _names(files)
     masks = None if masks is None else given_folder(masks, "masks")
+    home = path.parent
     if images is not None:
         if not Path(images).is_dir():
             raise ProjectError(f"{images}: no such image folder")
-        files = [Path(images) / name for name in names]
+        home = Path(images)
+        files = [home / name for name in names]
+    for i, file in enumerate(files):
+        named_file(home, file, where=f"{path}, frame {i}")
     photographs, absent, defects = _photographs(path, data, list(zip(names, files, strict=True)),
                                                 masks=masks, findings=findings)  # fmt: skip
     if not photographs:
@@ -114,8 +119,8 @@ def _photographs(
         cam_from_world, defect = _pose(keys, what)
         defects.append(defect)
         views = _views(keys, file, lenses, what=what)
-        mask = _beside(path.parent, keys.mask_path)
-        depth = _beside(path.parent, keys.depth_file_path)
+        mask = _beside(path.parent, keys.mask_path, what)
+        depth = _beside(path.parent, keys.depth_file_path, what)
         lost = [item.name for item in (mask, depth) if item and not os.path.isfile(item)]
         if lost:
             findings.append(Finding("warning", f"{what}: {', '.join(lost)} is absent on disk"))
@@ -231,7 +236,7 @@ def load_frames(path: Path) -> dict[str, Any]:
         ProjectError: no such file, or not of that form.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path)
     except FileNotFoundError:
         raise ProjectError(f"{path}: no such file") from None
     except (OSError, ValueError, RecursionError) as error:
@@ -295,6 +300,6 @@ def _matrix(value: Any, what: str) -> np.ndarray:
         raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers") from None
 
 
-def _beside(folder: Path, name: str | None) -> Path | None:
+def _beside(folder: Path, name: str | None, what: str) -> Path | None:
     """The file that a frame names, on disk or not; None when it names none."""
-    return folder / name if name else None
+    return named_file(folder, name, where=what) if name else None

@@ -9,6 +9,7 @@ centres as integers.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +27,13 @@ from gvtools.scenes.rgbd_recording import (
 )
 from gvtools.scenes.scene import Finding
 from gvtools.trajectory_files import read_poses
+from gvtools.untrusted import is_file, named_file, read_text
 
 Float64 = NDArray[np.float64]
 
 DEPTH_UNIT = 1 / 5000
+# Depth maps within the limit of a picture, on average, at most.
+MOST_CANDIDATES = 100
 FILES = ("rgb.txt", "depth.txt", "groundtruth.txt")
 
 # fx, fy, cx, cy and k1, k2, p1, p2, k3 as published with the benchmark; freiburg3 is rectified.
@@ -92,14 +96,17 @@ def frame_files(root: Path, limit: float) -> tuple[list[tuple[float, Path, Path 
     frames: list[tuple[float, Path, Path | None]] = []
     absent = 0
     for i, (time, name) in enumerate(colors):
-        if not (root / name).is_file():
+        color = named_file(root, name, where=str(root / "rgb.txt"))
+        if not is_file(color):
             absent += 1
             continue
-        depth = None if i not in depth_of else root / depths[depth_of[i]][1]
-        if depth is not None and not depth.is_file():
+        depth = None
+        if i in depth_of:
+            depth = named_file(root, depths[depth_of[i]][1], where=str(root / "depth.txt"))
+        if depth is not None and not is_file(depth):
             absent += 1
             depth = None
-        frames.append((time, root / name, depth))
+        frames.append((time, color, depth))
     return frames, absent
 
 
@@ -113,10 +120,18 @@ def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:
 
     Returns:
         For indices of ``first``, the index of ``second``.
+
+    Raises:
+        ProjectError: nearly all stamps are within the limit of nearly all others.
     """
     order = np.argsort(second, kind="stable")
     low = np.searchsorted(second[order], first - limit, side="left")
     high = np.searchsorted(second[order], first + limit, side="right")
+    if int((high - low).sum()) > MOST_CANDIDATES * (len(first) + len(second)):
+        raise ProjectError(
+            f"{int((high - low).sum())} pairs of {len(first)} and {len(second)} time stamps are "
+            f"within {limit:g} s; expected a few of each; give a smaller max_time_difference"
+        )
     candidates = sorted(
         (abs(first[i] - second[j]), i, int(j))
         for i in range(len(first))
@@ -133,7 +148,7 @@ def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:
 
 def _read_list(path: Path) -> list[tuple[float, str]]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ProjectError(f"{path}: unreadable ({error})") from None
     entries = []
@@ -143,6 +158,8 @@ def _read_list(path: Path) -> list[tuple[float, str]]:
         try:
             time, name = line.replace(",", " ").split(maxsplit=1)
             entries.append((float(time), name.strip()))
+            if not math.isfinite(entries[-1][0]):
+                raise ValueError
         except ValueError:
             raise ProjectError(
                 f"{path}, line {number}: {line!r}; expected a time stamp in seconds and a file"

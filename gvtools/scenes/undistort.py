@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 # A detection whose ray projects back farther than this (pixels) lies where the distortion has no
 # inverse.
 ROUND_TRIP_TOLERANCE = 0.05
+# Of a side of a picture; its border is walked where a lens is undistorted.
+MOST_PIXELS = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +226,7 @@ def _impossible(camera: pycolmap.Camera) -> str:
         return f"has {len(camera.params)} parameters"
     if not np.isfinite(camera.params).all():
         return "holds NaN or infinity"
-    if min(camera.width, camera.height) < 1 or max(camera.width, camera.height) > 1_000_000:
+    if min(camera.width, camera.height) < 1 or max(camera.width, camera.height) > MOST_PIXELS:
         return "has an impossible size"
     if camera.is_perspective() and min(camera.focal_length_x, camera.focal_length_y) <= 0:
         return "has a focal length that is not positive"

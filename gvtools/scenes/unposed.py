@@ -91,7 +91,7 @@ def _files(root: Path, kind: str, options: RgbdOptions) -> list[tuple[Path, Path
         return [(color, depth) for color, depth, _ in sevenscenes.frame_files(root)]
     if kind == "tum":
         listed, _ = tum.frame_files(root, options.max_time_difference)
-        return [(color, depth) for _, color, depth in sorted(listed)]
+        return [(color, depth) for _, color, depth in sorted(listed, key=lambda item: item[:2])]
     if kind == "scannet":
         return [(color, depth) for color, depth, _ in scannet.frame_files(root)]
     folder = redwood.color_folder(root)

@@ -15,6 +15,7 @@ from typing import Any, TypeVar, get_args, get_origin
 
 from gvtools.errors import OptionError
 from gvtools.settings.base import Entry, Settings, entries, keys, unknown
+from gvtools.untrusted import read_json
 
 S = TypeVar("S", bound=Settings)
 NONE = ("none", "null", "auto")
@@ -47,7 +48,7 @@ def with_file(settings: S, path: Path, *, presets: Mapping[str, str] | None = No
         OptionError: unreadable, no JSON object, an unknown key or a wrong value.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path)
     except (OSError, ValueError) as error:
         raise OptionError(f"{path}: no readable JSON settings ({error})") from None
     if not isinstance(data, dict):

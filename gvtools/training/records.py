@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gvtools.files import write_text
+from gvtools.untrusted import parse_json, read_text
 
 STAGES = ("encoder", "denoiser", "reflow", "heads", "refiner")  # in order
 LOG = "log.jsonl"
@@ -37,9 +38,9 @@ def read_log(folder: Path) -> list[dict[str, Any]]:
     """The whole records of a stage; a line that was cut by a kill is left out."""
     path = folder / LOG
     records = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+    for line in read_text(path).splitlines() if path.exists() else ():
         try:
-            records.append(json.loads(line))
+            records.append(parse_json(line))
         except ValueError:
             continue
     return records

@@ -23,6 +23,7 @@ from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written
 from gvtools.training.dataset import Samples
 from gvtools.training.view_sample import TENSORS, Sample
+from gvtools.untrusted import load_arrays
 
 COLORS, DEPTHS = ("images", "hint"), ("depth", "hint_depth", "evidence")
 GREATEST = float(np.finfo(np.float16).max)
@@ -116,7 +117,6 @@ def _sample(packed: dict[str, NDArray[Any]]) -> Sample:
 def _read(path: Path) -> dict[str, NDArray[Any]] | None:
     """What a file holds; None where it is damaged, and then it is made again."""
     try:
-        with np.load(path) as stored:
-            return {name: stored[name] for name in stored.files}
+        return load_arrays(path)
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
         return None

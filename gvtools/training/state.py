@@ -10,6 +10,8 @@ from typing import Any
 import torch
 
 from gvtools.errors import CheckpointError
+from gvtools.networks.tensor_files import first_line
+from gvtools.untrusted import archive
 
 FILE = "state.pt"
 
@@ -75,11 +77,13 @@ def load_state(
     if not path.exists():
         return None
     try:
+        with archive(path):
+            pass  # its members claim what they may
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
         state = StageState(**{**content, "progress": Progress(**content["progress"])})
     except Exception as error:
         raise CheckpointError(
-            f"{path}: cannot be read ({error}); start the stage again without --resume"
+            f"{path}: cannot be read ({first_line(error)}); start the stage again without --resume"
         ) from None
     difference = _difference(state.identity, identity)
     if difference is not None:
@@ -94,7 +98,8 @@ def load_state(
 def saved_identity(folder: Path) -> dict[str, Any]:
     """Of the saved state; empty where there is none that can be read, which is said later."""
     try:
-        content = torch.load(folder / FILE, map_location="cpu", weights_only=True, mmap=True)
+        with archive(folder / FILE):
+            content = torch.load(folder / FILE, map_location="cpu", weights_only=True, mmap=True)
         return dict(content["identity"])
     except Exception:
         return {}

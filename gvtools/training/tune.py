@@ -47,6 +47,7 @@ from gvtools.training.options import (
 )
 from gvtools.training.run import fingerprint
 from gvtools.training.tune_options import TuneOptions
+from gvtools.untrusted import read_json
 
 Say = Callable[[str], None]
 
@@ -178,7 +179,7 @@ def tuned_before(
     None, too, where its weights are damaged.
     """
     with suppress(OSError, ValueError, CheckpointError):
-        record: dict[str, Any] = json.loads((out / RECORD).read_text(encoding="utf-8"))
+        record: dict[str, Any] = read_json(out / RECORD)
         split = split_context(scene, check_headers(out), seed=seed)
         if record["inputs"] == inputs_of(split, weights, options=options, seed=seed):
             return record

@@ -16,6 +16,7 @@ from typing import Any
 import gvtools
 from gvtools.errors import GvError, OptionError
 from gvtools.files import write_json
+from gvtools.untrusted import read_json
 from pipelines.benchmark.measure import Cell, measure_cell
 from pipelines.console import Console
 
@@ -48,7 +49,7 @@ def read_cell(cell: Cell) -> dict[str, Any] | None:
         OptionError: it was measured with other settings.
     """
     try:
-        found = json.loads(cell.result.read_text(encoding="utf-8"))
+        found = read_json(cell.result)
         before = found["identity"]
     except (OSError, ValueError, KeyError, TypeError):
         return None

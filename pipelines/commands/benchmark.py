@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.untrusted import read_json
 from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def _refuse_others(out: Path, name: str) -> None:
     from pipelines.benchmark.results import RESULTS
 
     try:
-        found = json.loads((out / RESULTS).read_text(encoding="utf-8"))["benchmark"]
+        found = read_json(out / RESULTS)["benchmark"]
     except (OSError, ValueError, KeyError, TypeError):
         return
     if found != name:

@@ -30,11 +30,12 @@ from gvtools.appearance.start import from_depth, from_points, pixels_with_depth
 from gvtools.depth.choice import is_estimated
 from gvtools.depth.fitted_depth import FittedDepth
 from gvtools.depth.source import MixedDepth, RecordedDepth, is_recorded
-from gvtools.errors import DegenerateError, GvError, OptionError, ShapeError
+from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError, ShapeError
 from gvtools.memory.projection import project
 from gvtools.runs.poses import RunPoses
 from gvtools.scenes.reduced import reduced
 from gvtools.scenes.scene import Frame, View
+from gvtools.untrusted import load_arrays
 from gvtools.view_selection import evenly_spread
 from pipelines.reconstruction import poses as run_poses
 from pipelines.reconstruction.prefetch import prefetch
@@ -98,11 +99,12 @@ class Fitted:
             MemoryFileError: missing or damaged.
         """
         appearance = Appearance.load(path)
-        with np.load(path) as data:
-            return cls(
-                appearance, RunPoses.load(path), bool(data.get("spread")),
-                steps=int(data.get("steps", 0)),
-            )  # fmt: skip
+        data = load_arrays(path)
+        spread, steps = data.get("spread", False), data.get("steps", 0)
+        try:
+            return cls(appearance, RunPoses.load(path), bool(spread), steps=int(steps))
+        except (TypeError, ValueError, OverflowError) as error:
+            raise MemoryFileError(f"{path}: no readable fit ({error})") from None
 
     def on(self, device: str) -> Fitted:
         """The same with what draws Gaussians on a device, "cpu" or "cuda"."""

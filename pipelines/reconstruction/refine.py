@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from gvtools.runs.run import Run, load_run
 from gvtools.scenes.data_sets.address import is_address
 from gvtools.scenes.reading import open_recorded
 from gvtools.settings import dotted, with_values
+from gvtools.untrusted import read_json
 from pipelines.reconstruction.compile_kernels import compile_kernels
 from pipelines.reconstruction.fitting import Fitted, fit_appearance
 from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
@@ -149,7 +149,7 @@ def _earlier(run: Run, console: Console) -> Fitted | None:
 def _figures(path: Path) -> Mapping[str, Any]:
     """The means of a run's metrics.json; none where the run is not finished."""
     try:
-        figures = json.loads((path / METRICS).read_text(encoding="utf-8"))
+        figures = read_json(path / METRICS)
     except (OSError, ValueError):
         return {}
     return figures if isinstance(figures, dict) else {}

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gvtools.cameras import rigid_transform
+from gvtools.errors import GvError, printable
 from gvtools.evaluation.view_figures import FIGURES
 from gvtools.runs.layout import METRICS
+from gvtools.untrusted import read_json
 from pipelines.report.nested import nested
 from viz.plots.trajectories import Trajectories
 from viz.report.content import Measures, Poses
@@ -26,6 +28,16 @@ EVALUATION = "evaluation/evaluation.json"
 
 def read_measures(run: Run) -> Measures:
     """Of evaluation/evaluation.json where it is of this run as it stands, else of metrics.json."""
+    try:
+        return _measures(run)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        line = (
+            f"{METRICS} or {EVALUATION} is of another form ({error!r}); gvtools evaluate renews it"
+        )
+        return Measures(warnings=[printable(line)])
+
+
+def _measures(run: Run) -> Measures:
     names = [view.name for view in run.views]
     warnings: list[str] = []
     evaluation, entry = _read(run.path / EVALUATION, warnings), None
@@ -70,7 +82,10 @@ def _read(file: Path, warnings: list[str]) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     try:
-        return dict(json.loads(file.read_text(encoding="utf-8")))
+        found = read_json(file)
+        if not isinstance(found, dict):
+            raise ValueError(f"a {type(found).__name__}")
+        return found
     except (OSError, ValueError) as error:
         warnings.append(f"{file.name} cannot be read ({error})")
         return None
@@ -116,7 +131,7 @@ def report_poses(
     note = "Lines from the marks: viewing directions. "
     if scene is None:
         note += "The context's cameras are missing, since the project cannot be read. "
-    known = {view["name"]: view["cam_from_world"] for view in nested(found, "views") or ()}
+    known = _found_poses(found)
     if known:
         estimated = _inverted([known.get(view["name"]) for view in entries])
         note += (
@@ -128,6 +143,18 @@ def report_poses(
     if not len(requested) + len(given):
         return Poses(None, note.strip(), ())
     return Poses(Trajectories(given, requested, estimated), note.strip(), _errors(found))
+
+
+def _found_poses(found: Mapping[str, Any] | None) -> dict[str, Any]:
+    """cam_from_world by name, of what the pose probe found; None where it found none."""
+    known: dict[str, Any] = {}
+    for view in nested(found, "views") or ():
+        pose = view["cam_from_world"]
+        try:
+            known[view["name"]] = None if pose is None else rigid_transform(pose, what="")[0]
+        except (GvError, TypeError, ValueError):
+            known[view["name"]] = None
+    return known
 
 
 def _inverted(poses: Sequence[Any]) -> NDArray[np.float64]:

@@ -19,6 +19,7 @@ from gvtools.runs.layout import METRICS
 from gvtools.scenes.scene import Scene
 from gvtools.settings import with_values
 from gvtools.training.tune_options import TuneOptions
+from gvtools.untrusted import read_json
 from pipelines.console import Console
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
@@ -105,7 +106,7 @@ class Trials:
     def kept(self, label: str, settings: Mapping[str, Any]) -> Trial | None:
         """What this trial gave before; None if it was not made, or its file is damaged."""
         try:
-            data = json.loads(self._file(settings).read_text(encoding="utf-8"))
+            data = read_json(self._file(settings))
             return Trial(**data | {"label": label})
         except (OSError, ValueError, TypeError):
             return None
@@ -123,7 +124,7 @@ class Trials:
             reconstruct(self.scene, applied(self.config, settings), out, console=_Silent())
             seconds = time.perf_counter() - start
             report = RunDirectory(out).reports()[-1]
-            figures = json.loads((out / METRICS).read_text(encoding="utf-8"))
+            figures = read_json(out / METRICS)
         finally:
             shutil.rmtree(out, ignore_errors=True)
         if figures["psnr"] is None:

@@ -15,6 +15,7 @@ from gvtools.errors import ProjectError
 from gvtools.files import write_text
 from gvtools.training.records import STAGES, read_log
 from gvtools.training.run import SETTINGS, WEIGHTS
+from gvtools.untrusted import read_json
 
 # Records of a stage's log that are kept.
 RECORDS = 150
@@ -66,7 +67,7 @@ def pack(training: Path, out: Path) -> Path:
         lines = (json.dumps({k: _short(v) for k, v in line.items()}) for line in kept)
         write_text(out / f"log_{stage}.jsonl", "\n".join(lines) + "\n")
         if (training / stage / SETTINGS).exists():
-            settings = json.loads((training / stage / SETTINGS).read_text(encoding="utf-8"))
+            settings = read_json(training / stage / SETTINGS)
             # Where its samples were kept is of no use elsewhere.
             settings["data"]["cache"] = None
             write_text(out / f"training_{stage}.json", json.dumps(settings, indent=2) + "\n")

@@ -410,5 +410,5 @@ def test_aspects_are_fields_of_a_setting():
 def test_a_wrong_specification_is_refused(old, new, message):
     text = published._specs()["dl3dv"]
     assert old in text
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(OptionError, match=message):
         parse_benchmark(text.replace(old, new, 1))

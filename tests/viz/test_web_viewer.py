@@ -281,6 +281,24 @@ def test_points_cost_fifteen_bytes_and_stay_within_the_budget(small_run):
         viewer.stop()
 
 
+EVIL = '<img src=x onerror="window.stolen=1"><script>window.stolen=1</script>&amp;](x).png'
+
+
+def test_names_of_files_are_shown_and_never_run(browser, viewer):
+    before = viewer.run
+    last = before.cameras[-1]
+    try:
+        viewer.update(replace(before, cameras=(*before.cameras[:-1], replace(last, name=EVIL))))
+        label = f"{last.kind} {last.round}: {EVIL}"
+        viewer._panel.set_note(EVIL)
+        choose(browser, viewer._panel._camera.value, label)
+        wait(lambda: f"{EVIL}, {TARGET}, round {last.round}" in browser.text())
+        assert browser.driver.execute_script("return window.stolen") is None
+        assert not browser.driver.find_elements("css selector", "img[src=x]")
+    finally:
+        viewer.update(before)
+
+
 def on_screen(client, viewer, shown) -> tuple[float, float]:
     """Where the middle of a camera's frustum is in the canvas, CSS pixels."""
     seen = viewer.frame.client_camera(client, longest=LONGEST)

@@ -22,6 +22,7 @@ from gvtools.completers.geoverse.video_prior.prior import VideoPriorConfig
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.networks.config_json import check_choice, check_range, from_json, to_json
 from gvtools.networks.depth_anything.network import DepthAnythingConfig
+from gvtools.untrusted import read_json
 
 NAMES = ("base", "gld", "tiny")
 
@@ -228,7 +229,7 @@ def read(path: Path) -> GeoVerseConfig:
         CheckpointError: no such file, no JSON, or not a configuration of this model.
     """
     try:
-        return from_json(GeoVerseConfig, json.loads(path.read_text(encoding="utf-8")))
+        return from_json(GeoVerseConfig, read_json(path))
     except FileNotFoundError:
         raise CheckpointError(
             f"no {path}; expected the config.json of a GeoVerse folder (gvtools weights list)"

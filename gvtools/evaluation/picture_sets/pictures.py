@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gvtools.errors import ProjectError
 from gvtools.evaluation.picture_matching import IMAGE_ENDINGS
 from gvtools.scenes.scene import Frame, natural_key
+from gvtools.untrusted import open_picture
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -91,16 +92,14 @@ def read_rgb(source: Path | IO[bytes], *, name: str = "") -> NDArray[np.uint8]:
     Raises:
         ProjectError: absent, damaged, or no picture of 8 or 16 bits a channel.
     """
-    from PIL import Image
-
-    from gvtools.scenes.images import read_header, read_image
+    from gvtools.scenes.images import UNREADABLE, read_header, read_image
 
     if isinstance(source, Path) and not read_header(source).has_alpha:
         return read_image(source).rgb
     try:
-        with Image.open(source) as image:
+        with open_picture(source if isinstance(source, Path) else source.read()) as image:
             return _on_black(image)
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+    except UNREADABLE as error:
         raise ProjectError(
             f"{name or source}: no readable picture ({error}); expected PNG or JPEG"
         ) from None

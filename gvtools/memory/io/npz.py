@@ -16,12 +16,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import GvError, MemoryFileError
 from gvtools.files import ZIP_EPOCH, replaced_when_written
 from gvtools.memory.store.store import MemoryOptions, Store
 from gvtools.memory.store.views import SourceView, ViewTable
 from gvtools.memory.store.voxel_index import MOST_LEVEL
+from gvtools.untrusted import parse_json, read_array, regular
 
 S = TypeVar("S", bound=Store)
 
@@ -152,6 +153,7 @@ def _views(names: list[str], arrays: dict[str, NDArray[Any]]) -> list[SourceView
             arrays["view_size"][rows, 1],
             (name,),
         )
+        check_usable(camera)
         height, width = arrays["grid_shape"][i].tolist()
         grid = arrays["grid_depth"][at : at + height * width].reshape(height, width).copy()
         at += height * width
@@ -171,11 +173,11 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         raise MemoryFileError(f"{path}: no such memory file")
     size = path.stat().st_size
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(regular(path)) as archive:
             # A damaged directory may claim absurd sizes; nothing here is compressed.
             if sum(item.file_size for item in archive.infolist()) > size:
                 raise MemoryFileError(f"{path}: its directory claims more bytes than the file has")
-            header = json.loads(archive.read("header.json"))
+            header = parse_json(archive.read("header.json"))
             if not isinstance(header, dict) or header.get("format") != FORMAT:
                 raise MemoryFileError(f"{path}: not a gvtools memory")
             version = header.get("version")
@@ -187,7 +189,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
             arrays = {}
             for name, (dtype, shape) in header["arrays"].items():
                 data = archive.read(f"{name}.npy")
-                array = np.load(io.BytesIO(data), allow_pickle=False)
+                array = read_array(io.BytesIO(data), len(data))
                 if array.dtype.str != dtype or list(array.shape) != shape:
                     raise MemoryFileError(f"{path}: array {name} is not what the header lists")
                 arrays[name] = array
@@ -214,6 +216,14 @@ def _check_consistency(arrays: dict[str, NDArray[Any]], views: int) -> None:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")
     if "view_scanned" in arrays and arrays["view_scanned"].shape != (views,):
         raise ValueError(f"view_scanned has shape {arrays['view_scanned'].shape}, not ({views},)")
+    for name, array in arrays.items():
+        # Depth of free space, and boxes of nothing, may be infinite.
+        bad = np.isnan(array) if name in ("grid_depth", "segment_box") else ~np.isfinite(array)
+        if bad.any():
+            raise ValueError(f"{name} holds numbers that are not finite")
+    for name in ("spacing", "confidence"):
+        if (arrays[name] < 0).any():
+            raise ValueError(f"{name} is negative in places")
     rows = arrays["view"]
     if count and not (rows.min() >= 0 and rows.max() < views):
         raise ValueError("an observation names a view that is not there")

@@ -17,6 +17,7 @@ from gvtools.errors import MemoryFileError, OptionError
 from gvtools.files import replaced_when_written
 from gvtools.memory.store.store import Store
 from gvtools.memory.thinning import thinned
+from gvtools.untrusted import regular
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -49,7 +50,7 @@ def read_ply(path: Path) -> NDArray[np.void]:
         MemoryFileError: no such file, another kind of PLY, or a size other than the header's.
     """
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             head = file.read(_MAX_HEADER)
     except OSError as error:
         raise MemoryFileError(f"{path}: cannot be read ({error.strerror})") from None
@@ -77,7 +78,12 @@ def _parse_header(path: Path, text: str) -> tuple[int, np.dtype[np.void]]:
             continue
         if words[0] == "format" and words[1:] == ["binary_little_endian", "1.0"]:
             continue
-        if words[0] == "element" and len(words) == 3 and words[2].isdecimal():
+        if (
+            words[0] == "element"
+            and len(words) == 3
+            and words[2].isdecimal()
+            and len(words[2]) < 20
+        ):
             if words[1] == "vertex" and count < 0:
                 count = int(words[2])
                 continue

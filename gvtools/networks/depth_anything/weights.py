@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from gvtools.networks.depth_anything.geometry_head import GeometryHeadConfig
 from gvtools.networks.depth_anything.network import DepthAnything3, DepthAnythingConfig
 from gvtools.networks.tensor_files import TensorFiles, read_tensors
 from gvtools.networks.tensors import load, not_finite, share_tied
+from gvtools.untrusted import read_json
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def load_depth_anything(
 
 def _geoverse_config(path: Path) -> DepthAnythingConfig:
     try:
-        stored: Any = json.loads(path.read_text(encoding="utf-8"))
+        stored: Any = read_json(path)
         return from_json(DepthAnythingConfig, stored.get("geometry", {}), where="geometry")
     except FileNotFoundError:
         raise CheckpointError(

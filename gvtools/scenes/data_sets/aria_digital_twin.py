@@ -11,7 +11,6 @@ glasses' colour sensor lies on its side: pictures are read as stored, not turned
 from __future__ import annotations
 
 import csv
-import json
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +30,7 @@ from gvtools.scenes.data_sets.posed_pictures import (
 from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.data_sets.timed_poses import pose_at
 from gvtools.scenes.scene import Finding, Scene
+from gvtools.untrusted import read_json, regular
 
 VIDEO, TRAJECTORY, DEPTH = "video.vrs", "aria_trajectory.csv", "depth_images.vrs"
 METADATA = ("metadata.json", "gt-metadata.json")
@@ -80,7 +80,7 @@ def _version(folder: Path) -> str:
             path = home / name
             if path.is_file():
                 try:
-                    data = json.loads(path.read_text(encoding="utf-8"))
+                    data = read_json(path)
                     return str(data.get("dataset_version", FIRST_VERSION))
                 except (OSError, ValueError, AttributeError) as error:
                     raise ProjectError(f"{path}: {error}; copy it again") from None
@@ -101,7 +101,7 @@ def read_trajectory(path: Path, *, version: str) -> tuple[Float64, Float64]:
         ProjectError: absent, empty or not of that form.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with regular(path).open(newline="", encoding="utf-8") as file:
             rows = list(csv.reader(file))[1:]
         values = np.array([[row[1], *row[3:10]] for row in rows if row], np.float64)
     except (OSError, ValueError, IndexError) as error:

@@ -34,6 +34,7 @@ from gvtools.scenes.images import read_depth
 from gvtools.scenes.rgbd_recording import MILLIMETRES
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.untrusted import read_text
 
 LOW, HIGH = "lowres_wide", "wide"
 DEPTH_OF = {LOW: "lowres_depth", HIGH: "highres_depth"}
@@ -112,7 +113,7 @@ def _pincams(folder: Path) -> dict[int, LensParameters]:
     lenses: dict[int, LensParameters] = {}
     for path in folder.glob("*.pincam"):
         try:
-            width, height, *K = (float(word) for word in path.read_text().split())
+            width, height, *K = (float(word) for word in read_text(path).split())
             lenses[round(_stamp(path.name) * 1000)] = pinhole_lens(K, (int(width), int(height)))
         except (OSError, ValueError):
             continue  # as if it were absent
@@ -134,7 +135,7 @@ def read_trajectory(path: Path) -> tuple[Float64, Float64]:
     from scipy.spatial.transform import Rotation
 
     try:
-        rows = np.loadtxt(path, np.float64, ndmin=2)
+        rows = np.loadtxt(read_text(path).splitlines(), np.float64, ndmin=2)
     except (OSError, ValueError) as error:
         raise ProjectError(f"{path}: {error}; expected seven numbers a line") from None
     if rows.shape[0] == 0 or rows.shape[1] != 7:

@@ -14,6 +14,7 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.data_sets.posed_pictures import natural, pinhole_lens
 from gvtools.scenes.images import read_header
 from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.untrusted import read_text
 
 Float64 = NDArray[np.float64]
 
@@ -62,7 +63,7 @@ def number_table(path: Path, columns: int, *, header: bool = False) -> Float64:
         ProjectError: not of that form.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()[int(header) :]
+        lines = read_text(path).splitlines()[int(header) :]
     except FileNotFoundError:
         lines = []
     except (OSError, UnicodeDecodeError) as error:

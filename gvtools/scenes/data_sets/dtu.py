@@ -17,7 +17,6 @@ from __future__ import annotations
 import re
 from functools import partial
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +35,7 @@ from gvtools.scenes.data_sets.posed_pictures import Float64, PosedPicture, natur
 from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.rgbd_recording import MILLIMETRES
 from gvtools.scenes.scene import Scene
+from gvtools.untrusted import load_arrays
 
 RECTIFIED, CAMERAS, NPZ = "Rectified", "Cameras", "cameras.npz"
 LIGHT = "3"
@@ -61,7 +61,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
         pictures = _idr(folder)
     else:
         pictures = _cams(folder)
-    return posed_scene(folder, pictures, poses="cam_from_world", metric=True)
+    return posed_scene(folder, pictures, poses="cam_from_world", metric=True, home=root)
 
 
 def _rectified(root: Path, folder: Path) -> list[PosedPicture]:
@@ -119,14 +119,13 @@ def _cams(folder: Path) -> list[PosedPicture]:
 def _idr(folder: Path) -> list[PosedPicture]:
     """Of IDR's form."""
     try:
-        with np.load(folder / NPZ, allow_pickle=False) as data:
-            prefix = "world_mat_"
-            matrices = {
-                int(key.removeprefix(prefix)): np.asarray(data[key], np.float64)
-                for key in data
-                if re.fullmatch(prefix + r"\d+", key)
-            }
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        prefix = "world_mat_"
+        matrices = {
+            int(key.removeprefix(prefix)): np.asarray(matrix, np.float64)[:3, :4].reshape(3, 4)
+            for key, matrix in load_arrays(folder / NPZ).items()
+            if re.fullmatch(prefix + r"\d{1,9}", key)
+        }
+    except (OSError, ValueError, TypeError, IndexError) as error:
         raise ProjectError(f"{folder / NPZ}: {error}; expected world_mat_0, ...") from None
     home = folder / "image"
     found = pictures_by_stem(home) if home.is_dir() else {}
@@ -134,7 +133,7 @@ def _idr(folder: Path) -> list[PosedPicture]:
     pictures = []
     for number in sorted(matrices):
         image = by_number.get(number, home / f"{number:06d}.png")
-        camera = decomposed(matrices[number][:3, :4])
+        camera = decomposed(matrices[number])
         pictures.append(posed_picture(image.name, image, camera, sizes=SIZES, unit=MILLIMETRES))
     return pictures
 

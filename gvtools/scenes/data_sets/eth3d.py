@@ -25,6 +25,7 @@ from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.photographs import Depth
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.undistort import Undistortion
+from gvtools.untrusted import regular
 
 UNDISTORTED, ORIGINAL = "dslr_calibration_undistorted", "dslr_calibration_jpg"
 DEPTH = Path("ground_truth_depth") / "dslr_images"
@@ -108,7 +109,7 @@ def read_raw_depth(path: Path, *, size: tuple[int, int], lens: Undistortion | No
     """
     width, height = size
     try:
-        values = np.fromfile(path, "<f4")
+        values = np.fromfile(regular(path), "<f4")
     except OSError as error:
         raise ProjectError(f"{path}: unreadable ({error}); copy it again") from None
     if values.size != width * height:

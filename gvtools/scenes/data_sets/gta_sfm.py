@@ -7,7 +7,6 @@ the game's and is not published.
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Iterable
 from functools import partial
@@ -15,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.data_sets.array_files import hdf5_array, hdf5_file
@@ -23,7 +21,9 @@ from gvtools.scenes.data_sets.drawn import NO_LENS, drawn_lens
 from gvtools.scenes.data_sets.layouts import Layout
 from gvtools.scenes.data_sets.posed_pictures import PosedPicture, natural, posed_scene
 from gvtools.scenes.data_sets.spec import DataSetSpec
+from gvtools.scenes.images import UNREADABLE
 from gvtools.scenes.scene import Frame, Scene
+from gvtools.untrusted import open_picture
 
 SUFFIX = ".hdf5"
 KEY = re.compile(r"(image|depth|pose|K)_([0-9]+)")
@@ -37,9 +37,9 @@ def hdf5_picture(path: Path, *, key: str) -> Frame:
     """
     data = np.asarray(hdf5_array(path, key), np.uint8).tobytes()
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with open_picture(data) as image:
             return Frame(np.array(image.convert("RGB")))
-    except (OSError, SyntaxError, ValueError) as error:
+    except UNREADABLE as error:
         raise ProjectError(f"{path}, {key}: no picture ({error}); download it again") from None
 
 
@@ -90,9 +90,9 @@ def _size(pictures: Iterable[NDArray[np.uint8]]) -> tuple[int, int]:
     """Width and height of the first encoded picture with a sound header, pixels; else 1 x 1."""
     for data in pictures:
         try:
-            with Image.open(io.BytesIO(np.asarray(data, np.uint8).tobytes())) as image:
+            with open_picture(np.asarray(data, np.uint8).tobytes()) as image:
                 return image.size
-        except (OSError, SyntaxError, ValueError):
+        except UNREADABLE:
             continue
     return 1, 1
 

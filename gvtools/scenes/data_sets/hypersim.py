@@ -46,6 +46,7 @@ from gvtools.scenes.images import read_image
 from gvtools.scenes.photographs import Depth
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.untrusted import regular
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -101,7 +102,14 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
                 read=read,
             )
         )
-    return posed_scene(root / scene, frames, poses="world_from_cam", metric=True, findings=findings)
+    return posed_scene(
+        root / scene,
+        frames,
+        poses="world_from_cam",
+        metric=True,
+        findings=findings,
+        home=root,
+    )
 
 
 @dataclass(frozen=True)
@@ -244,7 +252,7 @@ def _parameters(root: Path, scene: str) -> dict[str, str]:
     for folder in (root, root.resolve().parent):
         path = folder / PARAMETERS
         if path.is_file():
-            with path.open(newline="", encoding="utf-8") as file:
+            with regular(path).open(newline="", encoding="utf-8") as file:
                 found = (row for row in csv.DictReader(file) if row["scene_name"] == scene)
                 return next(found, {})
     return {}
@@ -271,7 +279,7 @@ def _projection(parameters: dict[str, str]) -> tuple[Float64, tuple[int, int], l
 def _metres_per_unit(path: Path, parameters: dict[str, str]) -> float:
     texts = [parameters.get("settings_units_info_meters_scale") or ""]
     if path.is_file():
-        with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        with regular(path).open(newline="", encoding="utf-8", errors="replace") as file:
             rows = [row for row in csv.reader(file) if row[:1] == ["meters_per_asset_unit"]]
         texts = [row[1] for row in rows if len(row) > 1] + texts
     for text in texts:

@@ -33,6 +33,7 @@ from gvtools.scenes.data_sets.posed_pictures import (
 )
 from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.scene import Scene
+from gvtools.untrusted import load_array
 
 POSES = "poses_bounds.npy"
 # Columns "right, down, forward" of the columns "down, right, backwards".
@@ -55,8 +56,8 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
 def _rows(path: Path) -> Float64:
     """(N, 3, 5) float64 of a file of poses and bounds."""
     try:
-        rows = np.load(path, allow_pickle=False).astype(np.float64)
-    except (OSError, ValueError, EOFError) as error:
+        rows = load_array(path).astype(np.float64)
+    except (OSError, ValueError, TypeError) as error:
         raise ProjectError(f"{path}: {error}; expected an array of N x 17 numbers") from None
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise ProjectError(f"{path}: shape {rows.shape}; expected N x 17")

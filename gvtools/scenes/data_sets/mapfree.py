@@ -28,6 +28,7 @@ from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.images import read_depth
 from gvtools.scenes.rgbd_recording import MILLIMETRES
 from gvtools.scenes.scene import Finding, Scene
+from gvtools.untrusted import read_text
 
 POSES, INTRINSICS = "poses.txt", "intrinsics.txt"
 
@@ -86,7 +87,7 @@ def _table(path: Path, columns: int) -> dict[str, Float64]:
     """Lines of a name and numbers; comments begin with #."""
     rows = {}
     try:
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for line in read_text(path).splitlines():
             words = line.split()
             if not words or line.startswith("#"):
                 continue

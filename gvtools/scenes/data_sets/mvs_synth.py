@@ -9,7 +9,6 @@ unit is the game's and is not published, so the scene is not taken to be metric.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from gvtools.scenes.data_sets.layouts import Layout
 from gvtools.scenes.data_sets.posed_pictures import PosedPicture, posed_scene
 from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.scene import Finding, Scene
+from gvtools.untrusted import read_json
 
 Float64 = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def _scenes(root: Path) -> tuple[str, ...]:
 def _camera(path: Path) -> tuple[Float64, tuple[float, ...]]:
     """cam_from_world and fx, fy, cx, cy of a pose file."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = read_json(path)
         pose = np.array(values["extrinsic"], np.float64).reshape(4, 4)
         lens = tuple(float(values[key]) for key in ("f_x", "f_y", "c_x", "c_y"))
     except (OSError, ValueError, KeyError, TypeError) as error:

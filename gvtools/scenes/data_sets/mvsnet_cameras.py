@@ -14,6 +14,7 @@ import numpy as np
 from gvtools.errors import ProjectError
 from gvtools.scenes.data_sets.posed_pictures import Float64, PosedPicture, pinhole_lens
 from gvtools.scenes.images import read_header
+from gvtools.untrusted import read_text
 
 SUFFIX = "_cam.txt"
 # How far a principal point may be from the middle, as a share of a side, to be of that picture.
@@ -41,7 +42,7 @@ def read_camera(path: Path) -> MvsCamera:
         ProjectError: absent or not of that form.
     """
     try:
-        words = path.read_text(encoding="utf-8").split()
+        words = read_text(path).split()
         at = words.index("extrinsic") + 1
         pose = np.array(words[at : at + 16], np.float64).reshape(4, 4)
         at = words.index("intrinsic") + 1

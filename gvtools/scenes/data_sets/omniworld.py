@@ -10,21 +10,21 @@ applied.
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.data_sets.drawn import NO_LENS, numbers_in, picture_size, pose_of
 from gvtools.scenes.data_sets.layouts import Layout
 from gvtools.scenes.data_sets.posed_pictures import PosedPicture, natural, pinhole_lens, posed_scene
 from gvtools.scenes.data_sets.spec import DataSetSpec
+from gvtools.scenes.images import UNREADABLE
 from gvtools.scenes.scene import Finding, Scene
+from gvtools.untrusted import open_picture, read_json
 
 Float64 = NDArray[np.float64]
 
@@ -41,9 +41,9 @@ def buffer_depth(path: Path) -> NDArray[np.float32]:
         ProjectError: absent, damaged, or not 16-bit grey.
     """
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             mode, raw = image.mode, np.asarray(image)
-    except (OSError, SyntaxError, ValueError) as error:
+    except UNREADABLE as error:
         raise ProjectError(f"{path}: unreadable ({error}); download it again") from None
     if not mode.startswith("I"):
         raise ProjectError(f"{path}: depth as {mode}; expected 16-bit grey")
@@ -95,7 +95,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
 
 def _json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return read_json(path)
     except (OSError, ValueError) as error:
         raise ProjectError(f"{path}: unreadable ({error}); download it again") from None
 

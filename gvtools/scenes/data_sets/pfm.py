@@ -8,6 +8,7 @@ import numpy as np
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.photographs import Depth
+from gvtools.untrusted import regular
 
 
 def read_pfm_depth(path: Path, *, unit: float = 1.0) -> Depth:
@@ -21,7 +22,7 @@ def read_pfm_depth(path: Path, *, unit: float = 1.0) -> Depth:
         ProjectError: absent, truncated, coloured or no PFM.
     """
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             kind = file.readline().split()
             width, height = (int(word) for word in file.readline().split())
             scale = float(file.readline())

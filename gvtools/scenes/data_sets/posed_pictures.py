@@ -31,6 +31,7 @@ from gvtools.scenes.photographs import (
 from gvtools.scenes.scene import Finding, Frame, Scene, natural_key
 from gvtools.scenes.transforms_frame import LensParameters
 from gvtools.scenes.undistort import Undistortion, undistortion
+from gvtools.untrusted import named_file
 
 Float64 = NDArray[np.float64]
 Poses = Literal["cam_from_world", "world_from_cam"]
@@ -178,6 +179,7 @@ def posed_scene(
     poses: Poses,
     metric: bool,
     findings: Sequence[Finding] = (),
+    home: Path | None = None,
 ) -> Scene:
     """The scene of the frames that can be used.
 
@@ -187,11 +189,17 @@ def posed_scene(
         poses: which way ``PosedPicture.pose`` maps.
         metric: whether the units of poses and depth are metres.
         findings: what the reader met.
+        home: the folder that no file of a frame may lie outside of; None: ``root``.
 
     Raises:
-        ProjectError: no frame is left.
+        ProjectError: no frame is left, or one names a file outside of the data set.
     """
     sieve = _Sieve(len(pictures))
+    for picture in pictures:
+        for path in (picture.image, picture.depth, picture.mask):
+            # A download may be kept elsewhere and linked; a name out of a file may not lead there.
+            if path is not None:
+                named_file(home or root, path, where=f"{root}, frame {picture.name}", links=True)
     lenses: dict[LensParameters, Undistortion] = {}
     photographs = []
     for picture in sorted(pictures, key=lambda item: natural_key(item.name)):

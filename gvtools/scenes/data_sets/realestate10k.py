@@ -29,6 +29,7 @@ from gvtools.scenes.images import read_header
 from gvtools.scenes.rgbd_recording import PICTURES
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.untrusted import read_text, regular
 
 SPLITS = ("train", "validation", "test")
 VIDEOS = (".mp4", ".mkv", ".webm", ".mov")
@@ -67,7 +68,7 @@ def _videos(root: Path, split: str) -> Iterator[Path]:
 
 def _address(path: Path) -> str:
     """The video's name in its address: ``watch?v=NAME``, or the last part of the path."""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with regular(path).open(encoding="utf-8", errors="replace") as file:
         parts = urlsplit(file.readline().strip())
     return parse_qs(parts.query).get("v", [parts.path.rpartition("/")[2]])[0]
 
@@ -95,7 +96,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
 def _rows(path: Path) -> Float64:
     """(N, 19) float64: the lines of a camera file after its first."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()[1:]
+        lines = read_text(path).splitlines()[1:]
         rows = np.array([line.split() for line in lines if line.strip()], np.float64)
     except (OSError, ValueError) as error:
         raise ProjectError(

@@ -14,7 +14,6 @@ world_from_cam with OpenCV axes in the scan's world, ``intrinsic`` is of the pic
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,6 +39,7 @@ from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.images import read_depth
 from gvtools.scenes.rgbd_recording import MILLIMETRES
 from gvtools.scenes.scene import Scene
+from gvtools.untrusted import read_json
 
 POSES = "pose_intrinsic_imu.json"
 UNDISTORTED = Path("nerfstudio") / "transforms_undistorted.json"
@@ -124,7 +124,7 @@ def _iphone(folder: Path) -> Scene:
 
 def _records(path: Path) -> dict[str, dict[str, Any]]:
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path)
         return {str(name): dict(record) for name, record in data.items()}
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise ProjectError(f"{path}: {error}; expected a record for each frame") from None

@@ -11,11 +11,12 @@ from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from gvtools.errors import ProjectError
+from gvtools.scenes.images import UNREADABLE
 from gvtools.scenes.photographs import Depth
 from gvtools.scenes.scene import Frame
+from gvtools.untrusted import open_picture, regular
 
 Float64 = NDArray[np.float64]
 
@@ -78,7 +79,7 @@ class SensFile:
             ProjectError: absent, no such file, or of a compression that is not read.
         """
         try:
-            with path.open("rb") as file:
+            with regular(path).open("rb") as file:
                 (version,) = _unpack(file, "<I")
                 if version != VERSION:
                     raise ProjectError(
@@ -135,11 +136,11 @@ def read_color(path: Path, *, frame: SensFrame) -> Frame:
         ProjectError: absent or damaged.
     """
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             file.seek(frame.offset)
-            image = Image.open(io.BytesIO(file.read(frame.color_bytes)))
+            image = open_picture(file.read(frame.color_bytes))
             return Frame(np.array(image.convert("RGB")))
-    except (OSError, SyntaxError, ValueError) as error:
+    except UNREADABLE as error:
         raise ProjectError(f"{path}: unreadable picture ({error}); copy it again") from None
 
 
@@ -151,7 +152,7 @@ def read_sens_depth(path: Path, *, frame: SensFrame, sens: SensFile) -> Depth:
     """
     width, height = sens.depth_size
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             file.seek(frame.offset + frame.color_bytes)
             data = file.read(frame.depth_bytes)
         if sens.depth_code == ZLIB_USHORT:

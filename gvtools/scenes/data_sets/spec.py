@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from gvtools.errors import OptionError
+from gvtools.untrusted import parse_yaml
 
 Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
@@ -190,14 +191,14 @@ def parse_spec(text: str, *, where: str = "spec") -> DataSetSpec:
     Raises:
         OptionError: a key that is unknown or absent, or a value of another type.
     """
-    import yaml
-
     try:
-        return DataSetSpec.model_validate(yaml.safe_load(text))
+        return DataSetSpec.model_validate(parse_yaml(text))
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise OptionError(f"{where}, {place}: {first['msg']}") from None
+    except ValueError as error:
+        raise OptionError(f"{where}: {error}; expected the YAML of a data set") from None
 
 
 def name_key(text: str) -> str:

@@ -11,14 +11,15 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.data_sets.layouts import Layout
 from gvtools.scenes.data_sets.posed_pictures import pinhole_lens
 from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.data_sets.tartanair import SKY_FROM, read_trajectory, trajectory_scenes
+from gvtools.scenes.images import UNREADABLE
 from gvtools.scenes.scene import Scene
+from gvtools.untrusted import open_picture
 
 LENS = pinhole_lens([320.0, 320.0, 320.0, 320.0], (640, 640))
 DIRECTIONS = ("front", "back", "left", "right", "top", "bottom")
@@ -32,9 +33,9 @@ def packed_depth(path: Path) -> NDArray[np.float32]:
         ProjectError: absent, damaged, or no picture of four 8-bit channels.
     """
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             mode, pixels = image.mode, np.asarray(image)
-    except (OSError, SyntaxError, ValueError) as error:
+    except UNREADABLE as error:
         raise ProjectError(f"{path}: unreadable ({error}); download it again") from None
     if mode != "RGBA":
         raise ProjectError(f"{path}: depth as {mode}; expected the four bytes of a float as RGBA")

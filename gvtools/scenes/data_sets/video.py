@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.scene import Frame
+from gvtools.untrusted import regular
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -116,8 +117,13 @@ def read_frame(path: Path, *, seconds: float, edits: bool = True) -> Frame:
 def _opened(path: Path, *, edits: bool = True) -> Any:
     av = _av()
     try:
-        container = av.open(str(path), options={} if edits else {"ignore_editlist": "1"})
-    except (av.error.FFmpegError, OSError) as error:
+        # Text of the file's own, which may be no UTF-8, is not looked at.
+        container = av.open(
+            str(regular(path)),
+            options={} if edits else {"ignore_editlist": "1"},
+            metadata_errors="replace",
+        )
+    except (av.error.FFmpegError, OSError, ValueError) as error:
         raise ProjectError(f"{path}: no readable video ({error}); copy it again") from None
     if not container.streams.video:
         container.close()

@@ -75,7 +75,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
                 partial(read_depth, unit=CENTIMETRES),
             )
         )
-    return posed_scene(texts, pictures, poses="cam_from_world", metric=True)
+    return posed_scene(texts, pictures, poses="cam_from_world", metric=True, home=root)
 
 
 LAYOUT = Layout("SceneNN/VARIATION with frames, intrinsic.txt and extrinsic.txt", _scenes, _read)

@@ -12,12 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.data_sets.layouts import Layout
@@ -28,8 +26,10 @@ from gvtools.scenes.data_sets.posed_pictures import (
     posed_scene,
 )
 from gvtools.scenes.data_sets.spec import DataSetSpec
+from gvtools.scenes.images import UNREADABLE
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.untrusted import open_picture
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -107,9 +107,9 @@ def read_picture(path: Path, *, group: int, row: int) -> Frame:
             ):
                 if row < seen + batch.num_rows:
                     data = batch.column(0)[row - seen].as_py()
-                    return Frame(np.array(Image.open(BytesIO(data)).convert("RGB")))
+                    return Frame(np.array(open_picture(data).convert("RGB")))
                 seen += batch.num_rows
-    except (OSError, SyntaxError, ValueError, TypeError) as error:
+    except UNREADABLE as error:
         raise ProjectError(f"{path}: unreadable picture ({error}); copy it again") from None
     raise ProjectError(f"{path}: no row {row} in row group {group}; copy it again")
 

@@ -10,7 +10,6 @@ gvtools does.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,6 +30,7 @@ from gvtools.scenes.images import read_depth, read_mask, resize_nearest
 from gvtools.scenes.photographs import Depth
 from gvtools.scenes.rgbd_recording import MILLIMETRES
 from gvtools.scenes.scene import Finding, Scene
+from gvtools.untrusted import read_json
 
 WORLD_UP = 1  # y
 
@@ -93,7 +93,7 @@ def read_lidar(path: Path, *, confidence: Path | None) -> Depth:
 def read_object(path: Path) -> dict[str, Any]:
     """The JSON object in a file; empty where it is absent or damaged, as if it had no key."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path)
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
@@ -103,7 +103,7 @@ def numbers(values: object, shape: tuple[int, ...]) -> Float64 | None:
     """An array of finite numbers of that shape, row by row; None where the values are others."""
     try:
         array = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         return None
     if array.size != int(np.prod(shape)) or not np.isfinite(array).all():
         return None

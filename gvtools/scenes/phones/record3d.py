@@ -13,17 +13,13 @@ identity.
 
 from __future__ import annotations
 
-import io
-import json
-import zlib
+import ctypes
 from functools import partial
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from pydantic import BaseModel, Field, ValidationError
 
 from gvtools.errors import ProjectError
@@ -35,16 +31,20 @@ from gvtools.scenes.data_sets.posed_pictures import (
     quaternion_pose,
     scaled_lens,
 )
+from gvtools.scenes.images import UNREADABLE
 from gvtools.scenes.phones.arkit import PhoneLayout, numbers, opencv_pose, phone_scene, readings
 from gvtools.scenes.photographs import Depth
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.untrusted import archive, open_picture, parse_json, read_bytes
 
 NAME = "Record3D"
 ARCHIVE, EXPORT = ".r3d", "EXR_RGBD"
 PICTURES = (".jpg", ".png")
 CHANNELS = ("R", "Y", "Z")
 NO_POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+# LZFSE packs no more bytes than this into one.
+LZFSE_RATIO = 4000
 LIDAR = (192, 256)  # width and height of depth maps where the metadata does not say
 
 
@@ -111,7 +111,7 @@ def _read(path: Path) -> Scene:
 
 def _metadata(home: Path, name: str) -> Metadata:
     try:
-        metadata = Metadata.model_validate(json.loads(_stored(home, name)))
+        metadata = Metadata.model_validate(parse_json(_stored(home, name)))
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
@@ -182,9 +182,9 @@ def _members(path: Path) -> set[str]:
     if not path.is_file():
         return {f"rgbd/{item.name}" for item in (path / "rgbd").iterdir()}
     try:
-        with ZipFile(path) as archive:
-            return {item.filename for item in archive.infolist() if item.file_size}
-    except (OSError, BadZipFile) as error:
+        with archive(path) as opened:
+            return {item.filename for item in opened.infolist() if item.file_size}
+    except (OSError, ValueError) as error:
         raise _damaged(path, error) from None
 
 
@@ -192,10 +192,10 @@ def _stored(home: Path, name: str) -> bytes:
     """A file of a folder or of an archive."""
     try:
         if not home.is_file():
-            return (home / name).read_bytes()
-        with ZipFile(home) as archive:
-            return archive.read(name)
-    except (OSError, KeyError, BadZipFile, zlib.error) as error:
+            return read_bytes(home / name)
+        with archive(home) as opened:
+            return opened.read(name)
+    except (OSError, KeyError, ValueError) as error:
         raise _damaged(home / name, error) from None
 
 
@@ -208,17 +208,17 @@ def _picture_size(path: Path, held: set[str]) -> tuple[int, int] | None:
     for name in sorted(held):
         if name.endswith(".jpg"):
             try:
-                return Image.open(io.BytesIO(_stored(path, name))).size
-            except (OSError, ProjectError):
+                return open_picture(_stored(path, name)).size
+            except (OSError, ValueError, ProjectError):
                 continue
     return None
 
 
 def _picture(path: Path, *, member: str) -> Frame:
     try:
-        image = Image.open(io.BytesIO(_stored(path, member)))
+        image = open_picture(_stored(path, member))
         return Frame(np.array(image.convert("RGB")))
-    except (OSError, SyntaxError) as error:
+    except UNREADABLE as error:
         raise _damaged(path / member, error) from None
 
 
@@ -249,13 +249,38 @@ def _unpacked(home: Path, name: str, dtype: str, *, shape: tuple[int, int]) -> N
             "pip install 'gvtools[phones]', or export EXR and JPG"
         ) from None
     try:
-        data = lzfse.decompress(_stored(home, name))
+        data = _decompressed(_stored(home, name), np.dtype(dtype).itemsize * shape[0] * shape[1])
         return np.frombuffer(data, dtype).reshape(shape)
-    except (lzfse.error, ValueError) as error:
+    except (lzfse.error, ValueError, MemoryError) as error:
         raise ProjectError(
             f"{home / name}: unreadable ({error}); expected {shape[0]}x{shape[1]} values by LZFSE; "
             "export the recording again"
         ) from None
+
+
+def _decompressed(data: bytes, size: int) -> bytes:
+    """What LZFSE packed, which has to be of so many bytes.
+
+    The package's own function takes ever more memory for damaged data. The library inside it, which
+    takes a buffer of fixed size, is called where it can be found.
+    """
+    import lzfse
+
+    try:
+        decode = ctypes.CDLL(lzfse.__file__).lzfse_decode_buffer
+    except (OSError, AttributeError):
+        return bytes(lzfse.decompress(data))
+    if size > LZFSE_RATIO * len(data):
+        raise ValueError(f"{len(data)} bytes for {size}")
+    decode.restype = ctypes.c_size_t
+    decode.argtypes = [
+        ctypes.c_void_p, ctypes.c_size_t, ctypes.c_char_p, ctypes.c_size_t, ctypes.c_void_p,
+    ]  # fmt: skip
+    buffer = ctypes.create_string_buffer(size + 1)
+    found = decode(buffer, size + 1, data, len(data), None)
+    if found != size:
+        raise ValueError(f"damaged, or {found} bytes")
+    return buffer.raw[:size]
 
 
 RECORD3D = PhoneLayout(

@@ -34,6 +34,7 @@ from gvtools.scenes.phones.arkit import (
 )
 from gvtools.scenes.rgbd_recording import load_matrix
 from gvtools.scenes.scene import Finding, Scene
+from gvtools.untrusted import regular
 
 NAME = "Stray Scanner"
 VIDEO, ODOMETRY, MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
@@ -84,7 +85,7 @@ def read_odometry(path: Path) -> list[dict[str, float]]:
         ProjectError: absent, empty, or without frame numbers.
     """
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with regular(path).open(encoding="utf-8-sig", newline="") as file:
             lines = list(csv.DictReader(file, skipinitialspace=True))
     except (OSError, ValueError, csv.Error) as error:
         raise ProjectError(f"{path}: unreadable ({error}); export the recording again") from None

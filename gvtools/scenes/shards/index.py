@@ -13,6 +13,7 @@ from typing import Annotated, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gvtools.errors import ProjectError
+from gvtools.untrusted import read_bytes, regular
 
 INDEX = "index.json"
 FORMAT, VERSION = "gvtools shards", 1
@@ -167,7 +168,7 @@ def is_shards(folder: Path) -> bool:
     path = folder / INDEX
     if not path.is_file():
         return False
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         return f'"{FORMAT}"'.encode() in file.read(200)
 
 
@@ -198,12 +199,18 @@ def read_shard_index(path: Path, checksum: str) -> ShardRecord:
     Args:
         path: of the file.
         checksum: as ``index.json`` lists it; part of the cache's key, so that a shard that was
-            converted anew is read again. It is not compared with the file.
+            converted anew is read again.
 
     Raises:
-        ProjectError: absent or damaged.
+        ProjectError: absent, damaged, or of another checksum.
     """
-    return read_record(path, ShardRecord)
+    record = read_record(path, ShardRecord)
+    if sha256_of(path) != checksum:
+        raise ProjectError(
+            f"{path}: damaged: its SHA-256 is not that of {INDEX}; run gvtools data shards again, "
+            "which writes what is damaged anew"
+        )
+    return record
 
 
 def read_record(path: Path, kind: type[R]) -> R:
@@ -213,7 +220,7 @@ def read_record(path: Path, kind: type[R]) -> R:
         ProjectError: absent or damaged.
     """
     try:
-        return kind.model_validate_json(path.read_bytes())
+        return kind.model_validate_json(read_bytes(path))
     except (OSError, ValidationError) as error:
         reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error.strerror
         raise ProjectError(
@@ -225,7 +232,7 @@ def read_record(path: Path, kind: type[R]) -> R:
 def sha256_of(path: Path) -> str:
     """SHA-256 of a file, as hex digits."""
     digest = hashlib.sha256()
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         while chunk := file.read(_CHUNK):
             digest.update(chunk)
     return digest.hexdigest()

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.images import DEPTH_SATURATED
+from gvtools.scenes.images import DEPTH_SATURATED, UNREADABLE
 from gvtools.scenes.scene import Frame, View
+from gvtools.untrusted import load_arrays, open_picture
 
 PICTURES = ("jpg", "png")
 DEPTH_PNG, DEPTH_NPZ, MASK, CAMERA = "depth.png", "depth.npz", "mask.png", "json"
@@ -89,17 +90,16 @@ def decoded(members: Mapping[str, bytes], *, depth_unit: float | None, where: st
     """
     try:
         picture = next(members[name] for name in PICTURES if name in members)
-        rgb = np.array(Image.open(io.BytesIO(picture)).convert("RGB"))
+        rgb = np.array(open_picture(picture).convert("RGB"))
         depth = mask = None
         if DEPTH_PNG in members:
-            raw = np.asarray(Image.open(io.BytesIO(members[DEPTH_PNG])))
+            raw = np.asarray(open_picture(members[DEPTH_PNG]))
             depth = raw.astype(np.float32) * np.float32(depth_unit or 1.0)
         elif DEPTH_NPZ in members:
-            with np.load(io.BytesIO(members[DEPTH_NPZ]), allow_pickle=False) as stored:
-                depth = stored["depth"]
+            depth = load_arrays(members[DEPTH_NPZ], "depth")["depth"]
         if MASK in members:
-            mask = np.asarray(Image.open(io.BytesIO(members[MASK]))).astype(bool)
-    except (OSError, ValueError, KeyError, StopIteration, SyntaxError) as error:
+            mask = np.asarray(open_picture(members[MASK])).astype(bool)
+    except (*UNREADABLE, StopIteration) as error:
         raise ProjectError(
             f"{where}: cannot be decoded ({error}); expected a view as gvtools data shards writes "
             "it; convert again"

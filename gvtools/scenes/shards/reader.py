@@ -29,6 +29,7 @@ from gvtools.scenes.shards.index import (
     sha256_of,
 )
 from gvtools.scenes.shards.members import decoded
+from gvtools.untrusted import named_file, read_bytes, regular
 
 AGAIN = "copy it again, or run gvtools data shards again"
 
@@ -42,7 +43,7 @@ def open_shards(folder: Path) -> SceneCollection:
     index = read_index(folder)
     names = tuple(scene.name for scene in index.scenes)
     counts = tuple(scene.with_depth for scene in index.scenes)
-    digest = hashlib.sha256((folder / INDEX).read_bytes()).hexdigest()[:16]
+    digest = hashlib.sha256(read_bytes(folder / INDEX)).hexdigest()[:16]
     read = ShardScenes(folder, index)
     return SceneCollection(index.title, names, read, counts, digest, index.data_set)
 
@@ -73,14 +74,22 @@ class ShardScenes:
         views: list[View] = []
         found = None
         for number in self.index.scenes[self._numbers[name]].shards:
-            listed = self.index.shards[number]
-            tar = self.folder / listed.file
+            listed = self._listed(number)
+            tar = named_file(self.folder, listed.file, where=str(self.folder / INDEX))
             _check_size(tar, listed)
             shard = read_shard_index(tar.with_suffix(".json"), listed.index_sha256)
-            found = next(scene for scene in shard.scenes if scene.name == name)
+            found = next((scene for scene in shard.scenes if scene.name == name), None)
+            if found is None:
+                raise ProjectError(f"{tar}: holds nothing of {name!r}, which {INDEX} says; {AGAIN}")
             views += [_view(tar, view) for view in shard.views if view.scene == found.number]
-        assert found is not None
+        if found is None:
+            raise ProjectError(f"{self.folder / INDEX}: no shard of {name!r}; {AGAIN}")
         return Scene(self.folder / name, found.kind, tuple(views), metric=found.metric)
+
+    def _listed(self, number: int) -> ListedShard:
+        if not 0 <= number < len(self.index.shards):
+            raise ProjectError(f"{self.folder / INDEX}: names shard {number}; {AGAIN}")
+        return self.index.shards[number]
 
 
 def verify(folder: Path, *, progress: Callable[[str], None] = lambda text: None) -> list[str]:
@@ -98,7 +107,7 @@ def verify(folder: Path, *, progress: Callable[[str], None] = lambda text: None)
     """
     problems = []
     for listed in read_index(folder).shards:
-        tar = folder / listed.file
+        tar = named_file(folder, listed.file, where=str(folder / INDEX))
         progress(listed.file)
         try:
             _check_size(tar, listed)
@@ -137,7 +146,8 @@ def _view(tar: Path, record: ViewRecord) -> View:
         np.array([record.height]),
         (record.name,),
     )
-    load = partial(_load, _Place(tar, record.members, record.depth_unit, record.name))
+    size = record.width, record.height
+    load = partial(_load, _Place(tar, record.members, record.depth_unit, record.name, size))
     return View(record.name, camera, load, record.has_depth, (tar,))
 
 
@@ -150,19 +160,21 @@ class _Place:
         members: by file extension, such as "depth.png": offset, size in bytes, CRC-32.
         depth_unit: scene units of 1 in a 16-bit depth picture; None for other depth.
         name: of the view, for error messages.
+        size: width and height, pixels.
     """
 
     tar: Path
     members: dict[str, tuple[int, int, int]]
     depth_unit: float | None
     name: str
+    size: tuple[int, int]
 
 
 def _load(place: _Place) -> Frame:
     where = f"{place.tar}, view {place.name}"
     members = {}
     try:
-        with place.tar.open("rb") as file:
+        with regular(place.tar).open("rb") as file:
             for name, (offset, size, checksum) in place.members.items():
                 file.seek(offset)
                 content = file.read(size)
@@ -174,4 +186,10 @@ def _load(place: _Place) -> Frame:
                 members[name] = content
     except OSError as error:
         raise ProjectError(f"{where}: unreadable ({error.strerror}); {AGAIN}") from None
-    return decoded(members, depth_unit=place.depth_unit, where=where)
+    frame = decoded(members, depth_unit=place.depth_unit, where=where)
+    shapes = {a.shape[:2] for a in (frame.rgb, frame.depth, frame.mask) if a is not None}
+    if shapes != {place.size[::-1]}:
+        raise ProjectError(f"{where}: pixels {shapes}; expected {place.size[::-1]}; {AGAIN}")
+    if frame.depth is not None and not (np.isfinite(frame.depth) & (frame.depth >= 0)).all():
+        raise ProjectError(f"{where}: depth that is not finite, or negative; {AGAIN}")
+    return frame

@@ -28,6 +28,7 @@ from gvtools.scenes.shards.index import (
     shard_name,
 )
 from gvtools.scenes.shards.walk import Walk, write_shard
+from gvtools.untrusted import read_json
 
 CONVERSION = "conversion.json"
 MEGABYTE = 10**6
@@ -145,7 +146,7 @@ def _settle_description(collection: SceneCollection, out: Path, options: ShardOp
         write_text(path, json.dumps(description, indent=1) + "\n")
         return
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))
+        before = read_json(path)
     except ValueError:
         before = {}
     for name, value in description.items():

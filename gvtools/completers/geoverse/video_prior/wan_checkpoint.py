@@ -30,6 +30,7 @@ from gvtools.errors import CheckpointError, OptionError, ProjectError
 from gvtools.files import replaced_when_written
 from gvtools.networks.tensor_files import INDEX, TensorFiles
 from gvtools.networks.tensors import check_fit
+from gvtools.untrusted import read_json
 
 _WEIGHTS = "diffusion_pytorch_model"
 # Bytes of tensors held in memory at a time, and of one file.
@@ -303,7 +304,7 @@ def _transformer(place: Path) -> Path:
 def _has_two_experts(place: Path) -> bool:
     index = place / "model_index.json"
     try:
-        return json.loads(index.read_text(encoding="utf-8")).get("boundary_ratio") is not None
+        return read_json(index).get("boundary_ratio") is not None
     except FileNotFoundError:
         return False
     except (OSError, ValueError, AttributeError) as error:

@@ -12,7 +12,6 @@ imported when first needed; no pipeline and no scheduler of it is used, and so n
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -25,6 +24,7 @@ from torch import Tensor, nn
 from gvtools.errors import CheckpointError
 from gvtools.networks.tensor_files import TensorFiles
 from gvtools.networks.tensors import Shapes, check_fit, shapes
+from gvtools.untrusted import read_json
 
 COMPONENTS = {"transformer": "WanVACETransformer3DModel", "vae": "AutoencoderKLWan"}
 EMPTY_PROMPT = "empty_prompt.safetensors"
@@ -161,7 +161,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / "config.json"
     try:
-        config = json.loads(path.read_text(encoding="utf-8"))
+        config = read_json(path)
     except OSError as error:
         raise CheckpointError(
             f"{path}: cannot be read ({error.strerror or error}); expected the config.json of a "

@@ -1,0 +1,331 @@
+"""Files that others made, read without trust: no wait, no code, no more memory than they deserve.
+
+What is wrong with a file ends in OSError or ValueError here, which every reader turns into its own
+error with the file's name. A file may be a pipe, a device or a folder; JSON may be nested a
+thousandfold; an archive or an array may claim terabytes in a kilobyte; a name may lead anywhere.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import stat
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from gvtools.errors import ProjectError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from PIL import Image
+
+# What may be unpacked of a compressed file: so many bytes, and so many for each of its own.
+UNPACKED_BYTES, UNPACKED_RATIO = 192 << 20, 2
+# What pixels of a picture may take: a blank picture is packed tightly, but not without end.
+PIXEL_BYTES, PIXEL_RATIO = 80 << 20, 200
+# Integers of more digits are larger than any float.
+MOST_INTEGER = 300
+# Of a YAML text with its aliases written out.
+MOST_NODES = 100_000
+# Numbers of more digits than this are none.
+MOST_DIGITS = 400
+
+
+def regular(path: Path) -> Path:
+    """``path``, where it is a file: not a folder, a pipe or a device, of which reading has no end.
+
+    Raises:
+        OSError: it is absent or something else.
+
+    >>> regular(Path("/"))
+    Traceback (most recent call last):
+        ...
+    IsADirectoryError: [Errno 21] is a folder; expected a file: '/'
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except ValueError as error:  # a name with a null
+        raise OSError(22, str(error), repr(str(path))) from None
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(21, "is a folder; expected a file", str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(22, "is a pipe or a device; expected a file", str(path))
+    return path
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file is there; False for names that no file can have, too long or with a null."""
+    return os.path.isfile(path)
+
+
+def read_bytes(path: Path) -> bytes:
+    """What a file holds.
+
+    Raises:
+        OSError: absent, unreadable, or no file.
+    """
+    return regular(path).read_bytes()
+
+
+def read_text(path: Path, *, errors: str = "strict") -> str:
+    """What a text file holds, in UTF-8.
+
+    Args:
+        path: the file.
+        errors: as ``bytes.decode`` takes it.
+
+    Raises:
+        OSError: absent, unreadable, or no file.
+        ValueError: no UTF-8.
+    """
+    return regular(path).read_text(encoding="utf-8", errors=errors)
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The value of a JSON text.
+
+    Raises:
+        ValueError: no JSON, nested too deep, or an integer beyond every float.
+
+    >>> parse_json("[" * 100_000)
+    Traceback (most recent call last):
+        ...
+    ValueError: nested too deep for JSON
+    """
+    try:
+        return json.loads(text, parse_int=_integer)
+    except RecursionError:
+        raise ValueError("nested too deep for JSON") from None
+
+
+def _integer(digits: str) -> int:
+    """An integer that is a number for NumPy, too, if not one of 64 bits."""
+    if len(digits) > MOST_INTEGER:
+        raise ValueError(f"an integer of {len(digits)} digits")
+    return int(digits)
+
+
+def read_json(path: Path) -> Any:
+    """The value in a JSON file.
+
+    Raises:
+        OSError: absent, unreadable, or no file.
+        ValueError: no JSON.
+    """
+    return parse_json(read_text(path))
+
+
+def parse_yaml(text: str) -> Any:
+    r"""The value of a YAML text: plain data, whose aliases stand for MOST_NODES values at most.
+
+    Raises:
+        ValueError: no YAML, a tag of anything but plain data, aliases of themselves or of too much.
+
+    >>> parse_yaml("a: &x [1, two]\nb: *x")
+    {'a': [1, 'two'], 'b': [1, 'two']}
+    >>> parse_yaml("a: &x [*x]")
+    Traceback (most recent call last):
+        ...
+    ValueError: an alias of what holds it
+    """
+    import yaml
+
+    try:
+        value = yaml.safe_load(text)
+        if _nodes(value, {}) > MOST_NODES:
+            raise ValueError(f"aliases stand for more than {MOST_NODES} values")
+        return value
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = "" if mark is None else f"line {mark.line + 1}: "
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise ValueError(f"{where}{problem}") from None
+    except (RecursionError, OverflowError, KeyError, AttributeError, TypeError) as error:
+        raise ValueError(f"no YAML ({type(error).__name__})") from None
+
+
+def _nodes(value: Any, known: dict[int, int]) -> int:
+    """How many values there are when every alias is written out."""
+    if not isinstance(value, (dict, list)):
+        return 1
+    if id(value) in known:
+        if known[id(value)] < 0:
+            raise ValueError("an alias of what holds it")
+        return known[id(value)]
+    known[id(value)] = -1
+    inner = [*value, *value.values()] if isinstance(value, dict) else value
+    known[id(value)] = 1 + sum(_nodes(item, known) for item in inner)
+    return known[id(value)]
+
+
+def named_file(folder: Path, name: str | Path, *, where: str, links: bool = False) -> Path:
+    """The path of a file that another file names, which has to lie in a folder.
+
+    The folder itself may be reached over links; from there on, neither "..", an absolute path nor
+    a link may lead out of it. The file need not be there.
+
+    Args:
+        folder: that the name is relative to, and may not leave.
+        name: as the file has it.
+        where: the file and the place in it, for the message.
+        links: whether links that lead out are followed, as those of a download that is kept
+            elsewhere; the name itself still may not.
+
+    Raises:
+        ProjectError: the name leads out of the folder, or is none that a file can have.
+    """
+    try:
+        path = folder / name
+        resolved = os.path.abspath if links else os.path.realpath
+        home, real = resolved(folder), resolved(path)
+        if "\0" in real:
+            raise ValueError("a null in its name")
+    except (OSError, ValueError) as error:
+        raise ProjectError(
+            f"{where}: names the file {str(name)[:80]!r} ({error}); expected a path in {folder}"
+        ) from None
+    if real != home and not real.startswith(home.rstrip("/") + "/"):
+        raise ProjectError(
+            f"{where}: names the file {str(name)[:80]!r}, which lies outside of {folder}; expected "
+            "a path below it; copy the file there"
+        )
+    return path
+
+
+@contextmanager
+def archive(source: Path | bytes) -> Iterator[zipfile.ZipFile]:
+    """A ZIP archive, open for reading, whose members together unpack to a sensible size.
+
+    Raises:
+        OSError: absent, unreadable, or no file.
+        ValueError: no archive, damaged, or with more in it than it can hold.
+        KeyError: no member of the name asked for in the block.
+    """
+    try:
+        size = len(source) if isinstance(source, bytes) else regular(source).stat().st_size
+        with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source) as opened:
+            claimed = sum(item.file_size for item in opened.infolist())
+            if claimed > UNPACKED_RATIO * size + UNPACKED_BYTES:
+                raise ValueError(f"its members claim {claimed} bytes in a file of {size}")
+            yield opened
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, struct.error,
+            RuntimeError, MemoryError, OverflowError) as error:  # fmt: skip
+        raise ValueError(f"damaged archive: {error or type(error).__name__}") from None
+
+
+def load_arrays(source: Path | bytes, *names: str) -> dict[str, NDArray[Any]]:
+    """Arrays of an ``.npz`` file, without pickle.
+
+    Args:
+        source: the file, or what it holds.
+        names: of the arrays; none for all that are there.
+
+    Raises:
+        OSError: absent, unreadable, or no file.
+        ValueError: no archive, damaged, with objects, or an array that claims more than it holds.
+        KeyError: no array of a name.
+    """
+    with archive(source) as opened:
+        held = {item.removesuffix(".npy") for item in opened.namelist()}
+        for name in names:
+            if name not in held:
+                raise KeyError(f"no array {name!r} among {', '.join(sorted(held)[:8])}")
+        return {name: _member(opened, name) for name in (names or sorted(held))}
+
+
+def _member(opened: zipfile.ZipFile, name: str) -> NDArray[Any]:
+    whole = f"{name}.npy" if f"{name}.npy" in opened.namelist() else name
+    with opened.open(whole) as stream:
+        return read_array(stream, opened.getinfo(whole).file_size)
+
+
+def load_array(path: Path) -> NDArray[Any]:
+    """The array of an ``.npy`` file, without pickle.
+
+    Raises:
+        OSError: absent, unreadable, or no file.
+        ValueError: no array, with objects, or another size than its head says.
+    """
+    with regular(path).open("rb") as stream:
+        return read_array(stream, path.stat().st_size)
+
+
+def read_array(stream: IO[bytes], size: int) -> NDArray[Any]:
+    """The array that a stream of ``size`` bytes holds in NumPy's format.
+
+    NumPy itself takes memory for whatever shape the head names before it reads.
+
+    Raises:
+        ValueError: no array, with objects, or another size than its head says.
+    """
+    import numpy as np
+
+    try:
+        version = np.lib.format.read_magic(stream)  # type: ignore[arg-type]
+        read_head = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }.get(version)
+        if read_head is None:
+            raise ValueError(f"an array of NumPy's format {version}")
+        shape, fortran, dtype = read_head(stream)  # type: ignore[arg-type]
+    except Exception as error:
+        # What its parser of the head, which is Python's own, stumbles upon, it raises as it comes.
+        raise ValueError(f"an array with a damaged head ({type(error).__name__})") from None
+    if dtype.hasobject:
+        raise ValueError("an array of objects, which may hold code")
+    count = 1
+    for length in shape:
+        if length < 0:
+            raise ValueError(f"an array of shape {shape}")
+        count *= int(length)
+    if count * dtype.itemsize > size:
+        raise ValueError(f"an array of shape {shape} and type {dtype} in {size} bytes")
+    data = stream.read(count * dtype.itemsize)
+    if len(data) != count * dtype.itemsize:
+        raise ValueError(f"an array that ends early, of shape {shape} and type {dtype}")
+    flat: np.ndarray[Any, Any] = np.frombuffer(bytearray(data), dtype, count)
+    return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
+
+
+def open_picture(source: Path | bytes) -> Image.Image:
+    """A picture, open but not decoded, whose pixels take no more memory than its file explains.
+
+    Args:
+        source: a file, or what one holds.
+
+    Raises:
+        OSError: absent, unreadable, or no picture.
+        ValueError: it claims more pixels than its bytes can hold.
+    """
+    from PIL import Image
+
+    size = len(source) if isinstance(source, bytes) else regular(source).stat().st_size
+    try:
+        image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source)
+    except (Image.DecompressionBombError, SyntaxError, OverflowError, struct.error, TypeError,
+            KeyError, IndexError, ZeroDivisionError, AttributeError, EOFError, MemoryError,
+            RuntimeError) as error:  # fmt: skip
+        raise ValueError(str(error) or type(error).__name__) from None
+    width, height = image.size
+    pixel = len(image.getbands()) * (4 if image.mode[:1] in "IF" else 1)
+    if width * height * pixel > PIXEL_BYTES + PIXEL_RATIO * size:
+        image.close()
+        raise ValueError(f"{width}x{height} pixels in {size} bytes")
+    return image
+
+
+def number_key(digits: str) -> int:
+    """Digits as a number to sort by, however many they are.
+
+    >>> number_key("010"), number_key("9" * 10_000) == number_key("8" * 9_000)
+    (10, True)
+    """
+    return int(digits) if len(digits) <= MOST_DIGITS else 10**MOST_DIGITS
