@@ -217,7 +217,7 @@ def write_transforms(
 def written_here(path: Path) -> bool:
     """Whether ``write_transforms`` wrote a file that is there."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path)
         return bool(data.get("exported_by") == EXPORTER)
     except (OSError, ValueError, AttributeError, RecursionError):
         return False
