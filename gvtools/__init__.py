@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from gvtools.guidance import Guidance
     from gvtools.memory.projection import project
     from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.memory.tiled_memory import TiledMemory
     from gvtools.runs.run import load_run
     from gvtools.scenes.project import open_project
     from gvtools.trajectory_files import read_poses
@@ -50,6 +51,7 @@ _SOURCES = {
     "Guidance": "gvtools.guidance:Guidance",
     "GvError": "gvtools.errors:GvError",
     "SpatialMemory": "gvtools.memory.spatial_memory:SpatialMemory",
+    "TiledMemory": "gvtools.memory.tiled_memory:TiledMemory",
     "ate": "gvtools.evaluation.trajectories:absolute_errors",
     "complete": "gvtools.completers.complete:complete",
     "evaluate": "pipelines.api:evaluate",
@@ -70,6 +72,7 @@ __all__ = [
     "Guidance",
     "GvError",
     "SpatialMemory",
+    "TiledMemory",
     "__version__",
     "ate",
     "complete",

@@ -17,12 +17,14 @@ ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 @contextmanager
-def replaced_when_written(path: Path, *, suffix: str = "") -> Iterator[Path]:
+def replaced_when_written(path: Path, *, suffix: str = "", flush: bool = True) -> Iterator[Path]:
     """Gives a temporary name beside ``path``; on success it is flushed and takes that name.
 
     Args:
         path: the file.
         suffix: that the temporary name ends with, for writers that tell the format by it.
+        flush: False leaves it to the system when the bytes reach the disk, for files that need not
+            outlast the process.
 
     Raises:
         ProjectError: writing failed; the temporary file is removed and ``path`` is untouched.
@@ -31,8 +33,8 @@ def replaced_when_written(path: Path, *, suffix: str = "") -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
+        if flush:
+            flush_file(temporary)
         temporary.replace(path)
     except OSError as error:
         _discard(temporary)
@@ -43,6 +45,12 @@ def replaced_when_written(path: Path, *, suffix: str = "") -> Iterator[Path]:
     except BaseException:
         _discard(temporary)
         raise
+
+
+def flush_file(path: Path) -> None:
+    """Wait until the bytes of a file are on the disk."""
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
 
 
 @contextmanager
@@ -79,6 +87,17 @@ def recover_folder(path: Path) -> None:
     old = _work(path) / "old"
     if old.is_dir() and not path.exists():
         os.rename(old, path)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder, if it is there; of a folder, a kill leaves all or nothing."""
+    if not path.is_dir():
+        path.unlink(missing_ok=True)
+        return
+    aside = _work(path)
+    shutil.rmtree(aside, ignore_errors=True)
+    os.rename(path, aside)
+    shutil.rmtree(aside)
 
 
 def only_in(old: Path, new: Path) -> list[str]:

@@ -31,6 +31,8 @@ DOCTESTED = (
     "gvtools.evaluation.splits",
     "gvtools.evaluation.picture_matching",
     "gvtools.evaluation.trajectories",
+    "gvtools.memory.store.byte_sizes",
+    "gvtools.memory.tiled_memory",
     "gvtools.scans.fuse",
     "gvtools.scans.placement",
     "gvtools.scenes.blocks",

@@ -133,6 +133,25 @@ def touching(rect, writable, segments):
     return out[:n]
 
 
+@compiled(inline="always")
+def _farthest_in(rect, farthest):
+    """The farthest depth of the tiles that a rectangle touches."""
+    bound = np.float32(0)
+    for row in range(rect[2] // TILE, rect[3] // TILE + 1):
+        for col in range(rect[0] // TILE, rect[1] // TILE + 1):
+            bound = max(bound, farthest[row, col])
+    return bound
+
+
+@compiled()
+def may_be_in_front(begin, end, segments, rect, z_range, farthest, margin, out):
+    """Mark in ``out`` (n,) the segments that ``in_front`` would look into."""
+    share = np.float32(1 - margin)
+    for i in range(begin, end):
+        r = segments[i]
+        out[i] = not z_range[r, 0] >= _farthest_in(rect[r], farthest) * share
+
+
 @compiled(fastmath=FAST)
 def in_front(
     begin, end, segments, segment_start, segment_length, rect, z_range, positions, M, K, depth,
@@ -149,11 +168,7 @@ def in_front(
     share = np.float32(1 - margin)
     for i in range(begin, end):
         r = segments[i]
-        bound = np.float32(0)
-        for row in range(rect[r, 2] // TILE, rect[r, 3] // TILE + 1):
-            for col in range(rect[r, 0] // TILE, rect[r, 1] // TILE + 1):
-                bound = max(bound, farthest[row, col])
-        if z_range[r, 0] >= bound * share:
+        if z_range[r, 0] >= _farthest_in(rect[r], farthest) * share:
             continue
         first = segment_start[r]
         for p in range(first, first + segment_length[r], SAMPLE):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -55,14 +56,49 @@ class FuseReport:
 
     def __add__(self, other: FuseReport) -> FuseReport:
         dropped = Counter(self.dropped) + Counter(other.dropped)
-        numbers = {k: v + getattr(other, k) for k, v in asdict(self).items() if k != "dropped"}
+        names = (f.name for f in fields(self) if f.name != "dropped")
+        numbers = {name: getattr(self, name) + getattr(other, name) for name in names}
         return FuseReport(**numbers, dropped=dict(dropped))
 
 
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """What became of points in one store.
+
+    Attributes:
+        report: see FuseReport.
+        first_point: (S,) int64, of each new segment's block the first of the points.
+        first_changed: the first segment of before whose box may have grown.
+    """
+
+    report: FuseReport
+    first_point: NDArray[np.int64]
+    first_changed: int
+
+
+# Points as columns (positions, colours, confidence, spacing), and the row of their view.
+Take = Callable[[list[NDArray[Any]], int], FuseReport]
+
+
 def fuse(
-    store: Store, points: PointSet, *, round: int, generated: bool = False, scanned: bool = False
+    store: Store,
+    points: PointSet,
+    *,
+    round: int,
+    generated: bool = False,
+    scanned: bool = False,
+    take: Take | None = None,
 ) -> FuseReport:
-    """Take one view's points in; see SpatialMemory.fuse."""
+    """Take one view's points in; see SpatialMemory.fuse.
+
+    Args:
+        store: that checks the points and knows the views.
+        points: see SpatialMemory.fuse.
+        round: likewise.
+        generated: likewise.
+        scanned: likewise.
+        take: gets what is left of the points; None fuses it into the store itself.
+    """
     _check(store, points, round)
     arrived = len(points)
     keep = np.isfinite(points.positions).all(axis=1)
@@ -92,7 +128,7 @@ def fuse(
     view = store.views.row_for(
         SourceView(points.camera, int(round), bool(generated), grid, bool(scanned))
     )
-    report = _fuse_columns(store, columns, view)
+    report = take(columns, view) if take else fuse_columns(store, columns, view).report
     return replace(
         report,
         points=arrived,
@@ -115,7 +151,14 @@ def _check(store: Store, points: PointSet, round: int) -> None:
         raise OptionError(f"round {round}; expected 0 to {LAST_ROUND}")
 
 
-def _fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> FuseReport:
+def fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> Fused:
+    """Fuse points that were checked into a store.
+
+    Args:
+        store: knows the views.
+        columns: positions, colours, confidence and spacing of the points.
+        view: row of the view that they come from.
+    """
     positions, colors, confidence, spacing = (np.ascontiguousarray(c) for c in columns)
     count = len(positions)
     keys = np.empty(count, np.int64)
@@ -125,9 +168,11 @@ def _fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> FuseR
     if outside:
         near = keys != EMPTY_KEY
         inside = [column[near] for column in (positions, colors, confidence, spacing)]
-        return replace(_fuse_columns(store, inside, view), out_of_reach=int(outside))
+        fused = fuse_columns(store, inside, view)
+        report = replace(fused.report, out_of_reach=int(outside))
+        return replace(fused, report=report, first_point=np.flatnonzero(near)[fused.first_point])
     if not count:
-        return FuseReport()
+        return Fused(FuseReport(), np.empty(0, np.int64), store.segments.count)
     index, views, segments = store.index, store.views, store.segments
     blocks = index.block_numbers(keys)
     touched, starts, order = group_by_block(blocks, index.blocks)
@@ -135,6 +180,7 @@ def _fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> FuseR
     index.top = max(index.top, int(levels.max()))
     store.columns.reserve(count)
     out = kernels.FusionOutput(
+        group=np.empty(len(touched), np.int32),
         start=np.empty(len(touched), np.int64),
         length=np.empty(len(touched), np.int32),
         box=np.empty((len(touched), 7), np.float32),
@@ -163,13 +209,15 @@ def _fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> FuseR
     if agreed:
         rows, weights = out.agreed_row[:agreed].copy(), out.agreed_weight[:agreed].copy()
         store.agree(rows, weights, round=round_)
-    return FuseReport(
+    report = FuseReport(
         added=int(out.report[kernels.ADDED]),
         merged=int(out.report[kernels.MERGED_POINTS]),
         rejected_observed=int(out.report[kernels.REJECTED_OBSERVED]),
         voxels=int(out.report[kernels.NEW_VOXELS]),
         agreed=int(out.report[kernels.AGREED]),
     )
+    changed = int(out.report[kernels.FIRST_SEGMENT])
+    return Fused(report, order[starts[out.group[:added]]], changed)
 
 
 def _rules(store: Store) -> kernels.FusionRules:

@@ -84,8 +84,12 @@ class SegmentTable(NamedTuple):
 
 
 class FusionOutput(NamedTuple):
-    """New segments, agreements with observations of earlier rounds, and the report's counts."""
+    """New segments, agreements with observations of earlier rounds, and the report's counts.
 
+    ``group`` is the row of ``Batch.touched`` that a segment's block has.
+    """
+
+    group: NDArray[np.int32]
     start: NDArray[np.int64]
     length: NDArray[np.int32]
     box: NDArray[np.float32]
@@ -283,6 +287,7 @@ def fuse_blocks(batch, index, columns, count, source, rules, old, out):
             report[MERGED_POINTS] += t_points[t] - 1
             count += 1
         if count > first:
+            out.group[segments] = g
             out.start[segments] = first
             out.length[segments] = count - first
             _box(out.box[segments], r_position[first:count], columns.spacing[first:count])

@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, check_usable
-from gvtools.errors import ShapeError
+from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.kernels import in_threads
 from gvtools.memory import culling
-from gvtools.memory.occlusion import in_free_space, stacked
+from gvtools.memory.occluders import segments_in_front
+from gvtools.memory.occlusion import in_free_space
 from gvtools.memory.splat.api import ONE_PIXEL, FrameBuffers, SplatOptions, Splatter
 from gvtools.memory.store.store import Store
 
@@ -76,6 +77,11 @@ def project(
     check_usable(cameras)
     options = options or SplatOptions()
     if options.backend in ONE_PIXEL:
+        if store.tiles is not None:
+            raise OptionError(
+                f"splat.backend {options.backend}: does not project a memory in tiles; choose cpu "
+                "or torch, or a greater memory.budget"
+            )
         from gvtools.memory.splat.one_pixel import project_one_pixel
 
         return project_one_pixel(store, cameras, open3d=options.backend == "open3d")
@@ -143,6 +149,10 @@ def observed_of(store: Store, camera: Cameras, *, options: SplatOptions) -> Obse
 
 
 def _splatter(store: Store, options: SplatOptions) -> Splatter:
+    if store.tiles is not None:
+        from gvtools.memory.splat.paged import PagedSplatter
+
+        return PagedSplatter(store, options)
     if options.backend == "torch":
         from gvtools.memory.splat.torch_splatter import TorchSplatter
 
@@ -341,19 +351,15 @@ class _Projection:
         first-tier view saw the object's place to be free, the object is noise or has moved.
         """
         store, target = self.store, self.target
-        segments = store.segments
-        view = segments.view[seen]
+        view = store.segments.view[seen]
         later = seen[self.tier[view] != 0]
         if not len(later):
             return
         grids = store.observed_grids(np.flatnonzero(self.tier == 0))
         tolerance = store.options.free_space_tolerance
-        hit = np.zeros(len(later), np.bool_)
-        in_threads(
-            culling.in_front, len(later), later, segments.start, segments.length, target.rect,
-            self.z_range, store.columns.positions, target.cam_from_local, self.K,
-            target.depth, culling.tile_farthest(target.depth), 2 * self.options.depth_band,
-            *stacked(grids), tolerance, hit,
+        hit = segments_in_front(
+            store, later, target, z_range=self.z_range, grids=grids,
+            margin=2 * self.options.depth_band,
         )  # fmt: skip
         if not hit.any():
             return

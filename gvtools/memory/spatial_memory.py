@@ -141,11 +141,30 @@ class SpatialMemory(Store):
 
         return project(self, cameras, options=options)
 
-    def save(self, path: Path | str) -> None:
-        """Write the memory; see gvtools.memory.io.npz."""
+    def overview(self, most: int | None = None) -> SpatialMemory:
+        """A memory in RAM for what works on a whole memory; this one is there already.
+
+        Args:
+            most: observations of a memory in tiles, see TiledMemory.overview.
+        """
+        return self
+
+    def close(self) -> None:
+        """Remove what a memory in tiles keeps on disk beside what was saved; nothing in RAM."""
+        if self.tiles is not None:
+            self.tiles.close()
+
+    def blank(self) -> SpatialMemory:
+        """An empty memory in RAM of the same voxels, frame and options."""
+        frame = self.frame
+        return SpatialMemory(self.voxel, origin=frame.origin, axes=frame.axes, options=self.options)
+
+    def save(self, path: Path | str) -> Path:
+        """Write the memory and return where it is; see gvtools.memory.io.npz."""
         from gvtools.memory.io.npz import save_memory
 
         save_memory(self, Path(path))
+        return Path(path)
 
     @classmethod
     def load(cls, path: Path | str) -> SpatialMemory:

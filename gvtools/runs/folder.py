@@ -18,10 +18,20 @@ from pathlib import Path
 from typing import Any
 
 from gvtools.errors import ProjectError
-from gvtools.files import replaced_when_written, write_json, write_text
+from gvtools.files import remove, replaced_when_written, write_json, write_text
+from gvtools.memory.io.tile_folder import copy_tiles
 from gvtools.runs.folder_lock import folder_lock
 from gvtools.runs.identity import versions
-from gvtools.runs.layout import MEMORY, METRICS, RECORD, REPORT, ROUNDS, round_folder
+from gvtools.runs.layout import (
+    MEMORY,
+    METRICS,
+    RECORD,
+    REPORT,
+    ROUNDS,
+    TILES,
+    round_folder,
+    saved_memory,
+)
 from gvtools.untrusted import read_json
 
 # Files and folders that are still being written.
@@ -174,7 +184,7 @@ class RunDirectory:
 
     def round_memory(self, number: int) -> Path:
         """The memory after round ``number``; kept for the last complete round only."""
-        return self.round_path(number) / MEMORY
+        return saved_memory(self.round_path(number))
 
     def last_memory(self, done: int) -> Path:
         """The newest memory file of a run with ``done`` complete rounds.
@@ -182,7 +192,7 @@ class RunDirectory:
         Raises:
             ProjectError: it is gone.
         """
-        for path in (self.round_memory(done - 1), self.path / MEMORY):
+        for path in (self.round_memory(done - 1), saved_memory(self.path)):
             if path.exists():
                 return path
         raise ProjectError(
@@ -201,9 +211,12 @@ class RunDirectory:
         last = self.round_memory(number)
         if last.exists():
             # Copy, then delete: a concurrent reader always finds at least one of the two.
-            with replaced_when_written(self.path / MEMORY) as temporary:
-                shutil.copyfile(last, temporary)
-            last.unlink()
+            if last.is_dir():
+                copy_tiles(last, self.path / TILES)
+            else:
+                with replaced_when_written(self.path / MEMORY) as temporary:
+                    shutil.copyfile(last, temporary)
+            remove(last)
 
     @contextmanager
     def writing_round(self, number: int) -> Iterator[Path]:
@@ -237,14 +250,28 @@ class RunDirectory:
     def _finish_round(self, number: int) -> None:
         """Remove the previous round's memory file and rewrite rounds.jsonl; safe to repeat."""
         if number:
-            self.round_memory(number - 1).unlink(missing_ok=True)
+            remove(self.round_memory(number - 1))
         lines = [json.dumps(report) for report in self.reports()]
         write_text(self.path / ROUNDS, "".join(f"{line}\n" for line in lines))
 
 
 def changed_keys(identity: Mapping[str, Any], record: Mapping[str, Any]) -> list[str]:
-    """The keys of an identity that have another value in a run's record."""
-    return [key for key in identity if record.get(key) != json.loads(json.dumps(identity[key]))]
+    """The keys of an identity that have another value in a run's record.
+
+    ``memory.budget`` changes no result: a run may go on with another.
+    """
+    return [
+        key
+        for key in identity
+        if _decisive(record.get(key)) != _decisive(json.loads(json.dumps(identity[key])))
+    ]
+
+
+def _decisive(value: Any) -> Any:
+    """A value of a record without ``memory.budget``, where it holds the settings."""
+    if not isinstance(value, dict) or not isinstance(value.get("memory"), dict):
+        return value
+    return {**value, "memory": {k: v for k, v in value["memory"].items() if k != "budget"}}
 
 
 def _clear(part: Path) -> None:

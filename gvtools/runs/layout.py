@@ -1,6 +1,6 @@
 """Where the files of a run lie, and how they are named.
 
-    run.json  rounds.jsonl  memory.npz  metrics.json
+    run.json  rounds.jsonl  memory.npz (or memory.tiles/)  metrics.json
     round_000/report.json  round_000/context_depth_VIEW.npz  round_000/appearance.npz
     round_000/poses.npz  tuned/{config.json,geoverse.safetensors,tuning.json}
     round_001/report.json  round_001/{guidance,valid,generated,after,depth}_TARGET.*
@@ -19,6 +19,9 @@ from gvtools.errors import OptionError, ProjectError
 
 RECORD, REPORT, ROUNDS, METRICS = "run.json", "report.json", "rounds.jsonl", "metrics.json"
 MEMORY, APPEARANCE, POSES = "memory.npz", "appearance.npz", "poses.npz"
+# The folder that a memory larger than its budget is saved as, in the place of MEMORY; and where its
+# tiles are written meanwhile.
+TILES, TILES_AT_WORK = "memory.tiles", ".tiles.part"
 # Weights of the generative core that were tuned to the run's context.
 TUNED = "tuned"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
@@ -55,6 +58,12 @@ def inside(folder: Path, path: Path) -> Path:
     if not path.resolve().is_relative_to(folder.resolve()):
         raise ProjectError(f"{path}: lies outside {folder}; only a run's own files are read")
     return path
+
+
+def saved_memory(folder: Path) -> Path:
+    """The memory in the folder of a run or of a round: its tiles, else its file, perhaps absent."""
+    tiles = folder / TILES
+    return tiles if tiles.is_dir() else folder / MEMORY
 
 
 def file_stems(names: Sequence[str]) -> dict[str, PurePosixPath]:

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.runs.layout import APPEARANCE, MEMORY, round_folder
+from gvtools.memory.io.tile_folder import INDEX
+from gvtools.runs.layout import APPEARANCE, MEMORY, round_folder, saved_memory
 
 if TYPE_CHECKING:
     from gvtools.appearance.appearance import Appearance
@@ -29,8 +30,8 @@ def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
     """The memory in a file or of a run.
 
     Args:
-        path: a memory file, a coloured PLY, or a run's folder; an unfinished run gives that of its
-            last complete round.
+        path: a memory file, a folder of tiles, a coloured PLY, or a run's folder; an unfinished run
+            gives that of its last complete round.
         up_to: forget the rounds after this one; None keeps all.
 
     Raises:
@@ -39,11 +40,14 @@ def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
         OptionError: the memory has no such round.
     """
     from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.memory.tiled_memory import TiledMemory
 
+    memory: SpatialMemory
     if path.suffix.lower() == ".ply":
         memory = SpatialMemory.from_ply(path)
     else:
-        memory = SpatialMemory.load(memory_path(path))
+        saved = memory_path(path)
+        memory = TiledMemory.load(saved) if saved.is_dir() else SpatialMemory.load(saved)
     if up_to is not None:
         if up_to not in memory.rounds:
             raise OptionError(
@@ -57,18 +61,18 @@ def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
 
 
 def memory_path(path: Path) -> Path:
-    """The memory file that ``path``, a file or a run's folder, stands for.
+    """The memory that ``path``, a file, a folder of tiles or a run's folder, stands for.
 
     Raises:
         ProjectError: there is none.
     """
-    if path.is_file():
+    if path.is_file() or (path / INDEX).is_file():
         return path
     if not path.is_dir():
         raise ProjectError(f"{path}: no such file or folder; expected a memory or a run's folder")
-    rounds = sorted(path.glob(f"round_*/{MEMORY}"))
-    for candidate in (path / MEMORY, *reversed(rounds)):
-        if candidate.is_file():
+    rounds = sorted(path.glob("round_*"))
+    for candidate in map(saved_memory, (path, *reversed(rounds))):
+        if candidate.exists():
             return candidate
     raise ProjectError(
         f"{path}: holds no {MEMORY} and no round with one; expected a run's folder or a memory file"

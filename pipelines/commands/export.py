@@ -98,6 +98,14 @@ def run(args: argparse.Namespace, console: Console) -> None:
     memory = load_memory(args.memory, up_to=args.round)
     if not len(memory):
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
+    if args.format != "ply" or args.max_points is not None:
+        shown = memory.overview()
+        if len(shown) < len(memory):
+            console.line(
+                f"{len(memory):,} observations exceed the memory's budget; {len(shown):,} stand "
+                "for them"
+            )
+        memory = shown
     console.line(writer.write(Source(args.memory, memory, args.round), args.out, options))
 
 

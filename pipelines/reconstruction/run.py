@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from gvtools.files import write_json
 from gvtools.runs.folder import RunDirectory
-from gvtools.runs.layout import APPEARANCE, MEMORY, POSES, REPORT
+from gvtools.runs.layout import (
+    APPEARANCE,
+    MEMORY,
+    POSES,
+    REPORT,
+    TILES_AT_WORK,
+    saved_memory,
+)
 from pipelines.console import Console
 from pipelines.reconstruction.compile_kernels import compile_kernels
 from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
@@ -104,9 +111,15 @@ def complete_run(
     """
     if fitted is not None:
         plan = fitted.applied(plan)
-    memory = _last_memory(plan, directory, done, console=console) if done else _empty_memory(plan)
+    memory = (
+        _last_memory(plan, directory, done, console=console)
+        if done
+        else _empty_memory(plan, directory)
+    )
     _run_rounds(plan, memory, directory, done=done, fitted=fitted, console=console)
-    return _finish(plan, memory, directory, console=console, draw=draw)
+    drawn = _finish(plan, memory, directory, console=console, draw=draw)
+    memory.close()
+    return drawn
 
 
 def _fitted(plan: Plan, directory: RunDirectory, done: int, *, console: Console) -> Fitted | None:
@@ -120,15 +133,18 @@ def _fitted(plan: Plan, directory: RunDirectory, done: int, *, console: Console)
     return fit_appearance(plan, console) if plan.config.refine.wanted else None
 
 
-def _empty_memory(plan: Plan) -> SpatialMemory:
+def _empty_memory(plan: Plan, directory: RunDirectory) -> SpatialMemory:
     from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.memory.tiled_memory import TiledMemory
     from pipelines.reconstruction.voxel_edge import grid_frame
 
     assert plan.config.voxel is not None
     frame = grid_frame(plan.scene, plan.context)
-    return SpatialMemory(
-        plan.config.voxel, origin=frame.origin, axes=frame.axes, options=plan.config.memory
-    )
+    options = plan.config.memory
+    place: dict[str, Any] = {"origin": frame.origin, "axes": frame.axes, "options": options}
+    if options.budget is None:
+        return SpatialMemory(plan.config.voxel, **place)
+    return TiledMemory(plan.config.voxel, **place, scratch=directory.path / TILES_AT_WORK)
 
 
 def _last_memory(
@@ -136,9 +152,16 @@ def _last_memory(
 ) -> SpatialMemory:
     """The memory after the last of ``done`` complete rounds."""
     from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.memory.tiled_memory import TiledMemory
 
     console.line(f"resuming after round {done - 1}")
-    memory = SpatialMemory.load(directory.last_memory(done))
+    saved, budget = directory.last_memory(done), plan.config.memory.budget
+    memory: SpatialMemory
+    if budget is None and not saved.is_dir():
+        memory = SpatialMemory.load(saved)
+    else:
+        scratch = directory.path / TILES_AT_WORK
+        memory = TiledMemory.load(saved, budget=budget, scratch=scratch)
     # A finished run's memory holds every round, also one whose folder was removed since.
     for later in [number for number in reversed(memory.rounds) if number >= done]:
         memory.forget(round=later)
@@ -225,5 +248,7 @@ def say_results(directory: RunDirectory, drawn: Sequence[str], console: Console)
     flagged = off_scale(reports[0].get("depth", ()))
     if flagged:
         console.warn(f"{flagged}; figures in {directory.round_path(0) / REPORT}")
-    files = ", ".join(["memory.npz", "memory.ply", *drawn, "metrics.json", "round_*/"])
+    files = ", ".join(
+        [saved_memory(directory.path).name, "memory.ply", *drawn, "metrics.json", "round_*/"]
+    )
     console.line(f"results in {directory.path}: {files}")

@@ -57,7 +57,7 @@ def run_round(
             plan, targets, number, context=context, folder=folder, clock=clock, console=console
         )
     report |= entries
-    generated, scanned = int(memory.generated.sum()), int(memory.scanned.sum())
+    generated, scanned = memory.generated_count, memory.scanned_count
     return {
         "round": number,
         "points": len(memory),

@@ -49,7 +49,7 @@ class ViewSource:
             shown = open_file(self.path)
             if shown is not None:
                 return shown
-            memory = load_memory(self.path)
+            memory = load_memory(self.path).overview()
             cameras = cameras_of(memory, ())
             return RunView(
                 self.path, memory, (), cameras, self._frames, None, LOOKS,
@@ -59,15 +59,16 @@ class ViewSource:
         if self._frames.run is None:
             self._frames = ProjectFrames(run)
         try:
-            cameras = cameras_of(run.memory, run.rounds)
+            memory = run.memory.overview()
+            cameras = cameras_of(memory, run.rounds)
         except GvError as error:
             raise ProjectError(
                 f"{self.path}: its rounds' reports hold a camera that is none ({error}); run "
                 "reconstruct again"
             ) from None
         return RunView(
-            self.path, run.memory, run.rounds, cameras, self._frames, run.planned, LOOKS,
-            partial(run_gaussians, self.path, run.memory),
+            self.path, memory, run.rounds, cameras, self._frames, run.planned, LOOKS,
+            partial(run_gaussians, self.path, memory),
         )  # fmt: skip
 
     def lacking(self) -> str | None:

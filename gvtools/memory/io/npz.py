@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,14 +43,7 @@ def save_memory(memory: Store, path: Path) -> None:
     """
     arrays = _arrays(memory)
     header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "convention": CONVENTION,
-        "voxel": memory.voxel.hex(),
-        "origin": [float(x).hex() for x in memory.origin],
-        "axes": [float(x).hex() for x in memory.frame.axes.ravel()],
-        "options": memory.options.to_dict(),
-        "names": [memory.views[i].camera.names[0] for i in range(len(memory.views))],
+        **description(memory),
         "arrays": {name: [array.dtype.str, list(array.shape)] for name, array in arrays.items()},
     }
     with (
@@ -61,6 +55,21 @@ def save_memory(memory: Store, path: Path) -> None:
             buffer = io.BytesIO()
             np.save(buffer, array, allow_pickle=False)
             _write(archive, f"{name}.npy", buffer.getvalue())
+
+
+def description(memory: Store) -> dict[str, Any]:
+    """What a header says of a memory, JSON-ready."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "convention": CONVENTION,
+        "voxel": memory.voxel.hex(),
+        "origin": [float(x).hex() for x in memory.origin],
+        "axes": [float(x).hex() for x in memory.frame.axes.ravel()],
+        # Where a memory is kept does not belong to what it holds.
+        "options": {k: v for k, v in memory.options.to_dict().items() if k != "budget"},
+        "names": [memory.views[i].camera.names[0] for i in range(len(memory.views))],
+    }
 
 
 def load_memory(path: Path, kind: type[S]) -> S:
@@ -76,15 +85,28 @@ def load_memory(path: Path, kind: type[S]) -> S:
         raise MemoryFileError(f"{path}: the memory's parts do not fit together ({error})") from None
 
 
-def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]], kind: type[S]) -> S:
-    memory = kind(
+def described(header: dict[str, Any], kind: Callable[..., S], **more: Any) -> S:
+    """An empty memory as a header describes it.
+
+    Args:
+        header: see ``description``.
+        kind: its class.
+        more: further options of the memory, and arguments of the class.
+    """
+    options = {k: more.pop(k) for k in list(more) if k in MemoryOptions.model_fields}
+    return kind(
         float.fromhex(header["voxel"]),
         origin=[float.fromhex(x) for x in header["origin"]],
         axes=np.reshape([float.fromhex(x) for x in header["axes"]], (3, 3)),
-        options=MemoryOptions(**header["options"]),
+        options=MemoryOptions(**header["options"], **options),
+        **more,
     )
+
+
+def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]], kind: type[S]) -> S:
+    memory = described(header, kind)
     _check_consistency(arrays, len(header["names"]))
-    memory.views = ViewTable(memory.frame, _views(header["names"], arrays))
+    memory.views = ViewTable(memory.frame, views_of(header["names"], arrays))
     view = arrays["view"]
     columns = {
         **{name: arrays[name] for name in _COLUMNS},
@@ -108,25 +130,13 @@ def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]], kind: ty
 
 
 def _arrays(memory: Store) -> dict[str, NDArray[Any]]:
-    segments, views = memory.segments, memory.views
+    segments = memory.segments
     arrays: dict[str, NDArray[Any]] = {name: getattr(memory.columns, name) for name in _COLUMNS}
     # Loading adds again what later rounds agreed.
     arrays["confidence"] = memory.own_confidence()
     for name in _SEGMENT_ARRAYS:
         arrays[f"segment_{name}"] = getattr(segments, name)[: segments.count]
-    rows = [views[i] for i in range(len(views))]
-    cameras = views.cameras
-    arrays["view_K"] = cameras.K if cameras else np.zeros((0, 3, 3))
-    arrays["view_cam_from_world"] = cameras.cam_from_world if cameras else np.zeros((0, 4, 4))
-    size = np.stack([cameras.width, cameras.height], 1) if cameras else np.zeros((0, 2), np.int64)
-    arrays["view_size"] = size
-    arrays["view_round"] = views.round
-    arrays["view_generated"] = views.generated
-    if views.scanned.any():
-        arrays["view_scanned"] = views.scanned
-    grids = [row.free_depth for row in rows]
-    arrays["grid_shape"] = np.array([g.shape for g in grids], np.int64).reshape(-1, 2)
-    arrays["grid_depth"] = np.concatenate([np.zeros(0, np.float32), *(g.ravel() for g in grids)])
+    arrays.update(view_arrays(memory.views))
     logs = [(r, entry) for r in sorted(memory.agreements) for entry in memory.agreements[r]]
     arrays["agreement_round"] = np.array([r for r, _ in logs], np.int32)
     lengths = [len(entry[0]) for _, entry in logs]
@@ -141,7 +151,27 @@ def _arrays(memory: Store) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _views(names: list[str], arrays: dict[str, NDArray[Any]]) -> list[SourceView]:
+def view_arrays(views: ViewTable) -> dict[str, NDArray[Any]]:
+    """Cameras, rounds and free-space grids of the views as arrays."""
+    cameras = views.cameras
+    grids = [view.free_depth for view in views]
+    scanned = {"view_scanned": views.scanned} if views.scanned.any() else {}
+    return {
+        **scanned,
+        "view_K": cameras.K if cameras else np.zeros((0, 3, 3)),
+        "view_cam_from_world": cameras.cam_from_world if cameras else np.zeros((0, 4, 4)),
+        "view_size": np.stack([cameras.width, cameras.height], 1)
+        if cameras
+        else np.zeros((0, 2), np.int64),
+        "view_round": views.round,
+        "view_generated": views.generated,
+        "grid_shape": np.array([g.shape for g in grids], np.int64).reshape(-1, 2),
+        "grid_depth": np.concatenate([np.zeros(0, np.float32), *(g.ravel() for g in grids)]),
+    }
+
+
+def views_of(names: list[str], arrays: dict[str, NDArray[Any]]) -> list[SourceView]:
+    """The views of ``view_arrays``."""
     views = []
     at = 0
     for i, name in enumerate(names):

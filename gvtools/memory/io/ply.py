@@ -7,8 +7,10 @@ size.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,8 @@ from gvtools.untrusted import regular
 if TYPE_CHECKING:
     import open3d as o3d
 
+    from gvtools.memory.tiles.tile import Tile
+
 TYPES = {
     "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4",
     "float": "<f4", "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2",
@@ -31,16 +35,32 @@ _NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 _MAX_HEADER = 1 << 16
 
 
-def write_ply(path: Path, vertices: NDArray[np.void], *, comments: tuple[str, ...] = ()) -> None:
-    """Write a structured array as the vertices of a little-endian binary PLY."""
+def write_ply(
+    path: Path,
+    vertices: NDArray[np.void],
+    *,
+    more: Iterable[NDArray[np.void]] = (),
+    count: int | None = None,
+    comments: tuple[str, ...] = (),
+) -> None:
+    """Write a structured array as the vertices of a little-endian binary PLY.
+
+    Args:
+        path: the PLY.
+        vertices: (N,) the first of them.
+        more: further ones, written as they come.
+        count: of all; None for N.
+        comments: of the header.
+    """
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
-    lines.append(f"element vertex {len(vertices)}")
+    lines.append(f"element vertex {len(vertices) if count is None else count}")
     names = vertices.dtype.names or ()
     lines += [f"property {_NAMES[vertices.dtype[name].str[1:]]} {name}" for name in names]
     lines.append("end_header\n")
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(lines).encode("ascii"))
-        vertices.tofile(file)
+        for part in chain([vertices], more):
+            part.tofile(file)
 
 
 def read_ply(path: Path) -> NDArray[np.void]:
@@ -146,6 +166,8 @@ def export_memory_ply(
         OptionError: nothing was observed.
         ProjectError: the file cannot be written.
     """
+    if memory.tiles is not None and max_points is None:
+        return _export_tiles(memory, path, observed=observed), 0.0
     among = ~memory.generated if observed else np.ones(len(memory), np.bool_)
     rows, edge = np.flatnonzero(among), 0.0
     if observed and not len(rows):
@@ -153,21 +175,61 @@ def export_memory_ply(
     if max_points is not None and len(rows) > max_points:
         thin = thinned(memory, max_points, among=among)
         rows, edge = thin.rows, thin.edge
-    positions = memory.positions[rows]
-    reach = float(np.abs(positions).max(initial=0))
+    reach = float(np.abs(memory.positions[rows]).max(initial=0))
+    columns = {name: getattr(memory.columns, name)[rows] for name in _COLUMNS}
+    vertices = _vertices(memory, columns, reach=reach)
+    write_ply(path, vertices, comments=_COMMENTS)
+    return len(rows), edge
+
+
+_COLUMNS = ("positions", "colors", "confidence", "spacing", "round", "view", "generated")
+_COMMENTS = ("gvtools memory, input world frame, scene units",)
+
+
+def _vertices(
+    memory: Store, columns: Mapping[str, NDArray[Any]], *, reach: float
+) -> NDArray[np.void]:
+    """Observations as vertices; ``reach`` is the greatest coordinate of all."""
     coordinate = "<f8" if reach * 2.0**-24 > 0.1 * memory.voxel else "<f4"
+    positions = memory.frame.to_world(columns["positions"])
     vertices = np.empty(
-        len(rows),
+        len(positions),
         [("x", coordinate), ("y", coordinate), ("z", coordinate), ("red", "u1"), ("green", "u1"),
          ("blue", "u1"), ("confidence", "<f4"), ("spacing", "<f4"), ("round", "<i4"),
          ("view", "<i4"), ("generated", "u1"), ("scanned", "u1")],
     )  # fmt: skip
-    columns = memory.columns
     for k, (axis, color) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
         vertices[axis] = positions[:, k]
-        vertices[color] = columns.colors[rows, k]
-    for name in ("confidence", "spacing", "round", "view", "generated"):
-        vertices[name] = getattr(columns, name)[rows]
-    vertices["scanned"] = memory.scanned[rows]
-    write_ply(path, vertices, comments=("gvtools memory, input world frame, scene units",))
-    return len(rows), edge
+        vertices[color] = columns["colors"][:, k]
+    for name in _COLUMNS[2:]:
+        vertices[name] = columns[name]
+    vertices["scanned"] = memory.views.scanned[columns["view"]]
+    return vertices
+
+
+def _export_tiles(memory: Store, path: Path, *, observed: bool) -> int:
+    """Write the observations tile by tile; returns how many."""
+    tiles, segments, n = memory.tiles, memory.segments, memory.segments.count
+    assert tiles is not None
+    box = segments.box[:n]
+    corners = np.concatenate([box[:, :3], box[:, 3:6]])
+    reach = float(np.abs(memory.frame.to_world(corners)).max(initial=0))
+    count = len(memory) - (memory.generated_count if observed else 0)
+    if not count:
+        raise OptionError(f"{path}: the memory holds nothing that was observed")
+
+    def part(tile: Tile) -> NDArray[np.void]:
+        columns = {name: tile.column(name) for name in (*_COLUMNS[:4], "view")}
+        view = columns["view"]
+        columns["round"], made = memory.views.round[view], memory.views.generated[view]
+        columns["generated"] = made
+        if observed:
+            columns = {name: column[~made] for name, column in columns.items()}
+        return _vertices(memory, columns, reach=reach)
+
+    none = {name: np.empty((0, 3) if name in _COLUMNS[:2] else 0, int) for name in _COLUMNS}
+    write_ply(
+        path, _vertices(memory, none, reach=reach), count=count, comments=_COMMENTS,
+        more=(part(tile) for tile in tiles.each()),
+    )  # fmt: skip
+    return count

@@ -39,6 +39,10 @@ class SplatOptions(Settings):
     """Kernel sum that makes a pixel valid."""
     max_splat_px: float = Field(32.0, gt=0)
     """Widest footprint, pixels; what a memory this coarse leaves open is a hole."""
+    far_detail_px: float = Field(0.0, ge=0)
+    """Where a memory is in tiles on disk and its voxels are finer than the picture, thinned copies
+    are drawn, whose cubes are at most so many pixels wide; 0 draws every observation, as in RAM.
+    [px]"""
     occluders: bool = True
     """Look for things in front that the first tiers did not see."""
     backend: Literal["cpu", "torch", "nearest", "open3d"] = "cpu"

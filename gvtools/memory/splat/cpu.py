@@ -33,8 +33,9 @@ class CpuSplatter:
         weight: NDArray[np.float32],
         writable: NDArray[np.bool_] | None,
         blend: bool,
+        fresh: bool = True,
     ) -> NDArray[np.float32]:
-        """See gvtools.memory.splat.api.Splatter."""
+        """See gvtools.memory.splat.api.Splatter; not ``fresh`` adds to the last splat's sums."""
         height, width = target.shape
         if self.zbuffer.shape != target.shape:
             self.zbuffer = np.empty(target.shape, np.float32)
@@ -59,7 +60,7 @@ class CpuSplatter:
         )
         splat_kernels.splat_segments(
             chosen, table_of, columns, weight, lens, rules, limit.reshape(-1), reachable,
-            numba.get_num_threads(), blend, self.zbuffer.reshape(-1),
+            numba.get_num_threads(), blend, fresh, self.zbuffer.reshape(-1),
             self.total.reshape(-1, splat_kernels.CHANNELS),
         )  # fmt: skip
         return self.zbuffer

@@ -121,8 +121,8 @@ def _project_segment(positions, spacing, lens, factor, max_splat_px, top, bottom
 
 @compiled(parallel=True, fastmath=FAST)
 def splat_segments(
-    chosen, segments, columns, view_weight, lens, rules, limit, reachable, threads, blend, depth,
-    total,
+    chosen, segments, columns, view_weight, lens, rules, limit, reachable, threads, blend, fresh,
+    depth, total,
 ):  # fmt: skip
     """Depth pass, then blending inside the depth band.
 
@@ -138,6 +138,7 @@ def splat_segments(
             when most of the image is open.
         threads: how many share the work.
         blend: False stops after the depth pass.
+        fresh: False adds to what ``total`` holds.
         depth: out (H x W,) float32, the nearest depth, or ``limit`` where nothing is nearer.
         total: out (H x W, CHANNELS) float32; depths are summed in ``lens.unit``.
     """
@@ -164,7 +165,7 @@ def splat_segments(
         part = (floats[0], floats[1], floats[2], u, v, depths, reach, c0, c1, r0, r1)
         for i in range(top * width, (bottom + 1) * width):
             depth[i] = limit[i]
-            if blend and limit[i] > 0:
+            if blend and fresh and limit[i] > 0:
                 for c in range(CHANNELS):
                     total[i, c] = 0
         for r in chosen:

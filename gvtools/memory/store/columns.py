@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,6 +27,7 @@ LAYOUT: dict[str, tuple[Any, int]] = {
     "level": (np.uint8, 1),
     "next": (np.int32, 1),
 }
+ROW_BYTES = sum(np.dtype(kind).itemsize * width for kind, width in LAYOUT.values())
 ATTRIBUTES = tuple(name for name in LAYOUT if name != "next")
 LAST_ROUND = int(np.iinfo(np.uint16).max)
 
@@ -96,11 +97,11 @@ class Columns:
         import open3d as o3d
 
         dtype, width = LAYOUT[name]
-        kind = getattr(o3d.core, np.dtype(dtype).name)
         if self.device == "cpu":
             # In memory that numpy gives: Open3D ends a process with status 1 where tensors of its
             # own are still alive, such as those that a viewer's window holds.
             return o3d.core.Tensor.from_numpy(np.empty((rows, width), dtype))
+        kind = getattr(o3d.core, np.dtype(dtype).name)
         return o3d.core.Tensor.empty((rows, width), kind, o3d.core.Device(self.device))
 
     @property
@@ -148,6 +149,15 @@ class Columns:
             array[:count] = values(name)
         self._tensors, self._arrays, self.count = fresh._tensors, fresh._arrays, count
 
+    def take_drawn(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Hold other rows, in these arrays themselves; columns that are not given have none."""
+        import open3d as o3d
+
+        self.count, self._arrays = len(arrays["positions"]), None
+        for name, array in arrays.items():
+            column = array.reshape(self.count, LAYOUT[name][1])
+            self._tensors[name] = o3d.core.Tensor.from_numpy(column)
+
     def to(self, device: str) -> Columns:
         """A copy of the rows in use on a device."""
         import open3d as o3d
@@ -186,7 +196,7 @@ class Columns:
     @property
     def nbytes(self) -> int:
         """Bytes of the rows in use."""
-        return self.count * sum(np.dtype(kind).itemsize * width for kind, width in LAYOUT.values())
+        return self.count * ROW_BYTES
 
 
 def _flat(tensor: o3d.core.Tensor) -> NDArray[Any]:
@@ -243,6 +253,13 @@ class Segments:
         first = min(self.count if changed is None else changed, self.count) // self.GROUP
         self.count = need
         self._box_groups(first)
+
+    def widen(self, rows: NDArray[np.int32], box: NDArray[np.float32]) -> None:
+        """Give some segments boxes that hold their present ones."""
+        self.box[rows] = box
+        group = rows // self.GROUP
+        np.minimum.at(self.group_box[:, :3], group, box[:, :3])
+        np.maximum.at(self.group_box[:, 3:], group, box[:, 3:])
 
     def _box_groups(self, first: int) -> None:
         """Bring the groups' boxes from group ``first`` on up to date."""

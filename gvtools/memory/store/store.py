@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from copy import copy, deepcopy
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from gvtools.errors import OptionError
+from gvtools.memory.store.byte_sizes import bytes_of
 from gvtools.memory.store.columns import Columns, Segments
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.views import FreeGrid, ViewTable
@@ -26,6 +27,8 @@ from gvtools.settings import Settings
 
 if TYPE_CHECKING:
     import open3d as o3d
+
+    from gvtools.memory.tiles.tile_set import TileSet
 
 S = TypeVar("S", bound="Store")
 
@@ -53,6 +56,15 @@ class MemoryOptions(Settings):
     finer than ``voxel``. 0: all voxels have the edge ``voxel``."""
     free_space_tolerance: float = Field(0.03, ge=0, lt=1)
     """Share of depth that a generated point may stand in front of an observed surface."""
+    budget: int | None = Field(None, ge=1_000_000)
+    """RAM that the memory may take, such as ``4GB``, ``400MB`` or ``2GiB``. A memory that outgrows
+    half of it is kept in tiles on disk, of which some are in RAM; none keeps everything in RAM.
+    [bytes]"""
+
+    @field_validator("budget", mode="before")
+    @classmethod
+    def _bytes(cls, value: Any) -> Any:
+        return bytes_of(value) if isinstance(value, str) else value
 
 
 class Store:
@@ -80,7 +92,11 @@ class Store:
             (A,) of observations of earlier rounds, confidence added (A,), confidence before (A,)).
         changes: how often something was fused or forgotten.
         observed_changes: how often that touched observed content.
+        tiles: where the observations of a memory larger than RAM lie, instead of in ``columns``;
+            None in RAM.
     """
+
+    tiles: TileSet | None = None
 
     def __init__(
         self,
@@ -161,15 +177,35 @@ class Store:
     def nbytes(self) -> int:
         """Bytes of everything that is kept, without spare capacity."""
         grids = sum(self.views[i].free_depth.nbytes for i in range(len(self.views)))
+        return self.stored_bytes + grids
+
+    @property
+    def stored_bytes(self) -> int:
+        """Bytes of the observations, their segments and index, and what was agreed."""
         agreed = sum(array.nbytes for log in self.agreements.values() for e in log for array in e)
-        return self.columns.nbytes + self.segments.nbytes + self.index.nbytes + grids + agreed
+        return self.columns.nbytes + self.segments.nbytes + self.index.nbytes + agreed
+
+    @property
+    def generated_count(self) -> int:
+        """Number of observations that a completer made."""
+        return self._count_of(self.views.generated)
+
+    @property
+    def scanned_count(self) -> int:
+        """Number of observations that a scan brought."""
+        return self._count_of(self.views.scanned)
+
+    def _count_of(self, kind: NDArray[np.bool_]) -> int:
+        """Number of observations of the views that are of a kind, (views,)."""
+        segments, n = self.segments, self.segments.count
+        return int(segments.length[:n][kind[segments.view[:n]]].sum(dtype=np.int64))
 
     def __len__(self) -> int:
         """Number of stored observations."""
         return self.columns.count
 
     def __repr__(self) -> str:
-        generated, scanned = int(self.generated.sum()), int(self.scanned.sum())
+        generated, scanned = self.generated_count, self.scanned_count
         apart = f"{generated:,} generated" + (f", {scanned:,} scanned" if scanned else "")
         where = "" if self.columns.device == "cpu" else f" on {self.columns.device}"
         return (
@@ -219,8 +255,19 @@ class Store:
             raise OptionError(f"round {round} is not in the memory; it has rounds {self.rounds}")
         self.changes += 1
         self.observed_changes += 1
-        columns, views, count = self.columns, self.views, len(self)
-        keep_view = views.round != round
+        keep = self.views.round != round
+        kept = ViewTable(self.frame, [self.views[int(i)] for i in np.flatnonzero(keep)])
+        return self.drop_views(keep, kept, round=round)
+
+    def drop_views(self, keep_view: NDArray[np.bool_], kept: ViewTable, *, round: int) -> int:
+        """Remove the views that are not kept, all those of a round; see ``forget``.
+
+        Args:
+            keep_view: (views,) bool.
+            kept: the table of those that are kept.
+            round: number of the round.
+        """
+        columns, count = self.columns, len(self)
         new_view = (np.cumsum(keep_view) - 1).astype(np.int32)
         keep = keep_view[columns.view]
         new_row = (np.cumsum(keep) - 1).astype(np.int32)
@@ -230,7 +277,7 @@ class Store:
         logs, self.agreements = self.agreements, {}
         columns.replace(int(keep.sum()), lambda name: getattr(columns, name)[keep])
         columns.view[:] = new_view[columns.view]
-        self.views = ViewTable(self.frame, [views[int(i)] for i in np.flatnonzero(keep_view)])
+        self.views = kept
         for number in sorted(set(logs) - {round}):
             for rows, weights, _ in logs[number]:
                 self.agree(new_row[rows[keep[rows]]], weights[keep[rows]], round=number)
@@ -239,7 +286,7 @@ class Store:
         stays = keep_view[segments.view[:n]]
         self.segments = Segments()
         self.segments.append(
-            new_row[segments.start[:n][stays]], segments.length[:n][stays],
+            new_row[segments.start[:n][stays]].astype(np.int64), segments.length[:n][stays],
             new_view[segments.view[:n][stays]], box=segments.box[:n][stays],
         )  # fmt: skip
         self.rebuild_index()

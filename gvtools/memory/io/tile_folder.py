@@ -1,0 +1,214 @@
+"""A memory in tiles as a folder: ``memory.index``, and a file for each tile.
+
+A tile's file is never changed: another state of it has another name, so saving links the files that
+are there already (a copy where the file system has no links). The folder is filled under a
+temporary name and renamed: a kill leaves what was saved before.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from gvtools.errors import GvError, MemoryFileError, ProjectError
+from gvtools.files import flush_file, folder_replaced_when_written, recover_folder
+from gvtools.memory.io.npz import VERSION, described, description, view_arrays, views_of
+from gvtools.memory.store.store import Store
+from gvtools.memory.store.views import ViewTable
+from gvtools.memory.tiles.array_file import ArrayFile, write_arrays
+from gvtools.memory.tiles.tile import Tile, read_segments
+from gvtools.memory.tiles.tile_set import TileSet
+
+S = TypeVar("S", bound=Store)
+
+INDEX, SUFFIX = "memory.index", ".tiles"
+
+
+def tile_folder(path: Path) -> Path:
+    """The folder of tiles that goes with the path of a memory's file."""
+    return path if path.suffix == SUFFIX else path.with_suffix(SUFFIX)
+
+
+def save_tiles(memory: Store, tiles: TileSet, folder: Path) -> Path:
+    """Write a memory in tiles.
+
+    Raises:
+        ProjectError: the disk is full or the folder cannot be written; what was there is intact.
+    """
+    with tiles.lock, _replaced(folder) as new:
+        table = []
+        for number, tile in tiles:
+            if tile.file is None or tile.dirty:
+                tiles.write(number)
+            assert tile.file is not None
+            flush_file(tile.file)
+            link(tile.file, new / tile.file.name)
+            checksum = ArrayFile(tile.file).checksum
+            table.append(
+                [list(tile.node), tile.file.name, checksum, tile.size, tile.count, tile.voxels,
+                 list(tile.agreed)]
+            )  # fmt: skip
+        meta = {
+            **description(memory),
+            "budget": memory.options.budget,
+            "tiles": table,
+            "divided": sorted(map(list, tiles.octree.divided)),
+        }
+        numbers = np.full(len(tiles.tiles), -1, np.int32)
+        numbers[[number for number, _ in tiles]] = np.arange(len(table))
+        places = tiles.places
+        write_arrays(
+            new / INDEX, meta,
+            {
+                **view_arrays(memory.views),
+                "segment_tile": numbers[places.tile[: places.count]],
+                "segment_local": places.local[: places.count],
+                "segment_level": places.level[: places.count],
+            },
+        )  # fmt: skip
+    # What only the earlier state had.
+    names = {INDEX, *(entry[1] for entry in table)}
+    for path in folder.iterdir():
+        if path.name not in names:
+            path.unlink(missing_ok=True)
+    return folder
+
+
+def load_tiles(
+    kind: type[S], folder: Path, *, budget: int | None = None, scratch: Path | None = None
+) -> S:
+    """Read a memory in tiles: the table of its segments; tiles when they are used.
+
+    Args:
+        kind: class of the memory.
+        folder: of the tiles.
+        budget: bytes; None takes that it was saved with.
+        scratch: where tiles that change are written; if given, tiles are linked into it at once,
+            so that the folder may be removed.
+
+    Raises:
+        MemoryFileError: absent, truncated, altered, of another kind or version.
+    """
+    recover_folder(folder)
+    index = ArrayFile(folder / INDEX)
+    meta = index.meta
+    if meta.get("version") != VERSION:
+        raise MemoryFileError(
+            f"{folder}: memory format version {meta.get('version')}; this gvtools reads version "
+            f"{VERSION}; run the reconstruction again"
+        )
+    try:
+        memory = described(
+            meta, kind, budget=meta["budget"] if budget is None else budget, scratch=scratch
+        )
+        arrays = {name: index.array(name) for name in index.names}
+        memory.views = ViewTable(memory.frame, views_of(meta["names"], arrays))
+        return _filled(memory, folder, index, scratch=scratch)
+    except MemoryFileError:
+        raise
+    except (GvError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise MemoryFileError(
+            f"{folder}: the memory's parts do not fit together ({error})"
+        ) from None
+
+
+def _filled(
+    memory: Any,
+    folder: Path,
+    index: ArrayFile,
+    *,
+    scratch: Path | None,
+) -> Any:
+    meta, arrays = index.meta, {name: index.array(name) for name in index.names}
+    tiles = memory.begin_tiles()
+    tiles.octree.divided = {tuple(node) for node in meta["divided"]}
+    of_tile, local = arrays["segment_tile"], arrays["segment_local"]
+    order = np.lexsort((local, of_tile))
+    ends = np.searchsorted(of_tile[order], np.arange(len(meta["tiles"]) + 1))
+    n = len(of_tile)
+    start, length = np.empty(n, np.int64), np.empty(n, np.int32)
+    view, box = np.empty(n, np.int32), np.empty((n, 7), np.float32)
+    for i, (node, name, checksum, size, count, voxels, agreed) in enumerate(meta["tiles"]):
+        path = folder / Path(name).name
+        file = ArrayFile(path)
+        if file.checksum != checksum:
+            raise MemoryFileError(
+                f"{path}: is another state of the tile than {INDEX} names; restore it or run again"
+            )
+        if scratch is not None:
+            path = tiles.folder / path.name
+            link(file.path, path)
+        rows = order[ends[i] : ends[i + 1]].astype(np.int32)
+        segments = read_segments(file)
+        if len(rows) != segments.count:
+            raise MemoryFileError(f"{file.path}: {segments.count} segments; expected {len(rows)}")
+        start[rows], length[rows] = segments.start[: len(rows)], segments.length[: len(rows)]
+        view[rows], box[rows] = segments.view[: len(rows)], segments.box[: len(rows)]
+        tile = Tile(
+            tuple(node), rows, file=path, owned=scratch is not None, size=size, count=count,
+            voxels=voxels, agreed=tuple(agreed),
+        )  # fmt: skip
+        tiles.add(tile)
+    tiles.places.append(of_tile, local, start, level=arrays["segment_level"])
+    memory.segments.append(np.cumsum(length, dtype=np.int64) - length, length, view, box=box)
+    memory.columns.count = int(length.sum(dtype=np.int64))
+    return memory
+
+
+def copy_tiles(source: Path, target: Path) -> None:
+    """Make the tiles in a folder those of another, too, by links where there are any.
+
+    Raises:
+        ProjectError: the disk is full or the folder cannot be written.
+    """
+    with _replaced(target) as new:
+        for path in sorted(source.iterdir()):
+            link(path, new / path.name)
+
+
+def link(source: Path, target: Path) -> None:
+    """Give a file a second name, or a copy where the file system has no links.
+
+    Raises:
+        OSError: neither is possible.
+    """
+    if target.exists() and target.samefile(source):
+        return
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+@contextmanager
+def _replaced(folder: Path) -> Iterator[Path]:
+    """An empty folder that takes the place of ``folder``, which may be absent.
+
+    Raises:
+        ProjectError: see folder_replaced_when_written.
+    """
+    recover_folder(folder)
+    if folder.exists():
+        with folder_replaced_when_written(folder) as new:
+            yield new
+        return
+    part = folder.with_name(f".{folder.name}.part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        yield part
+        os.rename(part, folder)
+    except OSError as error:
+        raise ProjectError(
+            f"{folder}: cannot be written ({error.strerror or error}); free some space or choose "
+            "another folder"
+        ) from error
+    finally:
+        with suppress(OSError):
+            shutil.rmtree(part)
