@@ -21,8 +21,9 @@ from gvtools.files import flush_file, folder_replaced_when_written, recover_fold
 from gvtools.memory.io.npz import VERSION, described, description, view_arrays, views_of
 from gvtools.memory.store.store import Store
 from gvtools.memory.store.views import ViewTable
+from gvtools.memory.store.voxel_index import MOST_LEVEL
 from gvtools.memory.tiles.array_file import ArrayFile, write_arrays
-from gvtools.memory.tiles.tile import Tile, read_segments
+from gvtools.memory.tiles.tile import Tile, check, check_segments, read_segments
 from gvtools.memory.tiles.tile_set import TileSet
 
 S = TypeVar("S", bound=Store)
@@ -112,7 +113,7 @@ def load_tiles(
         return _filled(memory, folder, index, scratch=scratch)
     except MemoryFileError:
         raise
-    except (GvError, IndexError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, GvError, IndexError, KeyError, TypeError, ValueError) as error:
         raise MemoryFileError(
             f"{folder}: the memory's parts do not fit together ({error})"
         ) from None
@@ -129,6 +130,9 @@ def _filled(
     tiles = memory.begin_tiles()
     tiles.octree.divided = {tuple(node) for node in meta["divided"]}
     of_tile, local = arrays["segment_tile"], arrays["segment_local"]
+    unknown = len(of_tile) and not 0 <= of_tile.min() <= of_tile.max() < len(meta["tiles"])
+    if unknown or int(arrays["segment_level"].max(initial=0)) > MOST_LEVEL:
+        raise ValueError("a segment names a tile or a level that is not there")
     order = np.lexsort((local, of_tile))
     ends = np.searchsorted(of_tile[order], np.arange(len(meta["tiles"]) + 1))
     n = len(of_tile)
@@ -146,8 +150,9 @@ def _filled(
             link(file.path, path)
         rows = order[ends[i] : ends[i + 1]].astype(np.int32)
         segments = read_segments(file)
-        if len(rows) != segments.count:
-            raise MemoryFileError(f"{file.path}: {segments.count} segments; expected {len(rows)}")
+        check(file, len(rows) == segments.count)
+        check(file, np.array_equal(local[rows], np.arange(len(rows))))
+        check_segments(file, segments, len(memory.views))
         start[rows], length[rows] = segments.start[: len(rows)], segments.length[: len(rows)]
         view[rows], box[rows] = segments.view[: len(rows)], segments.box[: len(rows)]
         tile = Tile(

@@ -7,6 +7,7 @@ arrays, each at a multiple of 64 bytes. Reading a column of some segments touche
 from __future__ import annotations
 
 import json
+import math
 import struct
 import zlib
 from collections.abc import Mapping
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
 from gvtools.files import replaced_when_written
+from gvtools.untrusted import regular
 
 MAGIC = b"gvtools arrays 1"
 ALIGNED = 64
@@ -71,7 +73,7 @@ class ArrayFile:
         self.path = path
         start = len(MAGIC) + _HEAD.size
         try:
-            with path.open("rb") as file:
+            with regular(path).open("rb") as file:
                 head = file.read(start)
                 if head[: len(MAGIC)] != MAGIC or len(head) < start:
                     raise MemoryFileError(f"{path}: not a file of arrays of gvtools")
@@ -82,9 +84,14 @@ class ArrayFile:
             raise MemoryFileError(f"{path}: cannot be read ({error.strerror})") from None
         if len(header) != length or zlib.crc32(header) != self.checksum:
             raise self._damaged("its header")
-        parsed = json.loads(header)
-        self.meta: dict[str, Any] = parsed["meta"]
-        self._table: dict[str, list[Any]] = parsed["arrays"]
+        try:
+            parsed = json.loads(header)
+            self.meta: dict[str, Any] = dict(parsed["meta"])
+            self._table: dict[str, list[Any]] = dict(parsed["arrays"])
+            for kind, shape, at, _ in self._table.values():
+                _check_entry(kind, shape, at)
+        except (KeyError, RecursionError, TypeError, ValueError) as error:
+            raise MemoryFileError(f"{path}: a header that none of gvtools is ({error})") from None
         self._data = -(-(start + length) // ALIGNED) * ALIGNED
         ends = [at + _nbytes(kind, shape) for kind, shape, at, _ in self._table.values()]
         if size != self._data + -(-max(ends, default=0) // ALIGNED) * ALIGNED:
@@ -99,6 +106,14 @@ class ArrayFile:
     def names(self) -> tuple[str, ...]:
         """The arrays."""
         return tuple(self._table)
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Of an array, as the header has it; () where there is none of that name."""
+        return tuple(self._table[name][1]) if name in self._table else ()
+
+    def kind(self, name: str) -> np.dtype[Any] | None:
+        """Type of an array's numbers; None where there is none of that name."""
+        return np.dtype(self._table[name][0]) if name in self._table else None
 
     def array(self, name: str) -> NDArray[Any]:
         """An array in the file's own pages.
@@ -124,8 +139,21 @@ class ArrayFile:
         )
 
 
+def _check_entry(kind: Any, shape: Any, at: Any) -> None:
+    """Refuse what no array of numbers is.
+
+    Raises:
+        TypeError: see ValueError.
+        ValueError: another type of numbers, or a shape or place that cannot be.
+    """
+    known = np.dtype(kind).kind in "biuf" and isinstance(kind, str)
+    numbers = [at, *shape]
+    if not known or not all(type(n) is int and 0 <= n < 2**48 for n in numbers) or at % ALIGNED:
+        raise ValueError(f"array of type {kind!r}, shape {shape!r} at {at!r}")
+
+
 def _nbytes(kind: str, shape: list[int]) -> int:
-    return int(np.dtype(kind).itemsize * np.prod(shape, dtype=np.int64))
+    return math.prod((np.dtype(kind).itemsize, *shape))
 
 
 def _bytes(array: NDArray[Any]) -> NDArray[np.uint8]:

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
-from gvtools.memory.store.columns import Segments
+from gvtools.memory.store.columns import LAYOUT, Segments
 from gvtools.memory.store.store import Store
+from gvtools.memory.store.voxel_index import MOST_LEVEL
 from gvtools.memory.tiles.array_file import ArrayFile, write_arrays
 from gvtools.memory.tiles.octree import Node
 from gvtools.memory.tiles.thinned_copies import DOUBLINGS, Drawn, ThinnedCopy, thinned_copy
@@ -98,7 +99,11 @@ class Tile:
         if self.store is None:
             file, head = self._open(), f"thinned{doublings}_"
             rows = Drawn(*(file.array(f"{head}{name}") for name in Drawn._fields))
-            return ThinnedCopy(file.array(f"{head}start"), rows)
+            start = file.array(f"{head}start")
+            check(file, len(start) == len(self.segments) + 1 and _alike(file, head, rows))
+            check(file, start[0] == 0 and start[-1] == len(rows.spacing))
+            check(file, bool((np.diff(start) >= 0).all()))
+            return ThinnedCopy(start, rows)
         if doublings not in self._copies:
             self._copies[doublings] = thinned_copy(self.store, doublings)
         return self._copies[doublings]
@@ -168,6 +173,7 @@ class Tile:
         assert self.file is not None
         if self.mapped is None:
             self.mapped = ArrayFile(self.file)
+            check_shapes(self.mapped)
         return self.mapped
 
 
@@ -201,15 +207,66 @@ def read_segments(file: ArrayFile) -> Segments:
     return segments
 
 
-def _check(file: ArrayFile, views: int) -> None:
-    """Whether the arrays fit together.
+def check(file: ArrayFile, fits: bool) -> None:
+    """Refuse a file whose arrays contradict each other.
+
+    Raises:
+        MemoryFileError: they do.
+    """
+    if not fits:
+        raise MemoryFileError(f"{file.path}: the tile's parts do not fit together; run again")
+
+
+def check_shapes(file: ArrayFile) -> None:
+    """Whether the columns have as many rows as the file says.
+
+    Raises:
+        MemoryFileError: they have not.
+    """
+    count = file.meta.get("count")
+    for name in COLUMNS:
+        kind, width = LAYOUT[name]
+        check(file, file.shape(name) == ((count, width) if width > 1 else (count,)))
+        check(file, file.kind(name) == np.dtype(kind))
+
+
+def check_segments(file: ArrayFile, segments: Segments, views: int) -> None:
+    """Whether segments cover the observations, one behind the other.
 
     Raises:
         MemoryFileError: they do not.
     """
-    count, view = int(file.meta["count"]), file.array("view")
-    lengths = {name: len(file.array(name)) for name in COLUMNS}
-    fits = all(length == count for length in lengths.values())
-    fits = fits and int(file.array("segment_length").sum()) == count
-    if not fits or (count and not 0 <= view.min() <= view.max() < views):
-        raise MemoryFileError(f"{file.path}: the tile's parts do not fit together; run again")
+    n = segments.count
+    start, length, view = (
+        segments.start[:n],
+        segments.length[:n].astype(np.int64),
+        segments.view[:n],
+    )
+    ends = np.cumsum(length)
+    check(file, bool((length > 0).all()) and np.array_equal(start, ends - length))
+    check(file, (int(ends[-1]) if n else 0) == file.meta.get("count"))
+    check(file, not n or bool(0 <= view.min() <= view.max() < views))
+
+
+def _check(file: ArrayFile, views: int) -> None:
+    """Whether the values of a tile's file fit together.
+
+    Raises:
+        MemoryFileError: they do not.
+    """
+    view, level, row = (file.array(name) for name in ("view", "level", "agreement_row"))
+    count = len(view)
+    check(file, not count or bool(0 <= view.min() <= view.max() < views))
+    check(file, int(level.max(initial=0)) <= MOST_LEVEL)
+    check(file, not len(row) or bool(0 <= row.min() <= row.max() < count))
+    check_segments(file, read_segments(file), views)
+
+
+def _alike(file: ArrayFile, head: str, rows: Drawn) -> bool:
+    """Whether a thinned copy's columns have one length and their types."""
+    count = len(rows.spacing)
+    return all(
+        column.shape == ((count, 3) if LAYOUT[name][1] == 3 else (count,))
+        and file.kind(f"{head}{name}") == np.dtype(LAYOUT[name][0])
+        for name, column in rows._asdict().items()
+    )
