@@ -1,6 +1,7 @@
 """The cameras of a memory, with points or without, for COLMAP's and nerfstudio's readers.
 
-Pictures stay where they are. Views that a completer made are named ``generated/NAME``, and stand in
+Pictures stay where they are; beside a ``transforms.json`` those from elsewhere get a link or a copy
+in ``images``. Views that a completer made are named ``generated/NAME``, and stand in
 ``generated.txt`` beside a model's files, one a line and, where a run has it, the path of the
 picture; in a
 ``transforms.json`` their frames have the key ``generated``. By the list, or by the key
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
-from gvtools.files import write_text
+from gvtools.files import link_or_copy, write_text
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.thinning import thinned
 from gvtools.runs.target_files import completed_picture
@@ -132,11 +133,22 @@ def write_transforms_export(
     """
     file = transforms_file(path)
     distinct = distinct_cameras(memory, run)
-    paths: list[str | Path] = []
+    home = file.parent.resolve()
+    paths, elsewhere = [], {}
     for name in distinct.cameras.names:
         made = distinct.generated.get(name)
-        paths.append(Path(images) / name if made is None else made)
+        picture = (home / images / name if made is None else made).resolve()
+        inside = picture.is_relative_to(home)
+        place = picture.relative_to(home) if inside else Path("images") / name
+        paths.append(place)
+        if not inside and picture.is_file():
+            elsewhere[home / place] = picture
     write_transforms(file, distinct.cameras, image_paths=paths, generated=distinct.generated.keys())
+    # Readers look nowhere else: pictures from elsewhere get a second name, by a link or a copy.
+    for place, picture in elsewhere.items():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.unlink(missing_ok=True)
+        link_or_copy(picture, place)
     return Written(len(distinct.cameras), len(distinct.generated))
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.exposed import exposed
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH
 from gvtools.appearance.turning import turned
@@ -111,6 +110,8 @@ def splats_of(source: Source, options: ExportOptions) -> Splats:
         return Splats(values, origin, 0, 0, rounds)
     first = appearance.gaussians
     if appearance.exposures is not None:
+        from gvtools.appearance.exposed import exposed
+
         first = exposed(first, appearance.exposures, _photographs(memory))
     fitted = turned(first.values, first.frame.axes)
     parts, rest = [fitted], None

@@ -114,7 +114,7 @@ def complete_run(
     memory = (
         _last_memory(plan, directory, done, console=console)
         if done
-        else _empty_memory(plan, directory)
+        else _empty_memory(plan, directory.path / TILES_AT_WORK)
     )
     _run_rounds(plan, memory, directory, done=done, fitted=fitted, console=console)
     drawn = _finish(plan, memory, directory, console=console, draw=draw)
@@ -133,7 +133,7 @@ def _fitted(plan: Plan, directory: RunDirectory, done: int, *, console: Console)
     return fit_appearance(plan, console) if plan.config.refine.wanted else None
 
 
-def _empty_memory(plan: Plan, directory: RunDirectory) -> SpatialMemory:
+def _empty_memory(plan: Plan, scratch: Path) -> SpatialMemory:
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.memory.tiled_memory import TiledMemory
     from pipelines.reconstruction.voxel_edge import grid_frame
@@ -144,7 +144,7 @@ def _empty_memory(plan: Plan, directory: RunDirectory) -> SpatialMemory:
     place: dict[str, Any] = {"origin": frame.origin, "axes": frame.axes, "options": options}
     if options.budget is None:
         return SpatialMemory(plan.config.voxel, **place)
-    return TiledMemory(plan.config.voxel, **place, scratch=directory.path / TILES_AT_WORK)
+    return TiledMemory(plan.config.voxel, **place, scratch=scratch)
 
 
 def _last_memory(

@@ -65,9 +65,10 @@ def test_pictures_of_two_sizes_are_refused():
 
 
 def test_observed_generated_and_holes_have_a_colour_each():
-    observed = np.array([[True, False, False]])
-    supported = np.array([[True, True, False]])
-    shown = support_map(observed, supported)[0]
+    observed = np.array([[True, True, False, False]])
+    supported = np.array([[True, True, True, False]])
+    scanned = np.array([[False, True, False, False]])
+    shown = support_map(observed, supported, scanned)[0]
     assert ["#" + bytes(pixel.tolist()).hex() for pixel in shown] == [
         color.lower() for color in SUPPORT.values()
     ]

@@ -143,14 +143,14 @@ def test_transforms_open_as_a_project(scene, memory, saved, tmp_path):
     )
     project = open_project(tmp_path / "out" / "transforms.json")
     by_name = {view.name.split("/")[-1]: view for view in project}
-    assert set(by_name) == {"view_0.png", "view_2.png", "generated_view_4.png"}
+    assert set(by_name) == {"view_0.png", "view_2.png", "view_4.png"}
     for name in ("view_0.png", "view_2.png"):
         np.testing.assert_allclose(
             by_name[name].camera.cam_from_world, scene[name].camera.cam_from_world, atol=1e-12
         )
         np.testing.assert_array_equal(by_name[name].load().rgb, scene[name].load().rgb)
     np.testing.assert_allclose(
-        by_name["generated_view_4.png"].camera.cam_from_world,
+        by_name["view_4.png"].camera.cam_from_world,
         scene["view_4.png"].camera.cam_from_world,
         atol=1e-12,
     )

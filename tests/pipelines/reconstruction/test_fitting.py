@@ -150,7 +150,7 @@ def test_without_steps_or_time_a_run_knows_nothing_of_gaussians(scan, tmp_path, 
     shown = guidance_of(out, 1)[guidance.valid[0]]
     assert np.abs(guidance.rgb[0][guidance.valid[0]] * 255 - shown).max() <= 0.51
     # The memory is that of the photographs at the given poses.
-    by_hand = _empty_memory(plan)
+    by_hand = _empty_memory(plan, Path())
     for name in plan.context:
         view = plan.scene[name]
         frame = view.load()
@@ -258,7 +258,8 @@ def test_a_fit_comes_back_from_its_file_as_it_was(tmp_path):
     rng = np.random.default_rng(0)
     values = rng.normal(size=(5, VALUES)).astype(np.float32)
     gaussians = Gaussians(values, frame=LocalFrame.at([1e6, 2, 3]))
-    poses = rng.normal(size=(2, 3, 4, 4))
+    poses = np.tile(np.eye(4), (2, 3, 1, 1))
+    poses[..., :3, 3] = rng.normal(size=(2, 3, 3))
     fitted = Fitted(Appearance(gaussians, 0.125, Blend(0.35, 0.4)), RunPoses(*poses))
     for saved in (fitted, replace(fitted, poses=None)):
         saved.save(tmp_path / "fit.npz")
@@ -277,7 +278,7 @@ def test_a_fit_comes_back_from_its_file_as_it_was(tmp_path):
 
 def test_the_blend_is_chosen_by_the_left_out_photographs(scan):
     plan = planned(scan, "context=first:4")
-    memory = _empty_memory(plan)
+    memory = _empty_memory(plan, Path())
     for name in plan.context:
         view = plan.scene[name]
         frame = view.load()
@@ -297,7 +298,7 @@ def test_the_blend_is_chosen_by_the_left_out_photographs(scan):
 
 def test_a_photograph_does_not_judge_a_memory_that_has_seen_it(scan):
     plan = planned(scan)
-    memory, name = _empty_memory(plan), plan.context[1]
+    memory, name = _empty_memory(plan, Path()), plan.context[1]
     view = plan.scene[name]
     frame = view.load()
     memory.observe(frame.rgb, frame.depth, view.camera, round=0)
