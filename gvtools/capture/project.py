@@ -28,6 +28,7 @@ from gvtools.capture.photographs import Photograph, copy_upright, find_photograp
 from gvtools.capture.placement import Placement, place
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import write_json
+from gvtools.runs.folder_lock import folder_lock
 from gvtools.scenes.faces import picture_of
 from gvtools.scenes.photographs import named
 from gvtools.scenes.scene import Finding
@@ -102,6 +103,7 @@ def capture_photographs(
     learned: LightGlueMatcher | None = None,
     lens: str = "auto",
     say: Say = lambda text: None,
+    draw: Callable[[Path, CaptureReport], object] = lambda folder, report: None,
 ) -> CaptureReport:
     """Find the cameras of a folder's photographs, or of a video's frames, and write a project.
 
@@ -115,6 +117,7 @@ def capture_photographs(
         lens: "perspective", "equirectangular" (panoramas, which are cut into faces), "fisheye", or
             "auto", which looks at the pictures.
         say: told of each step.
+        draw: adds pictures to the project's folder before it takes its name.
 
     Raises:
         ProjectError: too few pictures, no overlap between them, no model, or no place to write.
@@ -166,6 +169,7 @@ def capture_photographs(
         write_json(work / REPORT, report.to_dict())
         for spare in ("mapping", "frames", "whole_masks"):
             shutil.rmtree(work / spare, ignore_errors=True)
+        draw(work, report)
     return report
 
 
@@ -219,28 +223,36 @@ def replaced_folder(out: Path) -> Iterator[Path]:
     """A folder beside ``out`` to work in, which takes that name when all is done.
 
     Raises:
-        ProjectError: ``out`` holds something, or cannot be written.
+        ProjectError: ``out`` holds something, cannot be written, or another capture is at work
+            on it.
     """
+    _refuse_filled(out)
+    work = out.with_name(f".{out.name}.part")
+    with folder_lock(work):
+        try:
+            # Another capture may have ended since.
+            _refuse_filled(out)
+            # What a capture that was killed has left.
+            for path in work.iterdir():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            yield work
+            if out.is_dir():
+                out.rmdir()
+            work.rename(out)
+        except OSError as error:
+            raise ProjectError(
+                f"{out}: cannot be written ({error.strerror or error}); free some space or choose "
+                "another folder"
+            ) from error
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+
+
+def _refuse_filled(out: Path) -> None:
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise ProjectError(
             f"{out}: is there already, and not empty; nothing is overwritten; give another --out"
         )
-    work = out.with_name(f".{out.name}.part")
-    try:
-        # Left by a capture that was killed.
-        shutil.rmtree(work, ignore_errors=True)
-        work.mkdir(parents=True)
-        yield work
-        if out.is_dir():
-            out.rmdir()
-        work.rename(out)
-    except OSError as error:
-        raise ProjectError(
-            f"{out}: cannot be written ({error.strerror or error}); free some space or choose "
-            "another folder"
-        ) from error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def _made(folder: Path) -> Path:

@@ -96,6 +96,7 @@ def capture_rgbd(
     *,
     options: RgbdOptions | None = None,
     say: Say = lambda text: None,
+    draw: Callable[[Path, RgbdCaptureReport], object] = lambda folder, report: None,
 ) -> RgbdCaptureReport:
     """Find the poses of an RGB-D recording, and write a project.
 
@@ -104,6 +105,7 @@ def capture_rgbd(
         out: the project's folder; must not hold anything yet.
         options: what the folder does not tell by itself.
         say: told of each step.
+        draw: adds pictures to the project's folder before it takes its name.
 
     Raises:
         ProjectError: no RGB-D recording, no two frames that agree, or no place to write.
@@ -130,6 +132,7 @@ def capture_rgbd(
         _write(work, recording, resolved, found=found, names=names)
         write_json(work / REPORT, report.to_dict())
         shutil.rmtree(work / "recording", ignore_errors=True)
+        draw(work, report)
     return report
 
 

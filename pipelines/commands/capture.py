@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,9 +105,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
     report = capture_photographs(
         args.input, args.out, frames=args.frames, masks=args.masks, distance=args.distance,
         learned=_learned(args), lens=args.lens or "auto", say=console.line,
+        draw=partial(_draw, title=args.out.name),
     )  # fmt: skip
     _print(report, console)
-    _draw(args.out, report)
     console.line(f"{args.out}: gvtools check {args.out}; gvtools reconstruct {args.out} --out RUN")
 
 
@@ -143,9 +144,11 @@ def _run_rgbd(args: argparse.Namespace, reading: dict[str, Any], console: Consol
                 f"--{name}: of photographs and videos; {args.input} is an RGB-D recording, of "
                 "which all frames are taken and depth tells the metres"
             )
-    report = capture_rgbd(args.input, args.out, options=rgbd_options(reading), say=console.line)
+    report = capture_rgbd(
+        args.input, args.out, options=rgbd_options(reading), say=console.line,
+        draw=partial(_draw_rgbd, title=args.out.name),
+    )  # fmt: skip
     _print_rgbd(report, console)
-    _draw_rgbd(args.out, report)
     console.line(f"{args.out}: gvtools check {args.out}; gvtools reconstruct {args.out} --out RUN")
 
 
@@ -205,7 +208,7 @@ def _print_findings(report: CaptureReport | RgbdCaptureReport, console: Console)
         console.line(f"  {name}: {reason}")
 
 
-def _draw(out: Path, report: CaptureReport) -> None:
+def _draw(out: Path, report: CaptureReport, *, title: str) -> None:
     """``capture.png``: the cameras from above, and which of them overlap."""
     from gvtools.files import replaced_when_written
     from gvtools.scenes.project import open_project
@@ -215,13 +218,13 @@ def _draw(out: Path, report: CaptureReport) -> None:
     assert scene.points is not None
     figure = draw_capture(
         scene.cameras, scene.points.positions, report.overlap,
-        title=f"{out.name}: {len(report.registered)} of {report.pictures} pictures",
+        title=f"{title}: {len(report.registered)} of {report.pictures} pictures",
     )  # fmt: skip
     with replaced_when_written(out / PICTURE) as temporary:
         figure.savefig(temporary, format="png")
 
 
-def _draw_rgbd(out: Path, report: RgbdCaptureReport) -> None:
+def _draw_rgbd(out: Path, report: RgbdCaptureReport, *, title: str) -> None:
     """``capture.png``: the cameras from above, among the depth of some keyframes."""
     from gvtools.capture.rgbd_project import points_from_above
     from gvtools.files import replaced_when_written
@@ -232,7 +235,7 @@ def _draw_rgbd(out: Path, report: RgbdCaptureReport) -> None:
     cameras, points = points_from_above(scene, report.keyframes)
     figure = draw_capture(
         cameras, points, report.overlap,
-        title=f"{out.name}: {len(report.registered)} of {report.pictures} frames",
+        title=f"{title}: {len(report.registered)} of {report.pictures} frames",
     )  # fmt: skip
     with replaced_when_written(out / PICTURE) as temporary:
         figure.savefig(temporary, format="png")
