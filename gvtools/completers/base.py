@@ -206,12 +206,15 @@ def run_completer(
     That is its type, shapes, finite values, and that pixels which are valid in ``guidance`` kept
     their colour, unless whole views were generated.
 
+    Where memory does not suffice for all target views, they are completed in halves, and halves of
+    these; context and seed stay the same.
+
     Raises:
         ShapeError: it returned something else, of another size, or with NaN or infinity; or the
             views are damaged.
-        OptionError: it changed colours that memory knows.
+        OptionError: it changed colours that memory knows, or memory does not suffice for one view.
     """
-    completion = completer.complete(context, guidance, seed=seed)
+    completion = _completed(completer, context, guidance, seed=seed)
     if not isinstance(completion, Completion):
         found = type(completion).__name__
         raise ShapeError(f"completer {completer.name} returned a {found}; expected a Completion")
@@ -233,6 +236,58 @@ def run_completer(
             "them unchanged there"
         )
     return completion
+
+
+def _completed(
+    completer: Completer, context: Sequence[ContextView], guidance: Guidance, *, seed: int
+) -> Completion:
+    """The completion of all views, in parts where memory does not suffice for the whole."""
+    try:
+        return completer.complete(context, guidance, seed=seed)
+    except Exception as error:
+        if not _lacks_memory(error):
+            raise
+        said = (str(error).splitlines() or ["out of memory"])[0]
+    # Out here the error no longer holds the arrays of the attempt.
+    count, (height, width) = len(guidance), guidance.valid.shape[1:]
+    if count < 2:
+        raise OptionError(
+            f"completer {completer.name}: memory does not suffice for one view of {width}x{height} "
+            f"({said}); expected smaller pictures: --max-side {max(width, height) // 2}, or "
+            "another completer"
+        )
+    halves = (range(count // 2), range(count // 2, count))
+    parts = [
+        _completed(completer, context, guidance.select(list(rows)), seed=seed) for rows in halves
+    ]
+    if not all(isinstance(part, Completion) for part in parts):
+        return parts[0]  # Its caller says what is wrong with it.
+    return _joined(parts)
+
+
+def _lacks_memory(error: Exception) -> bool:
+    # Torch's allocator of the CPU raises a plain RuntimeError, CUDA's a class of its own.
+    text = str(error).lower()
+    lacks = "out of memory" in text or "can't allocate memory" in text
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and lacks)
+
+
+def _joined(parts: Sequence[Completion]) -> Completion:
+    """Completions of consecutive views as one."""
+    rays = [part.rays for part in parts if part.rays is not None]
+    aligned = [
+        alignment
+        for part in parts
+        for alignment in part.scale_alignment or (None,) * len(part.depth)
+    ]
+    return Completion(
+        *(np.concatenate([getattr(part, what) for part in parts])
+          for what in ("rgb", "depth", "confidence")),
+        rays=np.concatenate(rays) if len(rays) == len(parts) else None,
+        scale_alignment=None if all(part.scale_alignment is None for part in parts)
+        else tuple(aligned),
+        whole=all(part.whole for part in parts),
+    )  # fmt: skip
 
 
 _REGISTRY: dict[str, type[Completer] | str] = {
