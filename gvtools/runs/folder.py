@@ -32,6 +32,7 @@ from gvtools.runs.layout import (
     round_folder,
     saved_memory,
 )
+from gvtools.runs.sums import check_sums, write_sums
 from gvtools.untrusted import read_json
 
 # Files and folders that are still being written.
@@ -125,6 +126,8 @@ class RunDirectory:
             number = folder.name.removeprefix("round_")
             if number.isdigit() and int(number) >= done:
                 shutil.rmtree(folder)
+        for number in range(done):
+            check_sums(self.round_path(number))
         if done:
             self._finish_round(done - 1)
         return done
@@ -232,6 +235,7 @@ class RunDirectory:
             part.mkdir(parents=True, exist_ok=True)
             _clear(part)
             yield part
+            write_sums(part)
             os.replace(part, self.round_path(number))
         except BaseException as error:
             with suppress(OSError):

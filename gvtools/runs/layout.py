@@ -3,6 +3,7 @@
     run.json  rounds.jsonl  memory.npz (or memory.tiles/)  metrics.json
     round_000/report.json  round_000/context_depth_VIEW.npz  round_000/appearance.npz
     round_000/poses.npz  tuned/{config.json,geoverse.safetensors,tuning.json}
+    round_*/SHA256SUMS
     round_001/report.json  round_001/{guidance,valid,generated,after,depth}_TARGET.*
 
 Other modules of this package read and write these files; nothing outside knows their names.

@@ -14,6 +14,7 @@ from gvtools.cameras import rigid_transform
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import RECORD, REPORT, round_folder
+from gvtools.runs.sums import check_sums
 from gvtools.untrusted import read_json
 
 Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -146,4 +147,5 @@ def read_reports(path: Path) -> tuple[Mapping[str, Any], ...]:
                 f"{round_folder(path, number) / REPORT}: no report of this version; run "
                 "reconstruct again"
             )
+        check_sums(round_folder(path, number), (REPORT,))
     return reports

@@ -26,6 +26,7 @@ from gvtools.runs.layout import (
     target_picture,
     target_stems,
 )
+from gvtools.runs.sums import check_sums
 from gvtools.scenes.images import UNREADABLE
 from gvtools.untrusted import load_arrays, open_picture, read_json
 
@@ -138,6 +139,8 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
             f"{folder}: the target {entry.get('name', '?')} cannot be read ({error!r}); expected a "
             "round of this version; run reconstruct again"
         ) from error
+    pictures = (target_picture(folder, kind, stem) for kind in (COMPLETION, VALID))
+    check_sums(folder, (path.name for path in (*pictures, file)))
     observed = support >= SUPPORT_SCANNED
     aligned = depth * scale
     return TargetFiles(

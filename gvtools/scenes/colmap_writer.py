@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 
+# What readers know a model by.
+CAMERAS = "cameras.bin"
 NO_POINTS, NO_TRACKS = np.zeros((0, 3)), np.zeros(0, np.int64)
 
 
@@ -56,16 +58,22 @@ def write_colmap(
     model = _reconstruction(
         cameras, points, colors, point_index=point_index, view_index=view_index, xy=xy
     )
+    partial = folder / ".model.part"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".model-", dir=folder) as partial:
-            model.write_binary(partial)
-            # The writer does not notice a full disk; the walk over the records does.
-            model_files(Path(partial))
-            for file in sorted(Path(partial).iterdir()):
-                os.replace(file, folder / file.name)
+        # What a kill left of an earlier attempt.
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        model.write_binary(str(partial))
+        # The writer does not notice a full disk; the walk over the records does.
+        model_files(partial)
+        # A kill in between leaves no model, rather than one of new and old files.
+        (folder / CAMERAS).unlink(missing_ok=True)
+        for file in sorted(partial.iterdir(), key=lambda file: (file.name == CAMERAS, file.name)):
+            os.replace(file, folder / file.name)
     except OSError as error:
         raise ProjectError(f"{folder}: the model could not be written ({error})") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _reconstruction(

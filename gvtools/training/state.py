@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import zipfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from gvtools.errors import CheckpointError
+from gvtools.files import replaced_when_written
 from gvtools.networks.tensor_files import first_line
 from gvtools.untrusted import archive
 
@@ -53,11 +54,20 @@ class StageState:
 
 
 def save_state(state: StageState, folder: Path) -> None:
-    """Write to a temporary name, then rename: a kill leaves the previous state whole."""
-    folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f".{FILE}.part"
-    torch.save({**vars(state), "progress": asdict(state.progress)}, part)
-    os.replace(part, folder / FILE)
+    """Write the state; a kill or a full disk leaves the previous one whole.
+
+    Raises:
+        ProjectError: it cannot be written.
+    """
+    content = {**vars(state), "progress": asdict(state.progress)}
+    with replaced_when_written(folder / FILE) as part, part.open("wb") as file:
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:
+            # Torch's archive writer puts its own error over the system's.
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
 
 
 def load_state(
@@ -79,6 +89,7 @@ def load_state(
     try:
         with archive(path):
             pass  # its members claim what they may
+        _check_sums(path)
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
         state = StageState(**{**content, "progress": Progress(**content["progress"])})
     except Exception as error:
@@ -93,6 +104,14 @@ def load_state(
             "another --out"
         )
     return state
+
+
+def _check_sums(path: Path) -> None:
+    """Compare each member with its CRC-32, which torch's reader leaves out."""
+    with zipfile.ZipFile(path) as archive:
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ValueError(f"{damaged} is damaged")
 
 
 def saved_identity(folder: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,6 +94,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """
     from gvtools.completers.geoverse.weights.published import WHOLE_FILE
     from gvtools.files import check_parent, make_folder, write_text
+    from gvtools.runs.folder_lock import folder_lock
     from gvtools.settings import with_texts
     from gvtools.training.distributed import started
     from gvtools.training.options import shipped_or_read
@@ -117,7 +119,10 @@ def run(args: argparse.Namespace, console: Console) -> None:
         check_parent(args.json)
     make_folder(args.out)
     figures: dict[str, dict[str, float]] = {}
-    with started(args.device) as processes:
+    with ExitStack() as held:
+        processes = held.enter_context(started(args.device))
+        if processes.first:
+            held.enter_context(folder_lock(args.out))
         for stage in stages:
             stage_run = StageRun(
                 config,

@@ -93,6 +93,12 @@ def write_colmap_export(
     point, view, xy = _tracks(
         memory, distinct.cameras, kept.group, row_of_view=distinct.row_of_view
     )
+    lines = [
+        name if picture is None else f"{name}\t{picture}"
+        for name, picture in distinct.generated.items()
+    ]
+    # First, so that an export that was killed is known for one when it is made again.
+    write_text(folder / MODEL / GENERATED, "\n".join([HEADER, *lines]) + "\n")
     write_colmap(
         folder / MODEL,
         distinct.cameras,
@@ -102,11 +108,6 @@ def write_colmap_export(
         view_index=view,
         xy=xy,
     )
-    lines = [
-        name if picture is None else f"{name}\t{picture}"
-        for name, picture in distinct.generated.items()
-    ]
-    write_text(folder / MODEL / GENERATED, "\n".join([HEADER, *lines]) + "\n")
     return Written(
         views=len(distinct.cameras),
         generated=len(distinct.generated),

@@ -1,0 +1,70 @@
+"""Checksums of a round's files: ``SHA256SUMS`` in its folder, as ``sha256sum -c`` takes it.
+
+Pictures and JSON do not tell by themselves that a bit of them was flipped. The memory has checksums
+of its own, and moves on to the next round. A round without the file is taken as it is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from gvtools.errors import ProjectError
+from gvtools.files import write_text
+from gvtools.runs.layout import MEMORY
+
+SUMS = "SHA256SUMS"
+
+
+def write_sums(folder: Path) -> None:
+    """Write the sums of what a round's folder holds.
+
+    Raises:
+        ProjectError: it cannot be written.
+    """
+    names = sorted(path.name for path in folder.iterdir() if path.is_file())
+    lines = [f"{_sum(folder / name)}  {name}\n" for name in names if name not in (MEMORY, SUMS)]
+    write_text(folder / SUMS, "".join(lines))
+
+
+def check_sums(folder: Path, names: Iterable[str] | None = None) -> None:
+    """Refuse files of a round that are not as they were written.
+
+    Args:
+        folder: of the round.
+        names: of the files; None: all that have a sum.
+
+    Raises:
+        ProjectError: one is damaged or gone, or the sums are; it is named.
+    """
+    path = folder / SUMS
+    if not path.is_file():
+        return
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        sums = {name: total for total, name in (line.split("  ", 1) for line in lines)}
+    except (OSError, ValueError) as error:
+        raise _damaged(path, str(error)) from None
+    for name in sums if names is None else names:
+        try:
+            whole = sums.get(name) in (None, _sum(folder / name))
+        except OSError as error:
+            raise _damaged(folder / name, error.strerror or str(error)) from None
+        if not whole:
+            raise _damaged(folder / name, "its bytes are not those that were written")
+
+
+def _damaged(path: Path, why: str) -> ProjectError:
+    return ProjectError(
+        f"{path}: damaged ({why}); restore it, or remove {path.parent} and run reconstruct again "
+        f"with --resume (if it was edited on purpose, remove {path.parent / SUMS})"
+    )
+
+
+def _sum(path: Path) -> str:
+    total = hashlib.sha256()
+    with path.open("rb") as file:
+        while part := file.read(1 << 20):
+            total.update(part)
+    return total.hexdigest()

@@ -1,0 +1,163 @@
+"""A disk that is full, a folder that cannot be written: one line, and what was there stays."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from kill_contents import contents
+from tiny_scan import write_scan
+
+from gvtools.errors import GvError, ProjectError
+from gvtools.training.state import Progress, StageState, load_state, save_state
+from pipelines.cli import main
+
+RUN = ("--context", "first:4", "--targets", "range:4-5", "--refine", "0", "--set",
+       "views_per_round=1", "--quiet")  # fmt: skip
+
+
+@contextmanager
+def mounted(folder: Path, options: str) -> Iterator[Path]:
+    """A small disk in memory; the test is skipped where mounting is not allowed."""
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        pytest.skip(f"no mount here: {error}")
+    if done.returncode:
+        pytest.skip(f"mounting is not allowed here: {done.stderr.strip()}")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=False)
+
+
+def full(folder: Path, spare: int = 0) -> None:
+    """Fill the disk but for so many bytes."""
+    free = os.statvfs(folder)
+    (folder / "filler").write_bytes(b"0" * max(0, free.f_bavail * free.f_frsize - spare))
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory) -> Path:
+    return write_scan(tmp_path_factory.mktemp("disks") / "scan", views=6)
+
+
+@pytest.fixture(scope="module")
+def run(scan, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "run"
+    assert main(["reconstruct", str(scan), "--out", str(out), *RUN]) == 0
+    return out
+
+
+def one_line(capsys: pytest.CaptureFixture[str], *parts: str) -> None:
+    lines = [x for x in capsys.readouterr().err.splitlines() if not x.startswith("warning")]
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("gvtools: ") and "unexpected" not in lines[0]
+    assert any(part in lines[0] for part in parts), lines[0]
+
+
+@pytest.mark.parametrize("spare", [0, 40_000, 300_000])
+def test_a_run_on_a_full_disk_goes_on_when_there_is_room(scan, run, tmp_path, capsys, spare):
+    with mounted(tmp_path / "disk", "size=4m") as disk:
+        full(disk, spare)
+        words = ["reconstruct", str(scan), "--out", str(disk / "run"), *RUN]
+        assert main(words) == 2
+        one_line(capsys, "No space left", "cannot be")
+        (disk / "filler").unlink()
+        assert main([*words, "--resume"]) == 0
+        found, expected = contents(disk / "run"), contents(run)
+        assert [n for n in found.keys() | expected.keys() if found.get(n) != expected.get(n)] == []
+
+
+OUTPUTS = {
+    "ply": ("export", "--format", "ply", "--out", "points.ply"),
+    "colmap": ("export", "--format", "colmap", "--out", "project"),
+    "transforms": ("export", "--format", "transforms", "--out", "transforms.json"),
+    "glb": ("export", "--format", "glb", "--out", "points.glb"),
+    "mp4": ("film", "--path", "interpolate:3", "--out", "film.mp4"),
+    "gif": ("film", "--path", "interpolate:3", "--out", "film.gif"),
+}
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_exports_and_films_on_a_full_disk_are_one_line(run, tmp_path, capsys, name):
+    command, *words = OUTPUTS[name]
+    with mounted(tmp_path / "disk", "size=8m") as disk:
+        words = [*words[:-1], str(disk / words[-1])]
+        full(disk)
+        assert main([command, str(run), *words, "--quiet"]) == 2
+        one_line(capsys, "No space left", "could not be written", "cannot be")
+        left = [p for p in disk.rglob("*") if p.is_file() and p.stat().st_size]
+        assert [path.name for path in left] == ["filler"]
+        (disk / "filler").unlink()
+        assert main([command, str(run), *words, "--quiet"]) == 0
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(scan, run, tmp_path, capsys):
+    with mounted(tmp_path / "disk", "size=1m,ro") as disk:
+        assert main(["reconstruct", str(scan), "--out", str(disk / "run"), *RUN]) == 2
+        one_line(capsys, "Read-only")
+        for command, *words in OUTPUTS.values():
+            words = [*words[:-1], str(disk / words[-1])]
+            assert main([command, str(run), *words, "--quiet"]) == 2
+            one_line(capsys, "Read-only", "read-only")
+        assert main(["capture", str(scan), "--out", str(disk / "project"), "--quiet"]) == 2
+        words = ["data", "shards", str(scan), "--out", str(disk / "shards"), "--quiet"]
+        capsys.readouterr()
+        assert main(words) == 2
+        one_line(capsys, "Read-only")
+
+
+def state(value: float) -> StageState:
+    return StageState({"of": "a test"}, Progress(step=3), {"w": torch.full((60_000,), value)})
+
+
+def test_a_training_state_survives_a_full_disk(tmp_path):
+    with mounted(tmp_path / "disk", "size=1m") as disk:
+        save_state(state(1.0), disk / "stage")
+        full(disk, 100_000)
+        with pytest.raises(ProjectError, match="No space left"):
+            save_state(state(2.0), disk / "stage")
+        kept = load_state(disk / "stage", {"of": "a test"})
+        assert kept is not None and float(kept.model["w"][0]) == 1
+        assert [path.name for path in (disk / "stage").iterdir()] == ["state.pt"]
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_a_flipped_bit_of_a_training_state_is_named_or_without_effect(tmp_path, mapped):
+    save_state(state(1.0), tmp_path)
+    path = tmp_path / "state.pt"
+    before = path.read_bytes()
+    rng = np.random.default_rng(0)
+    found = 0
+    for place in rng.integers(0, len(before), 60).tolist():
+        content = bytearray(before)
+        content[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(content)
+        try:
+            kept = load_state(tmp_path, {"of": "a test"}, mapped=mapped)
+        except GvError as error:
+            found += 1
+            assert "state.pt" in str(error)
+        else:
+            assert kept is not None and torch.equal(kept.model["w"], state(1.0).model["w"])
+    assert found > 40
+
+
+def test_a_run_that_was_copied_reads_without_its_sums(run, tmp_path):
+    """Runs of earlier versions have none."""
+    from gvtools.runs.run import load_run
+
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    for path in copy.glob("round_*/SHA256SUMS"):
+        path.unlink()
+    assert len(list(load_run(copy).targets())) == 2
