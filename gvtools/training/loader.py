@@ -8,14 +8,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
 from typing import Any
 
 import numba
 import torch
 from numpy.typing import NDArray
 
-from gvtools.errors import GvError
+from gvtools.errors import GvError, ProjectError
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.dataset import Samples
 from gvtools.training.view_sample import TENSORS, Sample, collated
@@ -36,6 +36,7 @@ def batches(
 
     Raises:
         ShapeError: the numbers of context views of a batch differ.
+        ProjectError: a worker was killed.
     """
     if not workers:
         for part in parts:
@@ -52,8 +53,22 @@ def batches(
         # Torch would otherwise draw a number from its global generator.
         generator=torch.Generator(),
     )
-    for items in loader:
+    stream = iter(loader)
+    while (items := _next(stream)) is not None:
         yield collated([_restored(item) for item in items])
+
+
+def _next(stream: Iterator[list[_Made]]) -> list[_Made] | None:
+    """The samples of the next batch."""
+    try:
+        return next(stream, None)
+    except RuntimeError as error:
+        if "DataLoader worker" not in str(error):
+            raise
+        raise ProjectError(
+            f"a process that makes samples has died ({str(error).splitlines()[0]}); where memory "
+            "ran out, lower data.workers; go on with --resume"
+        ) from error
 
 
 class _Arrays:

@@ -1,0 +1,135 @@
+"""Two commands on one folder, a clock that jumps, a worker that dies, kills between two files."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+
+import pytest
+from run_files import results
+from tiny_scan import write_scan
+
+from gvtools.capture.project import replaced_folder
+from gvtools.errors import ProjectError
+from gvtools.runs.folder_lock import folder_lock
+from gvtools.scenes.colmap_writer import CAMERAS
+from pipelines.cli import main
+from pipelines.reconstruction.prefetch import prefetch
+
+RUN = ("--context", "first:4", "--targets", "range:4-5", "--refine", "0", "--quiet")
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory) -> Path:
+    return write_scan(tmp_path_factory.mktemp("interference") / "scan", views=6)
+
+
+@pytest.fixture(scope="module")
+def run(scan, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "run"
+    assert main(["reconstruct", str(scan), "--out", str(out), *RUN]) == 0
+    return out
+
+
+def test_a_second_run_of_a_folder_is_refused(scan, run, tmp_path, capsys):
+    with folder_lock(run):
+        assert main(["reconstruct", str(scan), "--out", str(run), *RUN, "--resume"]) == 2
+    assert "another process is at work" in capsys.readouterr().err
+
+
+def test_a_second_training_of_a_folder_is_refused(tmp_path, capsys):
+    words = ["train", "micro", "--stage", "encoder", "--device", "cpu", "--out", str(tmp_path)]
+    with folder_lock(tmp_path):
+        assert main([*words, "--quiet"]) == 2
+    assert "another process is at work" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_second_capture_leaves_the_first_ones_work_alone(tmp_path):
+    out = tmp_path / "project"
+    with replaced_folder(out) as work:
+        (work / "mine").write_text("half-done")
+        with pytest.raises(ProjectError, match="another process"), replaced_folder(out):
+            raise AssertionError("not reached")
+        assert (work / "mine").read_text() == "half-done"
+    assert [path.name for path in tmp_path.iterdir()] == ["project"]
+    assert (out / "mine").exists()
+
+
+def test_what_a_killed_capture_left_is_cleared(tmp_path):
+    left = tmp_path / ".project.part" / "mapping"
+    left.mkdir(parents=True)
+    (left / "database.db").write_bytes(b"half")
+    with replaced_folder(tmp_path / "project") as work:
+        assert list(work.iterdir()) == []
+        (work / "new").touch()
+    assert [path.name for path in (tmp_path / "project").iterdir()] == ["new"]
+
+
+def test_a_clock_that_jumps_by_a_day_changes_nothing(scan, run, tmp_path, monkeypatch):
+    """Back and forth: durations come from clocks that only go on, and no file is named by one."""
+    real, calls = time.time, 0
+
+    def jumping() -> float:
+        nonlocal calls
+        calls += 1
+        return real() + 86_400 * (-1) ** calls
+
+    monkeypatch.setattr(time, "time", jumping)
+    out = tmp_path / "run"
+    assert main(["reconstruct", str(scan), "--out", str(out), *RUN]) == 0
+    time.time()
+    assert calls
+    assert results(out) == results(run)
+    for line in (out / "rounds.jsonl").read_text().splitlines():
+        seconds = json.loads(line)["seconds"]
+        assert all(0 <= value < 600 for value in seconds.values()), seconds
+
+
+def test_an_error_in_the_thread_that_reads_ahead_ends_the_reading():
+    def load(item: int) -> int:
+        if item == 2:
+            raise ProjectError("frame 2: gone")
+        return item
+
+    found = []
+    with pytest.raises(ProjectError, match="frame 2: gone"):
+        for item in prefetch(load, range(4)):
+            found.append(item)
+    assert found == [0, 1]
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing catches it."""
+
+
+@pytest.mark.parametrize("moment", range(1, 6))
+def test_a_colmap_export_that_stops_at_any_rename_can_be_made_again(
+    run, tmp_path, monkeypatch, moment
+):
+    out, calls = tmp_path / "project", 0
+    words = ["export", str(run), "--format", "colmap", "--out", str(out), "--quiet"]
+    assert main(words) == 0
+    model = out / "sparse" / "0"
+    whole = {path.name: path.read_bytes() for path in model.iterdir()}
+
+    def stopping(rename):
+        def stopped(*args):
+            nonlocal calls
+            calls += 1
+            if calls == moment:
+                raise Killed
+            return rename(*args)
+
+        return stopped
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", stopping(os.replace))
+        with pytest.raises(Killed):
+            main(words)
+    # Either the earlier model as a whole, or none: never files of two.
+    assert not (model / CAMERAS).exists() or moment == 1
+    assert main(words) == 0
+    assert {path.name: path.read_bytes() for path in model.iterdir()} == whole
