@@ -167,8 +167,15 @@ def foreign_model(folder: Path) -> Path | None:
     except (OSError, ValueError):
         pass
     places = [folder / name for name in ("sparse", "cameras.bin", "cameras.txt")]
-    held = (path for path in places if path.is_file() or any(map(Path.is_file, path.rglob("*"))))
-    return next(held, None)
+    return next((path for path in places if path.is_file() or _holds_files(path)), None)
+
+
+def _holds_files(folder: Path) -> bool:
+    """Whether there are files below a folder, but for those that a kill left half-written."""
+    return any(
+        path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        for path in folder.rglob("*")
+    )
 
 
 def foreign_transforms(path: Path) -> Path | None:
