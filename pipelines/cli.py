@@ -28,6 +28,7 @@ COMMANDS = {
     "evaluate": "pipelines.commands.evaluate",
     "judge": "pipelines.commands.judge",
     "benchmark": "pipelines.commands.benchmark",
+    "fleet": "pipelines.commands.fleet",
     "trajectory": "pipelines.commands.trajectory",
     "report": "pipelines.commands.report",
     "plot": "pipelines.commands.plot",
@@ -103,8 +104,8 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
         return 2
     except KeyboardInterrupt:
         goes_on = (
-            "reconstruct and train go on with --resume, tradeoff, benchmark and data shards by "
-            "themselves; refine changed nothing"
+            "reconstruct and train go on with --resume, tradeoff, benchmark, fleet and data shards "
+            "by themselves; refine changed nothing"
         )
         print(f"gvtools: interrupted; {goes_on}", file=sys.stderr)
         return 1

@@ -1,0 +1,84 @@
+"""``gvtools fleet``: many scenes on one machine, a Ray cluster or Slurm."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.errors import OptionError, ProjectError
+
+if TYPE_CHECKING:
+    from pipelines.console import Console
+    from pipelines.fleet.engines import Engine
+    from pipelines.fleet.spec import Task
+
+SUMMARY = "run commands over many scenes: on Ray, under Slurm, or on this machine"
+EXAMPLES = (
+    "gvtools fleet scenes.yaml --address auto --out runs/fleet",
+    "gvtools fleet scenes.yaml --engine slurm --out /shared/fleet",
+    "gvtools fleet scenes.yaml --collect --out /shared/fleet",
+)
+ENGINES = ("ray", "processes", "slurm")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("scenes", type=Path, metavar="SCENES.yaml", help="stages and scenes")
+    parser.add_argument(
+        "--out",
+        required=True,
+        metavar="FOLDER",
+        help="of the results, a path or URL; goes on there",
+    )
+    parser.add_argument("--engine", choices=ENGINES, default="ray", help="default ray")
+    parser.add_argument(
+        "--address",
+        metavar="WHERE",
+        help="Ray's cluster: auto (the one that runs here), HOST:PORT, or local, a new one on this "
+        "machine (default local)",
+    )
+    parser.add_argument(
+        "--collect", action="store_true", help="run nothing; gather the results that are there"
+    )
+
+
+def run(args: argparse.Namespace, console: Console) -> None:
+    """Run what is not finished, and print one table.
+
+    Raises:
+        GvError: the list or an option is wrong, or a task failed; its record says why.
+    """
+    from pipelines.fleet.drive import run_fleet
+    from pipelines.fleet.results import report
+    from pipelines.fleet.slurm import write_slurm
+    from pipelines.fleet.spec import is_url, plan, read_list
+
+    if args.address is not None and args.engine != "ray":
+        raise OptionError(f"--address: belongs to --engine ray, not {args.engine}")
+    root = args.out.rstrip("/") if is_url(args.out) else str(Path(args.out).absolute())
+    tasks = plan(read_list(args.scenes), root, folder=args.scenes.absolute().parent)
+    if args.engine == "slurm" and not args.collect:
+        if is_url(root):
+            raise OptionError(f"--out {root}: expected a shared folder, which job scripts lie in")
+        script = write_slurm(tasks, Path(root))
+        console.line(f"{len(tasks)} tasks; submit them with: bash {script}")
+        console.line("then, when they have run: the same command with --collect")
+        return
+    if not args.collect:
+        run_fleet(tasks, lambda left: _engine(left, args, console), console=console)
+    failed = report(tasks, root, console)
+    if failed:
+        first = failed[0]
+        raise ProjectError(
+            f"{args.out}: {len(failed)} of {len(tasks)} tasks are not done, first {first['scene']} "
+            f"{first['stage']}: {first['reason']}; the same command tries them again"
+        )
+
+
+def _engine(left: list[Task], args: argparse.Namespace, console: Console) -> Engine:
+    from pipelines.fleet.engines import Processes, Ray
+
+    if args.engine == "processes":
+        return Processes(left)
+    return Ray(left, address=args.address or "local", console=console)

@@ -1,0 +1,154 @@
+"""Who runs a fleet's tasks: processes of this machine, or Ray."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import asdict
+from typing import Any, Protocol
+
+from gvtools.errors import OptionError, ProjectError
+from pipelines.console import Console
+from pipelines.fleet.spec import Task
+from pipelines.fleet.task import FAILED, run_task
+
+# How long a wait lasts before progress is shown again, s.
+WAIT_S = 1.0
+
+
+class Engine(Protocol):
+    """What the driver asks of an engine."""
+
+    def submit(self, task: Task, attempt: int) -> Any:
+        """Begin a task; returns what stands for it."""
+
+    def finished(self, handles: Sequence[Any]) -> list[tuple[Any, dict[str, Any]]]:
+        """Those that ended, after waiting for one at most ``WAIT_S``; with their records."""
+
+    def close(self) -> None:
+        """Let go of workers."""
+
+
+def lost(reason: str) -> dict[str, Any]:
+    """What stands for a record where the worker could not write one."""
+    return {"status": FAILED, "reason": reason, "again": True}
+
+
+class Processes:
+    """As many tasks side by side as this machine has cores for the largest of them."""
+
+    def __init__(self, tasks: Sequence[Task]) -> None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        largest = max(task.cpus for task in tasks)
+        gpus = any(task.gpus for task in tasks)
+        self._pool = ThreadPoolExecutor(1 if gpus else max(1, (cores or 1) // largest))
+
+    def submit(self, task: Task, attempt: int) -> Future[dict[str, Any]]:
+        """Begin a task as soon as a core is free."""
+        return self._pool.submit(run_task, asdict(task), attempt)
+
+    def finished(
+        self, handles: Sequence[Future[dict[str, Any]]]
+    ) -> list[tuple[Future[dict[str, Any]], dict[str, Any]]]:
+        """Those that ended."""
+        done, _ = wait(handles, timeout=WAIT_S, return_when=FIRST_COMPLETED)
+        return [(handle, _result(handle)) for handle in done]
+
+    def close(self) -> None:
+        """Let those that run end, and begin no other."""
+        self._pool.shutdown(cancel_futures=True)
+
+
+def _result(handle: Future[dict[str, Any]]) -> dict[str, Any]:
+    try:
+        return handle.result()
+    except Exception as error:
+        return lost(f"{type(error).__name__}: {error}")
+
+
+class Ray:
+    """A Ray cluster; each task asks for its cores, cards and memory.
+
+    Raises:
+        OptionError: Ray is not installed, or a local cluster is too small for a task.
+        ProjectError: no cluster answers at the address.
+    """
+
+    def __init__(self, tasks: Sequence[Task], *, address: str, console: Console) -> None:
+        try:
+            import ray
+        except ImportError:
+            raise OptionError(
+                "--engine ray: Ray is not installed; pip install 'gvtools[cluster]', or give "
+                "--engine processes or slurm"
+            ) from None
+        try:
+            context = ray.init(address=address, log_to_driver=False, logging_level="error")
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            reason = str(error).splitlines()[0]
+            raise ProjectError(
+                f"--address {address}: no Ray cluster ({reason}); begin one with 'ray start "
+                "--head', or give --address local"
+            ) from None
+        self._ray = ray
+        self._remote = ray.remote(run_task)
+        if context.dashboard_url:
+            console.line(f"Ray's dashboard: http://{context.dashboard_url}")
+        else:
+            console.line("Ray's dashboard is not installed; pip install 'ray[default]' brings it")
+        self._check(tasks, address, console)
+
+    def _check(self, tasks: Sequence[Task], address: str, console: Console) -> None:
+        """Say of tasks that fit no machine, which would wait for ever."""
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        for task in {task.stage: task for task in tasks}.values():
+            asked = {"CPU": task.cpus, "GPU": task.gpus, "memory": task.memory_gb * 1e9}
+            if any(all(node.get(k, 0) >= v for k, v in asked.items()) for node in nodes):
+                continue
+            text = (
+                f"stage {task.stage}: no machine has {task.cpus} cores, {task.gpus:g} cards and "
+                f"{task.memory_gb:g} GB"
+            )
+            if address == "local":
+                self.close()
+                raise OptionError(f"{text}; ask for less")
+            console.warn(f"{text}; it waits until one joins")
+
+    def submit(self, task: Task, attempt: int) -> Any:
+        """Begin a task on a machine with its labels, or, where none is left, on any."""
+        options: dict[str, Any] = {
+            "num_cpus": task.cpus,
+            "num_gpus": task.gpus,
+            "max_retries": 0,
+            "name": f"{task.scene} {task.stage}",
+        }
+        if task.memory_gb:
+            options["memory"] = int(task.memory_gb * 1e9)
+        if task.labels and self._holders(task.labels):
+            options["label_selector"] = dict(task.labels)
+            # A machine that is lost while the task waits for it.
+            options["fallback_strategy"] = [{"label_selector": {}}]
+        return self._remote.options(**options).remote(asdict(task), attempt)
+
+    def _holders(self, labels: dict[str, str]) -> bool:
+        return any(
+            node["Alive"] and labels.items() <= (node.get("Labels") or {}).items()
+            for node in self._ray.nodes()
+        )
+
+    def finished(self, handles: Sequence[Any]) -> list[tuple[Any, dict[str, Any]]]:
+        """Those that ended, also by the loss of their worker or machine."""
+        done, _ = self._ray.wait(list(handles), num_returns=1, timeout=WAIT_S)
+        return [(handle, self._record(handle)) for handle in done]
+
+    def _record(self, handle: Any) -> dict[str, Any]:
+        try:
+            return dict(self._ray.get(handle))
+        except self._ray.exceptions.RayError as error:
+            first = (str(error).strip().splitlines() or [""])[0]
+            return lost(f"worker lost ({type(error).__name__}: {first})")
+
+    def close(self) -> None:
+        """Leave the cluster; what still runs is ended."""
+        self._ray.shutdown()

@@ -1,0 +1,215 @@
+"""The list of scenes and stages that ``gvtools fleet`` reads, a YAML file.
+
+stages:
+  reconstruct:
+    command: reconstruct {project} --out {out} --refine 0
+    cpus: 2
+    memory_gb: 4
+  evaluate:
+    command: evaluate {reconstruct} --out {out}
+scenes:
+  - scans/*
+  - {project: "s3://bucket/kitchen", labels: {rack: a}}
+"""
+
+from __future__ import annotations
+
+import glob
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.settings import Settings
+
+# Words in braces that a command may hold, beside the names of earlier stages.
+WORDS = ("project", "name", "out")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+class Stage(Settings):
+    """A command that is run for every scene."""
+
+    section = "stages"
+
+    command: str
+    """What follows ``gvtools``; {project}, {name}, {out} and names of earlier stages stand for the
+    scene's input, its name, this stage's folder, and the folders of those stages."""
+    cpus: int = Field(1, ge=1)
+    """Cores; also the number of threads that the command may use."""
+    gpus: float = Field(0, ge=0)
+    """Cards; a part of one lets several commands share it."""
+    memory_gb: float = Field(0, ge=0)
+    """Memory that has to be free [GB]; 0 asks for none."""
+    retries: int = Field(2, ge=0)
+    """How often a command is begun again that was killed, or whose machine was lost."""
+
+
+class SceneEntry(Settings):
+    """An input, or several of a pattern."""
+
+    section = "scenes"
+
+    project: str
+    """A path (relative to the list), a pattern of folders, or an fsspec URL such as s3://."""
+    name: str | None = None
+    """Of the results' folder; the last part of the path where it is not given."""
+    labels: dict[str, str] = Field(default_factory=dict)
+    """Labels of the Ray nodes that hold the data; others are taken where none is left."""
+
+
+class FleetSpec(Settings):
+    """A whole list."""
+
+    section = "fleet"
+
+    stages: dict[str, Stage] = Field(min_length=1)
+    """In the order in which they run."""
+    scenes: tuple[SceneEntry, ...] = Field(min_length=1)
+    """What they run on."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One stage of one scene, as any machine can run it.
+
+    Attributes:
+        scene: the scene's name.
+        stage: the stage's name.
+        project: path or URL of the input.
+        command: arguments of ``gvtools``, with words in braces.
+        before: names of earlier stages.
+        root: path or URL of the fleet's results.
+        cpus: cores, and threads.
+        gpus: cards.
+        memory_gb: memory in GB.
+        retries: how often it may be begun again.
+        labels: of nodes that hold the data.
+    """
+
+    scene: str
+    stage: str
+    project: str
+    command: tuple[str, ...]
+    before: tuple[str, ...]
+    root: str
+    cpus: int
+    gpus: float
+    memory_gb: float
+    retries: int
+    labels: dict[str, str]
+
+
+def is_url(text: str) -> bool:
+    """Whether a place is an fsspec URL and not a path."""
+    return "://" in text
+
+
+def read_list(path: Path) -> FleetSpec:
+    """The list in a YAML file.
+
+    Raises:
+        ProjectError: it cannot be read.
+        OptionError: a key or value is wrong.
+    """
+    import yaml
+
+    try:
+        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ProjectError(f"{path}: cannot be read ({error.strerror})") from None
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise ProjectError(f"{path}: no YAML ({reason})") from None
+    if not isinstance(data, dict) or not isinstance(data.get("scenes"), list):
+        raise OptionError(f"{path}: expected the keys 'stages' and 'scenes', a list")
+    entries = [{"project": item} if isinstance(item, str) else item for item in data["scenes"]]
+    return FleetSpec(**{**data, "scenes": entries})
+
+
+def plan(spec: FleetSpec, root: str, *, folder: Path) -> list[Task]:
+    """Every stage of every scene, stage by stage.
+
+    Args:
+        spec: the list.
+        root: path or URL of the results.
+        folder: what relative paths are relative to.
+
+    Raises:
+        OptionError: a command is wrong, a pattern fits nothing, or two scenes have one name.
+    """
+    commands = {name: _command(name, spec) for name in spec.stages}
+    scenes: dict[str, SceneEntry] = {}
+    for entry in spec.scenes:
+        for scene in _expanded(entry, folder):
+            assert scene.name is not None
+            if not NAME.fullmatch(scene.name):
+                raise OptionError(
+                    f"scene {scene.name!r}; expected a name of letters, digits, '.', '_' and '-'"
+                )
+            if scene.name in scenes:
+                raise OptionError(
+                    f"scene {scene.name!r}: {scenes[scene.name].project} and {scene.project} have "
+                    "this name; give one of them another 'name'"
+                )
+            scenes[scene.name] = scene
+    names = list(spec.stages)
+    return [
+        Task(
+            scene=name,
+            stage=stage,
+            project=entry.project,
+            command=commands[stage],
+            before=tuple(names[: names.index(stage)]),
+            root=root,
+            labels=entry.labels,
+            **{key: getattr(spec.stages[stage], key) for key in Stage.model_fields
+               if key != "command"},
+        )
+        for stage in names
+        for name, entry in scenes.items()
+    ]  # fmt: skip
+
+
+def _command(name: str, spec: FleetSpec) -> tuple[str, ...]:
+    from pipelines.cli import COMMANDS
+
+    if not NAME.fullmatch(name) or name in WORDS:
+        raise OptionError(f"stage {name!r}; expected a name of letters, digits, '.', '_' and '-'")
+    try:
+        words = shlex.split(spec.stages[name].command)
+    except ValueError as error:
+        raise OptionError(f"stages.{name}.command: {error}") from None
+    if not words or words[0] not in COMMANDS or words[0] == "fleet":
+        known = ", ".join(command for command in COMMANDS if command != "fleet")
+        raise OptionError(f"stages.{name}.command {' '.join(words)!r}; expected one of {known}")
+    names = list(spec.stages)
+    known_words = (*WORDS, *names[: names.index(name)])
+    for word in re.findall(r"\{([^{}]*)\}", " ".join(words)):
+        if word not in known_words:
+            raise OptionError(
+                f"stages.{name}.command: {{{word}}} stands for nothing; expected one of "
+                f"{', '.join(known_words)}"
+            )
+    return tuple(words)
+
+
+def _expanded(entry: SceneEntry, folder: Path) -> list[SceneEntry]:
+    if is_url(entry.project):
+        name = entry.name or entry.project.rstrip("/").rpartition("/")[2]
+        return [entry.replaced(name=name)]
+    path = str((folder / Path(entry.project).expanduser()).absolute())
+    if glob.has_magic(entry.project):
+        found = sorted(place for place in glob.glob(path) if Path(place).is_dir())
+        if not found:
+            raise OptionError(f"scenes: no folder fits {entry.project!r}")
+        if entry.name is not None:
+            raise OptionError(f"scenes: {entry.project!r} is a pattern and can have no 'name'")
+        return [entry.replaced(project=place, name=Path(place).name) for place in found]
+    if not Path(path).exists():
+        raise OptionError(f"scenes: {path} is not there")
+    return [entry.replaced(project=path, name=entry.name or Path(path).name)]

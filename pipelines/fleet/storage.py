@@ -1,0 +1,135 @@
+"""Folders on shared storage, by path or by fsspec URL."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.files import folder_replaced_when_written, write_json
+from pipelines.fleet.spec import is_url
+
+
+def scratch(url: str) -> Path:
+    """A folder on this machine that stands for a URL."""
+    base = Path(
+        os.environ.get("GVTOOLS_FLEET_CACHE", Path(tempfile.gettempdir()) / "gvtools-fleet")
+    )
+    return base / hashlib.sha256(url.encode()).hexdigest()[:16] / url.rstrip("/").rpartition("/")[2]
+
+
+def fetched(place: str) -> Path:
+    """The path of a file or folder; that of a URL is copied to this machine, once.
+
+    Raises:
+        OptionError: no driver of such URLs is installed.
+        ProjectError: it cannot be read.
+    """
+    if not is_url(place):
+        return Path(place)
+    local = scratch(place)
+    if not local.exists():
+        files, remote = _open(place)
+        try:
+            if files.isfile(remote):
+                local.parent.mkdir(parents=True, exist_ok=True)
+                files.get_file(remote, f"{local}.part")
+                os.replace(f"{local}.part", local)
+            else:
+                with folder_replaced_when_written(local) as part:
+                    for name in _find(files, remote, place):
+                        target = part / _relative(name, remote)
+                        target.parent.mkdir(parents=True, exist_ok=True)
+                        files.get_file(name, str(target))
+        except (OSError, ValueError) as error:
+            raise ProjectError(f"{place}: cannot be fetched ({error})") from error
+    return local
+
+
+def stored(folder: Path, place: str) -> None:
+    """Copy a finished folder to its URL; nothing to do where that is its path.
+
+    Raises:
+        ProjectError: it cannot be written.
+    """
+    if not is_url(place):
+        return
+    files, remote = _open(place)
+    try:
+        if files.exists(remote):
+            # Left by a copy that was interrupted.
+            files.rm(remote, recursive=True)
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                files.pipe_file(
+                    f"{remote}/{path.relative_to(folder).as_posix()}", path.read_bytes()
+                )
+    except OSError as error:
+        raise ProjectError(f"{place}: cannot be written ({error})") from error
+
+
+def read_record(place: str) -> dict[str, Any] | None:
+    """A JSON object; None where there is none, or a damaged one.
+
+    Raises:
+        ProjectError: the storage does not answer.
+    """
+    try:
+        if is_url(place):
+            files, remote = _open(place)
+            files.invalidate_cache()
+            text = files.cat_file(remote)
+        else:
+            text = Path(place).read_bytes()
+        found = json.loads(text)
+    except (FileNotFoundError, ValueError):
+        return None
+    except OSError as error:
+        raise ProjectError(f"{place}: cannot be read ({error})") from error
+    return found if isinstance(found, dict) else None
+
+
+def write_record(place: str, data: dict[str, Any]) -> None:
+    """Write a JSON object whole.
+
+    Raises:
+        ProjectError: it cannot be written.
+    """
+    if not is_url(place):
+        write_json(Path(place), data)
+        return
+    files, remote = _open(place)
+    try:
+        files.pipe_file(remote, json.dumps(data, indent=1).encode())
+    except OSError as error:
+        raise ProjectError(f"{place}: cannot be written ({error})") from error
+
+
+def _open(place: str) -> tuple[Any, str]:
+    try:
+        import fsspec
+
+        files, remote = fsspec.url_to_fs(place)
+    except (ImportError, ValueError) as error:
+        raise OptionError(
+            f"{place}: {error}; pip install 'gvtools[cluster]' reads s3:// URLs"
+        ) from None
+    return files, str(remote).rstrip("/")
+
+
+def _find(files: Any, remote: str, place: str) -> list[str]:
+    names = [name for name in files.find(remote) if not name.endswith("/")]
+    if not names:
+        raise ProjectError(f"{place}: nothing is there")
+    return names
+
+
+def _relative(name: str, remote: str) -> str:
+    relative = name[len(remote) :].lstrip("/")
+    if not name.startswith(remote) or ".." in Path(relative).parts or not relative:
+        raise ProjectError(f"{name}: lies outside {remote}")
+    return relative

@@ -1,0 +1,238 @@
+"""A fleet of scenes: what is run, what is tried again, what is told in the end."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import refused
+
+from gvtools.errors import OptionError
+from pipelines.cli import main
+from pipelines.console import Console
+from pipelines.fleet.drive import run_fleet
+from pipelines.fleet.engines import Processes, lost
+from pipelines.fleet.results import collect, result_table
+from pipelines.fleet.slurm import write_slurm
+from pipelines.fleet.spec import FleetSpec, plan, read_list
+from pipelines.fleet.storage import fetched, read_record, stored
+from pipelines.fleet.task import run_task
+
+# Quick, and needs no scene.
+QUICK = "weights list"
+LIST = """
+stages:
+  first: {{command: "{first}", retries: 1}}
+  second: {{command: "weights list {{first}}", memory_gb: 0.5}}
+scenes: [scans/*]
+"""
+
+
+@pytest.fixture
+def scenes(tmp_path):
+    for name in ("a", "b", "c"):
+        (tmp_path / "scans" / name).mkdir(parents=True)
+    (tmp_path / "scans" / "manifest.json").write_text("{}")
+    path = tmp_path / "scenes.yaml"
+    path.write_text(LIST.format(first="weights list {project}"))
+    return path
+
+
+def tasks_of(path: Path, out: Path) -> list:
+    return plan(read_list(path), str(out), folder=path.parent)
+
+
+class Script:
+    """An engine that answers from a script: (scene, stage) -> the attempts' records."""
+
+    def __init__(self, answers: dict) -> None:
+        self.answers, self.begun = answers, []
+
+    def submit(self, task, attempt):
+        self.begun.append((task.scene, task.stage, attempt))
+        return task.scene, task.stage, attempt
+
+    def finished(self, handles):
+        scene, stage, attempt = handle = handles[-1]
+        done = {"status": "done", "reason": "", "again": False, "seconds": 1.0, "node": "n"}
+        found = self.answers.get((scene, stage), [])
+        return [(handle, found[attempt - 1] if attempt <= len(found) else done)]
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_pattern_gives_the_folders_that_fit_stage_by_stage(scenes, tmp_path):
+    tasks = tasks_of(scenes, tmp_path / "out")
+    assert [(t.stage, t.scene) for t in tasks] == [
+        (stage, scene) for stage in ("first", "second") for scene in "abc"
+    ]
+    assert tasks[3].before == ("first",)
+    assert tasks[0].project == str(tmp_path / "scans" / "a")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("retries: 1", "retry: 1"), "stages.first.retry"),
+        (("retries: 1", "retries: -1"), "retries -1; expected greater than or equal to 0"),
+        (("{project}", "{second}"), "{second} stands for nothing"),
+        (("weights list {project}", "rm -r {project}"), "expected one of demo, capture"),
+        (("scans/*", "nowhere/*"), "no folder fits 'nowhere/*'"),
+        (("[scans/*]", "[scans/a, {project: scans/b, name: a}]"), "have this name"),
+        (("[scans/*]", "[{project: scans/a, name: ../a}]"), "expected a name of letters"),
+        (("scenes:", "rooms:"), "expected the keys"),
+    ],
+)
+def test_a_wrong_list_is_refused_in_one_line(scenes, tmp_path, change, message):
+    scenes.write_text(scenes.read_text().replace(*change))
+    with pytest.raises(OptionError) as error:
+        tasks_of(scenes, tmp_path / "out")
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_lost_workers_are_replaced_and_a_failure_skips_what_follows(scenes, tmp_path):
+    tasks = tasks_of(scenes, tmp_path / "out")
+    wrong = {"status": "failed", "reason": "no cameras", "again": False}
+    engine = Script({("a", "first"): [lost("node lost")], ("b", "first"): [wrong],
+                     ("c", "second"): [lost("killed")] * 9})  # fmt: skip
+    run_fleet(tasks, lambda _: engine, console=Console(quiet=True))
+    assert ("a", "first", 2) in engine.begun and ("a", "second", 1) in engine.begun
+    assert ("b", "first", 2) not in engine.begun and ("b", "second", 1) not in engine.begun
+    assert [n for scene, stage, n in engine.begun if (scene, stage) == ("c", "second")] == [1, 2, 3]
+    records = {(r["scene"], r["stage"]): r for r in collect(tasks)}
+    assert records["b", "first"]["reason"] == "no cameras"
+    assert records["b", "second"]["reason"] == "stage first failed"
+    assert records["c", "second"]["attempts"] == 3
+    # The script's engine leaves no records of what it says is done: they are missing, and said so.
+    assert records["a", "second"]["status"] == "not run"
+    assert len(result_table(collect(tasks)).rows) == 6
+
+
+def test_a_list_runs_once_and_its_failures_are_told(scenes, tmp_path, capsys):
+    scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
+    out = tmp_path / "out"
+    scenes.write_text(scenes.read_text().replace("[scans/*]", "[scans/a]"))
+    command = ["fleet", str(scenes), "--engine", "processes", "--out", str(out)]
+    first = main(command)
+    records = json.loads((out / "results.json").read_text())["tasks"]
+    assert [record["stage"] for record in records] == ["first", "second"]
+    assert first == 0 and {record["status"] for record in records} == {"done"}
+    assert [row["stage"] for row in csv.DictReader((out / "results.csv").open())] == [
+        "first", "second"]  # fmt: skip
+    assert (out / "a" / "first.log").read_text()
+    before = (out / "a" / "first.json").stat().st_mtime_ns
+    capsys.readouterr()
+    assert main(command) == 0
+    assert "finished before" in capsys.readouterr().out
+    assert (out / "a" / "first.json").stat().st_mtime_ns == before
+
+
+def test_a_command_that_was_killed_may_be_tried_again_and_a_wrong_input_not(
+    scenes, tmp_path, monkeypatch
+):
+    task = tasks_of(scenes, tmp_path / "out")[0]
+    from dataclasses import asdict
+
+    class Ended:
+        returncode = -signal.SIGKILL
+
+    monkeypatch.setattr("pipelines.fleet.task.subprocess.run", lambda *_, **__: Ended)
+    record = run_task(asdict(task))
+    assert (record["reason"], record["again"]) == ("ended by SIGKILL", True)
+    Ended.returncode = 2
+    assert run_task(asdict(task))["again"] is False
+
+
+def test_slurm_scripts_run_each_task_and_collect_tells_what_is_missing(scenes, tmp_path):
+    scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
+    out = tmp_path / "out"
+    assert main(["fleet", str(scenes), "--engine", "slurm", "--out", str(out), "--quiet"]) == 0
+    scripts = [*out.glob("stage-*.sh"), out / "submit.sh"]
+    assert len(scripts) == 3
+    for script in scripts:
+        subprocess.run(["bash", "-n", str(script)], check=True)
+    root = Path(__file__).resolve().parents[3]
+    environment = {**os.environ, "SLURM_ARRAY_TASK_ID": "1", "PYTHONPATH": str(root)}
+    subprocess.run(["bash", str(out / "stage-first.sh")], env=environment, check=True)
+    record = read_record(f"{out}/b/first.json")
+    assert record is not None and record["status"] == "done"
+    error = refused("fleet", scenes, "--collect", "--out", out)
+    assert "5 of 6 tasks are not done" in error
+    table = (out / "results.md").read_text()
+    assert table.count("not run") == 5
+
+
+def test_slurm_asks_for_what_a_stage_needs(tmp_path):
+    (tmp_path / "a").mkdir()
+    stage = {"command": "check {project}", "cpus": 3, "gpus": 0.5, "memory_gb": 1.5}
+    spec = FleetSpec(stages={"look": stage}, scenes=[{"project": "a"}])
+    write_slurm(plan(spec, str(tmp_path / "o"), folder=tmp_path), tmp_path / "o")
+    script = (tmp_path / "o" / "stage-look.sh").read_text()
+    for option in ("--cpus-per-task=3", "--gres=gpu:1", "--mem=1500M", "--array=0-0"):
+        assert f"#SBATCH {option}\n" in script
+
+
+def test_folders_go_to_a_url_and_come_back(tmp_path, monkeypatch):
+    pytest.importorskip("fsspec")
+    monkeypatch.setenv("GVTOOLS_FLEET_CACHE", str(tmp_path / "cache"))
+    _round_trip("memory://bucket/scene", tmp_path)
+
+
+def test_folders_go_to_s3_and_come_back(tmp_path, monkeypatch):
+    pytest.importorskip("s3fs", reason="s3fs is not installed")
+    server = pytest.importorskip("moto.server", reason="moto[server] is not installed")
+    import s3fs
+
+    moto = server.ThreadedMotoServer(port=0)
+    moto.start()
+    try:
+        host, port = moto.get_host_and_port()
+        for key, value in {"AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ACCESS_KEY_ID": "a",
+                           "AWS_SECRET_ACCESS_KEY": "b", "AWS_DEFAULT_REGION": "us-east-1",
+                           "GVTOOLS_FLEET_CACHE": str(tmp_path / "cache")}.items():  # fmt: skip
+            monkeypatch.setenv(key, value)
+        s3fs.S3FileSystem().mkdir("bucket")
+        _round_trip("s3://bucket/scene", tmp_path)
+        spec = FleetSpec(stages={"x": {"command": QUICK}}, scenes=[{"project": "s3://bucket/scene"}])
+        tasks = plan(spec, "s3://bucket/fleet", folder=tmp_path)
+        run_fleet(tasks, Processes, console=Console(quiet=True))
+        [record] = collect(tasks)
+        assert (record["scene"], record["status"]) == ("scene", "done")
+    finally:
+        moto.stop()
+
+
+def _round_trip(url: str, tmp_path: Path) -> None:
+    folder = tmp_path / "scene"
+    (folder / "images").mkdir(parents=True)
+    contents = {"images/1.bin": bytes(range(256)), "cameras.txt": b"x\n"}
+    for name, data in contents.items():
+        (folder / name).write_bytes(data)
+    stored(folder, url)
+    found = fetched(url)
+    assert {p.relative_to(found).as_posix(): p.read_bytes() for p in found.rglob("*")
+            if p.is_file()} == contents  # fmt: skip
+
+
+def test_without_ray_the_engine_says_what_to_install(scenes, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert "gvtools[cluster]" in refused("fleet", scenes, "--out", tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_a_local_ray_cluster_runs_a_list(scenes, tmp_path, monkeypatch):
+    pytest.importorskip("ray", reason="ray is not installed")
+    root = str(Path(__file__).resolve().parents[3])
+    monkeypatch.setenv("PYTHONPATH", root)
+    scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
+    out = tmp_path / "out"
+    main(["fleet", str(scenes), "--out", str(out), "--address", "local"])
+    records = json.loads((out / "results.json").read_text())["tasks"]
+    assert len(records) == 6 and {record["status"] for record in records} == {"done"}
