@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.files import folder_replaced_when_written, write_json
+from gvtools.files import write_json
 from pipelines.fleet.spec import is_url
 
 
@@ -34,20 +35,30 @@ def fetched(place: str) -> Path:
     local = scratch(place)
     if not local.exists():
         files, remote = _open(place)
+        part: Path | None = None
         try:
-            if files.isfile(remote):
-                local.parent.mkdir(parents=True, exist_ok=True)
-                files.get_file(remote, f"{local}.part")
-                os.replace(f"{local}.part", local)
-            else:
-                with folder_replaced_when_written(local) as part:
-                    for name in _find(files, remote, place):
-                        target = part / _relative(name, remote)
-                        target.parent.mkdir(parents=True, exist_ok=True)
-                        files.get_file(name, str(target))
+            local.parent.mkdir(parents=True, exist_ok=True)
+            # A name of its own: several tasks of a machine may fetch the same.
+            part = Path(tempfile.mkdtemp(prefix=".part-", dir=local.parent))
+            _fetch(files, remote, part / local.name)
+            os.rename(part / local.name, local)
         except (OSError, ValueError) as error:
-            raise ProjectError(f"{place}: cannot be fetched ({error})") from error
+            if not local.exists():
+                raise ProjectError(f"{place}: cannot be fetched ({error})") from error
+        finally:
+            if part is not None:
+                shutil.rmtree(part, ignore_errors=True)
     return local
+
+
+def _fetch(files: Any, remote: str, target: Path) -> None:
+    if files.isfile(remote):
+        files.get_file(remote, str(target))
+        return
+    for name in _find(files, remote):
+        path = target / _relative(name, remote)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        files.get_file(name, str(path))
 
 
 def stored(folder: Path, place: str) -> None:
@@ -121,10 +132,10 @@ def _open(place: str) -> tuple[Any, str]:
     return files, str(remote).rstrip("/")
 
 
-def _find(files: Any, remote: str, place: str) -> list[str]:
+def _find(files: Any, remote: str) -> list[str]:
     names = [name for name in files.find(remote) if not name.endswith("/")]
     if not names:
-        raise ProjectError(f"{place}: nothing is there")
+        raise FileNotFoundError(f"nothing at {remote}")
     return names
 
 

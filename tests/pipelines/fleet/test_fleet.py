@@ -150,7 +150,7 @@ def test_a_command_that_was_killed_may_be_tried_again_and_a_wrong_input_not(
     assert run_task(asdict(task))["again"] is False
 
 
-def test_slurm_scripts_run_each_task_and_collect_tells_what_is_missing(scenes, tmp_path):
+def test_slurm_scripts_run_each_task_and_collect_tells_what_is_missing(scenes, tmp_path, capsys):
     scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
     out = tmp_path / "out"
     assert main(["fleet", str(scenes), "--engine", "slurm", "--out", str(out), "--quiet"]) == 0
@@ -163,7 +163,7 @@ def test_slurm_scripts_run_each_task_and_collect_tells_what_is_missing(scenes, t
     subprocess.run(["bash", str(out / "stage-first.sh")], env=environment, check=True)
     record = read_record(f"{out}/b/first.json")
     assert record is not None and record["status"] == "done"
-    error = refused("fleet", scenes, "--collect", "--out", out)
+    error = refused(capsys, "fleet", scenes, "--collect", "--out", out)
     assert "5 of 6 tasks are not done" in error
     table = (out / "results.md").read_text()
     assert table.count("not run") == 5
@@ -221,9 +221,9 @@ def _round_trip(url: str, tmp_path: Path) -> None:
             if p.is_file()} == contents  # fmt: skip
 
 
-def test_without_ray_the_engine_says_what_to_install(scenes, tmp_path, monkeypatch):
+def test_without_ray_the_engine_says_what_to_install(scenes, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
-    assert "gvtools[cluster]" in refused("fleet", scenes, "--out", tmp_path / "out")
+    assert "gvtools[cluster]" in refused(capsys, "fleet", scenes, "--out", tmp_path / "out")
 
 
 @pytest.mark.slow
