@@ -123,7 +123,9 @@ def _assert_same_arrays(path: Path, before: Path) -> None:
             np.testing.assert_array_equal(mine[key], theirs[key], err_msg=key)
 
 
-@pytest.mark.parametrize("name", ["report.json", "generated_*.png", "guidance_*.png", "after_*.png"])
+@pytest.mark.parametrize(
+    "name", ["report.json", "generated_*.png", "guidance_*.png", "after_*.png"]
+)
 def test_a_flipped_bit_is_named_when_the_run_goes_on(run, name, capsys):
     (path,) = (run / "round_001").glob(name)
     flip(path, path.stat().st_size // 2, 0)

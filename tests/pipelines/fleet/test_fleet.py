@@ -200,7 +200,9 @@ def test_folders_go_to_s3_and_come_back(tmp_path, monkeypatch):
             monkeypatch.setenv(key, value)
         s3fs.S3FileSystem().mkdir("bucket")
         _round_trip("s3://bucket/scene", tmp_path)
-        spec = FleetSpec(stages={"x": {"command": QUICK}}, scenes=[{"project": "s3://bucket/scene"}])
+        spec = FleetSpec(
+            stages={"x": {"command": QUICK}}, scenes=[{"project": "s3://bucket/scene"}]
+        )
         tasks = plan(spec, "s3://bucket/fleet", folder=tmp_path)
         run_fleet(tasks, Processes, console=Console(quiet=True))
         [record] = collect(tasks)
