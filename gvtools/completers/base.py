@@ -281,8 +281,9 @@ def _joined(parts: Sequence[Completion]) -> Completion:
         for alignment in part.scale_alignment or (None,) * len(part.depth)
     ]
     return Completion(
-        *(np.concatenate([getattr(part, what) for part in parts])
-          for what in ("rgb", "depth", "confidence")),
+        np.concatenate([part.rgb for part in parts]),
+        np.concatenate([part.depth for part in parts]),
+        np.concatenate([part.confidence for part in parts]),
         rays=np.concatenate(rays) if len(rays) == len(parts) else None,
         scale_alignment=None if all(part.scale_alignment is None for part in parts)
         else tuple(aligned),

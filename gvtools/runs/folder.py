@@ -126,8 +126,8 @@ class RunDirectory:
             number = folder.name.removeprefix("round_")
             if number.isdigit() and int(number) >= done:
                 shutil.rmtree(folder)
-        for number in range(done):
-            check_sums(self.round_path(number))
+        for finished in range(done):
+            check_sums(self.round_path(finished))
         if done:
             self._finish_round(done - 1)
         return done

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import socket
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict
@@ -15,6 +17,8 @@ from pipelines.fleet.task import FAILED, run_task
 
 # How long a wait lasts before progress is shown again, s.
 WAIT_S = 1.0
+# How long a cluster may take to accept a connection, s.
+CONNECT_S = 10.0
 
 
 class Engine(Protocol):
@@ -67,6 +71,24 @@ def _result(handle: Future[dict[str, Any]]) -> dict[str, Any]:
         return lost(f"{type(error).__name__}: {error}")
 
 
+def _check_reachable(address: str) -> None:
+    """Refuse an address where nothing listens, which Ray itself would try for a quarter of an hour.
+
+    Raises:
+        ProjectError: it takes no connection within ``CONNECT_S``.
+    """
+    host, colon, port = address.rpartition(":")
+    if not colon or not port.isdecimal() or "/" in host:
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise ProjectError(
+            f"--address {address}: no Ray cluster ({error}); begin one with 'ray start --head', "
+            "or give --address local"
+        ) from None
+
+
 class Ray:
     """A Ray cluster; each task asks for its cores, cards and memory.
 
@@ -83,8 +105,9 @@ class Ray:
                 "--engine ray: Ray is not installed; pip install 'gvtools[cluster]', or give "
                 "--engine processes or slurm"
             ) from None
+        _check_reachable(address)
         try:
-            context = ray.init(address=address, log_to_driver=False, logging_level="error")
+            context = ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
             raise ProjectError(

@@ -145,6 +145,7 @@ def test_completion_compares_fillers_student_and_teacher(weights, tmp_path):
     assert "| student 3+1 |" in tables.read_text()
 
 
+@pytest.mark.slow
 def test_without_the_perceptual_network_its_figure_is_null_with_the_reason(
     weights, tmp_path, monkeypatch
 ):

@@ -137,6 +137,7 @@ def test_several_runs_are_scenes(small_run, small_scan, tmp_path):
     assert (out / "views_001.csv").is_file()
 
 
+@pytest.mark.slow
 def test_the_protocol_splits_runs_and_measures(small_scan, tmp_path):
     out = tmp_path / "out"
     words = ["evaluate", str(small_scan), "--protocol", "pass", "--out", str(out), "--quiet"]

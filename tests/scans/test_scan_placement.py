@@ -49,6 +49,7 @@ def test_a_scan_that_fits_as_it_is_stays_where_it_is():
     np.testing.assert_array_equal(found.world_from_scan, np.eye(4))
 
 
+@pytest.mark.slow
 def test_another_place_is_refused():
     rng = np.random.default_rng(0)
     u, v = rng.uniform(0, 6.3, (2, 20_000))

@@ -64,6 +64,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_workers_end_with_a_process_that_is_killed(tmp_path):
     (tmp_path / "parent.py").write_text(_ORPHANS)
     root = Path(__file__).resolve().parents[2]

@@ -56,6 +56,7 @@ def painted(picture) -> int:
     return int((picture < 250).any(axis=2).sum())
 
 
+@pytest.mark.slow
 def test_the_slider_shows_the_memory_growing(browser, viewer):
     counts = [viewer.run.counts(number) for number in range(3)]
     thumb = browser.driver.find_element("css selector", "[role=slider]")

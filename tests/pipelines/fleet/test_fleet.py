@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -52,7 +53,8 @@ class Script:
     """An engine that answers from a script: (scene, stage) -> the attempts' records."""
 
     def __init__(self, answers: dict) -> None:
-        self.answers, self.begun = answers, []
+        self.answers = answers
+        self.begun: list[tuple[str, str, int]] = []
 
     def submit(self, task, attempt):
         self.begun.append((task.scene, task.stage, attempt))
@@ -226,6 +228,15 @@ def _round_trip(url: str, tmp_path: Path) -> None:
 def test_without_ray_the_engine_says_what_to_install(scenes, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
     assert "gvtools[cluster]" in refused(capsys, "fleet", scenes, "--out", tmp_path / "out")
+
+
+def test_an_address_without_a_cluster_is_refused_at_once(scenes, tmp_path, capsys):
+    pytest.importorskip("ray", reason="ray is not installed")
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{closed.getsockname()[1]}"
+        error = refused(capsys, "fleet", scenes, "--out", tmp_path / "out", "--address", address)
+    assert "no Ray cluster" in error
 
 
 @pytest.mark.slow

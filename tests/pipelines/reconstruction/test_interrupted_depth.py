@@ -95,6 +95,7 @@ def stop_before(monkeypatch, index: int, error: BaseException) -> None:
     monkeypatch.setattr(PlaneSweepStereo, "depth", failing)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("again", [("--resume",), ()])
 def test_a_killed_run_goes_on_with_the_next_view(scan, whole, tmp_path, asked, again):
     out = tmp_path / "run"
@@ -144,6 +145,7 @@ def test_another_run_computes_its_own(scan, tmp_path, monkeypatch, asked, other)
     assert results(out) == results(alone)
 
 
+@pytest.mark.slow
 def test_changed_pictures_and_versions_compute_anew(scan, tmp_path, monkeypatch, asked):
     mine, out = write_scan(tmp_path / "scan", views=2 * VIEWS), tmp_path / "run"
 
@@ -185,6 +187,7 @@ def test_a_damaged_file_of_an_unfinished_round_is_computed_anew(
     assert results(out) == results(whole)
 
 
+@pytest.mark.slow
 def test_why_a_view_has_no_depth_outlasts_the_interrupt(scan, tmp_path, monkeypatch, capsys):
     out, straight = tmp_path / "run", tmp_path / "straight"
     with monkeypatch.context() as lacking:
@@ -201,6 +204,7 @@ def test_why_a_view_has_no_depth_outlasts_the_interrupt(scan, tmp_path, monkeypa
     assert first_report(out) == first_report(straight)
 
 
+@pytest.mark.slow
 def test_what_was_taken_over_is_said(scan, tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
     with monkeypatch.context() as patch:

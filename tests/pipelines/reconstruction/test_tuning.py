@@ -68,6 +68,7 @@ def test_a_run_completes_with_its_tuned_weights(run, scan, weights, tmp_path):
         assert not (out / "tuned").exists()
 
 
+@pytest.mark.slow
 def test_a_resumed_run_takes_the_weights_that_it_tuned(
     run, scan, weights, tmp_path, monkeypatch, capsys
 ):
