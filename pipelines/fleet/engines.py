@@ -98,6 +98,8 @@ class Ray:
     """
 
     def __init__(self, tasks: Sequence[Task], *, address: str, console: Console) -> None:
+        # Of a cluster that has ended, address auto may still be known: 3 tries, not 20, 40 s each.
+        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "3")
         try:
             import ray
         except ImportError:
@@ -139,7 +141,7 @@ class Ray:
             console.warn(f"{text}; it waits until one joins")
 
     def submit(self, task: Task, attempt: int) -> Any:
-        """Begin a task on a machine with its labels, or, where none is left, on any."""
+        """Begin a task on a machine with its labels, or, where none of those is free, on any."""
         options: dict[str, Any] = {
             "num_cpus": task.cpus,
             "num_gpus": task.gpus,
@@ -148,17 +150,10 @@ class Ray:
         }
         if task.memory_gb:
             options["memory"] = int(task.memory_gb * 1e9)
-        if task.labels and self._holders(task.labels):
+        if task.labels:
             options["label_selector"] = dict(task.labels)
-            # A machine that is lost while the task waits for it.
             options["fallback_strategy"] = [{"label_selector": {}}]
         return self._remote.options(**options).remote(asdict(task), attempt)
-
-    def _holders(self, labels: dict[str, str]) -> bool:
-        return any(
-            node["Alive"] and labels.items() <= (node.get("Labels") or {}).items()
-            for node in self._ray.nodes()
-        )
 
     def finished(self, handles: Sequence[Any]) -> list[tuple[Any, dict[str, Any]]]:
         """Those that ended, also by the loss of their worker or machine."""

@@ -59,7 +59,7 @@ class SceneEntry(Settings):
     name: str | None = None
     """Of the results' folder; the last part of the path where it is not given."""
     labels: dict[str, str] = Field(default_factory=dict)
-    """Labels of the Ray nodes that hold the data; others are taken where none is left."""
+    """Labels of the Ray nodes that hold the data; others are taken where none of those is free."""
 
 
 class FleetSpec(Settings):
