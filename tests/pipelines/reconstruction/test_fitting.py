@@ -20,7 +20,7 @@ from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.appearance.start import from_points
 from gvtools.depth.foundation.source import FoundationDepth
 from gvtools.depth.source import DepthMap
-from gvtools.errors import DegenerateError, MemoryFileError
+from gvtools.errors import DegenerateError, MemoryFileError, ProjectError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
@@ -117,7 +117,7 @@ def test_resuming_after_round_0_gives_the_same_bytes_without_a_second_fit(
 def test_a_damaged_fit_is_named_when_a_run_is_resumed(scan, tmp_path):
     out = run(scan, tmp_path / "run", "rounds=1")
     (out / FITTED).write_bytes((out / FITTED).read_bytes()[:-3000])
-    with pytest.raises(MemoryFileError, match=r"appearance\.npz"):
+    with pytest.raises(ProjectError, match=r"appearance\.npz: damaged"):
         run(scan, out, "rounds=1", resume=True)
 
 
