@@ -25,6 +25,7 @@ from pydantic import Field
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.settings import Settings
+from gvtools.untrusted import parse_yaml
 
 # Words in braces that a command may hold, beside the names of earlier stages.
 WORDS = ("project", "name", "out")
@@ -116,13 +117,11 @@ def read_list(path: Path) -> FleetSpec:
         ProjectError: it cannot be read.
         OptionError: a key or value is wrong.
     """
-    import yaml
-
     try:
-        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data: Any = parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ProjectError(f"{path}: cannot be read ({error.strerror})") from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
+    except ValueError as error:
         reason = " ".join(str(error).split())
         raise ProjectError(f"{path}: no YAML ({reason})") from None
     if not isinstance(data, dict) or not isinstance(data.get("scenes"), list):

@@ -90,6 +90,7 @@ def test_no_file_outside_the_run_is_read(small_run, tmp_path):
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(secret)
     path = copy / "round_001" / "report.json"
     report = json.loads(path.read_text())
+    (copy / "round_001" / "SHA256SUMS").unlink()
     # guidance_x/../../../guidance_secret.png is outside; so is what a link leads to.
     (copy / "round_001" / "guidance_x").mkdir()
     (copy / "round_001" / "guidance_link.png").symlink_to(secret)
