@@ -244,6 +244,8 @@ def test_a_local_ray_cluster_runs_a_list(scenes, tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="ray is not installed")
     root = str(Path(__file__).resolve().parents[3])
     monkeypatch.setenv("PYTHONPATH", root)
+    # Ray keeps a token there.
+    monkeypatch.setenv("HOME", str(tmp_path))
     scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
     out = tmp_path / "out"
     main(["fleet", str(scenes), "--out", str(out), "--address", "local"])
