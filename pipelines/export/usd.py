@@ -1,7 +1,7 @@
 """Points as USD: ``UsdGeom.Points`` with widths and display colours.
 
 Positions are float32 around the middle of the cloud; the parent's translation, in double, moves
-them to the input's world frame.
+them to the input's world frame. A scene unit is a metre, as glTF has it.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
     columns, rows = memory.columns, points.rows
     center = middle(points.positions)
     stage = Usd.Stage.CreateInMemory()
+    # Where a stage does not say, its unit is a centimetre: rooms would open far too small.
+    UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
     root = UsdGeom.Xform.Define(stage, ROOT)
     root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*center.tolist()))
     stage.SetDefaultPrim(root.GetPrim())

@@ -66,6 +66,7 @@ def test_pxr_reads_the_points(bare_run, tmp_path, suffix):
     export_run(bare_run.folder, "--format", "usd", "--out", out)
     assert sorted(tmp_path.iterdir()) == [out]
     stage = Usd.Stage.Open(str(out))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
     (cloud,) = (UsdGeom.Points(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Points))
     world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(cloud.GetPrim()))
     local = np.array(cloud.GetPointsAttr().Get(), np.float64)
