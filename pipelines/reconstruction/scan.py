@@ -56,11 +56,21 @@ class PlacedScan:
     placement: Placement
 
     def fuse_into(self, memory: SpatialMemory) -> tuple[FuseReport, dict[str, Any]]:
-        """Fuse it into round 0; returns what became of it, and its entry in the round's report."""
+        """Fuse it into round 0; returns what became of it, and its entry in the round's report.
+
+        Raises:
+            DegenerateError: all of it lies farther away than the memory's voxels reach.
+        """
         from gvtools.scans.fuse import fuse_scan
 
         report = fuse_scan(memory, self.scan, self.placement)
         scan = self.scan
+        if report.points and report.out_of_reach == report.points:
+            raise DegenerateError(
+                f"{scan.name}: all of its {report.points:,} points lie beyond the "
+                f"{memory.reach:.3g} scene units that voxels of {memory.voxel:g} reach from the "
+                "cameras; expected a scan around them; correct its placement (--cloud-placement)"
+            )
         return report, {
             "file": scan.name,
             "points": scan.count,

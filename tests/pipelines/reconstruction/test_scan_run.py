@@ -104,6 +104,10 @@ def test_viewers_tell_the_three_sources(runs):
         (["--cloud", "{root}/none.laz"], "no such file"),
         (["--cloud", "{root}/scan.laz", "--cloud-placement", "1,2"], "2 numbers"),
         (["--cloud-placement", "identity"], "without a scan"),
+        (
+            ["--cloud", "{root}/scan.laz", "--cloud-placement", "1,0,0,1e9,0,1,0,0,0,0,1,0"],
+            "points lie beyond",
+        ),
     ],
 )
 def test_what_cannot_be_placed_is_refused_in_one_line(runs, tmp_path, capsys, options, said):
