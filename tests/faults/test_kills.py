@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections import Counter
@@ -19,7 +20,7 @@ def killed(folder: Path, *words: str) -> list[dict]:
     program = ROOT / "tests" / "fixtures" / "kill_runs.py"
     done = subprocess.run(
         [sys.executable, str(program), str(folder), "--log", str(log), *words],
-        cwd=ROOT, env={**__import__("os").environ, "PYTHONPATH": str(ROOT)},
+        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     cases = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
