@@ -86,6 +86,38 @@ def test_workers_end_with_a_process_that_is_killed(tmp_path):
     assert not any(_runs(worker) for worker in workers)
 
 
+_DEATH = """
+import multiprocessing, os, signal
+from gvtools.errors import ProjectError
+from gvtools.training.context_choice import ContextChoice
+from gvtools.training.dataset import ProceduralViews
+from gvtools.training.loader import batches
+
+if __name__ == "__main__":
+    data = ProceduralViews(views=3, size=(24, 24), context=ContextChoice(most=2, group=4))
+    made = batches(data, (range(2 * i, 2 * i + 2) for i in range(10_000)), workers=1)
+    next(made)
+    os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
+    try:
+        for batch in made:
+            pass
+    except ProjectError as error:
+        print(error)
+"""
+
+
+def test_a_worker_that_dies_is_one_line(tmp_path):
+    (tmp_path / "parent.py").write_text(_DEATH)
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "parent.py")],
+        env={**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"},
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    (line,) = done.stdout.splitlines()
+    assert "a process that makes samples has died" in line and "--resume" in line
+
+
 def _runs(process: int) -> bool:
     try:
         os.kill(process, 0)
