@@ -140,6 +140,7 @@ def _filled(
     view, box = np.empty(n, np.int32), np.empty((n, 7), np.float32)
     for i, (node, name, checksum, size, count, voxels, agreed) in enumerate(meta["tiles"]):
         path = folder / Path(name).name
+        tiles.write_after(path.name)
         file = ArrayFile(path)
         if file.checksum != checksum:
             raise MemoryFileError(

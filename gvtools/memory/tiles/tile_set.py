@@ -182,6 +182,11 @@ class TileSet:
         if owned and old is not None:
             old.unlink(missing_ok=True)
 
+    def write_after(self, name: str) -> None:
+        """Give later states of tiles other names than that of a file which is there already."""
+        with suppress(IndexError, ValueError):
+            self._writes = max(self._writes, int(name.split(".")[1]))
+
     def drop(self, number: int) -> None:
         """A tile is no more."""
         tile = self[number]

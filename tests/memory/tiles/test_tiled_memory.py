@@ -248,6 +248,16 @@ def test_what_was_saved_is_read_back(tiled, expected, tmp_path):
     assert {path.name for path in folder.iterdir()} == {*names, "memory.index"}
 
 
+def test_a_memory_that_is_read_back_again_and_again_loses_no_tile(expected, tmp_path):
+    """As in a run that is killed and goes on, again and again: names of files stay distinct."""
+    memory, _ = in_tiles(tmp_path / "scratch", ())
+    for i in range(VIEWS):
+        fuse_views(memory, [i])
+        saved = memory.save(tmp_path / "memory.npz")
+        memory = TiledMemory.load(saved, budget=BUDGET, scratch=tmp_path / f"scratch_{i}")
+    assert_same(memory, expected[0], order=False)
+
+
 def test_a_file_of_a_memory_in_ram_is_read_into_tiles(expected, tmp_path):
     path = expected[0].save(tmp_path / "memory.npz")
     assert_same(TiledMemory.load(path, budget=BUDGET), expected[0])
