@@ -154,7 +154,7 @@ class RunDirectory:
         ]
 
     def _drop_partial(self, *, but: Path | None) -> None:
-        for partial in self.path.glob(PARTIAL):
+        for partial in (*self.path.glob(PARTIAL), *self.path.glob(f"round_*/{PARTIAL}")):
             if partial == but:
                 continue
             if partial.is_dir():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import time
 from pathlib import Path
 
@@ -56,6 +57,16 @@ def test_a_second_capture_leaves_the_first_ones_work_alone(tmp_path):
         assert (work / "mine").read_text() == "half-done"
     assert [path.name for path in tmp_path.iterdir()] == ["project"]
     assert (out / "mine").exists()
+
+
+def test_what_a_kill_left_in_a_round_is_cleared(scan, run, tmp_path):
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    left = copy / "round_000" / ".memory.tiles.part"
+    left.mkdir()
+    (left / "00001.000001.tile").write_bytes(b"of no use")
+    assert main(["reconstruct", str(scan), "--out", str(copy), *RUN, "--resume"]) == 0
+    assert not left.exists()
+    assert results(copy) == results(run)
 
 
 def test_what_a_killed_capture_left_is_cleared(tmp_path):
