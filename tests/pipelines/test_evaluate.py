@@ -259,6 +259,7 @@ def test_files_outside_the_run_are_refused(small_run, tmp_path, capsys, stem):
     own = report.parent / f"generated_{content['views'][0]['stem']}.png"
     # generated_x/../../../secret.png is outside; so is what a link leads to.
     secret = own.rename(tmp_path / "secret.png")
+    (report.parent / "SHA256SUMS").unlink()
     (report.parent / "generated_x").mkdir()
     (report.parent / "generated_link.png").symlink_to(secret)
     content["views"][0]["stem"] = stem

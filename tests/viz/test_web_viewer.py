@@ -79,13 +79,13 @@ def test_the_slider_shows_the_memory_growing(browser, viewer):
 @pytest.mark.slow
 def test_colours_tell_generated_from_observed(browser, viewer):
     plain = steady(browser)
-    choose(browser, "colour", "observed / generated")
+    choose(browser, "colour", "observed / scanned / generated")
     wait(lambda: "where a point comes from" in browser.text())
     tinted = steady(browser, plain).astype(int)
     red, green, blue = np.moveaxis(tinted, -1, 0)
     assert ((red > blue + 60) & (green > blue + 30)).sum() > 200, "nothing orange"
     assert ((blue > red + 60) & (blue > green)).sum() > 200, "nothing blue"
-    choose(browser, "observed / generated", "view count")
+    choose(browser, "observed / scanned / generated", "view count")
     wait(lambda: "views with observations in the point's voxel" in browser.text())
     assert (steady(browser, tinted) != tinted).any()
     choose(browser, "view count", "colour")
