@@ -27,7 +27,7 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
 from gvtools.appearance.start import from_depth, from_points, pixels_with_depth
-from gvtools.depth.choice import is_estimated
+from gvtools.depth.choice import is_estimated, rough_source
 from gvtools.depth.fitted_depth import FittedDepth
 from gvtools.depth.source import MixedDepth, RecordedDepth, is_recorded
 from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError, ShapeError
@@ -42,6 +42,7 @@ from pipelines.reconstruction.prefetch import prefetch
 from pipelines.reconstruction.voxel_edge import grid_frame
 
 if TYPE_CHECKING:
+    from gvtools.depth.source import DepthSource
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.memory.store.local_frame import LocalFrame
     from gvtools.scenes.scene import Scene
@@ -378,13 +379,16 @@ def _swept(plan: Plan, views: Sequence[FitView]) -> list[FitView]:
     """Some views, with the depth of a plane sweep; without those that no other view overlaps."""
     from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 
-    some = evenly_spread(list(zip(plan.context, views, strict=True)), SWEPT_VIEWS)
-    if len(some) < 2:
+    if len(plan.context) < 2:
         return []
-    names = tuple(name for name, _ in some)
-    source = PlaneSweepStereo(plan.scene, options=plan.config.stereo, views=names)
+    source: DepthSource = PlaneSweepStereo(
+        plan.scene, options=plan.config.stereo, views=plan.context
+    )
+    if len(views) > SWEPT_VIEWS:
+        # Each needs the depth of its neighbours, too.
+        source = rough_source(plan.scene, source)
     swept = []
-    for name, view in some:
+    for name, view in evenly_spread(list(zip(plan.context, views, strict=True)), SWEPT_VIEWS):
         frame = Frame(view.rgb, None, view.mask)
         with suppress(DegenerateError):
             depth = source.depth(plan.scene, plan.scene[name], frame).depth

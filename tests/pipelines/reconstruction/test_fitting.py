@@ -18,8 +18,10 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture
 from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.appearance.start import from_points
+from gvtools.depth.choice import rough_source
 from gvtools.depth.foundation.source import FoundationDepth
-from gvtools.depth.source import DepthMap
+from gvtools.depth.source import DepthMap, DepthSource
+from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import DegenerateError, MemoryFileError, ProjectError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -29,10 +31,11 @@ from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.console import Console
 from pipelines.reconstruction import fitting
-from pipelines.reconstruction.fitting import Fitted, fit_appearance
+from pipelines.reconstruction.fitting import Fitted, _swept, _views, fit_appearance
 from pipelines.reconstruction.plan import Plan, make_plan
 from pipelines.reconstruction.run import _empty_memory, reconstruct
 from pipelines.reconstruction.settings import RunSettings
+from pipelines.reconstruction.voxel_edge import grid_frame
 
 SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "depth=auto",
             "fusion.max_psnr_drop_db=none", "refine.most_gaussians=2000")  # fmt: skip
@@ -209,6 +212,28 @@ def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeyp
     assert len(known) == 2
     error = np.abs(few[150:, 2, None] - known).min(axis=1)
     assert np.median(error) < 0.05
+
+
+def test_some_of_many_views_are_swept_beside_all_others(tmp_path, monkeypatch):
+    scan = write_colmap_scan(tmp_path / "scan", views=10, points=15)
+    plan = planned(scan)
+    made: list[DepthSource] = []
+
+    def rough(scene, source):
+        made.append(rough_source(scene, source))
+        return made[-1]
+
+    monkeypatch.setattr(fitting, "SWEPT_VIEWS", 3)
+    monkeypatch.setattr(fitting, "rough_source", rough)
+    views = _views(plan, grid_frame(plan.scene, plan.context), Console(quiet=True))
+    swept = _swept(plan, views)
+    assert len(swept) == 3
+    for view in swept:
+        assert view.depth is not None
+        assert np.count_nonzero(view.depth) > 0.3 * view.depth.size
+    (source,) = made
+    assert isinstance(source, PlaneSweepStereo)
+    assert source.views == plan.context
 
 
 def test_nothing_is_fitted_to_views_that_tell_no_depth(tmp_path, monkeypatch):
