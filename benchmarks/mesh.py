@@ -44,7 +44,7 @@ SHOWN = 0.06
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class HeldOutView:
     """A held-out view: rgb (H, W, 3) uint8, depth (H, W), K (3, 3), cam_from_world (4, 4)."""
 
     name: str
@@ -67,7 +67,7 @@ class Surface:
             o3d.core.Tensor(self.mesh.faces.astype(np.uint32)),
         )
 
-    def cast(self, view: Held, pose: NDArray[np.float64] | None = None) -> dict[str, Any]:
+    def cast(self, view: HeldOutView, pose: NDArray[np.float64] | None = None) -> dict[str, Any]:
         """What Open3D's rays through a view's pixels meet."""
         pose = (view.pose if pose is None else pose).copy()
         pose[:3, 3] += pose[:3, :3] @ self.middle
@@ -102,7 +102,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write pictures of the misses")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    views = held_out(args.run)
+    views = held_out_views(args.run)
     if args.depth_from is not None:
         other = Surface(args.depth_from)
         views = [_with_depth(view, other) for view in views]
@@ -122,7 +122,7 @@ def main() -> None:
         write_json(args.json, figures)
 
 
-def held_out(folder: Path) -> list[Held]:
+def held_out_views(folder: Path) -> list[HeldOutView]:
     """The run's targets with their recorded pictures and depth, at the poses the run has."""
     run = load_run(folder)
     truths = run.scenes[1]
@@ -135,12 +135,14 @@ def held_out(folder: Path) -> list[Held]:
         if frame.depth is None:
             raise ProjectError(f"{name}: no depth; expected an RGB-D project")
         camera = view.camera
-        views.append(Held(name, frame.rgb, frame.depth, camera.K[0], camera.cam_from_world[0]))
+        views.append(
+            HeldOutView(name, frame.rgb, frame.depth, camera.K[0], camera.cam_from_world[0])
+        )
     return views
 
 
 def measured(
-    surface: Surface, views: list[Held], *, within: float, pictures: Path | None = None
+    surface: Surface, views: list[HeldOutView], *, within: float, pictures: Path | None = None
 ) -> dict[str, float]:
     """Percentages of pixels with depth, and PSNR [dB]."""
     errors, depths, edges, levels = [], [], [], []
@@ -193,12 +195,14 @@ def _edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(far - near > SPREAD * depth + LEAST)
 
 
-def _with_depth(view: Held, surface: Surface) -> Held:
+def _with_depth(view: HeldOutView, surface: Surface) -> HeldOutView:
     depth = surface.cast(view)["t_hit"]
-    return Held(view.name, view.rgb, np.where(np.isfinite(depth), depth, 0), view.K, view.pose)
+    return HeldOutView(
+        view.name, view.rgb, np.where(np.isfinite(depth), depth, 0), view.K, view.pose
+    )
 
 
-def _moved(surface: Surface, view: Held) -> Held:
+def _moved(surface: Surface, view: HeldOutView) -> HeldOutView:
     """The view at the pose at which its depth fits the mesh best, point to plane."""
     line, column = np.mgrid[: view.depth.shape[0], : view.depth.shape[1]] + 0.5
     rays = np.stack([column, line, np.ones_like(line)], axis=-1) @ np.linalg.inv(view.K).T
@@ -226,10 +230,10 @@ def _moved(surface: Surface, view: Held) -> Held:
         move[:3, :3], move[:3, 3] = cv2.Rodrigues(step[:3])[0], step[3:]
         # The camera's points move to the mesh: cam_from_world takes the inverse.
         pose = np.linalg.inv(move) @ pose
-    return Held(view.name, view.rgb, view.depth, view.K, pose)
+    return HeldOutView(view.name, view.rgb, view.depth, view.K, pose)
 
 
-def _draw(path: Path, view: Held, error: NDArray[np.floating]) -> None:
+def _draw(path: Path, view: HeldOutView, error: NDArray[np.floating]) -> None:
     """The photograph beside the error: red in front, blue behind, grey without depth or hit."""
     share = np.clip(np.nan_to_num(error) / SHOWN, -1, 1)[..., None]
     color = np.where(share < 0, [255, 0, 0], [0, 0, 255]) * np.abs(share) + 255 * (1 - abs(share))

@@ -165,7 +165,7 @@ def _nodes(value: Any, known: dict[int, int]) -> int:
     return known[id(value)]
 
 
-def named_file(folder: Path, name: str | Path, *, where: str, links: bool = False) -> Path:
+def named_file(folder: Path, name: str | Path, *, where: str, follow_links: bool = False) -> Path:
     """The path of a file that another file names, which has to lie in a folder.
 
     The folder itself may be reached over links; from there on, neither "..", an absolute path nor
@@ -175,15 +175,15 @@ def named_file(folder: Path, name: str | Path, *, where: str, links: bool = Fals
         folder: that the name is relative to, and may not leave.
         name: as the file has it.
         where: the file and the place in it, for the message.
-        links: whether links that lead out are followed, as those of a download that is kept
-            elsewhere; the name itself still may not.
+        follow_links: whether links to places outside are followed, as those of a download that is
+            kept elsewhere; the name itself still may not.
 
     Raises:
         ProjectError: the name leads out of the folder, or is none that a file can have.
     """
     try:
         path = folder / name
-        resolved = os.path.abspath if links else os.path.realpath
+        resolved = os.path.abspath if follow_links else os.path.realpath
         home, real = resolved(folder), resolved(path)
         if "\0" in real:
             raise ValueError("a null in its name")

@@ -144,9 +144,9 @@ def test_a_name_that_stays_inside_passes(tmp_path):
             assert named_file(folder, name, where="") == folder / name
     # A download may lie elsewhere and be linked.
     (home / "linked.bin").symlink_to(tmp_path / "elsewhere.bin")
-    assert named_file(home, "linked.bin", where="", links=True) == home / "linked.bin"
+    assert named_file(home, "linked.bin", where="", follow_links=True) == home / "linked.bin"
     with pytest.raises(ProjectError):
-        named_file(home, "../linked.bin", where="", links=True)
+        named_file(home, "../linked.bin", where="", follow_links=True)
 
 
 def test_json_and_yaml_bombs_are_refused(tmp_path):

@@ -14,13 +14,16 @@ import torch
 from box_project import write_box
 from command_line import refused
 from export_runs import export_run, saved_run
+from PIL import Image
 from reference_gaussians import rotations
 
-from gvtools.errors import MemoryFileError
+from gvtools.errors import MemoryFileError, OptionError
 from gvtools.memory.thinning import thinned
 from pipelines.cli import main
 from pipelines.export import splat, spz
 from pipelines.viewing.source import ViewSource
+from viz.run_view.from_outside import camera_outside
+from viz.run_view.screenshot import chosen_camera
 from viz.run_view.view import MESH, POINTS, RENDERED, SPLATS, TARGET
 
 
@@ -223,3 +226,24 @@ def test_names_of_files_say_nothing_to_the_file_system(exported):
     assert (
         os.path.basename(ViewSource(exported("a b'<i>.ply", "splat")).read().title) == "a b'<i>.ply"
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "form"), [("look.ply", "splat"), ("look.glb", "mesh"), ("look.las", "las")]
+)
+def test_a_picture_of_a_file_shows_it_whole_from_outside(exported, tmp_path, name, form):
+    if form == "las":
+        pytest.importorskip("laspy", reason="laspy is not installed")
+    file, shot = exported(name, form), tmp_path / "shot.png"
+    assert main(["view", str(file), "--screenshot", str(shot), "--quiet"]) == 0
+    picture = np.array(Image.open(shot))
+    painted = picture.min(axis=2) < 250
+    assert painted.mean() > 0.02
+    # Nothing is cut off.
+    assert not painted[[0, -1]].any()
+    assert not painted[:, [0, -1]].any()
+    run, up = ViewSource(file).read(), ViewSource(file).read().up()
+    camera = camera_outside(run)
+    assert camera.cam_from_world[0, 1, :3] @ up < 0, "up is upwards in the picture"
+    with pytest.raises(OptionError, match="holds no cameras"):
+        chosen_camera(run, "a.png")

@@ -26,7 +26,8 @@ from viz.run_view.view import TARGET
 
 pytest.importorskip("viser", reason="viser is not installed (extra web)")
 
-from viz.web.frame import FIELD_OF_VIEW, PageFrame, home
+from viz.run_view.from_outside import FIELD_OF_VIEW
+from viz.web.frame import PageFrame, home
 from viz.web.pictures import GAP, ROW_WIDTH
 from viz.web.rendered import LONGEST
 from viz.web.viewer import WebViewer

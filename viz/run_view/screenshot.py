@@ -6,6 +6,7 @@ from pathlib import Path
 
 from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written
+from viz.run_view.from_outside import camera_outside
 from viz.run_view.render import RunRenderer, picture_of
 from viz.run_view.view import CONTEXT, RunView, ShownCamera
 
@@ -33,19 +34,21 @@ def write_screenshot(
 
 
 def chosen_camera(run: RunView, name: str | None) -> ShownCamera:
-    """The camera of a view, or the first of the context.
+    """The camera of a view, or the first of the context; outside of a cloud without cameras.
 
     Raises:
-        OptionError: no such view, or no cameras at all.
+        OptionError: no such view.
     """
-    if not run.cameras:
-        raise OptionError(f"{run.path}: holds no cameras to look from; expected a run's memory")
+    if not run.cameras and name is None:
+        return ShownCamera("outside", CONTEXT, 0, camera_outside(run))
     if name is None:
         return next((c for c in run.cameras if c.kind == CONTEXT), run.cameras[0])
     for shown in run.cameras:
         if shown.name == name:
             return shown
     names = [shown.name for shown in run.cameras]
+    if not names:
+        raise OptionError(f"--camera {name!r}: {run.path} holds no cameras; leave the option out")
     raise OptionError(
         f"--camera {name!r}: no such view; expected one of {len(names)}, such as {names[0]!r} or "
         f"{names[-1]!r}"

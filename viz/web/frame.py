@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.memory.store.local_frame import LocalFrame
+from viz.run_view.from_outside import position_outside
 
 if TYPE_CHECKING:
     import viser
@@ -23,11 +24,6 @@ if TYPE_CHECKING:
 
 # What the typical depth of a run is on the page, in its units: as that of a room in metres.
 TYPICAL = 3.0
-# The page's own vertical field of view to begin with, radians.
-FIELD_OF_VIEW = np.radians(75.0)
-# Of the look at a cloud that nobody is known to have seen: how far above the horizon, radians, and
-# how much room there is around it.
-ABOVE, ROOM = np.radians(30.0), 1.1
 
 Float64 = NDArray[np.float64]
 
@@ -90,24 +86,13 @@ def home(run: RunView, frame: PageFrame) -> tuple[Float64, Float64]:
 
     Behind the first camera; where there is none, in front of the whole cloud and above it.
     """
-    up = run.up()
     if run.cameras:
         pose = run.cameras[0].camera.world_from_cam[0]
         depth = run.typical_depth
-        back = -0.5 * depth * pose[:3, 2] + 0.25 * depth * up
+        back = -0.5 * depth * pose[:3, 2] + 0.25 * depth * run.up()
         return (
             frame.position(pose[:3, 3] + back),
             frame.position(pose[:3, 3] + depth * pose[:3, 2]),
         )
-    low, high = run.bounds
-    middle = (low + high) / 2
-    radius = float(np.linalg.norm(high - low)) / 2 or run.typical_depth
-    # Level and along the axis in which the cloud reaches least, so that its broad side is in view.
-    reach = high - low
-    reach[np.argmax(np.abs(up))] = np.inf
-    ahead = np.eye(3)[np.argmin(reach)]
-    ahead = ahead - (ahead @ up) * up
-    ahead /= np.linalg.norm(ahead)
-    away = ROOM * radius / np.sin(FIELD_OF_VIEW / 2)
-    position = middle + away * (np.sin(ABOVE) * up - np.cos(ABOVE) * ahead)
+    position, middle = position_outside(run)
     return frame.position(position), frame.position(middle)

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from gvtools.errors import GvError
 from viz.run_view.detail import detail
+from viz.run_view.from_outside import FIELD_OF_VIEW
 from viz.run_view.point_colors import MODES, Legend
 from viz.run_view.view import MESH, POINTS, RENDERED, SPLATS, RunView, ShownCamera
 from viz.web.camera_path import CameraPath
 from viz.web.cameras import CameraNodes, fly_to
-from viz.web.frame import FIELD_OF_VIEW, PageFrame, home
+from viz.web.frame import PageFrame, home
 from viz.web.gaussians import GaussianNodes, add_surface
 from viz.web.panel import Panel
 from viz.web.pictures import shown_pictures

@@ -199,7 +199,9 @@ def posed_scene(
         for path in (picture.image, picture.depth, picture.mask):
             # A download may be kept elsewhere and linked; a name out of a file may not lead there.
             if path is not None:
-                named_file(home or root, path, where=f"{root}, frame {picture.name}", links=True)
+                named_file(
+                    home or root, path, where=f"{root}, frame {picture.name}", follow_links=True
+                )
     lenses: dict[LensParameters, Undistortion] = {}
     photographs = []
     for picture in sorted(pictures, key=lambda item: natural_key(item.name)):
