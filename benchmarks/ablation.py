@@ -16,8 +16,12 @@ import sys
 from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
+
+if TYPE_CHECKING:
+    from pipelines.reconstruction.fitting import Fitted
+    from pipelines.reconstruction.plan import Plan
 
 # Project below SHARED/data, context, targets, steps. With seven photographs a fit converges after
 # 560 steps, so that three are made; the others have one fit.
@@ -27,33 +31,52 @@ SCENES = {
     "kitchen": ("sevenscenes_reg", "every:2", "every:2+1", 300),
 }
 # Parts that a scene has no use for are not taken away there.
-FEW_VIEWS, DEPTH = ("several fits", "dropout of Gaussians", "fading of opacities"), (
-    "pose refinement", "depth in the loss", "check of depth by other views",
-)  # fmt: skip
+FEW_VIEWS = ("several fits", "dropout of Gaussians", "fading of opacities")
+PHOTOGRAPHS = ("swept depth to begin with", "depth of the Gaussians (a plane sweep instead)")
+DEPTH = ("pose refinement", "depth in the loss", "check of depth by other views")
 UNUSED = {
     "fox": (*FEW_VIEWS, *DEPTH),
     "fox, 7 views": DEPTH,
-    "kitchen": (*FEW_VIEWS, "smoothness of surfaces"),
+    "kitchen": (*FEW_VIEWS, *PHOTOGRAPHS, "smoothness of surfaces"),
 }
-# What is taken away: settings, and constants by module and name.
+
+
+def _with_swept_depth(fitted: Fitted, plan: Plan) -> Plan:
+    """The plan with a fit's poses alone, so that photographs keep the plane sweep's depth."""
+    from pipelines.reconstruction.poses import applied
+
+    return plan if fitted.poses is None else applied(fitted.poses, plan)
+
+
+def _as_completed(projected: Any, guidance: Any, rgb: Any) -> Any:
+    """The completer's pictures as they are."""
+    return rgb
+
+
+# What is taken away: settings, and constants and functions by module and name.
 PARTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "nothing (all parts)": ({}, {}),
     "fitting": ({"refine.steps": 0}, {}),
-    "several fits": ({}, {"appearance.fits.MOST_FITS": 1}),
+    "several fits": ({}, {"gvtools.appearance.fits.MOST_FITS": 1}),
     "exposures": ({"refine.exposure": False}, {}),
-    "exposures of new cameras": ({}, {"appearance.exposures.Exposures.shrinkage": 0.0}),
-    "smoothness of surfaces": ({}, {"appearance.fit.SMOOTH": 0.0}),
-    "dropout of Gaussians": ({}, {"appearance.fit.LEFT_OUT": 0.0}),
-    "fading of opacities": ({}, {"appearance.fit.FADING": 0.0}),
+    "exposures of new cameras": ({}, {"gvtools.appearance.exposures.Exposures.shrinkage": 0.0}),
+    "smoothness of surfaces": ({}, {"gvtools.appearance.fit.SMOOTH": 0.0}),
+    "dropout of Gaussians": ({}, {"gvtools.appearance.fit.LEFT_OUT": 0.0}),
+    "fading of opacities": ({}, {"gvtools.appearance.fit.FADING": 0.0}),
+    "swept depth to begin with": ({}, {"pipelines.reconstruction.fitting.ENOUGH_POINTS": 0}),
+    "depth of the Gaussians (a plane sweep instead)": (
+        {},
+        {"pipelines.reconstruction.fitting.Fitted.applied": _with_swept_depth},
+    ),
     "pose refinement": ({"refine.poses": False}, {}),
     "depth in the loss": ({"refine.depth": 0.0}, {}),
     # More views than are asked.
-    "check of depth by other views": ({}, {"depth.view_check.LEAST": 255}),
+    "check of depth by other views": ({}, {"gvtools.depth.view_check.LEAST": 255}),
     # The default, 0, keeps all.
     "completions of little confidence": ({"fusion.min_confidence": 0.35}, {}),
     "Gaussians' colours in holes": (
         {},
-        {"appearance.projection_cache.CachedProjection.colored": lambda self, guidance, rgb: rgb},
+        {"gvtools.appearance.projection_cache.CachedProjection.colored": _as_completed},
     ),
 }
 
@@ -91,7 +114,7 @@ def _measured(scene: str, part: str, shared: Path, out: Path) -> dict[str, Any]:
     shutil.rmtree(run, ignore_errors=True)
     with ExitStack() as changes:
         for path, value in constants.items():
-            holder, name = f"gvtools.{path}".rsplit(".", 1)
+            holder, name = path.rsplit(".", 1)
             changes.enter_context(patch.object(_named(holder), name, value))
         reconstruct(
             shared / "data" / project, run, context=context, targets=targets,
