@@ -30,8 +30,9 @@ from gvtools.runs.poses import RunPoses
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.console import Console
-from pipelines.reconstruction import fitting
-from pipelines.reconstruction.fitting import Fitted, _swept, _views, fit_appearance
+from pipelines.reconstruction import fit_inputs, fitting
+from pipelines.reconstruction.fit_inputs import _swept, first_gaussians, fit_views
+from pipelines.reconstruction.fitting import Fitted, fit_appearance
 from pipelines.reconstruction.plan import Plan, make_plan
 from pipelines.reconstruction.run import _empty_memory, reconstruct
 from pipelines.reconstruction.settings import RunSettings
@@ -130,7 +131,7 @@ def test_a_run_that_nothing_can_be_fitted_to_goes_on_without_and_resumes(
     def nowhere(*args, **kwargs):
         raise DegenerateError("no surface is known")
 
-    monkeypatch.setattr(fitting, "from_depth", nowhere)
+    monkeypatch.setattr(fit_inputs, "from_depth", nowhere)
     out = run(scan, tmp_path / "run")
     assert "no Gaussians are fitted: no surface is known" in capsys.readouterr().err
     assert not (out / FITTED).exists()
@@ -190,6 +191,15 @@ def test_photographs_alone_get_depth_by_the_gaussians(tmp_path, points):
     assert 1.5 < np.median(shown[shown > 0]) < 3.5
 
 
+@pytest.mark.parametrize(("steps", "told"), [(20, True), (80, False)])
+def test_a_fit_too_short_for_its_photographs_is_told(tmp_path, capsys, steps, told):
+    scan = write_colmap_scan(tmp_path / "scan", views=10, points=300)
+    plan = planned(scan, f"refine.steps={steps}")
+    fit_appearance(plan, Console())
+    usual = 15 * len(plan.context)
+    assert (f"expected about {usual}" in capsys.readouterr().err) == told
+
+
 def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeypatch):
     begun = []
 
@@ -197,11 +207,11 @@ def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeyp
         begun.append(positions)
         return from_points(positions, colors, **kwargs)
 
-    monkeypatch.setattr(fitting, "from_points", watched)
+    monkeypatch.setattr(fit_inputs, "from_points", watched)
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=15)
     plan = planned(scan, "refine.steps=1", "refine.most_gaussians=20000")
     fit_appearance(plan, Console(quiet=True))
-    monkeypatch.setattr(fitting, "ENOUGH_POINTS", 150)
+    monkeypatch.setattr(fit_inputs, "ENOUGH_POINTS", 150)
     fit_appearance(plan, Console(quiet=True))
     few, enough = begun
     assert len(enough) == 150
@@ -223,9 +233,9 @@ def test_some_of_many_views_are_swept_beside_all_others(tmp_path, monkeypatch):
         made.append(rough_source(scene, source))
         return made[-1]
 
-    monkeypatch.setattr(fitting, "SWEPT_VIEWS", 3)
-    monkeypatch.setattr(fitting, "rough_source", rough)
-    views = _views(plan, grid_frame(plan.scene, plan.context), Console(quiet=True))
+    monkeypatch.setattr(fit_inputs, "SWEPT_VIEWS", 3)
+    monkeypatch.setattr(fit_inputs, "rough_source", rough)
+    views = fit_views(plan, grid_frame(plan.scene, plan.context), Console(quiet=True))
     swept = _swept(plan, views)
     assert len(swept) == 3
     for view in swept:
@@ -238,7 +248,7 @@ def test_some_of_many_views_are_swept_beside_all_others(tmp_path, monkeypatch):
 
 def test_nothing_is_fitted_to_views_that_tell_no_depth(tmp_path, monkeypatch):
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=6)
-    monkeypatch.setattr(fitting, "_swept", lambda plan, views: [])
+    monkeypatch.setattr(fit_inputs, "_swept", lambda plan, views: [])
     console = Console(quiet=True)
     assert fit_appearance(planned(scan, "refine.steps=1"), console) is None
 
@@ -362,13 +372,13 @@ def test_a_networks_depth_guides_the_fit_and_its_failures_do_not_stop_it(
 
     monkeypatch.setattr(FoundationDepth, "depth", depth)
     frame = fitting.grid_frame(plan.scene, plan.context)
-    first, second, *_ = fitting._views(plan, frame, Console())
+    first, second, *_ = fit_views(plan, frame, Console())
     assert first.depth is None and first.estimate is not None and (first.estimate == 3).all()
     assert second.estimate is None
     assert "is fitted without an estimate of its depth: no scale" in capsys.readouterr().err
-    plain = fitting._views(planned(scan), frame, Console(quiet=True))
+    plain = fit_views(planned(scan), frame, Console(quiet=True))
     assert all(view.depth is None and view.estimate is None for view in plain)
     # Without sparse points the fit begins there, too.
     scene = replace(plan.scene, points=None)
-    start = fitting._start(replace(plan, scene=scene), [first, second], frame)
+    start = first_gaussians(replace(plan, scene=scene), [first, second], frame)
     assert len(start) > 50
