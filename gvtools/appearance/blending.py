@@ -1,7 +1,7 @@
-"""Colours from Gaussians and memory together: each is wrong where the other need not be.
+"""Colours of pixels that both the Gaussians and the memory know, blended.
 
-Gaussians are smooth and rarely far off; the memory is sharp, and far off where depth was wrong. Its
-detail is added where both agree once blurred.
+Gaussians are smooth, with small errors; the memory is sharp, with large errors where its depth is
+wrong. The memory's detail is added to the Gaussians' colours where both agree after a blur.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Float32 = NDArray[np.float32]
 
 # Standard deviation of the blur [px].
 BLUR = 3.0
-# What is tried for the share and the tolerance.
+# Values of Blend.share and Blend.tolerance that ``best_blend`` compares.
 SHARES, TOLERANCES = (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0), (0.05, 0.1, 0.2, 0.4, 1.0, 4.0)
 
 
@@ -27,8 +27,9 @@ class Blend:
     """How much of the memory's colours is taken.
 
     Attributes:
-        share: where both agree, 0 to 1.
-        tolerance: difference after blurring, of colours 0 to 1, at which it is down to 37 %.
+        share: weight of the memory's colours where both agree after the blur, 0 to 1.
+        tolerance: difference of the blurred colours (0 to 1) at which the weight has fallen to
+            37 % (1/e) of that.
     """
 
     share: float = 0.5
@@ -36,13 +37,13 @@ class Blend:
 
 
 def blended(shown: Float32, memory: Float32, where: NDArray[np.bool_], *, blend: Blend) -> Float32:
-    """(H, W, 3) colours of both in the pixels ``where``, the memory's elsewhere.
+    """(H, W, 3) blended colours in the pixels ``where``, the memory's elsewhere.
 
     Args:
         shown: (H, W, 3) colours of the Gaussians, 0 to 1.
         memory: (H, W, 3) colours of the memory, 0 to 1.
         where: (H, W) pixels that both know.
-        blend: how.
+        blend: share and tolerance.
 
     >>> shown, everywhere = np.full((9, 9, 3), 0.5, np.float32), np.ones((9, 9), bool)
     >>> alike, unlike = shown + np.float32(0.02), shown + np.float32(0.4)
@@ -62,11 +63,11 @@ def best_blend(
     *,
     least_tolerance: float = 0.0,
 ) -> Blend:
-    """The blend that comes nearest to photographs, by mean PSNR; the default if none tells.
+    """The blend with the highest mean PSNR on photographs; the default without any sample.
 
     Args:
-        samples: of each photograph the colours of the Gaussians and of the memory, neither of which
-            has seen it, the pixels that both know, and the photograph, 0 to 1.
+        samples: for each photograph (H, W, 3) colours of the Gaussians and of the memory, both made
+            without it, (H, W) the pixels that both know, and (H, W, 3) the photograph; 0 to 1.
         least_tolerance: smaller tolerances are not tried.
     """
     tolerances = [tolerance for tolerance in TOLERANCES if tolerance >= least_tolerance]

@@ -10,21 +10,22 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.camera_corrections import mean_near
 
-# Photographs that tell a camera's exposure, and how fast their weight falls: it is proportional to
+# A camera's exposure is predicted from the COUNT photographs nearest to it, weighted by
 # exp(-(distance / (SHIFT typical depths) + angle between viewing directions [rad] / TURN)).
 COUNT, SHIFT, TURN = 4, 0.2, 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class Exposures:
-    """How bright photographs are, and therefore a camera that stands among them.
+    """Exposures of photographs, from which that of a camera near them is predicted.
 
-    Phones expose for what they see, so photographs near each other are exposed alike. How far that
-    holds in a scene is found by predicting each photograph's exposure from the others'.
+    Cameras on automatic expose for what they see, so photographs near each other have similar
+    exposures. How far that holds in a scene is found by predicting each photograph's exposure from
+    the others'.
 
     Attributes:
         poses: (V, 4, 4) cam_from_local, in the Gaussians' own frame.
-        log_gains: (V, 3) logarithms of the brightness of red, green and blue, with mean zero.
+        log_gains: (V, 3) natural logarithms of the factors of red, green and blue, with mean zero.
         depth: typical depth, scene units.
 
     >>> poses = np.tile(np.eye(4), (9, 1, 1))
@@ -41,9 +42,9 @@ class Exposures:
 
     @cached_property
     def shrinkage(self) -> float:
-        """Slope of the photographs' logarithms by those predicted from the others, 0 to 1.
+        """Regression slope of the log gains on those predicted from the other photographs, 0 to 1.
 
-        0: neighbours tell nothing, and new cameras are exposed like the mean of all photographs.
+        At 0 neighbours predict nothing, and new cameras get the mean exposure of all photographs.
         """
         if len(self.poses) < 2:
             return 0.0
@@ -54,7 +55,7 @@ class Exposures:
         return float(np.clip((near * self.log_gains).sum() / squares, 0, 1))
 
     def at(self, pose: NDArray[np.float64]) -> NDArray[np.float32]:
-        """(3,) what red, green and blue are multiplied by in a camera, cam_from_local (4, 4)."""
+        """(3,) factors of red, green and blue for a camera at ``pose``, cam_from_local (4, 4)."""
         if self.shrinkage == 0:
             return np.ones(3, np.float32)
         return np.exp(self.shrinkage * self._near(pose)).astype(np.float32)

@@ -1,7 +1,8 @@
 """Fitting of Gaussians to photographs: stochastic gradient descent, one photograph a step.
 
-After Kerbl et al. 2023, with step lengths for hundreds of steps instead of tens of thousands: a
-position moves by shares of a pixel where it lies, so no scale of the scene enters.
+After Kerbl et al. 2023, with step lengths for hundreds of steps instead of tens of thousands.
+Positions move in units of a pixel's width at their depth, so results do not depend on the scene's
+scale.
 """
 
 from __future__ import annotations
@@ -44,39 +45,39 @@ GROWTH_SHARE, GROWTH_SHARE_FEW, FEW = 0.13, 0.25, 10
 # Early steps are quick because pictures are small: shares of the steps that are made (OF_STEPS) and
 # of the time that is over by then (OF_TIME), with straight lines between.
 OF_STEPS, OF_TIME = (0.0, 0.5, 0.86, 1.0), (0.0, 0.2, 0.6, 1.0)
-# Positions move by at most about so many pixels a step, and by this share of it at the end.
+# Positions move by at most about POSITION_RATE pixels a step, times POSITION_END at the end.
 POSITION_RATE, POSITION_END = 0.32, 0.01
 # A fit that goes on with fitted Gaussians begins here: pictures have all of their size.
 CONTINUED = 0.6
-# Step lengths of log scales, quaternions, logits, colours and the other harmonics.
+# Step lengths (Adam) of log scales, quaternions, opacity logits, colours and higher harmonics.
 RATES = (0.02, 0.004, 0.05, 0.01, 5e-4)
-# From REST_BEGINS on, step lengths of all but positions fall to the share REST of theirs: else each
-# photograph undoes a part of what the others said.
+# From REST_BEGINS (progress) on, step lengths of all but positions fall to the share REST:
+# otherwise each step undoes a part of what steps on other photographs gained.
 REST, REST_BEGINS = 0.1, 0.75
-# Judges: one of JUDGE_OF photographs, at most MOST_JUDGES, is not fitted until JUDGES_JOIN, so that
-# it tells how well the others predict it.
-JUDGE_OF, JUDGES_JOIN, MOST_JUDGES = 8, 0.75, 5
+# Validation photographs: one of VALIDATION_EVERY, at most MOST_VALIDATION, are not fitted until
+# VALIDATION_ENDS (progress), so that they tell how well the others predict them.
+VALIDATION_EVERY, VALIDATION_ENDS, MOST_VALIDATION = 8, 0.75, 5
 # Dropout: without recorded depth, each step ignores a random share of the Gaussians, progress times
-# LEFT_OUT / number of photographs, at most MOST_LEFT_OUT, so that none relies on others that hide
-# it from the few directions that there are. After "DropGaussian" (Park et al. 2025).
+# LEFT_OUT / number of photographs, at most MOST_LEFT_OUT. Otherwise Gaussians behind others would
+# get no gradient from few viewing directions. After "DropGaussian" (Park et al. 2025).
 LEFT_OUT, MOST_LEFT_OUT = 1.2, 0.5
-# With few photographs, all opacities shrink by this share at each step: what photographs do not ask
-# for again fades, above all right before the cameras. After "Binocular-Guided 3D Gaussian
-# Splatting" (Han et al. 2024).
+# With few photographs, all opacities shrink by this share at each step; gradients restore those
+# that photographs need. The others vanish, above all floaters close to the cameras. After
+# "Binocular-Guided 3D Gaussian Splatting" (Han et al. 2024).
 FADING = 0.003
-# Gradients leave out blocks of 16 pixels that got less light than this from a Gaussian together:
+# The backward pass skips blocks of 16 pixels to which a Gaussian adds less light than this in all:
 # a tenth less time for the same pictures.
 FAINT = 0.01
-# Weight of the bending of surfaces without recorded depth, in the loss.
+# Weight in the loss of the bending of surfaces, see smooth_depth; for views without recorded depth.
 SMOOTH = 0.1
-# Reduced photographs are kept for later steps where all of them together take less.
+# Reduced photographs are kept for later steps if all of them together take fewer bytes.
 KEPT_BYTES = 2**30
-# What judges must gain, on average, by their neighbours' corrections of poses for other cameras to
-# take these [dB].
+# Cameras that are not fitted take the pose corrections of those near them only if validation
+# photographs gain at least this on average by doing so [dB].
 LEAST_GAIN = 0.1
-# Poses are checked at these parts of the fit, and at its end.
+# The progress at which refined poses are checked, beside the end.
 POSE_CHECKS = (0.3, 0.6)
-# From so many pixels on a Gaussian is split, below it gets a twin.
+# Where Gaussians are added, those at least so wide are split, smaller ones are cloned [px].
 WIDE = 2.0
 
 
@@ -87,10 +88,10 @@ class Fit:
         population: the Gaussians.
         cameras: corrections of poses and exposures.
         recorded: whether all photographs have recorded depth.
-        converged_after: steps after which more of them gain next to nothing.
+        converged_after: number of steps after which further ones gain next to nothing.
         steps: made so far.
-        judged: pictures of the photographs that were left out, by their numbers, as they were
-            predicted before these joined the fit.
+        predicted: pictures of the validation photographs, by their numbers, as rendered before
+            these joined the fit.
     """
 
     def __init__(
@@ -111,7 +112,7 @@ class Fit:
             options: see FitOptions.
             seed: of the order of photographs and of where Gaussians are added.
             begin: progress at which the fit begins, above 0 where ``start`` was fitted to the same
-                photographs before; none of them is a judge then.
+                photographs before; there are no validation photographs then.
             splatter: draws the Gaussians.
         """
         self.start, self.seed, self.splatter = start, seed, splatter
@@ -130,13 +131,13 @@ class Fit:
         )
         self.near = 0.02 * self.cameras.depth
         self.steps = 0
-        self.judged: dict[int, Picture] = {}
+        self.predicted: dict[int, Picture] = {}
         self.begin = begin
         # The limit of Gaussians does not count those of an earlier fit.
         self._begun_with = len(start.values) if begin else 0
-        self._judges = () if begin else judges(len(self.views))
+        self._validation = () if begin else validation_rows(len(self.views))
         self._checks = tuple(share for share in POSE_CHECKS if share > begin)
-        # Recorded depth holds Gaussians as more directions would.
+        # Recorded depth fixes Gaussians along the ray, as photographs from more directions would.
         self._left_out = 0.0 if self.recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
         self._fading = len(self.views) < FEW and not self.recorded
         self._grown = (0, begin)
@@ -145,8 +146,8 @@ class Fit:
         self._reduced: dict[int, ReducedView] = {}
         self._factor = 0
         self._errors: list[float] = []
-        # PSNR of judges, one of them at each call of ``judged_psnr``.
-        self._told: list[float] = []
+        # PSNR of one validation photograph for each call of ``validation_psnr``.
+        self._validation_psnr: list[float] = []
 
     @property
     def gaussians(self) -> Gaussians:
@@ -176,7 +177,7 @@ class Fit:
 
         Args:
             clock: tells seconds.
-            report: is called now and then, and at the end, with the share of it that is over.
+            report: is called now and then, and at the end, with the share that is done, 0 to 1.
         """
         options, began = self.options, clock()
         most = np.inf if self.begin else self.converged_after
@@ -199,35 +200,35 @@ class Fit:
 
     @property
     def psnr(self) -> float:
-        """Of the last 50 steps' photographs, each before its step and at its size then [dB]."""
+        """PSNR of the last 50 steps' photographs, each before its step, at its size then [dB]."""
         return _psnr(float(np.mean(self._errors[-50:])) if self._errors else 1.0)
 
-    def judged_psnr(self) -> float | None:
-        """Mean PSNR of the left-out photographs [dB]; None without any.
+    def validation_psnr(self) -> float | None:
+        """Mean PSNR of the validation photographs [dB]; None without any.
 
-        While they are left out, each call predicts one of them anew: all would take too long.
+        While they are left out, each call renders only one of them again, to save time.
         """
-        if self._judges:
-            row = self._judges[len(self._told) % len(self._judges)]
+        if self._validation:
+            row = self._validation[len(self._validation_psnr) % len(self._validation)]
             shown = self._picture(row, self.cameras.given[row])
-            self._told.append(-self._error(row, shown))
-            return float(np.mean(self._told[-len(self._judges) :]))
-        return self.judge(self.judged) if self.judged else None
+            self._validation_psnr.append(-self._error(row, shown))
+            return float(np.mean(self._validation_psnr[-len(self._validation) :]))
+        return self.psnr_of(self.predicted) if self.predicted else None
 
-    def judge(self, pictures: Mapping[int, Picture]) -> float:
-        """Mean PSNR of pictures of photographs, by their numbers [dB]."""
+    def psnr_of(self, pictures: Mapping[int, Picture]) -> float:
+        """Mean PSNR of rendered pictures against their photographs, by their numbers [dB]."""
         return -float(np.mean([self._error(row, shown) for row, shown in pictures.items()]))
 
     def step(self, share: float) -> None:
-        """One step, on one photograph, at a progress of ``share``."""
+        """Make one step, on one photograph, at a progress of ``share``."""
         self.steps += 1
         if self._checks and share >= self._checks[0]:
             self._checks = self._checks[1:]
             self._check_poses()
-        if share >= JUDGES_JOIN and self._judges:
-            self._let_judges_join()
+        if share >= VALIDATION_ENDS and self._validation:
+            self._add_validation()
         if not self._order:
-            given = [row for row in range(len(self.views)) if row not in self._judges]
+            given = [row for row in range(len(self.views)) if row not in self._validation]
             self._order = self.rng.permutation(given).tolist()
         number = self._order.pop()
         view = self._at_size(number, share)
@@ -259,7 +260,7 @@ class Fit:
             self.population.remove_faint()
 
     def _most_gaussians(self, share: float) -> int:
-        """How many Gaussians there may be at a progress of ``share``."""
+        """Limit of the number of Gaussians at a progress of ``share``."""
         steps: float = self.options.steps_for(len(self.views))
         if self.options.seconds is not None:
             over = (share - self.begin) / (1 - self.begin)
@@ -271,33 +272,33 @@ class Fit:
         return min(self._begun_with + most, self.options.most_gaussians)
 
     def _check_poses(self) -> None:
-        """Give poses back as they were unless they predict neighbouring photographs better now."""
+        """Restore the given poses unless refined ones predict neighbouring photographs better."""
         if self.cameras.with_poses:
             before = prediction_error(self.views, self.cameras.given)
             after = prediction_error(self.views, self.cameras.poses())
             if not after < before * (1 - LEAST_BETTER):
                 self.cameras.give_back()
 
-    def _let_judges_join(self) -> None:
-        """Predict the photographs that were left out, then fit them, too.
+    def _add_validation(self) -> None:
+        """Render the validation photographs, then add them to the fit.
 
-        They also tell whether a camera's error in pose is that of its neighbours.
+        They also decide whether other cameras take the pose corrections of their neighbours.
         """
-        rows, cameras = self._judges, self.cameras
-        self.judged = {row: self._picture(row, cameras.given[row]) for row in rows}
+        rows, cameras = self._validation, self.cameras
+        self.predicted = {row: self._picture(row, cameras.given[row]) for row in rows}
         if cameras.with_poses:
             near = {row: self._picture(row, cameras.like_neighbours(row, but=rows)) for row in rows}
             gain = [
-                self._error(row, self.judged[row]) - self._error(row, near[row]) for row in rows
+                self._error(row, self.predicted[row]) - self._error(row, near[row]) for row in rows
             ]
             if np.mean(gain) > LEAST_GAIN:
-                cameras.spread, self.judged = True, near
+                cameras.spread, self.predicted = True, near
         cameras.start_like_neighbours(rows)
         known = self._exposures()
         for row in rows:
             cameras.log_gains[row] = np.log(known.at(cameras.given[row]))
         cameras.log_gains -= cameras.log_gains.mean(axis=0)
-        self._judges = ()
+        self._validation = ()
 
     def _picture(self, number: int, pose: NDArray[np.float64]) -> Picture:
         view = self.views[number]
@@ -307,13 +308,13 @@ class Fit:
         return Picture.of(self.splatter(self.population.values, lens), gain=gain)
 
     def _exposures(self) -> Exposures:
-        """Of the photographs that are fitted."""
-        given = [row for row in range(len(self.views)) if row not in self._judges]
+        """Exposures of the photographs that are fitted, without the validation photographs."""
+        given = [row for row in range(len(self.views)) if row not in self._validation]
         gains = self.cameras.log_gains[given]
         return Exposures(self.cameras.given[given], gains - gains.mean(axis=0), self.cameras.depth)
 
     def _error(self, number: int, picture: Picture) -> float:
-        """Negative PSNR of a picture of a photograph [dB]."""
+        """Negative PSNR of a rendered picture against its photograph [dB]."""
         view = self.views[number]
         off = picture.rgb - view.rgb / np.float32(255)
         off = off if view.mask is None else off[view.mask]
@@ -331,11 +332,12 @@ class Fit:
         return view
 
     def _loss_gradient(self, number: int, picture: Splat, view: ReducedView) -> NDArray[np.float32]:
-        """(5, H, W) gradient of the loss, times the number of pixels: it then has useful digits."""
+        """(5, H, W) gradient of the loss, times the number of pixels to avoid tiny numbers."""
         options, pixels = self.options, view.weight.size
         gain = self.cameras.gain(number)
         shown = picture.image[:3] * gain[:, None, None]
-        # SSIM compares windows: what is masked must look as it should, or it counts nearby.
+        # SSIM compares windows: masked pixels take the rendered colour as their target, so that
+        # they add nothing to the loss of pixels near them.
         masked = self.views[number].mask is not None
         target = np.where(view.weight > 0, view.target, shown) if masked else view.target
         gradient = np.zeros_like(picture.image)
@@ -350,15 +352,16 @@ class Fit:
         return gradient
 
     def _note_pulls(self, lens: Lens, seen: NDArray[np.int64], rows: NDArray[np.float32]) -> None:
+        """Add up gradients by the centres in the picture; half a picture is 1, see FitOptions."""
         population = self.population
         pull = np.hypot(rows[:, VALUES] * lens.width, rows[:, VALUES + 1] * lens.height)
         population.pull[seen] += pull * (0.5 / (lens.width * lens.height))
         population.pulls[seen] += 1
 
 
-def judges(views: int) -> tuple[int, ...]:
-    """Numbers of the photographs that are left out at first, of so many in all."""
-    count = min(views // JUDGE_OF, MOST_JUDGES)
+def validation_rows(views: int) -> tuple[int, ...]:
+    """Numbers of the validation photographs among ``views`` photographs, evenly spread."""
+    count = min(views // VALIDATION_EVERY, MOST_VALIDATION)
     return tuple((2 * k + 1) * views // (2 * count) for k in range(count))
 
 

@@ -1,8 +1,8 @@
 """Several fits to the same photographs, whose pictures are averaged.
 
 A fit has converged after a number of steps that grows with the number of photographs; more steps
-gain next to nothing. Further fits with other random choices make other errors, above all where few
-photographs leave much open, so the mean of their pictures is nearer to the truth than each.
+gain next to nothing. Fits with other random seeds make other errors, above all where few
+photographs leave much undetermined, so the mean of their pictures is better than each of them.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from collections.abc import Callable
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.picture import mean_picture
 
-# More fits than this gain nothing that was measured.
+# More fits than this gain nothing measurable.
 MOST_FITS = 6
-# No further fit is made when the last one raised the PSNR of left-out photographs by less [dB].
+# No further fit is made when the last one raised the PSNR of validation photographs by less [dB].
 LEAST_GAIN = 0.05
-# No further fit begins with less left than this share of the time, or steps, that the first took.
+# A further fit begins only if at least this share of the first one's time, or steps, is left.
 LEAST_SHARE = 0.5
 
 
@@ -29,17 +29,18 @@ def run_fits(
 ) -> list[Fit]:
     """Run a fit; if it converges before its time or its steps are over, run further ones.
 
-    There are no more when the time or the steps are over, when there are ``MOST_FITS``, or when
-    photographs that were left out of the fits gain less than ``LEAST_GAIN`` by the last one. None
-    come after a fit that continues an earlier one (``Fit.begin`` above 0).
+    No more are made when the time or the steps are over, when there are ``MOST_FITS``, or when the
+    last one raised the PSNR of validation photographs by less than ``LEAST_GAIN``. A fit that
+    continues an earlier one (``Fit.begin`` above 0) is run alone.
 
     Args:
         first: has not been run.
-        clock: tells seconds.
-        report: is called now and then with a fit and the share of the whole that is over.
+        clock: returns seconds.
+        report: is called now and then with the fit at work and the share of the whole time, or
+            steps, that is over.
 
     Returns:
-        The fits whose pictures together are best, the first one first.
+        The fits to average, the first one first: a fit that lowered that PSNR is left out.
     """
     options, began = first.options, clock()
     timed = options.seconds is not None
@@ -60,7 +61,7 @@ def run_fits(
         left = budget - used()
         if left < LEAST_SHARE * taken or left <= 0:
             break
-        # What is left is shared evenly by the fits that find room in it.
+        # The rest is shared evenly by as many fits as fit into it.
         part = left / max(round(left / taken), 1)
         more = options.replaced(**({"seconds": part} if timed else {"steps": round(part)}))
         fit = first.again(len(made), more)
@@ -76,12 +77,12 @@ def run_fits(
 
 
 def _gain(fits: list[Fit], another: Fit) -> float | None:
-    """What left-out photographs gain from another fit [dB]; None where none was left out."""
-    if not another.judged:
+    """Gain in PSNR of validation photographs by another fit [dB]; None if there are none."""
+    if not another.predicted:
         return None
-    before = {row: mean_picture([fit.judged[row] for fit in fits]) for row in another.judged}
+    before = {row: mean_picture([fit.predicted[row] for fit in fits]) for row in another.predicted}
     after = {
-        row: mean_picture([*(fit.judged[row] for fit in fits), shown])
-        for row, shown in another.judged.items()
+        row: mean_picture([*(fit.predicted[row] for fit in fits), shown])
+        for row, shown in another.predicted.items()
     }
-    return another.judge(after) - another.judge(before)
+    return another.psnr_of(after) - another.psnr_of(before)

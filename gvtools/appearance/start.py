@@ -1,4 +1,4 @@
-"""The Gaussians that a fit begins with: few, at sparse points or at pixels with recorded depth."""
+"""The Gaussians that a fit begins with, at sparse points or at pixels with depth."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.errors import DegenerateError
 from gvtools.memory.store.local_frame import LocalFrame
 
-# Few are fitted faster and end better: the fit adds more where pictures ask for them.
+# Points are thinned to fewer than twice as many: few Gaussians are fitted faster, and the fit adds
+# more where they are needed.
 STARTING_GAUSSIANS = 25_000
-# Least red, green and blue that a Gaussian begins with: one that has none of it feels no pull.
+# Least red, green and blue (of 255) that a Gaussian begins with: colours are clipped at 0, where
+# their gradient is 0, too.
 DARKEST = 8
-# Nearest neighbours whose distance gives a Gaussian its size, and the largest size by quantile.
+# A Gaussian is as wide as its NEIGHBOURS nearest neighbours are away, at most this quantile of all.
 NEIGHBOURS, LARGEST = 3, 0.99
 
 
@@ -30,10 +32,10 @@ def from_points(
     """Gaussians at coloured points, as wide as the points lie apart.
 
     Args:
-        positions: (N, 3) in ``frame``, at least two different ones.
-        colors: (N, 3).
-        frame: is passed on.
-        most: how many there may be; None sets no limit beside the usual number.
+        positions: (N, 3) in ``frame``, scene units, at least two different ones.
+        colors: (N, 3) uint8.
+        frame: of the Gaussians.
+        most: limit of their number; None: about STARTING_GAUSSIANS.
     """
     every = max(1, len(positions) // STARTING_GAUSSIANS)
     if most is not None:
@@ -49,13 +51,13 @@ def from_depth(
     """Gaussians at randomly picked pixels with depth.
 
     Args:
-        views: those without depth give none.
-        frame: is passed on.
-        seed: of which pixels.
+        views: those without depth are skipped.
+        frame: of the Gaussians.
+        seed: of the choice of pixels.
         most: as for ``from_points``.
 
     Raises:
-        DegenerateError: next to no pixel has depth.
+        DegenerateError: hardly any pixel has depth.
     """
     count = STARTING_GAUSSIANS if most is None else min(most, STARTING_GAUSSIANS)
     positions, colors = pixels_with_depth(views, seed=seed, count=count)
@@ -69,12 +71,15 @@ def from_depth(
 def pixels_with_depth(
     views: Sequence[FitView], *, seed: int, count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Positions, in the local frame, and colours of randomly picked pixels with depth.
+    """Randomly picked pixels with depth, lifted to 3D.
 
     Args:
-        views: those without depth give none; each other one at most its share of ``count``.
-        seed: of which pixels.
-        count: about how many.
+        views: those without depth are skipped; the others contribute equal shares of ``count``.
+        seed: of the choice of pixels.
+        count: about how many in all.
+
+    Returns:
+        (N, 3) float64 positions in the local frame, and (N, 3) uint8 colours.
     """
     rng = np.random.default_rng(seed)
     share = max(count // max(sum(view.depth is not None for view in views), 1), 1)

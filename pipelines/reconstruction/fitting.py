@@ -40,40 +40,39 @@ if TYPE_CHECKING:
     from pipelines.console import Console
     from pipelines.reconstruction.plan import Plan
 
-# Progress is told so often [s].
+# Progress is printed at this interval [s].
 SAY_EVERY = 5.0
-# Least tolerance of the blend with recorded depth. Gaussians smear where no view near the target
-# saw them, and judges stand too near to others to show it; recorded depth is right there, too.
+# Least tolerance of the blend with recorded depth. In targets far from all views Gaussians are
+# smeared and the memory is right; validation photographs are too near to other views to show it.
 WITH_DEPTH = 0.4
 # A warning tells of a fit of less than this share of the usual steps. With 50, 100 and 600 steps,
 # 44 photographs have 18.8, 21.1 and 29.1 dB in held-out pictures, and 27.3 without a fit.
 SHORT = 0.5
-# Longer side at which photographs with fitted depth enter the memory [px]: it need only tell what
-# is known, as the Gaussians show it.
+# Longer side at which photographs with fitted depth are fused into the memory [px]: the memory then
+# only decides which pixels are known; their colours come from the Gaussians.
 EVIDENCE_SIDE = 320
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """What a fit leaves for the run.
+    """The results of fitting that a run uses.
 
     Attributes:
         appearance: the fitted Gaussians.
-        poses: of context and targets, as they were refined along; None where kept as given.
-        spread: whether the targets share the corrections of the context near them.
-        judged: pictures of context views as they were predicted without their photographs; not
-            kept in the file.
-        steps: of the first fit, with those of the one that it went on with.
+        poses: refined poses of context and targets; None where they are as given.
+        spread: whether targets take the pose corrections of the context views near them.
+        predicted: pictures of validation photographs as rendered before these joined, by view.
+        steps: of the first fit, including those of an earlier fit that it continued.
     """
 
     appearance: Appearance
     poses: RunPoses | None = None
     spread: bool = False
-    judged: Mapping[str, Picture] = field(default_factory=dict)
+    predicted: Mapping[str, Picture] = field(default_factory=dict)
     steps: int = 0
 
     def save(self, path: Path) -> None:
-        """Write all of it into one file."""
+        """Write it, without ``predicted``, into one file."""
         arrays = {**self.appearance.arrays(), "spread": self.spread, "steps": self.steps}
         if self.poses is not None:
             arrays |= self.poses.arrays
@@ -96,11 +95,11 @@ class Fitted:
             raise MemoryFileError(f"{path}: no readable fit ({error})") from None
 
     def on(self, device: str) -> Fitted:
-        """The same with what draws Gaussians on a device, "cpu" or "cuda"."""
+        """The same, drawn on a device, "cpu" or "cuda"."""
         return replace(self, appearance=replace(self.appearance, splatter=splatter_on(device)))
 
     def applied(self, plan: Plan) -> Plan:
-        """The plan with refined poses, and with the fitted depth for views that have no other."""
+        """The plan with refined poses, and the Gaussians' depth where views have none."""
         if self.poses is not None:
             plan = run_poses.applied(self.poses, plan)
         scene, source = plan.scene, plan.source
@@ -119,16 +118,16 @@ class Fitted:
         )
 
     def with_best_blend(self, plan: Plan, memory: SpatialMemory) -> Fitted:
-        """The same with the blend that predicts the left-out photographs best.
+        """The same with the blend that predicts the validation photographs best.
 
-        Without recorded depth, the Gaussians' colours stay alone: the memory's depth is theirs, and
-        its detail lowers structural similarity.
+        Without recorded depth only the Gaussians' colours are used: the memory's depth comes from
+        the Gaussians, and its detail lowers structural similarity.
 
         Args:
             plan: after ``applied``.
             memory: of the context.
         """
-        if not (_recorded(plan) and self.judged):
+        if not (_recorded(plan) and self.predicted):
             return self
         blend = best_blend(self._samples(plan, memory), least_tolerance=WITH_DEPTH)
         return replace(self, appearance=replace(self.appearance, blend=blend))
@@ -136,7 +135,7 @@ class Fitted:
     def _samples(
         self, plan: Plan, memory: SpatialMemory
     ) -> Iterator[tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_], NDArray[Any]]]:
-        for name, picture in self.judged.items():
+        for name, picture in self.predicted.items():
             view = plan.scene[name]
             frame = view.load()
             options = plan.config.splat
@@ -148,16 +147,15 @@ class Fitted:
 
 
 def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = None) -> Fitted | None:
-    """Fit Gaussians to a run's context; None where that cannot be, and the console says why.
+    """Fit Gaussians to a run's context; None if that is impossible, with a warning that says why.
 
     Args:
         plan: of the run.
-        console: where progress goes.
-        earlier: fits of this run. The first is continued until it has converged; further ones are
-            then added.
+        console: prints progress.
+        earlier: fits of this run: the first is continued, or further ones added if it converged.
 
     Raises:
-        OptionError: an earlier fit has converged, and time or steps do not suffice for another.
+        OptionError: an earlier fit has converged, and the time or steps are too few for another.
     """
     plan = _posed(plan, earlier)
     if earlier is None or _converged(plan, earlier):
@@ -191,10 +189,10 @@ def _warn_of_few_steps(fitted: Fitted, plan: Plan, console: Console) -> None:
 
 
 def _worth_adding(fits: Sequence[Fit], earlier: Fitted) -> Sequence[Fit]:
-    """Those of new fits that are long enough to be averaged with earlier ones.
+    """The new fits that are long enough to be averaged with earlier ones.
 
     Raises:
-        OptionError: none is.
+        OptionError: none is long enough.
     """
     least = round(LEAST_SHARE * fits[0].converged_after)
     long = [fit for fit in fits if fit.steps >= least]
@@ -207,7 +205,7 @@ def _worth_adding(fits: Sequence[Fit], earlier: Fitted) -> Sequence[Fit]:
 
 
 def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None:
-    """A fit from the start; with an earlier one, at its poses and with other random choices."""
+    """A new fit; after an earlier one, at its poses and with another random seed."""
     frame = grid_frame(plan.scene, plan.context)
     options, seed = plan.config.refine, plan.config.seed
     if earlier is not None:
@@ -251,7 +249,7 @@ def _recorded(plan: Plan) -> bool:
 
 
 def _first_blend(plan: Plan) -> Blend:
-    """Until left-out photographs choose one; without recorded depth they choose none."""
+    """The blend before validation photographs choose one; Gaussians alone without depth."""
     return Blend() if _recorded(plan) else Blend(share=0.0)
 
 
@@ -263,7 +261,7 @@ def _posed(plan: Plan, earlier: Fitted | None) -> Plan:
 
 
 def _run(first: Fit, console: Console) -> list[Fit]:
-    """Run a fit and further ones; say now and then how far they are."""
+    """Run a fit and further ones, and print progress."""
     began, told = time.perf_counter(), 0.0
 
     def say(fit: Fit, share: float) -> None:
@@ -271,8 +269,8 @@ def _run(first: Fit, console: Console) -> list[Fit]:
         now = time.perf_counter() - began
         if now - told >= SAY_EVERY or share >= 1:
             told = now
-            judged = fit.judged_psnr()
-            left_out = "" if judged is None else f", left-out photographs {judged:.2f} dB"
+            psnr = fit.validation_psnr()
+            left_out = "" if psnr is None else f", left-out photographs {psnr:.2f} dB"
             console.line(
                 f"fitting: {share:.0%}, {now:.0f} s, step {fit.steps}, "
                 f"{len(fit.population):,} Gaussians, {fit.psnr:.2f} dB{left_out}"
@@ -287,7 +285,7 @@ def _run(first: Fit, console: Console) -> list[Fit]:
 
 
 def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
-    """What fits that have ended leave; what they did not change is that of an earlier one."""
+    """The results of fits that have ended, joined with those of an earlier one."""
     first = fits[0]
     cameras, frame = first.cameras, first.frame
     sets, steps = [fit.gaussians for fit in fits], first.steps
@@ -301,9 +299,9 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
     exposures = Exposures(cameras.poses(), log_gains, cameras.depth)
     found = Fitted(
         Appearance(sets[0], first.near, blend, first.splatter, tuple(sets[1:]), exposures),
-        judged={
-            plan.context[row]: mean_picture([fit.judged[row] for fit in fits])
-            for row in first.judged
+        predicted={
+            plan.context[row]: mean_picture([fit.predicted[row] for fit in fits])
+            for row in first.predicted
         },
         steps=steps,
     )

@@ -1,4 +1,4 @@
-"""Fits of a small scene: better pictures, the same bytes, on time, masks, exposure, judges."""
+"""Fits of a small scene: better pictures, the same bytes, on time, masks, exposure, validation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from splat_scene import (
 from gvtools.appearance import fit as fit_module
 from gvtools.appearance import fit_options
 from gvtools.appearance.depth_loss import ESTIMATE, ESTIMATE_TOLERANCE, add_depth
-from gvtools.appearance.fit import JUDGES_JOIN, OF_STEPS, OF_TIME, Fit, judges
+from gvtools.appearance.fit import OF_STEPS, OF_TIME, VALIDATION_ENDS, Fit, validation_rows
 from gvtools.appearance.fit_options import (
     PER_STEP,
     PER_VIEW,
@@ -93,7 +93,7 @@ def test_a_fit_for_a_time_ends_in_time(views, seconds, steps):
 def test_a_fit_tells_now_and_then_what_it_has_reached():
     told: list[tuple[float, int, float, float | None]] = []
     fit = Fit(rough_gaussians(), photographs(walk(8)), options=FitOptions(steps=100))
-    fit.run(report=lambda share: told.append((share, fit.steps, fit.psnr, fit.judged_psnr())))
+    fit.run(report=lambda share: told.append((share, fit.steps, fit.psnr, fit.validation_psnr())))
     assert [(share, steps) for share, steps, *_ in told] == [
         (pytest.approx(np.interp(0.49, OF_STEPS, OF_TIME)), 50),
         (pytest.approx(np.interp(0.99, OF_STEPS, OF_TIME)), 100),
@@ -103,11 +103,11 @@ def test_a_fit_tells_now_and_then_what_it_has_reached():
     # One photograph is left out until three quarters of the fit are over.
     assert told[0][3] is not None and told[1][3] is not None
     assert told[0][3] < told[1][3] == told[2][3]
-    assert fit.judged_psnr() == fit.judge(fit.judged)
+    assert fit.validation_psnr() == fit.psnr_of(fit.predicted)
 
 
-def test_without_judges_nothing_is_told_of_them(fitted):
-    assert fitted.judged_psnr() is None
+def test_without_validation_photographs_there_is_no_psnr_of_them(fitted):
+    assert fitted.validation_psnr() is None
 
 
 @pytest.mark.parametrize("options", [{"steps": 40}, {"seconds": 40.0}])
@@ -246,14 +246,14 @@ def test_an_estimate_pulls_less_where_it_is_missed_by_less_than_its_tolerance():
     assert not gradient.any()
 
 
-def test_judges_are_spread_over_the_photographs():
-    assert judges(7) == ()
-    assert judges(8) == (4,)
-    assert judges(16) == (4, 12)
-    assert len(judges(1000)) == len(set(judges(1000))) == 5
+def test_validation_photographs_are_evenly_spread():
+    assert validation_rows(7) == ()
+    assert validation_rows(8) == (4,)
+    assert validation_rows(16) == (4, 12)
+    assert len(validation_rows(1000)) == len(set(validation_rows(1000))) == 5
 
 
-def test_judges_begin_with_the_exposure_that_their_neighbours_tell():
+def test_validation_photographs_begin_with_the_exposure_of_their_neighbours():
     views = photographs(walk(16))
     brightness = np.exp(np.linspace(-0.1, 0.1, 16))
     views = [
@@ -261,40 +261,40 @@ def test_judges_begin_with_the_exposure_that_their_neighbours_tell():
         for view, bright in zip(views, brightness, strict=True)
     ]
     fit = Fit(rough_gaussians(), views, options=FitOptions())
-    for share in np.linspace(0, JUDGES_JOIN - 1e-6, 300):
+    for share in np.linspace(0, VALIDATION_ENDS - 1e-6, 300):
         fit.step(share)
-    rows = list(judges(16))
+    rows = list(validation_rows(16))
     assert not fit.cameras.log_gains[rows].any()
-    fit._let_judges_join()
+    fit._add_validation()
     gains = fit.cameras.log_gains[:, 0]
     assert gains[rows[0]] < -0.01 < 0.01 < gains[rows[1]]
     np.testing.assert_allclose(fit.cameras.log_gains.mean(axis=0), 0, atol=1e-12)
 
 
-def test_judges_are_left_out_until_they_join():
+def test_validation_photographs_are_left_out_until_they_join():
     views = photographs(walk(8))
-    (judge,) = judges(8)
+    (held,) = validation_rows(8)
     noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
     altered = [*views]
-    altered[judge] = replace(views[judge], rgb=noise)
+    altered[held] = replace(views[held], rgb=noise)
     options = FitOptions(exposure=False)
     fits = [Fit(rough_gaussians(), each, options=options) for each in (views, altered)]
-    before = JUDGES_JOIN - 1e-6
+    before = VALIDATION_ENDS - 1e-6
     for fit in fits:
         for share in np.linspace(0, before, 24):
             fit.step(share)
-        assert fit.judged == {}
+        assert fit.predicted == {}
     values = fits[0].gaussians.values.copy()
     assert values.tobytes() == fits[1].gaussians.values.tobytes()
     for fit in fits:
         for _ in range(16):
-            fit.step(JUDGES_JOIN)
+            fit.step(VALIDATION_ENDS)
     assert fits[0].gaussians.values.tobytes() != fits[1].gaussians.values.tobytes()
     # Predicted before they joined: from the given pose, by the Gaussians of then.
-    assert list(fits[0].judged) == [judge]
-    expected = picture(type(rough_gaussians())(values), views[judge].cam_from_local)
+    assert list(fits[0].predicted) == [held]
+    expected = picture(type(rough_gaussians())(values), views[held].cam_from_local)
     for fit in fits:
-        np.testing.assert_allclose(fit.judged[judge].rgb, expected.rgb, atol=1e-5)
+        np.testing.assert_allclose(fit.predicted[held].rgb, expected.rgb, atol=1e-5)
 
 
 def test_harmonics_join_one_degree_after_the_other(views):

@@ -9,7 +9,7 @@ import pytest
 from splat_scene import photographs, picture, pose, pose_errors, rough_gaussians, walk
 
 from gvtools.appearance.camera_corrections import CameraCorrections, moved
-from gvtools.appearance.fit import JUDGES_JOIN, Fit, judges
+from gvtools.appearance.fit import VALIDATION_ENDS, Fit, validation_rows
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.pose_check import prediction_error
 from gvtools.appearance.start import from_depth
@@ -81,29 +81,29 @@ def test_poses_are_refined_only_where_asked_for_and_depth_is_recorded(views, tru
 
 
 @pytest.mark.parametrize("alike", [True, False])
-def test_neighbours_corrections_are_taken_only_if_judges_gain(views, truth, gaussians, alike):
-    (judge,) = judges(COUNT)
+def test_neighbours_corrections_are_taken_only_if_validation_gains(views, truth, gaussians, alike):
+    (held,) = validation_rows(COUNT)
     motions = np.zeros((COUNT, 6))
     motions[:, 0] = 0.06
     motions[[0, 1, 7], 0] = -0.1
     if not alike:
-        motions[judge] = 0
+        motions[held] = 0
     off = given(views, motions)
     fit = Fit(gaussians, off, options=FitOptions())
-    # As if the fit had found the errors of all but the judge, whose photograph it has not seen.
+    # As if the fit had found the errors of all views but the one held out.
     fit.cameras.twists[:, 0] = -motions[:, 0] / fit.cameras.depth
-    fit.cameras.twists[judge] = 0
-    before = fit.cameras.given[judge]
-    near = fit.cameras.like_neighbours(judge, but=[judge])
-    fit.step(JUDGES_JOIN)
+    fit.cameras.twists[held] = 0
+    before = fit.cameras.given[held]
+    near = fit.cameras.like_neighbours(held, but=[held])
+    fit.step(VALIDATION_ENDS)
     assert fit.cameras.with_poses
     assert fit.cameras.spread == alike
     taken = near if alike else before
     np.testing.assert_allclose(
-        fit.judged[judge].rgb, picture(gaussians, taken).rgb, atol=1e-3, rtol=0
+        fit.predicted[held].rgb, picture(gaussians, taken).rgb, atol=1e-3, rtol=0
     )
-    other = off[judge].cam_from_local
-    error = np.linalg.norm(fit.cameras.corrected(other)[:3, 3] - truth[judge][:3, 3])
+    other = off[held].cam_from_local
+    error = np.linalg.norm(fit.cameras.corrected(other)[:3, 3] - truth[held][:3, 3])
     assert error < 0.02
     assert alike or np.array_equal(fit.cameras.corrected(other), other)
 

@@ -72,9 +72,11 @@ def test_what_another_fit_gains_is_that_of_the_mean_of_both():
     for fit in (first, second):
         fit.run()
     gain = module._gain([first], second)
-    alone = first.judge(first.judged)
-    both = {row: mean_picture([shown, second.judged[row]]) for row, shown in first.judged.items()}
-    assert gain == pytest.approx(first.judge(both) - alone, abs=1e-6)
+    alone = first.psnr_of(first.predicted)
+    both = {
+        row: mean_picture([shown, second.predicted[row]]) for row, shown in first.predicted.items()
+    }
+    assert gain == pytest.approx(first.psnr_of(both) - alone, abs=1e-6)
     assert gain != 0
     assert module._gain([first], first) == pytest.approx(0, abs=1e-6)
     assert module._gain([first], fit_of(steps=1)) is None

@@ -323,15 +323,15 @@ def test_the_blend_is_chosen_by_the_left_out_photographs(scan):
     truth = (plan.scene[name].load().rgb / np.float32(255)).astype(np.float32)
     alpha = np.ones(truth.shape[:2], np.float32)
     good, bad = Picture(truth, alpha), Picture(1 - truth, alpha)
-    fitted = Fitted(Appearance(gaussians, 0.1), judged={name: good})
+    fitted = Fitted(Appearance(gaussians, 0.1), predicted={name: good})
     assert fitted.with_best_blend(plan, memory).appearance.blend.share == 0
-    fitted = Fitted(Appearance(gaussians, 0.1), judged={name: bad})
+    fitted = Fitted(Appearance(gaussians, 0.1), predicted={name: bad})
     assert fitted.with_best_blend(plan, memory).appearance.blend == Blend(1.0, 4.0)
     fitted = Fitted(Appearance(gaussians, 0.1, Blend(0.3, 0.3)))
     assert fitted.with_best_blend(plan, memory) is fitted
 
 
-def test_a_photograph_does_not_judge_a_memory_that_has_seen_it(scan):
+def test_a_photograph_does_not_validate_a_memory_that_has_seen_it(scan):
     plan = planned(scan)
     memory, name = _empty_memory(plan, Path()), plan.context[1]
     view = plan.scene[name]
@@ -340,17 +340,17 @@ def test_a_photograph_does_not_judge_a_memory_that_has_seen_it(scan):
     ones = np.ones(frame.rgb.shape[:2], np.float32)
     grey = Picture(np.full(frame.rgb.shape, 0.5, np.float32), ones)
     appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1)
-    fitted = Fitted(appearance, judged={name: grey})
+    fitted = Fitted(appearance, predicted={name: grey})
     assert fitted.with_best_blend(plan, memory).appearance.blend == Blend()
 
 
-def test_a_run_with_judges_keeps_the_blend_that_they_chose(tmp_path):
+def test_a_run_with_validation_photographs_keeps_the_blend_that_they_chose(tmp_path):
     scan = write_scan(tmp_path / "scan", views=9)
     settings = ("context=first:8", "targets=range:8-8")
     out = run(scan, tmp_path / "run", *settings)
     plan = planned(scan, *settings)
     fitted = fit_appearance(plan, Console(quiet=True))
-    assert fitted is not None and list(fitted.judged) == [plan.context[4]]
+    assert fitted is not None and list(fitted.predicted) == [plan.context[4]]
     chosen = fitted.with_best_blend(fitted.applied(plan), memory_of_round_0(out))
     assert chosen.appearance.blend != Blend()
     assert Fitted.load(out / FITTED).appearance.blend == chosen.appearance.blend
