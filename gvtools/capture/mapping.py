@@ -1,10 +1,10 @@
 """Cameras from photographs: features, matching and mapping by pycolmap.
 
 Global mapping (GLOMAP, Pan et al. 2024) solves for all cameras at once. It can end in a model whose
-parts have different scales, with every picture registered and small reprojection errors (a scene of
-a stuffed fox: camera centres wrong by 35 % of their extent, errors of 0.5 pixels). Such a model is
-told by the share of verified matches that became 3D points: 69 % there, 94 % in the right one.
-Where that share is low, incremental mapping is tried as well, and the model with the larger share
+parts have different scales, with every picture registered and small reprojection errors (the fox of
+instant-ngp: camera centres wrong by 35 % of their extent, reprojection errors of 0.5 pixels). The
+share of verified matches that became 3D points reveals such a model: 69 % there, 94 % in the right
+one. If that share is low, incremental mapping is tried as well, and the model with the larger share
 is kept.
 """
 
@@ -29,18 +29,18 @@ if TYPE_CHECKING:
     from gvtools.capture.panoramas import FaceRig
     from gvtools.evaluation.pose_probe.features import FeatureMatcher
 
-# Where a smaller share of the verified matches became points of the global model, it is compared
-# with an incremental one.
+# If a smaller share of the verified matches became points of the global model, incremental mapping
+# is tried, too.
 ENOUGH = 0.9
 # A picture that sees fewer 3D points is deregistered: global mapping keeps some that see a dozen,
 # and these distort the whole model (demo room: camera centres wrong by 28 % of their extent, by 2 %
 # without them).
 LEAST_POINTS = 30
-# Principal points are refined where every camera took at least this many pictures; fewer do not
+# Principal points are refined if every camera took at least this many pictures; fewer do not
 # determine them.
 REFINED_FROM = 8
-# Detections that a point misses by more are dropped [px]: lenses of 180 degrees and more have no
-# finite projection near 90 degrees off the axis.
+# Observations with a larger reprojection error are dropped [px]: COLMAP's projection of fisheye
+# models is not finite near 90 degrees off the axis.
 LOST = 64.0
 
 Say = Callable[[str], object]
@@ -53,7 +53,7 @@ class Mapped:
     Attributes:
         model: the one with the most registered pictures; its scale is arbitrary.
         how: "global" or "incremental" mapping.
-        others: the pictures that each further model registered, most first.
+        others: names of the pictures of each further model, the largest model first.
         matching: how pairs were chosen, in words.
         pairs: number of verified matches of each pair of pictures, by their names.
         explained: share of these matches that became points of the model, 0 to 1.
@@ -86,19 +86,19 @@ def find_cameras(
         images: the folder of the pictures.
         cameras: names of the pictures that each camera took; they share its intrinsics.
         work: a folder without files yet, for COLMAP's database and models.
-        source: what messages name, where ``images`` are copies.
+        source: the user's folder for messages, if ``images`` holds copies.
         in_order: the pictures follow a path in the order of their names, as frames of a video do;
-            then neighbours are matched, too, where there are too many pictures to match all pairs.
+            neighbours are then matched even if there are too many pictures to match all pairs.
         masks: folder of masks as COLMAP has them, ``a.jpg.png`` for ``a.jpg``, black where no
             features are to be found; None for none.
         learned: finds and matches features; None takes COLMAP's SIFT.
         rigs: faces of panoramas, whose names ``cameras`` holds face by face; their intrinsics and
-            turns are given and stay.
-        fisheye: parameters of OPENCV_FISHEYE to start from, of pictures by such a lens.
+            relative rotations are fixed.
+        fisheye: initial parameters of OPENCV_FISHEYE as COLMAP writes them; "" for other lenses.
         say: is called with a line of text at each step.
 
     Raises:
-        ProjectError: no two pictures overlap, or no model comes of those that do.
+        ProjectError: no two pictures overlap, or mapping gives no model.
     """
     import pycolmap
 
@@ -152,7 +152,7 @@ def _map(
 ) -> tuple[str, list[pycolmap.Reconstruction], float] | None:
     """The better of global and incremental mapping; None where neither gives a model.
 
-    ``refine`` says whether intrinsics are open; those of faces are not, nor are their turns.
+    ``refine``: whether to refine intrinsics; those of faces, and their rotations, are fixed.
 
     Returns:
         "global" or "incremental", its models, and ``explained`` of the largest of them.
@@ -237,7 +237,7 @@ def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
     """Deregister pictures that see too few points, then bundle-adjust the rest once more."""
     import pycolmap
 
-    # By frame: of one panorama all faces are registered or none.
+    # Counted by frame (COLMAP's word for one shot of a rig): a panorama's faces stay together.
     seen: Counter[int] = Counter()
     for image in model.images.values():
         if image.has_pose:
@@ -262,7 +262,7 @@ def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
 
 
 def _fix_cameras(options: pycolmap.BundleAdjustmentOptions) -> None:
-    """Keep intrinsics, and how the cameras of a rig are turned."""
+    """Hold intrinsics, and the relative poses of a rig's cameras, fixed."""
     options.refine_focal_length = False
     options.refine_extra_params = False
     options.refine_sensor_from_rig = False

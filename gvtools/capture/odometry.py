@@ -1,13 +1,14 @@
-"""How two frames of an RGB-D recording stand to each other.
+"""Relative poses of pairs of frames of an RGB-D recording.
 
-Open3D's hybrid odometry (colour and depth) starts a pair, its point-to-plane odometry (depth alone)
-ends it where the depth's shape holds all six directions. The colour and depth pictures of a depth
-camera are not taken at quite the same time, which the colour's part turns into errors of poses
+A pair is registered by Open3D's hybrid odometry (colour and depth), then refined by point-to-plane
+odometry (depth alone) if the depth map constrains all six degrees of freedom. Depth cameras do not
+take colour and depth at quite the same time, which hybrid odometry turns into pose errors
 (7-Scenes' kitchen, 40 frames in a row: 7.5 mm with hybrid odometry alone, 2.7 mm with both; every
-tenth frame: 38 mm and 26 mm). On a flat wall depth lets the camera slide, and the hybrid one
-stands.
+tenth frame: 38 mm and 26 mm). A flat wall leaves point-to-plane odometry free to slide; there the
+result of hybrid odometry stays.
 
-Tensor odometry adds in the order of its threads: results differ in the fifth digit between runs.
+Open3D's tensor odometry sums in the order of its threads: results differ in the fifth digit
+between runs.
 """
 
 from __future__ import annotations
@@ -27,32 +28,33 @@ if TYPE_CHECKING:
 
 Float64 = NDArray[np.float64]
 
-# Steps at a quarter, half and all of the size.
+# Iterations at a quarter, half and the full size.
 ITERATIONS = (10, 5, 3)
-# Points that are farther apart than this do not belong together [m].
+# Points farther apart than this are not taken for corresponding ones [m].
 APART = 0.07
-# Points within this count for a pair's weight in the pose graph [m].
+# Points within this distance count for a pair's information matrix in the pose graph [m].
 WEIGHED = 0.03
-# Farther readings are not used [m]. A depth camera's error grows with the square of the distance,
-# so the nearer limit holds for frames of which at least so much lies within it (every tenth frame
-# of 7-Scenes' kitchen: errors of positions of 26 mm, 37 mm without).
+# Greater depths than FARTHEST are not used, nor greater ones than NEAR in frames with at least
+# NEAR_SHARE of their depth below it [m]: a depth camera's error grows with the square of the
+# distance (every tenth frame of 7-Scenes' kitchen: position errors of 26 mm, 37 mm without).
 NEAR, NEAR_SHARE, FARTHEST = 2.5, 0.5, 5.0
-# A pair counts when so much of a frame falls on the other, when so much of that agrees in depth,
-# and when so little of it lies in front of what the other saw.
+# A pair is kept if at least LEAST_OVERLAP of a frame's pixels fall on depth of the other frame, and
+# of these at least LEAST_AGREEMENT agree with it and at most MOST_IN_FRONT lie in front of it.
 LEAST_OVERLAP, LEAST_AGREEMENT, MOST_IN_FRONT = 0.25, 0.7, 0.15
-# Depths agree within this [m, and share of depth].
+# Depths agree within this [m], or this share of the depth if that is more.
 AGREE = 0.02
-# Every n-th pixel and line is looked at to judge a pair.
+# Overlap and agreement are measured on every STEP-th pixel and row.
 STEP = 4
-# Depth holds a direction that weighs at least this beside the best held one: rooms have 0.08 to
-# 0.2 (Redwood, 7-Scenes), a noisy wall 7e-5.
-LEAST_HELD = 1e-2
-# Depth is averaged over blocks of this side to find its shape [px]: noise alone, pixel by pixel,
-# looks as if it held every direction.
+# Depth constrains all six degrees of freedom if the smallest eigenvalue of point-to-plane alignment
+# is at least this share of the largest: rooms have 0.08 to 0.2 (Redwood, 7-Scenes), a noisy wall
+# 7e-5.
+LEAST_CONSTRAINT = 1e-2
+# That is computed from depth averaged over blocks of this side [px]: the normals of single pixels
+# are so noisy that every degree of freedom would seem constrained.
 BLOCK = 8
-# Point-to-plane odometry moves a pose by less than this [m, degrees], or has slid away.
+# Where point-to-plane odometry moves a pose by more than this [m, degrees], it has slid away.
 MOST_SHIFT, MOST_TURN = 0.3, 15.0
-# RANSAC on features: matches by Lowe's ratio, inliers within pixels.
+# PnP with RANSAC: Lowe's ratio of matches, least number of inliers, their reprojection error [px].
 RATIO, LEAST_INLIERS, INLIER_PX = 0.8, 15, 3.0
 
 
@@ -62,12 +64,12 @@ class Pair:
 
     Attributes:
         source: number of a frame.
-        target: and of another one.
+        target: number of another frame.
         target_from_source: (4, 4) rigid, metres.
-        information: (6, 6) weight in a pose graph, as Open3D has it.
+        information: (6, 6) information matrix of Open3D's pose graph.
         overlap: share of the source's pixels with depth that fall on depth of the target.
         agreement: share of these that agree in depth.
-        apart: median difference of these depths, metres.
+        apart: median absolute difference of these depths, metres.
     """
 
     source: int
@@ -85,13 +87,13 @@ class Pair:
 
 
 def compare(frames: RgbdFrames, source: int, target: int, *, start: Float64) -> Pair | None:
-    """The relative pose of two frames, None where they do not agree.
+    """The relative pose of two frames; None if they do not agree.
 
     Args:
         frames: of the recording.
         source: number of a frame.
-        target: and of another one.
-        start: (4, 4) guess of ``target_from_source``, metres.
+        target: number of another frame.
+        start: (4, 4) initial ``target_from_source``, metres.
 
     Raises:
         ProjectError: a file is unreadable.
@@ -104,16 +106,16 @@ def compare(frames: RgbdFrames, source: int, target: int, *, start: Float64) -> 
     pose = _odometry(first, second, frames.K, start=start, method=method.Hybrid, reach=reach)
     if pose is None:
         return None
-    if _held(first.depth, frames.K):
+    if _constrains_pose(first.depth, frames.K):
         refined = _odometry(
             first, second, frames.K, start=pose, method=method.PointToPlane, reach=reach
         )
         if refined is not None and within(refined @ invert_rigid(pose), MOST_SHIFT, MOST_TURN):
-            # Whichever brings the surfaces together better.
-            by = [_judge(first.depth, second.depth, frames.K, pose=at) for at in (refined, pose)]
+            # Keep the pose with the smaller median difference of depths.
+            by = [_compared(first.depth, second.depth, frames.K, pose=at) for at in (refined, pose)]
             if by[0][2] <= by[1][2]:
                 pose = refined
-    overlap, agreement, apart, in_front = _judge(first.depth, second.depth, frames.K, pose=pose)
+    overlap, agreement, apart, in_front = _compared(first.depth, second.depth, frames.K, pose=pose)
     if in_front > MOST_IN_FRONT:
         return None
     pair = Pair(
@@ -137,7 +139,7 @@ def _odometry(
     method: Any,
     reach: float,
 ) -> Float64 | None:
-    """``second_from_first``; None where the comparison fails."""
+    """(4, 4) ``second_from_first``, metres; None if odometry fails."""
     import open3d as o3d
 
     odometry = o3d.t.pipelines.odometry
@@ -149,14 +151,14 @@ def _odometry(
             method=method, params=odometry.OdometryLossParams(APART, 0.05, 0.1),
         )  # fmt: skip
     except RuntimeError:
-        # Nothing overlaps, or nothing holds the camera: a singular system.
+        # No overlap, or a singular system: the geometry does not determine the pose.
         return None
     pose = result.transformation.numpy()
     return pose if np.isfinite(pose).all() and result.fitness > 0 else None
 
 
 def _reach(depth: NDArray[np.float32]) -> float:
-    """Up to which depth a frame is compared, metres."""
+    """The greatest depth of a frame that is used, metres: NEAR or FARTHEST."""
     known = depth[(depth > 0) & (depth < FARTHEST)]
     return NEAR if (known < NEAR).sum() >= NEAR_SHARE * max(1, known.size) else FARTHEST
 
@@ -198,12 +200,12 @@ def within(pose: Float64, shift: float, turn: float) -> bool:
     return bool(np.linalg.norm(pose[:3, 3]) <= shift and np.degrees(np.arccos(cosine)) <= turn)
 
 
-def _held(depth: NDArray[np.float32], K: Float64) -> bool:
-    """Whether the depth's shape alone tells all six directions of a motion (point to plane)."""
+def _constrains_pose(depth: NDArray[np.float32], K: Float64) -> bool:
+    """Whether point-to-plane alignment of a depth map determines all six degrees of freedom."""
     points = _block_points(depth, K)
     normals = np.cross(points[:-1, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, :-1])
     length = np.linalg.norm(normals, axis=-1)
-    # Pieces across a depth edge are longer than what a surface spans.
+    # Leave out normals across depth edges: their cross products are far longer than a surface's.
     usable = np.isfinite(length) & (length > 0)
     if usable.sum() < 50:
         return False
@@ -213,13 +215,20 @@ def _held(depth: NDArray[np.float32], K: Float64) -> bool:
     p = (p - p.mean(axis=0)) / max(float(p.std()), 1e-9)
     rows = np.concatenate([np.cross(p, n), n], axis=1)
     weights = np.linalg.eigvalsh(rows.T @ rows)
-    return bool(weights[0] >= LEAST_HELD * weights[-1])
+    return bool(weights[0] >= LEAST_CONSTRAINT * weights[-1])
 
 
-def _judge(
+def _compared(
     first: NDArray[np.float32], second: NDArray[np.float32], K: Float64, *, pose: Float64
 ) -> tuple[float, float, float, float]:
-    """Overlap, agreement, median difference (metres), and the share in front of ``second``."""
+    """Overlap, agreement and median difference, see ``Pair``, and the share in front of ``second``.
+
+    Args:
+        first: (h, w) depth, metres.
+        second: (h, w) depth, metres.
+        K: (3, 3) of both.
+        pose: (4, 4) second_from_first, metres.
+    """
     points = _points(first, K).reshape(-1, 3)
     points = points[np.isfinite(points[:, 2])]
     moved = points @ pose[:3, :3].T + pose[:3, 3]
@@ -240,11 +249,11 @@ def _judge(
 
 
 def start_from_features(source: Features, target: Features, K: Float64) -> Float64 | None:
-    """A guess of ``target_from_source`` by SIFT matches and perspective-n-point with RANSAC.
+    """An initial ``target_from_source`` by SIFT matches and perspective-n-point with RANSAC.
 
     Args:
-        source: features with points.
-        target: features.
+        source: features with 3D points.
+        target: features with pixels.
         K: (3, 3) of the target's pixels.
 
     Returns:
@@ -265,7 +274,7 @@ def start_from_features(source: Features, target: Features, K: Float64) -> Float
             None, iterationsCount=500, reprojectionError=INLIER_PX, flags=cv2.SOLVEPNP_EPNP,
         )  # fmt: skip
     except cv2.error:
-        # Points in one place.
+        # Degenerate points, such as many in one place.
         return None
     if not found or inliers is None or len(inliers) < LEAST_INLIERS:
         return None
@@ -275,7 +284,7 @@ def start_from_features(source: Features, target: Features, K: Float64) -> Float
 
 
 def _matches(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.int64]:
-    """(M, 2) rows of descriptors that are each other's nearest, and clearly so."""
+    """(M, 2) rows of mutually nearest descriptors that pass Lowe's ratio test."""
     products = first @ second.T
     best = products.argmax(axis=1)
     rows = np.arange(len(first))

@@ -1,7 +1,7 @@
-"""Panoramas and fisheye pictures of a capture: which they are, and panoramas cut into faces.
+"""Panoramas and fisheye pictures of a capture: recognised, and panoramas cut into faces.
 
-Features are found and matched on perspective faces, which overlap, and mapping knows that the faces
-of one panorama share a centre: they are a rig whose turns are given.
+Features are found and matched on overlapping perspective faces. For mapping the faces of a panorama
+are a rig: they share a centre, and their relative rotations are known exactly.
 """
 
 from __future__ import annotations
@@ -30,12 +30,13 @@ LENSES = ("auto", "perspective", "equirectangular", "fisheye")
 FACE_DEGREES = 100.0
 # XMP of Google's photo sphere schema, near the beginning of a file.
 XMP_KEY, XMP_VALUE, XMP_WITHIN = b"ProjectionType", b"equirectangular", 1 << 18
-# A picture twice as wide as high is a panorama where its sides meet: neighbours across them differ
-# by at most this many times as much as columns inside, in grey levels with an allowance of one.
+# A 2:1 picture is a panorama if its left and right borders continue each other: the mean difference
+# between first and last column is at most this many times that of neighbouring columns, plus one.
+# [grey levels]
 MEETS = 2.0
 # Corners of a fisheye picture, outside its image circle, are at most so bright. [grey levels]
 DARK = 12
-# What the image circle of a fisheye picture shows, until mapping refines it. [degrees]
+# Field of view across a fisheye's image circle that mapping starts from. [degrees]
 FISHEYE_DEGREES = 180.0
 
 
@@ -44,20 +45,20 @@ class FaceRig:
     """The faces of panoramas of one size.
 
     Attributes:
-        faces: their mappings.
-        panoramas: names of the pictures.
+        faces: how each face is sampled from a panorama.
+        panoramas: names of the panoramas.
     """
 
     faces: tuple[Face, ...]
     panoramas: tuple[str, ...]
 
     def prefix(self, face: Face) -> str:
-        """What the names of a face's files begin with while mapping goes on."""
+        """Folder of a face's files during mapping, as COLMAP's rigs need it; see rename_faces."""
         width, height = face.source_size
         return f"{width}x{height}/{face.face}/"
 
     def names(self, face: Face) -> list[str]:
-        """Names of the face of all panoramas while mapping goes on."""
+        """Names of one face of all panoramas during mapping."""
         return [f"{self.prefix(face)}{name}" for name in self.panoramas]
 
     def config(self) -> pycolmap.RigConfig:
@@ -78,7 +79,7 @@ class FaceRig:
 
 
 def lens_of(photographs: Sequence[Photograph], lens: str) -> str:
-    """Which of ``LENSES`` took the pictures, by themselves where it is "auto".
+    """The kind of lens, one of LENSES but "auto"; recognised from the pictures if ``lens`` is.
 
     Raises:
         OptionError: panoramas among other pictures, or pictures that cannot be panoramas.
@@ -114,7 +115,7 @@ def _is_panorama(item: Photograph) -> bool:
     grey = _grey(item)
     inside = np.abs(np.diff(grey, axis=1)).mean()
     across = np.abs(grey[:, 0] - grey[:, -1]).mean()
-    # Each pole is one place, all along its row.
+    # The first and the last row each show a single point, so they have one colour.
     poles = max(np.abs(np.diff(grey[row])).mean() for row in (0, -1))
     return bool(across <= MEETS * (inside + 1) and poles <= inside + 1)
 
@@ -136,10 +137,10 @@ def _grey(item: Photograph, side: int = 512) -> NDArray[np.float64]:
 
 
 def fisheye_params(photographs: Sequence[Photograph]) -> str:
-    """Parameters of OPENCV_FISHEYE to start mapping from, as COLMAP writes them.
+    """Initial parameters of OPENCV_FISHEYE for mapping, as COLMAP writes them.
 
-    The circle that shows FISHEYE_DEGREES touches the nearer sides of a picture with dark corners,
-    and the corners of others.
+    The circle of FISHEYE_DEGREES is taken to touch the long sides of a picture with dark corners,
+    and to pass through the corners of a picture without.
     """
     width, height = photographs[0].size
     across = min(width, height) if _is_fisheye(photographs[0]) else math.hypot(width, height)
@@ -211,7 +212,7 @@ def rename_faces(
 
 
 def panorama_pairs(pairs: Mapping[tuple[str, str], int]) -> dict[tuple[str, str], int]:
-    """Verified matches of pairs of panoramas, from those of their faces while mapping goes on."""
+    """Verified matches of pairs of panoramas: the sums over their pairs of faces."""
     found: Counter[tuple[str, str]] = Counter()
     for pair, count in pairs.items():
         first, second = sorted(name.split("/", 2)[2] for name in pair)

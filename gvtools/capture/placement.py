@@ -1,7 +1,7 @@
-"""Where a model lies in the world: metric and level by GPS, metric by a length, or level alone.
+"""Position, orientation and scale of a model in the world, which mapping leaves undetermined.
 
-Mapping leaves position, direction and size of a model open. World axes here are x east (or to the
-right), y north (or ahead), z up.
+With GPS the world is metric, with x east, y north and z up. Otherwise z is the mean up direction of
+the cameras, x and y are arbitrary, and so is the scale unless a distance is given.
 """
 
 from __future__ import annotations
@@ -20,8 +20,10 @@ from gvtools.scenes.scene import Finding
 if TYPE_CHECKING:
     import pycolmap
 
-# GPS of a phone or a drone errs by so much; what spreads less cannot be placed by it. [metres]
+# Error of a phone's or a drone's GPS; positions that spread by less than twice this are not used.
+# [metres]
 GPS_ERROR = 5.0
+# Pictures with GPS that are needed to place a model.
 LEAST_PLACED = 3
 SEED = 1
 
@@ -32,8 +34,8 @@ class Placement:
 
     Attributes:
         metric: whether its units are metres.
-        by: "GPS", "distance" or "cameras".
-        origin: latitude, longitude, height of its origin, with GPS; None else.
+        by: "GPS", "distance" (scale only) or "cameras" (mean up direction only).
+        origin: latitude, longitude [degrees] and height [m] of its origin; None without GPS.
     """
 
     metric: bool
@@ -47,12 +49,12 @@ def place(
     locations: Mapping[str, tuple[float, float, float]],
     distance: tuple[str, str, float] | None = None,
 ) -> tuple[Placement, list[Finding]]:
-    """Move, turn and scale a model in place.
+    """Move, rotate and scale a model in place.
 
     Args:
-        model: changed.
-        locations: latitude, longitude, height of pictures by name.
-        distance: two pictures and the metres between the places where they were taken.
+        model: is changed.
+        locations: latitude and longitude [degrees] and height [m] of pictures by name.
+        distance: two pictures and the distance of the places where they were taken, metres.
 
     Raises:
         OptionError: the pictures of ``distance`` are not in the model, or were taken at one place.
@@ -129,15 +131,15 @@ def _by_gps(
 
 
 def _level(model: pycolmap.Reconstruction) -> None:
-    """Turn the mean up vector of the cameras to +z, and move their mean centre to the origin."""
+    """Rotate the cameras' mean up vector to +z, and move their mean centre to the origin."""
     import pycolmap
     from scipy.spatial.transform import Rotation
 
     images = [image for image in model.images.values() if image.has_pose]
     rotations = np.stack([image.cam_from_world().rotation.matrix() for image in images])
     centres = np.stack([image.projection_center() for image in images])
-    # Row 1 of cam_from_world is the camera's y axis, which points down; of a panorama's upper and
-    # lower faces it does not, and the two cancel.
+    # Row 1 of cam_from_world is the camera's y axis, which points down. In upper and lower faces
+    # of a panorama it is horizontal, and the two cancel.
     up = -rotations[:, 1].mean(axis=0)
     if np.linalg.norm(up) < 1e-3:
         return

@@ -1,7 +1,7 @@
 """From photographs or a video to a COLMAP project that every command reads.
 
-``images/``, ``sparse/0`` (the largest model that was found) and ``capture.json``, a report. All of
-it appears at once, when it is complete.
+``images/``, ``sparse/0`` (the largest model that was found) and ``capture.json``, a report. The
+folder gets its name when it is complete.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 REPORT = "capture.json"
 IMAGES, MODEL = "images", "sparse/0"
-# A model that explains less of the matches is likely to be wrong.
+# A model in which a smaller share of the matches became points is likely to be wrong.
 DOUBTFUL = 0.75
 
 Say = Callable[[str], object]
@@ -50,23 +50,23 @@ class CaptureReport:
 
     Attributes:
         source: absolute path of the input.
-        pictures: how many were tried.
-        registered: names of those with a camera, in order.
-        left_out: name and reason of each other one.
-        reprojection_px: mean error of the triangulated points, pixels.
-        points: how many.
+        pictures: number of readable, different pictures.
+        registered: names of those with a camera, in natural order.
+        left_out: reason for each other picture, by name.
+        reprojection_px: mean reprojection error of the triangulated points, pixels.
+        points: number of triangulated points.
         track_length: mean number of pictures that a point is seen in.
-        explained: share of the verified matches that became points; low where a model is doubtful.
+        explained: share of the verified matches that became points, 0 to 1; low for a wrong model.
         mapping: "global" or "incremental".
         features: "sift", "aliked" or "disk".
-        matching: how pairs were chosen.
-        other_models: pictures of further models that do not connect to this one.
-        overlap: pairs of pictures, and their verified matches.
-        cameras: model and parameters of each camera.
+        matching: how pairs were chosen, in words.
+        other_models: number of pictures of each further model, not connected to this one.
+        overlap: pairs of pictures, and the number of their verified matches.
+        cameras: model, size and parameters of each camera, as COLMAP has them.
         metric: whether units are metres.
         placed_by: "GPS", "distance" or "cameras", see ``placement``.
-        origin: latitude, longitude and height of the origin, with GPS.
-        findings: what was met.
+        origin: latitude and longitude [degrees] and height [m] of the origin; None without GPS.
+        findings: notes and warnings.
     """
 
     source: str
@@ -109,15 +109,15 @@ def capture_photographs(
 
     Args:
         source: the folder or the video.
-        out: the project's folder; must not hold anything yet.
-        frames: how many frames of a video to take; None goes by its motion.
-        masks: folder of ``NAME.png``, black where nothing is to be matched; photographs alone.
-        distance: names of two pictures and the metres between them.
+        out: the project's folder; absent or empty.
+        frames: how many frames of a video to take; None goes by its motion, see ``video``.
+        masks: folder of ``NAME.png``, black where no features are to be found; not for videos.
+        distance: names of two pictures and the distance between their places, metres.
         learned: finds and matches features; None takes COLMAP's SIFT.
         lens: "perspective", "equirectangular" (panoramas, which are cut into faces), "fisheye", or
-            "auto", which looks at the pictures.
-        say: told of each step.
-        draw: adds pictures to the project's folder before it takes its name.
+            "auto": recognised from the pictures.
+        say: is called with a line of text at each step.
+        draw: adds pictures to the project's folder before it gets its name.
 
     Raises:
         ProjectError: too few pictures, no overlap between them, no model, or no place to write.
@@ -208,7 +208,7 @@ def _map(
 
 @contextmanager
 def _telling(findings: Sequence[Finding]) -> Iterator[None]:
-    """Add the warnings so far to the error of what comes."""
+    """Append the warnings so far to an error raised inside, since they may explain it."""
     try:
         yield
     except ProjectError as error:
@@ -220,7 +220,7 @@ def _telling(findings: Sequence[Finding]) -> Iterator[None]:
 
 @contextmanager
 def replaced_folder(out: Path) -> Iterator[Path]:
-    """A folder beside ``out`` to work in, which takes that name when all is done.
+    """A working folder beside ``out``, renamed to ``out`` at the end and removed after an error.
 
     Raises:
         ProjectError: ``out`` holds something, cannot be written, or another capture is at work
@@ -230,9 +230,9 @@ def replaced_folder(out: Path) -> Iterator[Path]:
     work = out.with_name(f".{out.name}.part")
     with folder_lock(work):
         try:
-            # Another capture may have ended since.
+            # Another capture may have written it while this one waited for the lock.
             _refuse_filled(out)
-            # What a capture that was killed has left.
+            # Left by a capture that was killed.
             for path in work.iterdir():
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
             yield work

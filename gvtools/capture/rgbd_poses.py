@@ -1,4 +1,4 @@
-"""Poses of an RGB-D recording: pairs along the path, loops by appearance, one pose graph."""
+"""Poses of an RGB-D recording: registered pairs of frames, loop closures, and a pose graph."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from gvtools.capture.rgbd_frames import RgbdFrames
 
 Float64 = NDArray[np.float64]
 
-# A pair of neighbours that agrees by less is started in other ways, too: a pair that has run into a
-# wrong place can agree in two thirds of its pixels.
+# Neighbours whose agreement is below this are registered from other initial poses, too: at a wrong
+# local minimum two thirds of the pixels can agree.
 SURE = 0.9
-# A frame is compared with those so many before it; every n-th with the one n before.
+# Every n-th frame is also registered to the one n before it.
 GAPS = (2, 4, 8, 16, 32)
-# A new keyframe after so much motion [m, degrees].
+# A new keyframe after so much motion since the last one [m, degrees].
 KEY_SHIFT, KEY_TURN = 0.08, 5.0
-# A keyframe is compared with so many of those that look most like it, or are near by their poses.
+# Loop closures are tried between a keyframe and the ALIKE others that look most like it, and the
+# NEAR ones of nearest pose,
 ALIKE, NEAR = 6, 4
-# Near: within these [m, degrees].
+# of those within this [m, degrees].
 NEAR_SHIFT, NEAR_TURN = 0.6, 30.0
-# Rounds of looking for loops near by the poses of the round before.
+# How often loops by pose are looked for, each time with the poses optimised so far.
 ROUNDS = 2
 
 Say = Callable[[str], object]
@@ -34,15 +35,16 @@ Say = Callable[[str], object]
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Poses of the largest connected part.
+    """Poses of the largest connected part of a recording.
 
     Attributes:
         poses: (4, 4) ``world_from_cam`` by frame, metres; the first frame's is the identity.
         parts: frames of each connected part, the largest first.
         pairs: all that agreed.
-        loops: pairs that close loops, of the largest part.
-        drift: of these, by how much the chain along the path departed: (L, 2) mm and degrees.
-        residuals: the same after optimisation.
+        loops: loop closures, pairs of the largest part that are not neighbours along the path.
+        drift: (L, 2) their errors [mm, degrees] if neighbouring pairs are simply chained; loops
+            across a break of the chain have no row.
+        residuals: (loops, 2) their errors after optimisation [mm, degrees].
         keyframes: numbers of the keyframes.
     """
 
@@ -60,7 +62,7 @@ def find_poses(frames: RgbdFrames, *, say: Say = lambda text: None) -> Found:
 
     Args:
         frames: in order of time.
-        say: told of each step.
+        say: is called with a line of text at each step.
 
     Raises:
         ProjectError: a file is unreadable.
@@ -135,9 +137,9 @@ def _along(frames: RgbdFrames, say: Say) -> dict[tuple[int, int], Pair]:
 
 
 def _next(frames: RgbdFrames, at: int, motion: Float64) -> Pair | None:
-    """A frame and the one before: the best of what its possible starts lead to.
+    """The pair of a frame and the one before it, from the initial pose that gives the best result.
 
-    The camera goes on as it went, or stands still, or is recognised by its features.
+    Tried in this order until one is ``_sure``: the motion before, no motion, and PnP on features.
     """
     best = compare(frames, at, at - 1, start=motion)
     if not _sure(best) and not np.array_equal(motion, np.eye(4)):
@@ -157,6 +159,7 @@ def _better(first: Pair | None, second: Pair | None) -> Pair | None:
 
 
 def _recognised(frames: RgbdFrames, source: int, target: int) -> Pair | None:
+    """The pair of two frames whose initial pose comes from matched features."""
     start = start_from_features(frames.features(source), frames.features(target), frames.feature_K)
     return None if start is None else compare(frames, source, target, start=start)
 
@@ -181,7 +184,7 @@ def _keyframes(count: int, chain: dict[int, Pair]) -> list[int]:
 def _loops_alike(
     frames: RgbdFrames, keyframes: list[int], pairs: dict[tuple[int, int], Pair], *, say: Say
 ) -> None:
-    """Add pairs of keyframes that look alike and agree."""
+    """Add loop closures between keyframes that look alike."""
     say(f"looking for loops among {len(keyframes)} keyframes")
     if len(keyframes) < 2:
         return
@@ -208,7 +211,7 @@ def _loops_near(
     *,
     poses: dict[int, Float64],
 ) -> None:
-    """Add pairs of keyframes that are near by their poses and agree."""
+    """Add loop closures between keyframes whose poses are near each other."""
     for row, source in enumerate(keyframes):
         near = []
         for target in keyframes[:row]:
@@ -222,7 +225,7 @@ def _loops_near(
 
 
 def _drift(loops: list[Pair], chain: dict[int, Pair]) -> Float64:
-    """Residuals of loops on the poses that pairs of neighbours alone give, where they do."""
+    """(L, 2) errors [mm, degrees] of loops on chained poses, where the chain has no break."""
     rows = []
     for pair in loops:
         steps = [chain.get(at) for at in range(pair.source, pair.target, -1)]

@@ -1,9 +1,12 @@
 """A memory that may be larger than RAM: what outgrows its budget is kept in tiles on disk.
 
-It begins as any memory, in RAM. Once it takes more than half of its budget (arrays that grow are
-copied), its observations move to tiles, cubes of voxels, each a store of its own that is in RAM
-while it is used. The table of segments stays in RAM, in the order that it would have there, so that
-culling and the choice of what is drawn are the same; what is chosen is gathered from its tiles.
+It begins like any memory, wholly in RAM. Once it takes more than half of its budget (the rest is
+room for copies while arrays grow), its observations move to tiles. A tile covers a cube of space.
+It is a Store of its own, in RAM while it is used, in a file otherwise.
+
+A segment is the stored sequence of one view's observations in one block (16 x 16 x 16 voxels of one
+level). The table of all segments stays in RAM, in the order that it would have without tiles, so
+that culling and the choice of what is drawn are the same; chosen segments are copied from tiles.
 """
 
 from __future__ import annotations
@@ -28,17 +31,24 @@ from gvtools.memory.tiles.octree import WHOLE
 from gvtools.memory.tiles.tile import Tile
 from gvtools.memory.tiles.tile_set import TileSet
 
-# A memory moves to tiles when it takes this share of the budget.
+# A memory moves to tiles when it takes more than this share of the budget.
 IN_RAM = 0.5
-# What an observation takes in RAM: columns, index, its share of segments and of what was agreed.
+# RAM for an observation: columns, index, its share of segments and of the log of agreements.
 OBSERVATION_BYTES = 64
 
 
 class _NewSegments(NamedTuple):
-    """Segments that one view adds to a tile.
+    """S segments that one view adds to a tile.
 
-    ``first`` is the first of the view's points in the segment's block, ``number`` the tile's,
-    ``local`` and ``start`` where they are in it; the others are the segment's own.
+    Attributes:
+        first: (S,) index of the view's first point in the segment's block.
+        number: (S,) number of the tile.
+        local: (S,) row of the segment in the tile's own table.
+        start: (S,) row of the segment's first observation in the tile.
+        level: (S,) of its voxels: 2**level finest voxels wide.
+        length: (S,) number of observations.
+        view: (S,) row of the view.
+        box: (S, 7) see Segments.
     """
 
     first: NDArray[np.int64]
@@ -54,7 +64,7 @@ class _NewSegments(NamedTuple):
 def _new_segments(
     store: Store, number: int, before: int, *, first: NDArray[np.int64]
 ) -> _NewSegments:
-    """Those behind the first ``before`` of a tile."""
+    """A tile's segments from row ``before`` of its table on."""
     s, span = store.segments, slice(before, store.segments.count)
     start = s.start[span].copy()
     return _NewSegments(
@@ -65,16 +75,16 @@ def _new_segments(
 
 
 class PagedColumns(Columns):
-    """The columns of a memory in tiles: their number alone."""
+    """Stands for the columns of a memory in tiles: it knows only the number of observations."""
 
     def __init__(self) -> None:
         self.device, self.count = "cpu", 0
 
     def tensor(self, name: str) -> Any:
-        """There is none.
+        """Refuse: there are no columns in RAM.
 
         Raises:
-            OptionError: always; what to do instead.
+            OptionError: always; it says what to do instead.
         """
         raise OptionError(
             f"the memory's {self.count:,} observations are in tiles on disk, larger than its "
@@ -84,19 +94,19 @@ class PagedColumns(Columns):
 
     @property
     def arrays(self) -> Any:
-        """There are none; see ``tensor``."""
+        """Refuse; see ``tensor``."""
         return self.tensor("")
 
     def cloud(self) -> Any:
-        """There is none; see ``tensor``."""
+        """Refuse; see ``tensor``."""
         return self.tensor("")
 
 
 class TiledMemory(SpatialMemory):
-    """A SpatialMemory with a budget: the same verbs, the same results.
+    """A SpatialMemory with a budget of RAM: the same methods, the same results.
 
-    Observations are the same to the bit, whatever the budget. Pictures are, too, unless a tile is
-    smaller than a block (16 voxels) of its coarsest level; then colours are summed in another order
+    Observations are the same to the bit, whatever the budget. Pictures are, too, unless a block (16
+    voxels a side) of wide voxels is larger than its tile; then colours are summed in another order
     there.
 
     Args:
@@ -105,7 +115,7 @@ class TiledMemory(SpatialMemory):
         axes: see Store.
         options: with a ``budget``.
         scratch: folder for the files of tiles that are not in RAM; None takes the system's for
-            temporary files. They go with the memory: ``save`` keeps it.
+            temporary files. They are deleted with the memory; ``save`` keeps them.
 
     >>> memory = TiledMemory(voxel=0.05, options=MemoryOptions(budget="400MB"))
     >>> len(memory), memory.tiles is None
@@ -132,7 +142,7 @@ class TiledMemory(SpatialMemory):
     def fuse(
         self, points: PointSet, *, round: int, generated: bool = False, scanned: bool = False
     ) -> FuseReport:
-        """Take one view's points in; see SpatialMemory.fuse.
+        """Fuse one view's points; see SpatialMemory.fuse.
 
         Raises:
             OptionError: see SpatialMemory.fuse, as of ShapeError.
@@ -151,7 +161,7 @@ class TiledMemory(SpatialMemory):
             self._move_to_tiles()
 
     def _move_to_tiles(self) -> None:
-        """Begin with one tile of everything, and divide it."""
+        """Make one tile of all observations, and divide it."""
         whole = self._empty()
         whole.columns, whole.segments, whole.index = self.columns, self.segments, self.index
         whole.agreements = self.agreements
@@ -172,7 +182,7 @@ class TiledMemory(SpatialMemory):
         tiles.shrink()
 
     def begin_tiles(self) -> TileSet:
-        """Keep observations in tiles from now on; there are none yet."""
+        """Keep observations in tiles from now on; starts with no tile."""
         assert self.options.budget is not None
         self.columns, self.index, self.agreements = PagedColumns(), VoxelIndex(), {}
         self.tiles = TileSet(self._empty, budget=self.options.budget, scratch=self.scratch)
@@ -186,7 +196,7 @@ class TiledMemory(SpatialMemory):
         return store
 
     def _fuse_tiles(self, columns: list[NDArray[Any]], view: int) -> FuseReport:
-        """Fuse points, checked already, tile by tile."""
+        """Fuse a view's checked points, sorted by tile, tile by tile."""
         tiles = self.tiles
         assert tiles is not None
         with tiles.lock:
@@ -214,7 +224,7 @@ class TiledMemory(SpatialMemory):
         return total
 
     def _update_boxes(self, tile: Tile, fused: Fused, before: int) -> None:
-        """Widen the boxes in the memory's table as those of a tile's segments have become."""
+        """Copy the boxes of a tile's older segments, which new points may widen, to the table."""
         assert tile.store is not None
         rows = tile.segments[fused.first_changed : before]
         box = tile.store.segments.box[fused.first_changed : before]
@@ -222,7 +232,7 @@ class TiledMemory(SpatialMemory):
         self.segments.widen(rows[differs], box[differs])
 
     def _append_segments(self, new: list[_NewSegments]) -> None:
-        """Enter new segments in the order that they would have in RAM: of their first points."""
+        """Enter new segments in the table by their first points: the order without tiles."""
         tiles = self.tiles
         assert tiles is not None
         order = np.argsort(np.concatenate([part.first for part in new]), kind="stable")
@@ -249,7 +259,7 @@ class TiledMemory(SpatialMemory):
 
     @property
     def stored_bytes(self) -> int:
-        """Bytes of the observations, in RAM or not, their segments and index, and agreements."""
+        """Bytes of observations, segments, index and agreements, in RAM or in files."""
         if self.tiles is None:
             return super().stored_bytes
         return self.segments.nbytes + sum(tile.size for _, tile in self.tiles)
@@ -261,7 +271,7 @@ class TiledMemory(SpatialMemory):
         tiles, before = self.tiles, len(self)
         segments, n = self.segments, self.segments.count
         stays = keep_view[segments.view[:n]]
-        # Rows of views change from the first that goes.
+        # Views after the first removed one get new rows, so their tiles change, too.
         first = int(np.argmin(keep_view))
         touched = set(np.unique(tiles.places.tile[:n][segments.view[:n] >= first]).tolist())
         touched |= {number for number, tile in tiles if round in tile.agreed}
@@ -292,22 +302,22 @@ class TiledMemory(SpatialMemory):
         return before - len(self)
 
     def compact(self) -> int:
-        """Join tiles that hold little, as after forgetting; returns by how many there are less."""
+        """Join small neighbouring tiles, as after ``forget``; returns how many fewer there are."""
         if self.tiles is None:
             return 0
         with self.tiles.lock:
             return self.tiles.join_small()
 
     def overview(self, most: int | None = None) -> SpatialMemory:
-        """A memory in RAM of at most ``most`` observations, for what works on a whole memory.
+        """A memory in RAM of at most ``most`` observations, for code that needs a whole memory.
 
-        Where all of them fit, it is this memory as it would be in RAM, to the bit but for the
-        order of what was agreed within a round. Otherwise it is made of thinned copies, in which
-        each view keeps one observation for each cube of 4, or of 16, voxels; what later rounds
-        added to their confidence stays when these are forgotten.
+        If all observations fit, it equals this memory without tiles, to the bit except for the
+        order of agreements within a round. Otherwise it is made of thinned copies, in which each
+        view keeps one observation for each cube of 4, or of 16, voxels a side; confidence that
+        later rounds added to these stays if such a round is forgotten.
 
         Args:
-            most: None takes what half of the budget holds.
+            most: None: as many as half of the budget holds.
         """
         if self.tiles is None:
             return self
@@ -344,9 +354,9 @@ class TiledMemory(SpatialMemory):
         """Read a memory that was saved as a file or as tiles.
 
         Args:
-            path: that ``save`` was given, or the folder of tiles.
-            budget: bytes; None takes that of the memory that was saved as tiles.
-            scratch: see TiledMemory; where it is given, the saved folder may be removed afterwards.
+            path: the path given to ``save``, or the folder of tiles.
+            budget: bytes; None takes the budget saved with tiles.
+            scratch: see TiledMemory; if given, the saved folder may be removed afterwards.
 
         Raises:
             MemoryFileError: absent, truncated, altered, of another kind or version.

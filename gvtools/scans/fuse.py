@@ -14,11 +14,12 @@ from gvtools.memory.store.points import PointSet
 from gvtools.scans.placement import Placement
 from gvtools.scans.points import Scan
 
-# Nearest neighbours that tell how densely points lie.
+# Density around a point is computed from so many nearest neighbours.
 NEIGHBOURS = 8
-# A point so many times sparser than its neighbours is dust, or a mixed pixel at an edge.
+# A point whose neighbours are so many times farther away than those of its neighbours is isolated:
+# dust, or a mixed pixel at a depth edge.
 ISOLATED = 4.0
-# Views of scans are named so, apart from photographs.
+# A scan's views are named PREFIX/FILE/STATION.
 PREFIX = "scan"
 
 
@@ -27,7 +28,8 @@ def fuse_scan(
 ) -> FuseReport:
     """Fuse a scan's points, station by station; they are ``scanned``, see ``SpatialMemory.fuse``.
 
-    Each point is as wide as its neighbours are apart, which decides its voxel and its footprint.
+    A point's spacing is the distance between its neighbours; it decides the point's voxel and the
+    size of its splat.
 
     Args:
         memory: is added to.
@@ -35,7 +37,7 @@ def fuse_scan(
         placement: of the scan in the memory's world.
         round: that its points belong to.
     """
-    # About the origins, where digits are not lost.
+    # Relative to both origins: georeferenced coordinates are too large for float32.
     turn = placement.world_from_scan[:3, :3]
     local = memory.frame.from_world(scan.positions @ turn.T + placement.apply(scan.origin))
     spacing, isolated = point_spacing(local)
@@ -64,11 +66,14 @@ def fuse_scan(
 def point_spacing(
     positions: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """How far apart points of a surface lie, from the density around each.
+    """The spacing of points on a surface, from the density around each.
+
+    Args:
+        positions: (N, 3).
 
     Returns:
-        (N,) distances, the unit of ``positions``: with the k-th neighbour at a distance r, points
-        are r sqrt(pi / (k - 1)) apart. (N,) bool, points that lie alone.
+        (N,) spacing, the unit of ``positions``: with the k-th neighbour at a distance r it is
+        r sqrt(pi / (k - 1)). (N,) bool, isolated points.
 
     >>> grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
     >>> round(float(np.median(point_spacing(grid)[0])), 1)
@@ -81,7 +86,7 @@ def point_spacing(
         return np.ones(len(positions)), np.zeros(len(positions), np.bool_)
     away, rows = KDTree(positions).query(positions, count + 1, workers=-1)
     radius = away[:, count]
-    # Unbiased where points lie at random: the last neighbour is on the rim.
+    # k - 1, since the k-th neighbour lies on the border of the disc: unbiased for random points.
     spacing = radius * np.sqrt(np.pi / max(count - 1, 1))
     around = np.median(radius[rows[:, 1:]], axis=1)
     isolated = radius > ISOLATED * around
@@ -91,7 +96,7 @@ def point_spacing(
 
 
 def _camera(name: str, center: NDArray[np.float64]) -> Cameras:
-    """Stands for a station: it has a place, and no picture."""
+    """A camera of one pixel at a station's place (3,), since a view needs one."""
     one = np.ones(1, np.int64)
     pose = np.eye(4)
     pose[:3, 3] = -center

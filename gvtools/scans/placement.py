@@ -1,4 +1,4 @@
-"""Where a scan lies in the photographs' world: a similarity, given or estimated."""
+"""The similarity from a scan's frame to the photographs' world, given or estimated."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FORMS = (
     f"{ESTIMATE}, {IDENTITY}, a text file with a 3x4 or 4x4 matrix, or its 12 or 16 numbers row by "
     "row with commas between"
 )
-# Entries of the rotation are a rotation's to this.
+# Tolerance of RᵀR = I for a given rotation R.
 ORTHONORMAL = 1e-3
 
 
@@ -26,11 +26,12 @@ class Placement:
     """A similarity, and how well it is supported.
 
     Attributes:
-        world_from_scan: (4, 4) float64, scale times rotation, and shift, of the file's coordinates.
-        how: "given", "as it is" or "estimated".
+        world_from_scan: (4, 4) float64, scale times rotation, and translation, for the file's
+            coordinates.
+        how: "given", "as it is" (an estimate that left the scan where it was) or "estimated".
         fitness: share of the photographs' points that have a point of the scan within
-            ``tolerance``; None where it was not looked at, as for the next ones.
-        scan_fitness: share of the scan's points near the photographs' that have one of those.
+            ``tolerance``; None for a given placement, like the next ones.
+        scan_fitness: share of the scan's points that have one of the photographs'.
         rmse: of the distances within ``tolerance``, scene units.
         tolerance: scene units.
     """
@@ -52,7 +53,7 @@ class Placement:
         return positions @ self.world_from_scan[:3, :3].T + self.world_from_scan[:3, 3]
 
     def told(self) -> str:
-        """What it is, for the user."""
+        """A line of text for the user."""
         text = f"{self.how}, scale {self.scale:.6g}"
         if self.fitness is None:
             return text
@@ -75,11 +76,11 @@ class Placement:
 
 
 def given_placement(text: str) -> Placement | None:
-    """The placement of a text, see FORMS; None where it is to be estimated.
+    """The placement that a text gives, see FORMS; None for "estimate".
 
     Raises:
-        OptionError: none of them, or no similarity.
-        ProjectError: a file that holds no such matrix.
+        OptionError: another form, or a matrix that is no similarity.
+        ProjectError: a file without a 3x4 or 4x4 matrix.
 
     >>> round(given_placement("2,0,0,5, 0,2,0,0, 0,0,2,0").scale, 6)
     2.0

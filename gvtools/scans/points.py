@@ -1,4 +1,4 @@
-"""What scan files hold, before they are placed: points in chunks, and stations that saw them."""
+"""Points of scan files, read in chunks in the file's frame, with the stations that saw them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 # Points that are read at once.
 CHUNK = 1 << 20
-# What files of gvtools call a completer's points: those are no scan's.
+# Name of the attribute that marks a completer's points in files of gvtools; they are left out.
 GENERATED = "generated"
 
 
@@ -20,8 +20,8 @@ class Station:
     """Where a scanner stood.
 
     Attributes:
-        name: of the scan.
-        center: x, y, z in the file's frame; None where the file does not tell.
+        name: of the scan taken there.
+        center: x, y, z in the file's frame; None if the file does not say.
     """
 
     name: str
@@ -34,10 +34,10 @@ class Chunk:
 
     Attributes:
         positions: (N, 3) float64, the file's frame and unit; may hold NaN.
-        colors: (N, 3), uint8, or uint16 where the file may mean 8 or 16 bits; None without.
-        intensity: (N,) float32, any unit; None without.
-        station: row of the file's stations.
-        dropped: points that the file itself marks as unusable, by reason.
+        colors: (N, 3) uint8, or uint16 if the file may mean 8 or 16 bits; None without colours.
+        intensity: (N,) float32, any unit; None without intensity.
+        station: index into the file's stations.
+        dropped: number of points that the file itself marks as unusable, by reason.
     """
 
     positions: NDArray[np.float64]
@@ -47,7 +47,7 @@ class Chunk:
     dropped: dict[str, int] = field(default_factory=dict)
 
     def without(self, flags: NDArray[np.bool_], reason: str) -> Chunk:
-        """The points but for those with a flag (N,), which are counted by the reason."""
+        """The points without the flagged ones (N,), which are counted as dropped for a reason."""
         if not flags.any():
             return self
         keep = ~flags
@@ -66,9 +66,9 @@ class ScanFile:
 
     Attributes:
         path: the file.
-        count: points that it holds, the unusable ones included.
+        count: number of points, including unusable ones.
         stations: at least one.
-        chunks: reads the points, from the first to the last.
+        chunks: reads all points, in the order of the file.
     """
 
     path: Path
@@ -83,15 +83,15 @@ class Scan:
 
     Attributes:
         name: of the file.
-        origin: (3,) float64 that positions count from, so that georeferenced ones keep their
-            digits.
-        positions: (N, 3) float64 from ``origin``.
+        origin: (3,) float64, subtracted from positions, so that georeferenced ones keep their
+            precision.
+        positions: (N, 3) float64, relative to ``origin``.
         colors: (N, 3) uint8.
-        station: (N,) int32, rows of ``stations``.
+        station: (N,) int32, indices into ``stations``.
         stations: where they were scanned from.
-        colored_by: "colour", "intensity" (grey) or "nothing" (an even grey).
-        count: points in the file.
-        dropped: points that are not here, by reason.
+        colored_by: source of the colours: "colour", "intensity" (grey) or "nothing" (one grey).
+        count: number of points in the file.
+        dropped: number of points of the file that are left out, by reason.
     """
 
     name: str

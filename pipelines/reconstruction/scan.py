@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pipelines.console import Console
     from pipelines.reconstruction.plan import Plan
 
-# Views whose recorded depth shows a scan's place, and pixels of each.
+# A scan is registered to recorded depth of at most so many views, and so many pixels of each.
 VIEWS, PIXELS = 40, 5000
 
 
@@ -39,8 +39,8 @@ class ScanOptions(Settings):
     """The similarity from the scan's frame to the photographs' world: estimate, identity, a text
     file with a 3x4 or 4x4 matrix, or its numbers row by row with commas between."""
     min_fitness: float = Field(0.5, gt=0, le=1)
-    """An estimated placement is refused where a smaller share of the photographs' points has a
-    point of the scan beside it, and of the scan's points near them, too."""
+    """An estimated placement is refused if smaller shares of both the photographs' points and the
+    scan's points have a point of the other beside them."""
 
     def files(self) -> tuple[Path, ...]:
         """What decides a run's result, for its fingerprint."""

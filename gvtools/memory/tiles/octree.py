@@ -17,11 +17,12 @@ from gvtools.memory.store.voxel_index import (
 )
 from gvtools.memory.store.voxel_levels import VoxelLevels
 
-# The blocks of this level are the cells: 16 voxels that are 8 edges wide.
+# Cells are the blocks of voxels of this level: 16 voxels, each 8 finest voxels wide.
 CELL_LEVEL = 3
+# Level of the cube of all cells.
 ROOT = COORDINATE_BITS
 _MASK = (1 << COORDINATE_BITS) - 1
-# Of points beyond every cell, whose voxels are wide enough to have a key.
+# Key of points beyond all cells; only the widest voxels reach there. They share the tile FAR.
 FAR_KEY = np.int64(1 << 62)
 # A cube: its level (edge of 2**level cells) and its coordinates in such edges.
 Node = tuple[int, int, int, int]
@@ -30,7 +31,7 @@ WHOLE: Node = (ROOT, 0, 0, 0)
 
 
 def cell_keys(positions: NDArray[np.float32], voxel: float) -> NDArray[np.int64]:
-    """(N,) key of the cell of each point."""
+    """(N,) int64 key of the cell of each point (N, 3); ``voxel``: edge of the finest voxels."""
     count = len(positions)
     keys, places = np.empty(count, np.int64), np.empty(count, np.uint16)
     levels = np.full(count, CELL_LEVEL, np.uint8)
@@ -46,12 +47,14 @@ def cell_coordinates(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class Octree:
-    """Leaves are tiles by number; the leaf of a cell is remembered until its cube is divided.
+    """An octree whose leaves are the cubes of tiles.
+
+    The tile of each cell is cached until its cube is divided or joined.
 
     Attributes:
         leaves: tile numbers by cube.
-        divided: cubes that have smaller ones in their place.
-        usual: level of a cube that a tile of the finest voxels fills.
+        divided: cubes that are divided into smaller ones.
+        usual: expected level of a tile that holds only the finest voxels, from the last division.
     """
 
     def __init__(self) -> None:
@@ -71,10 +74,10 @@ class Octree:
         *,
         free: int,
     ) -> tuple[NDArray[np.int32], list[Node]]:
-        """The tile of each point (N,), and the cubes of tiles that are new, numbered from ``free``.
+        """The tile of each point (N,), and the cubes of new tiles, numbered from ``free``.
 
-        Where no tile is, a cube becomes a leaf that is about as large as the parts of the last
-        division, in proportion to the voxels: a memory that grows need not be divided again.
+        A new tile's cube is about as large as the parts of the last division, in proportion to its
+        voxels, so that it will rarely have to be divided.
         """
         keys = cell_keys(positions, levels.edge)
         before = self._cells.blocks
@@ -89,7 +92,7 @@ class Octree:
         made: list[Node] = []
         unknown = np.flatnonzero(self._tile < 0)
         if len(unknown):
-            # Only those of this call: others may never be asked for again.
+            # Only cells of this call: other unknown ones may never be needed again.
             seen = np.zeros(len(self._tile), np.bool_)
             seen[cells] = True
             for cell in unknown[seen[unknown]].tolist():
@@ -117,16 +120,16 @@ class Octree:
         return node
 
     def forget_tile(self, number: int) -> None:
-        """Look the cells of a tile up anew when they are asked for."""
+        """Drop the cached cells of a tile."""
         self._tile[self._tile == number] = -1
 
     def divide(self, node: Node) -> None:
-        """A cube that is a leaf no longer."""
+        """Turn a leaf into a divided cube."""
         self.forget_tile(self.leaves.pop(node))
         self.divided.add(node)
 
     def families(self) -> dict[Node, list[Node]]:
-        """Divided cubes whose parts are leaves, with those parts."""
+        """Divided cubes whose parts are all leaves, with those parts."""
         inner = {parent(node) for node in self.divided if node != WHOLE}
         out: dict[Node, list[Node]] = {}
         for node in self.leaves:
@@ -135,7 +138,7 @@ class Octree:
         return out
 
     def join(self, node: Node, parts: list[Node], number: int) -> None:
-        """A divided cube becomes the leaf ``number``; its parts are leaves no more."""
+        """Turn a divided cube into the leaf of tile ``number``, in place of its parts."""
         for part in parts:
             self.forget_tile(self.leaves.pop(part))
         self.divided.discard(node)

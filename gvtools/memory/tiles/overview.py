@@ -1,4 +1,4 @@
-"""A memory in tiles as one in RAM: whole, or made of its tiles' thinned copies."""
+"""A memory in RAM made from one in tiles: of all observations, or of the tiles' thinned copies."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def overview(memory: SpatialMemory, tiles: TileSet, most: int) -> SpatialMemory:
 
 
 def _completed(memory: SpatialMemory, columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Columns with those that follow from the view."""
+    """Add the columns that follow from the view: round, generated, and empty chains."""
     view = columns["view"]
     made = {"round": memory.views.round[view], "generated": memory.views.generated[view]}
     return {**columns, **made, "next": np.full(len(view), -1, np.int32)}
@@ -67,7 +67,7 @@ def _whole(memory: SpatialMemory, tiles: TileSet, out: SpatialMemory) -> dict[st
 def _thinned(
     memory: SpatialMemory, tiles: TileSet, most: int
 ) -> tuple[dict[str, NDArray[Any]], NDArray[np.int32]]:
-    """Columns of the finest thinned copies that fit, else of the coarsest; segments' lengths."""
+    """Columns of the finest thinned copies that fit, else of the coarsest; and (n,) lengths."""
     segments, n = memory.segments, memory.segments.count
     doublings = next((d for d in DOUBLINGS if _size(tiles, d) <= most), DOUBLINGS[-1])
     kind = np.full(n, doublings, np.uint8)

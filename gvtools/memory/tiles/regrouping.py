@@ -1,4 +1,4 @@
-"""Stores cut into parts and put together, segment by segment."""
+"""Cutting a store into parts, and joining stores, by whole segments."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from gvtools.memory.store.columns import ATTRIBUTES
 from gvtools.memory.store.store import Store
 
-# Chains are linked anew.
+# Placeholder for the column ``next``: rebuild_index links the chains again.
 NONE = np.full(1, -1, np.int32)
 
 
 def part_of(store: Store, rows: NDArray[np.int64], part: Store) -> Store:
-    """Fill ``part`` with some segments of a store, by their ``rows`` in its table, ascending."""
+    """Copy the segments ``rows`` (ascending) of a store's table into the empty store ``part``."""
     segments = store.segments
     length = segments.length[rows].astype(np.int64)
     chosen = rows_of(segments.start[rows], length)
@@ -43,7 +43,7 @@ def part_of(store: Store, rows: NDArray[np.int64], part: Store) -> Store:
 
 
 def joined(stores: Sequence[Store], whole: Store) -> Store:
-    """Fill ``whole`` with stores that share no voxel, one behind the other."""
+    """Copy stores that share no voxel into the empty store ``whole``, one behind the other."""
     first = np.cumsum([0, *(len(store) for store in stores)])
     whole.columns.replace(
         int(first[-1]),
@@ -67,7 +67,7 @@ def joined(stores: Sequence[Store], whole: Store) -> Store:
 
 
 def rows_of(start: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The rows of segments, one segment after the other."""
+    """Rows of the observations of segments (start, length), one segment after the other."""
     ends = np.cumsum(length)
     total = int(ends[-1]) if len(ends) else 0
     return np.arange(total) + np.repeat(start - (ends - length), length)

@@ -1,7 +1,7 @@
-"""Level of detail: thinned copies of a tile's segments, for cameras far away.
+"""Level of detail: thinned copies of a tile's segments, for distant cameras.
 
-A copy has one observation for each cube of 4, or of 16, voxels of its level that a segment holds
-something of. Segments stay the unit: a copy's observations belong to the same block and view.
+In a copy, the observations of a segment that lie in one cube of 4, or of 16, voxels a side become
+one, their mean weighted by confidence. So a copy's segments have the same block and view.
 """
 
 # mypy: no-check-untyped-defs
@@ -17,12 +17,12 @@ from gvtools.kernels import compiled
 from gvtools.memory.store.store import Store
 from gvtools.memory.store.voxel_index import LOCAL_MASK
 
-# How often the edge of voxels is doubled in each copy.
+# The cubes of the copies are 2**2 and 2**4 voxels wide.
 DOUBLINGS = (2, 4)
 
 
 class Drawn(NamedTuple):
-    """What splatting reads of observations: (N, 3), (N, 3), (N,) and (N,), see ColumnArrays."""
+    """The columns that splatting reads: (N, 3), (N, 3), (N,) and (N,), see ColumnArrays."""
 
     positions: NDArray[np.float32]
     colors: NDArray[np.uint8]
@@ -38,7 +38,7 @@ class ThinnedCopy(NamedTuple):
 
 
 def drawn(count: int) -> Drawn:
-    """Rows to be written."""
+    """Uninitialised columns for ``count`` observations."""
     single = np.float32
     return Drawn(
         np.empty((count, 3), single), np.empty((count, 3), np.uint8),

@@ -1,4 +1,4 @@
-"""The tiles of a memory: which are in RAM, where segments lie, how tiles divide and join."""
+"""The tiles of a memory: which are in RAM, which hold a segment, and how they divide and join."""
 
 from __future__ import annotations
 
@@ -30,30 +30,31 @@ from gvtools.memory.tiles.regrouping import joined, part_of
 from gvtools.memory.tiles.segment_places import SegmentPlaces
 from gvtools.memory.tiles.tile import Tile
 
-# Levels of voxels whose blocks are as wide as a cell.
+# Level of the voxels whose blocks are as wide as a cell, see octree.
 BLOCK_LEVEL = 3
-# Shares of the budget: what tiles may take in RAM, and one of them.
+# Shares of the budget: all tiles in RAM together, and the largest tile.
 CACHE, LARGEST = 0.6, 1 / 32
-# Bytes below which a tile is not divided: files would be many.
+# Tiles of fewer bytes are not divided, which would give too many files.
 SMALLEST = 1 << 18
 
 
 class TileSet:
-    """Tiles, at most some of them in RAM: the least recently used is written to a file.
+    """Tiles, some of them in RAM; the least recently used ones are written to files.
 
-    Files of the working folder are scratch; what ``save`` wrote elsewhere links to them. A tile's
-    file is never written again: its next state gets another name.
+    The files of the working folder are scratch: ``save`` hard-links them elsewhere. A file is never
+    changed, as a saved memory may share it: a tile's next state gets another name.
 
     Args:
         empty: makes a tile's store without observations.
-        budget: bytes, of which tiles in RAM take a share.
-        scratch: where the working folder is made; None takes the system's.
+        budget: bytes; tiles in RAM may take the share CACHE of it.
+        scratch: where the working folder is made; None: the system's folder for temporary files.
 
     Attributes:
-        tiles: by number; None where one was divided or joined.
-        octree: their cubes.
-        places: of the memory's segments.
+        tiles: by number; None for a tile that was divided or joined.
+        octree: the cubes that the tiles cover.
+        places: tile and row of each segment of the memory.
         lock: held while tiles are read, written or moved.
+        reserved: bytes of a tile that is being divided, so that its parts find room beside it.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class TileSet:
         return tile
 
     def each(self) -> Iterator[Tile]:
-        """Every tile, to be read one by one; what was read before leaves RAM where it has to."""
+        """Every tile, to be read one by one; earlier ones are evicted if RAM is needed."""
         for number, tile in list(self):
             with self.lock:
                 yield tile
@@ -94,12 +95,12 @@ class TileSet:
 
     @property
     def resident(self) -> int:
-        """Bytes of the tiles in RAM."""
+        """Bytes that tiles take in RAM."""
         return self._resident
 
     @property
     def folder(self) -> Path:
-        """The working folder; it goes with the memory.
+        """The working folder, made when first needed and deleted with the memory.
 
         Raises:
             ProjectError: it cannot be made.
@@ -119,11 +120,11 @@ class TileSet:
         return self._folder
 
     def close(self) -> None:
-        """Remove the working folder, and with it what no ``save`` has kept."""
+        """Remove the working folder, and with it everything that was not saved."""
         self._remove()
 
     def add(self, tile: Tile) -> int:
-        """A further tile; returns its number."""
+        """Add a tile; returns its number."""
         self.tiles.append(tile)
         number = len(self.tiles) - 1
         self.octree.leaves[tile.node] = number
@@ -131,7 +132,7 @@ class TileSet:
         return number
 
     def load(self, number: int) -> Store:
-        """A tile's store, in RAM now.
+        """A tile's store, read into RAM if it is not there.
 
         Raises:
             MemoryFileError: its file is damaged.
@@ -145,15 +146,15 @@ class TileSet:
         return tile.store
 
     def touch(self, number: int) -> None:
-        """A tile was used, or takes another number of bytes than before."""
+        """Note that a tile was used, and how many bytes it takes in RAM now."""
         self._resident += self[number].resident - self._recent.pop(number, 0)
         self._recent[number] = self[number].resident
 
     def shrink(self, *, keep: int = -1) -> None:
-        """Write tiles to files, the least recently used first, until the others fit.
+        """Write tiles to files, the least recently used first, until the others fit the budget.
 
         Args:
-            keep: number of a tile that stays.
+            keep: number of a tile that stays in RAM.
 
         Raises:
             ProjectError: the disk is full; no tile is lost.
@@ -166,7 +167,7 @@ class TileSet:
                 self.evict(number)
 
     def evict(self, number: int) -> None:
-        """Take a tile out of RAM; what has changed is written first."""
+        """Take a tile out of RAM; if it has changed, it is written first."""
         tile = self[number]
         if tile.dirty:
             self.write(number)
@@ -183,12 +184,12 @@ class TileSet:
             old.unlink(missing_ok=True)
 
     def write_after(self, name: str) -> None:
-        """Give later states of tiles other names than that of a file which is there already."""
+        """Number later files after an existing one, so that none gets its name."""
         with suppress(IndexError, ValueError):
             self._writes = max(self._writes, int(name.split(".")[1]))
 
     def drop(self, number: int) -> None:
-        """A tile is no more."""
+        """Remove a tile that was divided or joined."""
         tile = self[number]
         self._resident -= self._recent.pop(number, 0)
         if tile.owned and tile.file is not None:
@@ -207,7 +208,7 @@ class TileSet:
         return numbers
 
     def divide_large(self, numbers: Sequence[int]) -> None:
-        """Divide those of some tiles that have grown too large, and what comes of them."""
+        """Divide the given tiles that have grown too large, and their parts if need be."""
         left = list(numbers)
         while left:
             number = left.pop()
@@ -216,7 +217,7 @@ class TileSet:
                 left += self._divide(number)
 
     def _divide(self, number: int) -> list[int]:
-        """The numbers of a tile's parts; none where no block may be cut further."""
+        """Divide a tile; returns its parts' numbers, none if only whole blocks are left."""
         tile = self[number]
         size = tile.size
         if size <= 2 * tile.indivisible or tile.node == FAR:
@@ -255,7 +256,7 @@ class TileSet:
         return out
 
     def join_small(self) -> int:
-        """Join the parts of divided cubes that hold little; returns by how many tiles less."""
+        """Join small parts of divided cubes; returns how many fewer tiles there are."""
         less = 0
         while True:
             small = [
@@ -296,17 +297,17 @@ def part_levels(
     least: int,
     largest: float,
 ) -> tuple[NDArray[np.int64], list[Node]]:
-    """How far a cube is divided: each part until it is light enough.
+    """Levels of the parts of a cube that is divided until each part is small enough.
 
     Args:
-        cells: (S, 3) of the segments.
-        weight: (S,) bytes.
-        level: of the cube.
-        least: level below which no cube may be.
+        cells: (S, 3) cell coordinates of the segments.
+        weight: (S,) bytes of the segments.
+        level: of the cube, 2**level cells wide.
+        least: smallest level that a part may have.
         largest: bytes that a part may have.
 
     Returns:
-        The level of each segment's part (S,), and the cubes that are divided.
+        (S,) the level of each segment's part, and the cubes that were divided.
     """
     levels = np.full(len(cells), level)
     inner: list[Node] = []
@@ -323,7 +324,7 @@ def part_levels(
 
 
 def _remove_scratch(folder: Path, scratch: Path | None) -> None:
-    """Remove a working folder, and the folder around it if it was made for that."""
+    """Remove a working folder, and ``scratch`` around it if it was made for it."""
     shutil.rmtree(folder, ignore_errors=True)
     if scratch is not None:
         with suppress(OSError):
