@@ -220,6 +220,56 @@ def archive(source: Path | bytes) -> Iterator[zipfile.ZipFile]:
         raise ValueError(f"damaged archive: {error or type(error).__name__}") from None
 
 
+def unpack_gzip(data: bytes, most: int) -> bytes:
+    """What a gzip stream holds.
+
+    Args:
+        data: one stream.
+        most: bytes that it may unpack to.
+
+    Raises:
+        ValueError: damaged, cut, or more than that.
+
+    >>> import gzip
+    >>> unpack_gzip(gzip.compress(b"abc"), 3)
+    b'abc'
+    """
+    unpacker = zlib.decompressobj(31)
+    try:
+        found = unpacker.decompress(data, most + 1)
+    except zlib.error as error:
+        raise ValueError(f"damaged gzip stream ({error})") from None
+    if len(found) > most:
+        raise ValueError(f"{len(data)} bytes that unpack to more than {most}")
+    if not unpacker.eof:
+        raise ValueError("a gzip stream that ends early")
+    return found
+
+
+class LimitedReader:
+    """A stream of which no more than a number of bytes can be read.
+
+    Args:
+        stream: unpacks what it reads.
+        most: bytes.
+    """
+
+    def __init__(self, stream: IO[bytes], most: int) -> None:
+        self.stream, self.left = stream, most
+
+    def read(self, size: int) -> bytes:
+        """Read on.
+
+        Raises:
+            ValueError: it holds more.
+        """
+        found = self.stream.read(size)
+        self.left -= len(found)
+        if self.left < 0:
+            raise ValueError("more than such a file can hold")
+        return found
+
+
 def load_arrays(source: Path | bytes, *names: str) -> dict[str, NDArray[Any]]:
     """Arrays of an ``.npz`` file, without pickle.
 

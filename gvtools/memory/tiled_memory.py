@@ -217,7 +217,8 @@ class TiledMemory(SpatialMemory):
                 tiles[number].changed()
                 tiles.touch(number)
                 tiles.shrink(keep=number)
-            self._append_segments(new)
+            if new:
+                self._append_segments(new)
             self.columns.count += total.added
             tiles.divide_large(touched.tolist())
             tiles.shrink()

@@ -13,6 +13,7 @@ from pathlib import Path
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
 from gvtools.runs.layout import MEMORY
+from gvtools.untrusted import named_file, read_text, regular
 
 SUMS = "SHA256SUMS"
 
@@ -42,13 +43,14 @@ def check_sums(folder: Path, names: Iterable[str] | None = None) -> None:
     if not path.is_file():
         return
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
         sums = {name: total for total, name in (line.split("  ", 1) for line in lines)}
     except (OSError, ValueError) as error:
         raise _damaged(path, str(error)) from None
     for name in sums if names is None else names:
+        file = named_file(folder, name, where=str(path))
         try:
-            whole = sums.get(name) in (None, _sum(folder / name))
+            whole = sums.get(name) in (None, _sum(file))
         except OSError as error:
             raise _damaged(folder / name, error.strerror or str(error)) from None
         if not whole:
@@ -64,7 +66,7 @@ def _damaged(path: Path, why: str) -> ProjectError:
 
 def _sum(path: Path) -> str:
     total = hashlib.sha256()
-    with path.open("rb") as file:
+    with regular(path).open("rb") as file:
         while part := file.read(1 << 20):
             total.update(part)
     return total.hexdigest()

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
+from gvtools.scans.e57_parts import check_e57
 from gvtools.scans.points import CHUNK, Chunk, ScanFile, Station
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -34,6 +35,7 @@ def open_e57(path: Path) -> ScanFile:
     """
     import pye57
 
+    check_e57(path)
     with pye57.E57(str(path)) as file:
         headers = [file.get_header(index) for index in range(file.scan_count)]
         if not headers:

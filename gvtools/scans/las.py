@@ -20,6 +20,8 @@ NOISE = (7, 18)
 COLORS = ("red", "green", "blue")
 # Bits that a compressed point takes at least; LASzip spends far more on coordinates.
 LEAST_BITS = 1
+# Of points that are read at once.
+CHUNK_BYTES = 1 << 26
 # Bytes of a header up to the counts of its records, and what each record takes at least.
 LEAST_HEADER, RECORD, LONG_RECORD = 227, 54, 60
 
@@ -47,7 +49,7 @@ def open_las(path: Path) -> ScanFile:
 
     def chunks() -> Iterator[Chunk]:
         with laspy.open(path) as reader:
-            for points in reader.chunk_iterator(CHUNK):
+            for points in reader.chunk_iterator(min(CHUNK, max(1, CHUNK_BYTES // max(size, 1)))):
                 yield _chunk(points)
 
     return ScanFile(path, count, (Station(path.stem),), chunks)
@@ -73,13 +75,30 @@ def _check_records(path: Path) -> None:
         )
     if head[25] >= 4 and len(head) >= 247:
         start, long_records = struct.unpack_from("<QI", head, 235)
-        if long_records and start + long_records * LONG_RECORD > size:
+        if long_records and not _long_records_fit(path, start, long_records, size=size):
             raise MemoryFileError(
                 f"{path}: its header says {long_records} records after byte {start} of {size}; the "
                 "file is truncated or damaged; save it again"
             )
     if head[104] & 0x80:
         _check_pieces(path, at, size)
+
+
+def _long_records_fit(path: Path, at: int, count: int, *, size: int) -> bool:
+    """Whether the records after the points, whose heads tell their lengths, end in the file."""
+    if at + count * LONG_RECORD > size:
+        return False
+    with path.open("rb") as file:
+        for _ in range(count):
+            file.seek(at)
+            head = file.read(LONG_RECORD)
+            if len(head) < LONG_RECORD:
+                return False
+            # After two reserved bytes, a name of 16 and a number of two.
+            at += LONG_RECORD + int(struct.unpack_from("<Q", head, 20)[0])
+            if at > size:
+                return False
+    return True
 
 
 def _check_pieces(path: Path, at: int, size: int) -> None:

@@ -1,7 +1,8 @@
-"""Points of PCD files: ASCII, binary, or compressed (through Open3D)."""
+"""Points of PCD files: ASCII, binary, or compressed."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,16 +13,26 @@ from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
 from gvtools.scans.points import Chunk, ScanFile, Station
-from gvtools.scans.tables import LEAST_TEXT, Columns, binary_rows, check_size, text_rows
+from gvtools.scans.tables import (
+    LEAST_TEXT,
+    Columns,
+    binary_rows,
+    check_size,
+    rows_at_once,
+    text_rows,
+)
 
 MAX_HEADER = 1 << 13
 KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS",
         "DATA")  # fmt: skip
 KINDS = {"F": "f", "U": "u", "I": "i"}
+SIZES = ("1", "2", "4", "8")
 # Three compressed bytes stand for no more than 264.
 MOST_RATIO = 88
-# Compressed points are unpacked all at once.
+# Of compressed points, which are unpacked into a temporary file.
 MOST_BYTES = 1 << 31
+# What is read of a compressed file's fields.
+READ = ("x", "y", "z", "rgb", "rgba", "intensity")
 
 
 @dataclass(frozen=True)
@@ -50,9 +61,8 @@ def open_pcd(path: Path) -> ScanFile:
 
     def chunks() -> Iterator[Chunk]:
         if header.data == "binary_compressed":
-            yield _decompressed(path, count)
-            return
-        if header.data == "binary":
+            rows = _unpacked_rows(path, header)
+        elif header.data == "binary":
             rows = binary_rows(path, dtype, count, offset=header.offset)
         else:
             rows = text_rows(path, _flat_names(dtype), count, offset=header.offset)
@@ -74,12 +84,12 @@ def _flat_names(dtype: np.dtype[np.void]) -> tuple[str, ...]:
 def _chunk(columns: Columns, dtype: np.dtype[np.void]) -> Chunk:
     positions = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
     packed = next((name for name in ("rgb", "rgba") if name in columns), None)
-    colors = None if packed is None else _unpacked(columns[packed], dtype[packed])
+    colors = None if packed is None else _rgb(columns[packed], dtype[packed])
     intensity = columns["intensity"].astype(np.float32) if "intensity" in columns else None
     return Chunk(positions, colors, intensity)
 
 
-def _unpacked(packed: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.uint8]:
+def _rgb(packed: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.uint8]:
     """(N, 3) of colours in one number each, 0xRRGGBB; as float, its bits are meant."""
     if kind.kind == "f":
         bits = packed.astype(np.float32).view(np.uint32)
@@ -110,24 +120,38 @@ def _check_compressed(path: Path, header: _Header) -> None:
         )
 
 
-def _decompressed(path: Path, count: int) -> Chunk:
-    import open3d as o3d
+def _unpacked_rows(path: Path, header: _Header) -> Iterator[Columns]:
+    """Chunks of compressed points, which lie field by field.
 
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.t.io.read_point_cloud(str(path), format="pcd")
-    held = {key: cloud.point[key].numpy() for key in cloud.point}
-    if len(held.get("positions", ())) != count:
-        raise MemoryFileError(
-            f"{path}: {len(held.get('positions', ()))} points could be unpacked; expected {count}; "
-            "the file is damaged; save it again"
-        )
-    colors = held.get("colors")
-    intensity = held.get("intensity")
-    return Chunk(
-        held["positions"].astype(np.float64),
-        None if colors is None else colors.astype(np.uint8),
-        None if intensity is None else intensity.reshape(-1).astype(np.float32),
-    )
+    Raises:
+        MemoryFileError: damaged.
+    """
+    from gvtools.scans.lzf import unpack
+
+    dtype, count = header.dtype, header.count
+    size = int(np.fromfile(path, "<u4", 1, offset=header.offset)[0])
+    packed = np.memmap(path, np.uint8, "r", header.offset + 8, (size,))
+    with tempfile.TemporaryFile() as file:
+        try:
+            found = unpack(packed, file)
+        except ValueError:
+            found = -1
+        del packed
+        file.flush()
+        if found != count * dtype.itemsize:
+            raise MemoryFileError(
+                f"{path}: its compressed points unpack to {max(found, 0)} bytes; expected "
+                f"{count * dtype.itemsize}; the file is damaged; save it again"
+            )
+        names = [name for name in READ if name in (dtype.names or ())]
+        step = rows_at_once(dtype)
+        for first in range(0, count, step):
+            rows, columns = min(step, count - first), {}
+            for name in names:
+                kind, start = dtype.fields[name][:2]  # type: ignore[index]
+                file.seek(count * start + first * kind.itemsize)
+                columns[name] = np.frombuffer(file.read(rows * kind.itemsize), kind, rows)
+            yield columns
 
 
 def _header(path: Path) -> _Header:
@@ -164,8 +188,8 @@ def _checked(given: dict[str, list[str]], offset: int) -> _Header:
     counts = [int(count) for count in given.get("COUNT", ["1"] * len(names))]
     columns: list[tuple[Any, ...]] = []
     for name, kind, size, count in zip(names, given["TYPE"], given["SIZE"], counts, strict=True):
-        if not 1 <= count <= 4096:
-            raise ValueError(f"COUNT {count}")
+        if not 1 <= count <= 4096 or size not in SIZES:
+            raise ValueError(f"COUNT {count}, SIZE {size[:9]}")
         # Gaps between fields have the name _, perhaps several times.
         label = f"gap {len(columns)}" if name == "_" else name
         shape = (label, KINDS[kind] + size)
@@ -173,6 +197,9 @@ def _checked(given: dict[str, list[str]], offset: int) -> _Header:
     dtype = np.dtype(columns)
     if not {"x", "y", "z"} <= set(names):
         raise ValueError("no x, y, z")
+    several = [name for name in READ if name in names and dtype[name].shape]
+    if several:
+        raise ValueError(f"{several[0]} of several numbers")
     count = int(given["POINTS"][0])
     if count < 0 or count != int(given["WIDTH"][0]) * int(given["HEIGHT"][0]):
         raise ValueError(f"{count} points")

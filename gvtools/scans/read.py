@@ -23,7 +23,7 @@ CELLS = 1 << 14
 DARK, BRIGHT, GREY = 0.01, 0.99, 128
 # Beyond it no unit is meant.
 FARTHEST = 1e15
-WRONG = (KeyboardInterrupt, SystemExit, GeneratorExit, MemoryError)
+WRONG = (KeyboardInterrupt, SystemExit, GeneratorExit)
 
 
 def open_scan(path: Path) -> ScanFile:
@@ -96,15 +96,24 @@ def _one_line(path: Path) -> Iterator[None]:
         raise
     except ImportError as error:
         raise OptionError(_absent(path, str(error))) from None
-    except BaseException as error:  # readers in Rust raise panics, which are no Exceptions
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        # laspy has an error of its own where no decompressor is installed.
-        if "backend" in reason.lower() and "No LazBackend" in reason:
-            raise OptionError(_absent(path, reason)) from None
+    except MemoryError:
         raise MemoryFileError(
-            f"{path}: cannot be read ({reason}); the file is damaged, or of a kind that is not "
-            "known; save it again"
+            f"{path}: asks for more memory than there is; the file is damaged, or too large for "
+            "this machine; save it again"
         ) from None
+    except BaseException as error:  # readers in Rust raise panics, which are no Exceptions
+        # laspy has an error of its own where no decompressor is installed.
+        if "No LazBackend" in str(error):
+            raise OptionError(_absent(path, "no decompressor")) from None
+        reason = getattr(error, "strerror", None)
+        if reason is None:
+            # The words of a format's library and its places in C++ tell users nothing.
+            failed = "checksum" in str(error).lower()
+            reason = "a checksum does not match" if failed else "its parts contradict each other"
+        raise MemoryFileError(
+            f"{path}: cannot be read ({reason}); expected a whole {path.suffix.upper()[1:]} point "
+            "cloud; the file is damaged, or of a kind that is not known; save it again"
+        ) from error
 
 
 def _absent(path: Path, reason: str) -> str:

@@ -7,7 +7,6 @@ fill all of space without overlap.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from gvtools.errors import ProjectError
 from gvtools.files import write_json
+from gvtools.untrusted import read_json
 
 FILE = "block.json"
 FORMAT, VERSION = "gvtools block", 1
@@ -118,10 +118,10 @@ class Block:
         """
         path = folder / FILE
         try:
-            kept = _File.model_validate(json.loads(path.read_text(encoding="utf-8")))
+            kept = _File.model_validate(read_json(path))
             poses = {name: np.array(pose, np.float64) for name, pose in kept.poses.items()}
-            if any(pose.shape != (4, 4) for pose in poses.values()):
-                raise ValueError("a pose is no 4x4 matrix")
+            if any(pose.shape != (4, 4) or not np.isfinite(pose).all() for pose in poses.values()):
+                raise ValueError("a pose is no 4x4 matrix of numbers")
             missing = {*kept.owners, *kept.targets} - poses.keys()
             if missing:
                 raise ValueError(f"no pose of {min(missing)}")

@@ -180,6 +180,11 @@ def undistortion(
         raise ProjectError(
             f"{what}: {model} {list(params)} cannot be undistorted ({error})"
         ) from None
+    if _impossible(target):
+        raise ProjectError(
+            f"{what}: {model} {list(params)} cannot be undistorted: what results "
+            f"{_impossible(target)}; solve or export the model again"
+        )
     return Undistortion(camera, target, False)
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import gzip
 import struct
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,10 +27,14 @@ from gvtools.appearance.splat.project_kernels import (
 from gvtools.appearance.turning import turned
 from gvtools.errors import MemoryFileError
 from gvtools.files import replaced_when_written
+from gvtools.untrusted import read_bytes, unpack_gzip
 from pipelines.export.source import ExportOptions, Source
 from pipelines.export.splats import Splats, splats_of
 
 MAGIC, VERSION = 0x5053474E, 3
+# What may be unpacked: so many bytes for each of the file's, which harmonics of zeros need, and so
+# many more. In RAM a Gaussian takes several times what it does there.
+MOST_RATIO, MOST_BYTES = 16, 1 << 22
 # Header: magic, version, count, degree of the harmonics, fractional bits, flags, reserved.
 HEADER = struct.Struct("<IIIBBBB")
 # From right, down, forward to right, up, back.
@@ -97,9 +100,10 @@ def read(path: Path) -> Splats:
             header says.
     """
     try:
-        data = gzip.decompress(path.read_bytes())
+        packed = read_bytes(path)
+        data = unpack_gzip(packed, MOST_RATIO * len(packed) + MOST_BYTES)
         magic, version, count, degree, fractional, _, _ = HEADER.unpack_from(data)
-    except (OSError, EOFError, zlib.error, struct.error) as error:
+    except (OSError, ValueError, struct.error) as error:
         raise MemoryFileError(
             f"{path}: no SPZ of version 2 or 3 ({error}); expected a gzip stream"
         ) from None
@@ -108,6 +112,8 @@ def read(path: Path) -> Splats:
             f"{path}: SPZ version {version}, harmonics of degree {degree}; expected version 2 or "
             "3, degree 3 at most"
         )
+    if not count:
+        raise MemoryFileError(f"{path}: no Gaussians; expected some")
     terms = (degree + 1) ** 2 - 1
     lengths = [9, 1, 3, 3, 3 if version == 2 else 4, 3 * terms]
     bytes_ = np.frombuffer(data, np.uint8, offset=HEADER.size)

@@ -25,7 +25,7 @@ from pydantic import Field
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.settings import Settings
-from gvtools.untrusted import parse_yaml
+from gvtools.untrusted import parse_yaml, read_text
 
 # Words in braces that a command may hold, beside the names of earlier stages.
 WORDS = ("project", "name", "out")
@@ -118,7 +118,7 @@ def read_list(path: Path) -> FleetSpec:
         OptionError: a key or value is wrong.
     """
     try:
-        data: Any = parse_yaml(path.read_text(encoding="utf-8"))
+        data: Any = parse_yaml(read_text(path))
     except OSError as error:
         raise ProjectError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError as error:

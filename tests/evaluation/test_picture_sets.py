@@ -179,6 +179,10 @@ def test_what_holds_no_pictures_is_refused(tmp_path):
     (tmp_path / "predictions.tar.gz").write_bytes(b"x")
     with pytest.raises(ProjectError, match="no readable archive"):
         open_pictures(tmp_path / "predictions.tar.gz")
+    bomb = {"color/a.png": bytes(200 << 20)}
+    write_archive(tmp_path / "large.tar.gz", bomb)
+    with pytest.raises(ProjectError, match="more than such a file can hold"):
+        open_pictures(tmp_path / "large.tar.gz")
     write_archive(tmp_path / "empty.tar.gz", {"info.json": b"{}"})
     with pytest.raises(ProjectError, match="no pictures under color/"):
         open_pictures(tmp_path / "empty.tar.gz")

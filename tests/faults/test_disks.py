@@ -153,6 +153,17 @@ def test_a_flipped_bit_of_a_training_state_is_named_or_without_effect(tmp_path, 
     assert found > 40
 
 
+def test_sums_name_no_file_outside_of_their_round(tmp_path):
+    from gvtools.runs.sums import SUMS, check_sums
+
+    (tmp_path / "secret").write_text("x")
+    folder = tmp_path / "round_000"
+    folder.mkdir()
+    (folder / SUMS).write_text(f"{'0' * 64}  ../secret\n")
+    with pytest.raises(ProjectError, match="outside"):
+        check_sums(folder)
+
+
 def test_a_run_that_was_copied_reads_without_its_sums(run, tmp_path):
     """Runs of earlier versions have none."""
     from gvtools.runs.run import load_run

@@ -190,6 +190,97 @@ def test_a_count_beyond_the_file_is_refused_before_anything_is_allocated(tmp_pat
         refused(pcd)
 
 
+def test_compressed_pcd_is_unpacked_piece_by_piece(tmp_path, monkeypatch):
+    o3d = pytest.importorskip("open3d")
+    from gvtools.scans import tables
+
+    # Far copies and long ones, over the borders of pieces.
+    rng = np.random.default_rng(1)
+    positions = np.repeat(rng.normal(size=(700, 3)).round(1), 9, axis=0).astype(np.float32)
+    path = tmp_path / "scan.pcd"
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(positions))
+    o3d.t.io.write_point_cloud(str(path), cloud, compressed=True)
+    monkeypatch.setattr(tables, "CHUNK_BYTES", 5000)
+    scan = same(path, positions, None)
+    assert len(scan) == 6300
+
+
+@pytest.mark.parametrize(
+    "packed",
+    [b"\x05ab", b"\x20\x00", b"\x00a\x20\x01", b"\x00a\x20", b"\x00a\xe0", b"\x00a\xe0\xff"],
+)
+def test_damaged_lzf_is_refused(packed):
+    import io
+
+    from gvtools.scans.lzf import unpack
+
+    with pytest.raises(ValueError, match="damaged"):
+        unpack(np.frombuffer(packed, np.uint8), io.BytesIO())
+
+
+def test_lzf_copies_reach_over_pieces():
+    import io
+
+    from gvtools.scans.lzf import PIECE, WINDOW, unpack
+
+    literal = bytes(range(32))
+    # 300 bytes at once, from 32 and from 8192 bytes back, 3 MB in all.
+    near, far = b"\xe0\xff\x1f", b"\xff\xff\xff"
+    expected = bytearray(literal)
+    tokens = [b"\x1f" + literal]
+    rng = np.random.default_rng(0)
+    while len(expected) < 3 * PIECE:
+        token, back = (far, WINDOW) if rng.random() < 0.5 and len(expected) > WINDOW else (near, 32)
+        tokens.append(token)
+        start = len(expected) - back
+        expected += bytes(expected[start + k % back] for k in range(264))
+        more = rng.integers(0, 256, 7, np.uint8).tobytes()
+        tokens.append(b"\x06" + more)
+        expected += more
+    out = io.BytesIO()
+    packed = np.frombuffer(b"".join(tokens), np.uint8)
+    assert unpack(packed, out) == len(expected) and out.getvalue() == bytes(expected)
+
+
+@pytest.mark.parametrize(
+    ("xml", "said"),
+    [
+        (b'<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "document type"),
+        (b"<a>" * 99 + b"</a>" * 99, "deep"),
+        (b"<r>" + b"<a/>" * 200_000 + b"</r>", "elements"),
+        ('<?xml version="1.0" encoding="UTF-16"?><a/>'.encode("utf-16"), "no element"),
+        (b'<?xml version="1.0" encoding="latin-1"?><a/>', "encoding"),
+        (b"<a>", "XML part"),
+    ],
+)
+def test_e57_whose_xml_would_take_too_much_is_refused(tmp_path, xml, said):
+    from hostile.sealed import PAGE, crc32c
+
+    step = PAGE - 4
+    pages = -(-(48 + len(xml)) // step)
+    head = b"ASTM-E57" + np.array([1, 0], "<u4").tobytes()
+    head += np.array([pages * PAGE, 48, len(xml), PAGE], "<u8").tobytes()
+    whole = (head + xml).ljust(pages * step, b"\0")
+    parts = [whole[k : k + step] for k in range(0, len(whole), step)]
+    path = tmp_path / "scan.e57"
+    if len(parts) < 20:
+        path.write_bytes(b"".join(p + crc32c(p).to_bytes(4, "big") for p in parts))
+    else:
+        path.write_bytes(b"".join(p + bytes(4) for p in parts))
+    assert said in refused(path)
+
+
+def test_errors_of_libraries_are_told_in_plain_words(tmp_path):
+    pytest.importorskip("pye57")
+    positions, _ = surface(300)
+    columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), positions.T, strict=True))
+    path = write_e57(tmp_path / "scan.e57", [columns])
+    message = refused(damaged(path, lambda data: data.__setitem__(2000, data[2000] ^ 1)))
+    assert "a checksum does not match" in message and "E57_" not in message
+    message = refused(damaged(path, lambda data: data.__delitem__(slice(4096, None))))
+    assert "4096 bytes, but its header says" in message
+
+
 def test_e57_with_a_count_beyond_its_bytes_is_refused(tmp_path, monkeypatch):
     pye57 = pytest.importorskip("pye57")
     positions, _ = surface(300)

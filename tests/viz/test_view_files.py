@@ -111,6 +111,14 @@ def test_splats_are_those_of_the_export(run, exported, name):
     np.testing.assert_allclose(gaussians.colors, colors, atol=0.51 if exact else 2.6)
 
 
+def test_spz_that_unpacks_to_more_than_it_can_hold_is_refused(tmp_path):
+    header = struct.pack("<IIIBBBB", 0x5053474E, 3, 1_000_000, 0, 12, 0, 0)
+    file = tmp_path / "a.spz"
+    file.write_bytes(gzip.compress(header + bytes(20_000_000)))
+    with pytest.raises(MemoryFileError, match="unpack to more"):
+        spz.read(file)
+
+
 @pytest.mark.parametrize("version", [2, 3])
 def test_spz_is_read_as_gsply_reads_it(tmp_path, version):
     gsply = pytest.importorskip("gsply")

@@ -8,9 +8,11 @@ evaluation. Its depth is not read: the files do not say whether it is along the 
 
 from __future__ import annotations
 
+import gzip
 import io
 import re
 import tarfile
+import zlib
 from functools import partial
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from gvtools.errors import ProjectError
 from gvtools.evaluation.picture_matching import IMAGE_ENDINGS
 from gvtools.evaluation.picture_sets.pictures import Picture, PictureSet, image_files, read_rgb
 from gvtools.scenes.scene import Frame, natural_key
+from gvtools.untrusted import UNPACKED_BYTES, UNPACKED_RATIO, LimitedReader, regular
 
 COLOR, TRUTH = "color/", "gt-color/"
 LAYOUT = "NerfBaselines"
@@ -61,14 +64,15 @@ def _picture(file: Path, folder: Path) -> Picture:
 def _archive(file: Path, path: Path, *, others: int = 0) -> PictureSet:
     stored: dict[str, bytes] = {}
     try:
-        with tarfile.open(file, "r:gz") as tar:
+        most = UNPACKED_RATIO * regular(file).stat().st_size + UNPACKED_BYTES
+        with gzip.open(file) as packed, _tar(LimitedReader(packed, most)) as tar:
             for member in tar:
                 name = member.name.removeprefix("./")
                 picture = Path(name).suffix.lower() in IMAGE_ENDINGS
                 if member.isfile() and picture and name.startswith((COLOR, TRUTH)):
                     content = tar.extractfile(member)
                     stored[name] = content.read() if content else b""
-    except (OSError, EOFError, tarfile.TarError) as error:
+    except (OSError, EOFError, ValueError, zlib.error, tarfile.TarError) as error:
         raise ProjectError(
             f"{file}: no readable archive ({error}); expected predictions of NerfBaselines"
         ) from None
@@ -81,6 +85,11 @@ def _archive(file: Path, path: Path, *, others: int = 0) -> PictureSet:
     return PictureSet(
         path, LAYOUT, tuple(_stored(name, stored, file) for name in names), notes=notes
     )
+
+
+def _tar(stream: LimitedReader) -> tarfile.TarFile:
+    # As a stream, of which nothing is skipped unread.
+    return tarfile.open(fileobj=stream, mode="r|")  # type: ignore[call-overload, no-any-return]
 
 
 def _stored(name: str, stored: dict[str, bytes], file: Path) -> Picture:

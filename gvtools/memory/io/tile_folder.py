@@ -139,6 +139,10 @@ def _filled(
     start, length = np.empty(n, np.int64), np.empty(n, np.int32)
     view, box = np.empty(n, np.int32), np.empty((n, 7), np.float32)
     for i, (node, name, checksum, size, count, voxels, agreed) in enumerate(meta["tiles"]):
+        if not all(
+            type(n) is int and 0 <= n < 2**48 for n in (*node, size, count, voxels, *agreed)
+        ):
+            raise ValueError(f"tile {name!r}: of {node!r}, {size!r}, {count!r}, {voxels!r}")
         path = folder / Path(name).name
         tiles.write_after(path.name)
         file = ArrayFile(path)

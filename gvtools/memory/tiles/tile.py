@@ -88,7 +88,9 @@ class Tile:
             arrays = self.store.columns.arrays
             return Drawn(arrays.positions, arrays.colors, arrays.confidence, arrays.spacing)
         file = self._open()
-        return Drawn(*(file.array(name) for name in Drawn._fields))
+        rows = Drawn(*(file.array(name) for name in Drawn._fields))
+        check(file, _numbers(rows))
+        return rows
 
     def thinned(self, doublings: int) -> ThinnedCopy:
         """The thinned copy whose cubes are 2**doublings voxels wide.
@@ -102,7 +104,7 @@ class Tile:
             start = file.array(f"{head}start")
             check(file, len(start) == len(self.segments) + 1 and _alike(file, head, rows))
             check(file, start[0] == 0 and start[-1] == len(rows.spacing))
-            check(file, bool((np.diff(start) >= 0).all()))
+            check(file, bool((np.diff(start) >= 0).all()) and _numbers(rows))
             return ThinnedCopy(start, rows)
         if doublings not in self._copies:
             self._copies[doublings] = thinned_copy(self.store, doublings)
@@ -112,7 +114,10 @@ class Tile:
         """A column of all observations."""
         if self.store is not None:
             return np.asarray(getattr(self.store.columns, name))
-        return self._open().array(name)
+        file = self._open()
+        column = file.array(name)
+        check(file, column.dtype.kind != "f" or bool(np.isfinite(column).all()))
+        return column
 
     def agreements(self) -> list[tuple[int, Agreement]]:
         """(round, (rows, confidence added, confidence before)) of each view that agreed here."""
@@ -245,6 +250,8 @@ def check_segments(file: ArrayFile, segments: Segments, views: int) -> None:
     ends = np.cumsum(length)
     check(file, bool((length > 0).all()) and np.array_equal(start, ends - length))
     check(file, (int(ends[-1]) if n else 0) == file.meta.get("count"))
+    # A box of nothing is infinite.
+    check(file, not np.isnan(segments.box[:n]).any())
     check(file, not n or bool(0 <= view.min() <= view.max() < views))
 
 
@@ -260,6 +267,20 @@ def _check(file: ArrayFile, views: int) -> None:
     check(file, int(level.max(initial=0)) <= MOST_LEVEL)
     check(file, not len(row) or bool(0 <= row.min() <= row.max() < count))
     check_segments(file, read_segments(file), views)
+    drawn = Drawn(*(file.array(name) for name in Drawn._fields))
+    check(file, _numbers(drawn) and bool((drawn.confidence >= 0).all()))
+    check(file, bool((drawn.spacing >= 0).all()))
+    number, start = file.array("agreement_round"), file.array("agreement_start")
+    check(file, start.shape == (len(number) + 1,) and int(start[0]) == 0)
+    check(file, int(start[-1]) == len(row) and bool((np.diff(start) >= 0).all()))
+    for name in ("weight", "before"):
+        values = file.array(f"agreement_{name}")
+        check(file, values.shape == row.shape and bool(np.isfinite(values).all()))
+
+
+def _numbers(rows: Drawn) -> bool:
+    """Whether the values of observations are finite."""
+    return bool(all(np.isfinite(column).all() for column in rows if column.dtype.kind == "f"))
 
 
 def _alike(file: ArrayFile, head: str, rows: Drawn) -> bool:

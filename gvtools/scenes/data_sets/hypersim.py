@@ -252,9 +252,12 @@ def _parameters(root: Path, scene: str) -> dict[str, str]:
     for folder in (root, root.resolve().parent):
         path = folder / PARAMETERS
         if path.is_file():
-            with regular(path).open(newline="", encoding="utf-8") as file:
-                found = (row for row in csv.DictReader(file) if row["scene_name"] == scene)
-                return next(found, {})
+            try:
+                with regular(path).open(newline="", encoding="utf-8") as file:
+                    found = (row for row in csv.DictReader(file) if row["scene_name"] == scene)
+                    return next(found, {})
+            except (OSError, KeyError, ValueError, csv.Error) as error:
+                raise ProjectError(f"{path}: unreadable ({error}); copy it again") from None
     return {}
 
 

@@ -32,6 +32,7 @@ from gvtools.scenes.images import read_mask
 from gvtools.scenes.scene import Finding, Scene
 
 BASELINE = 0.065  # metres
+LEAST_DISPARITY = 1e-9  # pixels
 SAME_SURFACE = 0.05  # relative disparity between neighbours of one surface
 
 IMAGE, DISPARITY = "frame_left_{:04d}.png", "disp1_left_{:04d}.dsp5"
@@ -58,7 +59,9 @@ def spring_depth(path: Path, *, focal: float, sky: Path | None) -> NDArray[np.fl
         times = disparity.shape[0] // mask.shape[0]
         disparity[np.repeat(np.repeat(mask, times, axis=0), times, axis=1)] = 0
     middle = halved(disparity)
-    depth = np.divide(focal * BASELINE, middle, out=np.zeros_like(middle), where=middle > 0)
+    # Nearer to nothing than any disparity is, it gives no depth that float32 holds.
+    near = middle > LEAST_DISPARITY
+    depth = np.divide(focal * BASELINE, middle, out=np.zeros_like(middle), where=near)
     return depth.astype(np.float32)
 
 

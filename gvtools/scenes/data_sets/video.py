@@ -125,9 +125,11 @@ def _opened(path: Path, *, edits: bool = True) -> Any:
         )
     except (av.error.FFmpegError, OSError, ValueError) as error:
         raise ProjectError(f"{path}: no readable video ({error}); copy it again") from None
-    if not container.streams.video:
+    streams = container.streams.video
+    if not streams or streams[0].codec_context is None:
         container.close()
-        raise ProjectError(f"{path}: a file without video stream; expected a video")
+        what = "whose codec is not known" if streams else "without video stream"
+        raise ProjectError(f"{path}: a file {what}; expected a video")
     return container
 
 

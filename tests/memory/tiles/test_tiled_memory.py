@@ -148,6 +148,15 @@ def test_a_round_is_forgotten_as_in_ram(tmp_path, round):
     assert_same(memory, expected)
 
 
+def test_a_view_none_of_whose_points_is_usable_changes_nothing(tiled):
+    memory, _ = tiled
+    before = len(memory)
+    none = random_points(np.random.default_rng(0), 9, origin=ORIGIN, name="none")
+    none.positions[:] = np.nan
+    report = memory.fuse(none, round=9)
+    assert (report.added, len(memory), len(memory.views)) == (0, before, VIEWS + 1)
+
+
 def test_forgetting_unknown_rounds_is_refused(tiled):
     with pytest.raises(OptionError, match="round 7 is not in the memory"):
         tiled[0].forget(round=7)
@@ -318,6 +327,26 @@ def test_a_flipped_bit_is_named(tiled, tmp_path, name):
     path.unlink()
     path.write_bytes(data)
     with pytest.raises(MemoryFileError, match=rf"{path.name}.*array {name}.*checksum"):
+        TiledMemory.load(folder).overview(1 if name.startswith("thinned") else 10**9)
+
+
+@pytest.mark.parametrize("name", ["positions", "thinned2_spacing", "segment_box"])
+def test_numbers_that_are_none_are_refused_in_spite_of_a_sound_checksum(tiled, tmp_path, name):
+    folder = tiled[0].save(tmp_path / "memory.npz")
+    path = max(folder.glob("*.tile"), key=lambda p: p.stat().st_size)
+    file = array_file.ArrayFile(path)
+    arrays = {key: file.array(key).copy() for key in file.names}
+    arrays[name][0] = np.nan
+    path.unlink()
+    array_file.write_arrays(path, file.meta, arrays)
+    # As one would who also changes what the index says of the tile.
+    index = array_file.ArrayFile(folder / "memory.index")
+    meta, others = index.meta, {key: index.array(key).copy() for key in index.names}
+    for entry in meta["tiles"]:
+        entry[2] = array_file.ArrayFile(folder / entry[1]).checksum
+    (folder / "memory.index").unlink()
+    array_file.write_arrays(folder / "memory.index", meta, others)
+    with pytest.raises(MemoryFileError, match=r"do not fit together|not finite"):
         TiledMemory.load(folder).overview(1 if name.startswith("thinned") else 10**9)
 
 
