@@ -40,6 +40,7 @@ def python(*words: str, **more: Any) -> subprocess.CompletedProcess[str]:
 def test_what_once_failed_is_read_or_refused():
     # In a process of its own: a reader that crashes would take the tests with it.
     names = [reader.name for reader in READERS]
+    names += [reader.name for reader in data_sets() if entries(reader.name)]
     done = python("-m", "hostile.corpus", *names)
     assert done.returncode == 0, done.stderr[-3000:]
     judged = int(done.stdout.split()[-2])
