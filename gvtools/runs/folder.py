@@ -25,6 +25,7 @@ from gvtools.runs.identity import versions
 from gvtools.runs.layout import (
     MEMORY,
     METRICS,
+    POINTS,
     RECORD,
     REPORT,
     ROUNDS,
@@ -32,7 +33,7 @@ from gvtools.runs.layout import (
     round_folder,
     saved_memory,
 )
-from gvtools.runs.sums import check_sums, write_sums
+from gvtools.runs.sums import SUMS, check_sums, write_sums
 from gvtools.untrusted import read_json
 
 # Files and folders that are still being written.
@@ -128,6 +129,8 @@ class RunDirectory:
                 shutil.rmtree(folder)
         for finished in range(done):
             check_sums(self.round_path(finished))
+        # The run's end writes anew what it has sums of.
+        (self.path / SUMS).unlink(missing_ok=True)
         if done:
             self._finish_round(done - 1)
         return done
@@ -204,7 +207,7 @@ class RunDirectory:
         )
 
     def finish(self, number: int, metrics: Mapping[str, Any]) -> None:
-        """Write the run's figures, and make the memory after its last round the run's own.
+        """Write the run's figures, make the last round's memory the run's own, and write sums.
 
         Args:
             number: of the last round.
@@ -220,6 +223,7 @@ class RunDirectory:
                 with replaced_when_written(self.path / MEMORY) as temporary:
                     shutil.copyfile(last, temporary)
             remove(last)
+        write_sums(self.path, [n for n in (METRICS, POINTS) if (self.path / n).is_file()])
 
     @contextmanager
     def writing_round(self, number: int) -> Iterator[Path]:

@@ -1,6 +1,6 @@
 """Where the files of a run lie, and how they are named.
 
-    run.json  rounds.jsonl  memory.npz (or memory.tiles/)  metrics.json
+    run.json  rounds.jsonl  memory.npz (or memory.tiles/)  memory.ply  metrics.json  SHA256SUMS
     round_000/report.json  round_000/context_depth_VIEW.npz  round_000/appearance.npz
     round_000/poses.npz  tuned/{config.json,geoverse.safetensors,tuning.json}
     round_*/SHA256SUMS
@@ -19,6 +19,7 @@ from pathlib import Path, PurePosixPath
 from gvtools.errors import OptionError, ProjectError
 
 RECORD, REPORT, ROUNDS, METRICS = "run.json", "report.json", "rounds.jsonl", "metrics.json"
+POINTS = "memory.ply"
 MEMORY, APPEARANCE, POSES = "memory.npz", "appearance.npz", "poses.npz"
 # The folder that a memory larger than its budget is saved as, in the place of MEMORY; and where its
 # tiles are written meanwhile.

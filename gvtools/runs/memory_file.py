@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.io.tile_folder import INDEX
 from gvtools.runs.layout import APPEARANCE, MEMORY, round_folder, saved_memory
+from gvtools.runs.sums import check_sums
 
 if TYPE_CHECKING:
     from gvtools.appearance.appearance import Appearance
@@ -35,7 +36,7 @@ def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
         up_to: forget the rounds after this one; None keeps all.
 
     Raises:
-        ProjectError: neither a memory nor a run with one.
+        ProjectError: neither a memory nor a run with one, or the PLY of a run, damaged.
         MemoryFileError: a damaged file.
         OptionError: the memory has no such round.
     """
@@ -44,6 +45,7 @@ def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
 
     memory: SpatialMemory
     if path.suffix.lower() == ".ply":
+        check_sums(path.parent, (path.name,))
         memory = SpatialMemory.from_ply(path)
     else:
         saved = memory_path(path)

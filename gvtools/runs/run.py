@@ -13,10 +13,11 @@ import numpy as np
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError, ProjectError
 from gvtools.runs.folder import RunDirectory
-from gvtools.runs.layout import round_folder
+from gvtools.runs.layout import METRICS, round_folder
 from gvtools.runs.memory_file import load_memory
 from gvtools.runs.poses import refined_poses_of, with_poses
 from gvtools.runs.record import read_record, read_reports, resolved_settings
+from gvtools.runs.sums import check_sums
 from gvtools.runs.target_files import TargetFiles, entry_camera, read_target
 
 if TYPE_CHECKING:
@@ -180,6 +181,7 @@ def load_run(path: Path | str, *, project: Path | None = None) -> Run:
         ProjectError: no run, a damaged one, or one of another version.
     """
     path = Path(path)
+    check_sums(path, [METRICS] if (path / METRICS).is_file() else [])
     return Run(path, read_record(path), read_reports(path), project)
 
 

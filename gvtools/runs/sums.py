@@ -1,7 +1,7 @@
-"""Checksums of a round's files: ``SHA256SUMS`` in its folder, as ``sha256sum -c`` takes it.
+"""Checksums of the files of a run and of its rounds: ``SHA256SUMS``, as ``sha256sum -c`` takes it.
 
-Pictures and JSON do not tell by themselves that a bit of them was flipped. The memory has checksums
-of its own, and moves on to the next round. A round without the file is taken as it is.
+Pictures, PLY and JSON do not tell by themselves that a bit of them was flipped. The memory has
+checksums of its own, and moves on to the next round. A folder without the file is taken as it is.
 """
 
 from __future__ import annotations
@@ -12,28 +12,34 @@ from pathlib import Path
 
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
-from gvtools.runs.layout import MEMORY
+from gvtools.runs.layout import MEMORY, RECORD
 from gvtools.untrusted import named_file, read_text, regular
 
 SUMS = "SHA256SUMS"
 
 
-def write_sums(folder: Path) -> None:
-    """Write the sums of what a round's folder holds.
+def write_sums(folder: Path, names: Iterable[str] | None = None) -> None:
+    """Write the sums of files of a folder.
+
+    Args:
+        folder: of a run or of a round.
+        names: of the files; None: all but the memory.
 
     Raises:
-        ProjectError: it cannot be written.
+        ProjectError: they cannot be written.
     """
-    names = sorted(path.name for path in folder.iterdir() if path.is_file())
-    lines = [f"{_sum(folder / name)}  {name}\n" for name in names if name not in (MEMORY, SUMS)]
+    if names is None:
+        there = (path.name for path in folder.iterdir() if path.is_file())
+        names = (name for name in there if name not in (MEMORY, SUMS))
+    lines = [f"{_sum(folder / name)}  {name}\n" for name in sorted(names)]
     write_text(folder / SUMS, "".join(lines))
 
 
 def check_sums(folder: Path, names: Iterable[str] | None = None) -> None:
-    """Refuse files of a round that are not as they were written.
+    """Refuse files that are not as they were written.
 
     Args:
-        folder: of the round.
+        folder: of a run or of a round.
         names: of the files; None: all that have a sum.
 
     Raises:
@@ -58,9 +64,12 @@ def check_sums(folder: Path, names: Iterable[str] | None = None) -> None:
 
 
 def _damaged(path: Path, why: str) -> ProjectError:
+    folder = path.parent
+    # A run writes anew what is made of its rounds.
+    anew = "" if (folder / RECORD).is_file() else f"remove {folder} and "
     return ProjectError(
-        f"{path}: damaged ({why}); restore it, or remove {path.parent} and run reconstruct again "
-        f"with --resume (if it was edited on purpose, remove {path.parent / SUMS})"
+        f"{path}: damaged ({why}); restore it, or {anew}run reconstruct again with --resume (if "
+        f"it was edited on purpose, remove {folder / SUMS})"
     )
 
 

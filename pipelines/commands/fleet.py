@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,6 +50,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     Raises:
         GvError: the list or an option is wrong, or a task failed; its record says why.
     """
+    from gvtools.runs.folder_lock import folder_lock
     from pipelines.fleet.drive import run_fleet
     from pipelines.fleet.results import report
     from pipelines.fleet.slurm import write_slurm
@@ -65,9 +67,12 @@ def run(args: argparse.Namespace, console: Console) -> None:
         console.line(f"{len(tasks)} tasks; submit them with: bash {script}")
         console.line("then, when they have run: the same command with --collect")
         return
-    if not args.collect:
-        run_fleet(tasks, lambda left: _engine(left, args, console), console=console)
-    failed = report(tasks, root, console)
+    # A second driver would begin the same commands; of a URL, the user has to take care.
+    alone = nullcontext() if args.collect or is_url(root) else folder_lock(Path(root))
+    with alone:
+        if not args.collect:
+            run_fleet(tasks, lambda left: _engine(left, args, console), console=console)
+        failed = report(tasks, root, console)
     if failed:
         first = failed[0]
         raise ProjectError(

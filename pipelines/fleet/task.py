@@ -11,19 +11,22 @@ import platform
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
 from gvtools.errors import GvError
-from gvtools.files import write_text
+from gvtools.files import remove, write_text
 from pipelines.fleet.spec import Task, is_url
 from pipelines.fleet.storage import fetched, read_record, scratch, stored, write_record
 
 DONE, FAILED = "done", "failed"
 # Commands that go on where an earlier attempt stopped, when told so.
-RESUMABLE = ("reconstruct", "train")
+RESUMABLE = ("reconstruct", "train", "merge")
+# Commands whose folder appears at once, and that refuse one which is there.
+AT_ONCE = ("capture", "split")
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _BUSY = "another process is at work there"
 
@@ -83,10 +86,14 @@ def _attempt(task: Task) -> tuple[str, str, bool]:
     words = {"project": str(fetched(task.project)), "name": task.scene,
              "out": str(_folder(task, task.stage)), **folders}  # fmt: skip
     arguments = [_filled(word, words) for word in task.command]
-    if task.command[0] in RESUMABLE and Path(words["out"]).exists():
+    out = Path(words["out"])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    log = out.with_name(f"{task.stage}.log")
+    if task.command[0] in RESUMABLE and out.exists():
         arguments += [] if "--resume" in arguments else ["--resume"]
-    Path(words["out"]).parent.mkdir(parents=True, exist_ok=True)
-    log = Path(words["out"]).with_name(f"{task.stage}.log")
+    elif task.command[0] in AT_ONCE and log.exists() and out.is_dir():
+        # An attempt ended after the command and before the record.
+        remove(out)
     with log.open("ab") as file:
         code = subprocess.run(
             [sys.executable, "-m", "pipelines.cli", *arguments],
@@ -94,14 +101,14 @@ def _attempt(task: Task) -> tuple[str, str, bool]:
             stdout=file,
             stderr=subprocess.STDOUT,
             env={**os.environ, **dict.fromkeys(THREADS, str(task.cpus))},
-            preexec_fn=_die_with_parent,
+            preexec_fn=_dying_with(os.getpid()),
         ).returncode
     last = (log.read_text(encoding="utf-8", errors="replace").splitlines() or [""])[-1]
     if is_url(task.root):
         write_record(f"{task.root}/{task.scene}/{task.stage}.log.json", {"log": log.read_text(
             encoding="utf-8", errors="replace")})  # fmt: skip
     if code == 0:
-        stored(Path(words["out"]), f"{task.root}/{task.scene}/{task.stage}")
+        stored(out, f"{task.root}/{task.scene}/{task.stage}")
         return DONE, "", False
     if code < 0:
         return FAILED, f"ended by {signal.Signals(-code).name}", True
@@ -109,12 +116,25 @@ def _attempt(task: Task) -> tuple[str, str, bool]:
     return FAILED, last or f"exit status {code}", code != 2 or _BUSY in last
 
 
-def _die_with_parent() -> None:
-    """A command must not outlive its worker: the next attempt needs the folder."""
-    if sys.platform == "linux":
-        import ctypes
+def _dying_with(worker: int) -> Callable[[], None] | None:
+    """What a command's process does first: it must not outlive its worker.
 
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    The next attempt needs the folder.
+    """
+    if sys.platform != "linux":
+        return None
+    import ctypes
+
+    # Loaded here: between fork and exec, locks of other threads may be held for ever.
+    system = ctypes.CDLL(None)
+
+    def die_with_worker() -> None:
+        system.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+        if os.getppid() != worker:
+            # It died before the line above.
+            os._exit(1)
+
+    return die_with_worker
 
 
 def _filled(word: str, words: dict[str, str]) -> str:

@@ -12,6 +12,7 @@ from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import (
     APPEARANCE,
     MEMORY,
+    POINTS,
     POSES,
     REPORT,
     TILES_AT_WORK,
@@ -232,7 +233,7 @@ def _finish(
     from gvtools.memory.io.ply import export_memory_ply
     from pipelines.reconstruction.measure import measure_run
 
-    export_memory_ply(memory, directory.path / "memory.ply")
+    export_memory_ply(memory, directory.path / POINTS)
     metrics = measure_run(plan, memory, directory, console=console)
     directory.finish(len(plan.schedule), metrics)
     return draw(plan, directory) if draw else ()
