@@ -50,9 +50,9 @@ class Guidance:
         """One view, as a batch of one."""
         return self.select([index])
 
-    def select(self, index: Sequence[int]) -> Guidance:
-        """Some views, in that order."""
-        rows = list(index)
+    def select(self, index: Sequence[int] | slice) -> Guidance:
+        """Some views, in that order; a slice copies no image."""
+        rows = index if isinstance(index, slice) else list(index)
         return Guidance(self.cameras[rows], *(getattr(self, name)[rows] for name in IMAGES))
 
     def blank(self) -> Guidance:

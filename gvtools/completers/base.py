@@ -256,10 +256,9 @@ def _completed(
             f"({said}); expected smaller pictures: --max-side {max(width, height) // 2}, or "
             "another completer"
         )
-    halves = (range(count // 2), range(count // 2, count))
-    parts = [
-        _completed(completer, context, guidance.select(list(rows)), seed=seed) for rows in halves
-    ]
+    # Not copied: there is no memory for it.
+    halves = (slice(count // 2), slice(count // 2, count))
+    parts = [_completed(completer, context, guidance.select(rows), seed=seed) for rows in halves]
     if not all(isinstance(part, Completion) for part in parts):
         return parts[0]  # Its caller says what is wrong with it.
     return _joined(parts)
