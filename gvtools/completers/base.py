@@ -212,7 +212,8 @@ def run_completer(
     Raises:
         ShapeError: it returned something else, of another size, or with NaN or infinity; or the
             views are damaged.
-        OptionError: it changed colours that memory knows, or memory does not suffice for one view.
+        OptionError: it changed colours that memory knows, or memory does not suffice for one view,
+            or for the results of all.
     """
     completion = _completed(completer, context, guidance, seed=seed)
     if not isinstance(completion, Completion):
@@ -261,7 +262,14 @@ def _completed(
     parts = [_completed(completer, context, guidance.select(rows), seed=seed) for rows in halves]
     if not all(isinstance(part, Completion) for part in parts):
         return parts[0]  # Its caller says what is wrong with it.
-    return _joined(parts)
+    try:
+        return _joined(parts)
+    except MemoryError as error:
+        raise OptionError(
+            f"completer {completer.name}: memory does not suffice for the results of {count} views "
+            f"of {width}x{height} ({error}); expected fewer of them, as --views-per-round 1, or "
+            "smaller pictures"
+        ) from None
 
 
 def _lacks_memory(error: Exception) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from kill_commands import FIT, settings
 from tiny_scan import write_scan
 
-from gvtools.errors import GvError
+from gvtools.errors import GvError, ProjectError
 from gvtools.runs.context_depth import UNREADABLE, read_context_depth
 from gvtools.runs.memory_file import load_appearance, load_memory
 from gvtools.runs.poses import RunPoses
@@ -87,6 +88,45 @@ def test_what_only_people_read_is_written_anew(run, whole):
     assert (run / "rounds.jsonl").read_bytes() == (whole / "rounds.jsonl").read_bytes()
     assert (run / "memory.ply").read_bytes() == (whole / "memory.ply").read_bytes()
     json.loads((run / "metrics.json").read_text())
+
+
+OWN = {
+    "metrics.json": (load_run, ("report",)),
+    "memory.ply": (load_memory, ("export", "--format", "ply", "--out", "copy.ply")),
+}
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_flipped_bit_of_a_runs_figures_or_points_is_named(run, monkeypatch, name, capsys):
+    path, (read, (command, *words)) = run / name, OWN[name]
+    place = path if name == "memory.ply" else run
+    before = path.read_bytes()
+    for share in (0.1, 0.5, 0.95):
+        flip(path, int(share * len(before)), 0)
+        with pytest.raises(ProjectError, match=f"{name}: damaged"):
+            read(place)
+        path.write_bytes(before)
+    read(place)
+    flip(path, len(before) // 2, 0)
+    monkeypatch.chdir(run)
+    assert main([command, str(place), *words, "--quiet"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert f"{path}: damaged" in line and f"or remove {run} and" not in line
+
+
+def test_the_sums_of_a_run_are_sha256sums(run):
+    lines = [line.split("  ") for line in (run / "SHA256SUMS").read_text().splitlines()]
+    assert [name for _, name in lines] == ["memory.ply", "metrics.json"]
+    for total, name in lines:
+        assert hashlib.sha256((run / name).read_bytes()).hexdigest() == total
+
+
+def test_a_run_without_figures_or_sums_is_taken_as_it_is(run):
+    (run / "metrics.json").unlink()
+    read_all(run)
+    (run / "SHA256SUMS").unlink()
+    flip(run / "memory.ply", -1)
+    load_memory(run / "memory.ply")
 
 
 ARRAYS = ("round_000/appearance.npz", "round_001/depth_*.npz")

@@ -12,15 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from kill_commands import PLAIN
 from kill_contents import contents
-from tiny_scan import write_scan
 
 from gvtools.errors import GvError, ProjectError
 from gvtools.training.state import Progress, StageState, load_state, save_state
 from pipelines.cli import main
 
-RUN = ("--context", "first:4", "--targets", "range:4-5", "--refine", "0", "--set",
-       "views_per_round=1", "--quiet")  # fmt: skip
+RUN = (*PLAIN, "--quiet")
 
 
 @contextmanager
@@ -44,18 +43,6 @@ def full(folder: Path, spare: int = 0) -> None:
     """Fill the disk but for so many bytes."""
     free = os.statvfs(folder)
     (folder / "filler").write_bytes(b"0" * max(0, free.f_bavail * free.f_frsize - spare))
-
-
-@pytest.fixture(scope="module")
-def scan(tmp_path_factory) -> Path:
-    return write_scan(tmp_path_factory.mktemp("disks") / "scan", views=6)
-
-
-@pytest.fixture(scope="module")
-def run(scan, tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("runs") / "run"
-    assert main(["reconstruct", str(scan), "--out", str(out), *RUN]) == 0
-    return out
 
 
 def one_line(capsys: pytest.CaptureFixture[str], *parts: str) -> None:

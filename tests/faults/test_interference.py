@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 
 import pytest
+from kill_commands import PLAIN
 from run_files import results
-from tiny_scan import write_scan
 
 from gvtools.capture.project import replaced_folder
 from gvtools.errors import ProjectError
@@ -19,19 +19,7 @@ from gvtools.scenes.colmap_writer import CAMERAS
 from pipelines.cli import main
 from pipelines.reconstruction.prefetch import prefetch
 
-RUN = ("--context", "first:4", "--targets", "range:4-5", "--refine", "0", "--quiet")
-
-
-@pytest.fixture(scope="module")
-def scan(tmp_path_factory) -> Path:
-    return write_scan(tmp_path_factory.mktemp("interference") / "scan", views=6)
-
-
-@pytest.fixture(scope="module")
-def run(scan, tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("runs") / "run"
-    assert main(["reconstruct", str(scan), "--out", str(out), *RUN]) == 0
-    return out
+RUN = (*PLAIN, "--quiet")
 
 
 def test_a_second_run_of_a_folder_is_refused(scan, run, tmp_path, capsys):

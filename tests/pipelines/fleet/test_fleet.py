@@ -9,12 +9,15 @@ import signal
 import socket
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
+from time import monotonic, sleep
 
 import pytest
 from command_line import refused
 
 from gvtools.errors import OptionError
+from gvtools.runs.folder_lock import folder_lock
 from pipelines.cli import main
 from pipelines.console import Console
 from pipelines.fleet.drive import run_fleet
@@ -23,8 +26,9 @@ from pipelines.fleet.results import collect, result_table
 from pipelines.fleet.slurm import write_slurm
 from pipelines.fleet.spec import FleetSpec, plan, read_list
 from pipelines.fleet.storage import fetched, read_record, stored
-from pipelines.fleet.task import run_task
+from pipelines.fleet.task import _dying_with, record_of, run_task
 
+ROOT = Path(__file__).resolve().parents[3]
 # Quick, and needs no scene.
 QUICK = "weights list"
 LIST = """
@@ -140,7 +144,6 @@ def test_a_command_that_was_killed_may_be_tried_again_and_a_wrong_input_not(
     scenes, tmp_path, monkeypatch
 ):
     task = tasks_of(scenes, tmp_path / "out")[0]
-    from dataclasses import asdict
 
     class Ended:
         returncode = -signal.SIGKILL
@@ -152,6 +155,107 @@ def test_a_command_that_was_killed_may_be_tried_again_and_a_wrong_input_not(
     assert run_task(asdict(task))["again"] is False
 
 
+def test_a_capture_that_ended_before_its_record_is_made_again(tmp_path, monkeypatch):
+    """It refuses a folder that is there, and would so fail each time that the fleet goes on."""
+    (tmp_path / "a").mkdir()
+    spec = FleetSpec(
+        stages={"take": {"command": "capture {project} --out {out}"}}, scenes=[{"project": "a"}]
+    )
+    (task,) = plan(spec, str(tmp_path / "o"), folder=tmp_path)
+    out = tmp_path / "o" / "a" / "take"
+    seen = []
+
+    def ran(*_, **__):
+        seen.append(out.exists())
+        out.mkdir(parents=True)
+        return subprocess.CompletedProcess([], 0)
+
+    monkeypatch.setattr("pipelines.fleet.task.subprocess.run", ran)
+    assert run_task(asdict(task))["status"] == "done"
+    Path(record_of(task)).unlink()
+    assert run_task(asdict(task))["status"] == "done"
+    assert seen == [False, False]
+    # What no attempt of the fleet has made is never removed.
+    Path(record_of(task)).unlink()
+    (tmp_path / "o" / "a" / "take.log").unlink()
+    with pytest.raises(FileExistsError):
+        run_task(asdict(task))
+    assert seen[2:] == [True]
+
+
+def test_a_merge_goes_on_where_an_attempt_stopped(tmp_path, monkeypatch):
+    (tmp_path / "a").mkdir()
+    spec = FleetSpec(
+        stages={"join": {"command": "merge {project} --out {out}"}}, scenes=[{"project": "a"}]
+    )
+    (task,) = plan(spec, str(tmp_path / "o"), folder=tmp_path)
+    words = []
+    monkeypatch.setattr(
+        "pipelines.fleet.task.subprocess.run",
+        lambda command, **_: words.append(command) or subprocess.CompletedProcess([], 1),
+    )
+    run_task(asdict(task))
+    (tmp_path / "o" / "a" / "join").mkdir()
+    run_task(asdict(task))
+    assert ["--resume" in command for command in words] == [False, True]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux")
+def test_a_command_begun_by_a_worker_that_has_died_ends_at_once():
+    die = _dying_with(os.getpid() + 1)
+    assert die is not None
+    process = os.fork()
+    if not process:
+        die()
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux")
+def test_a_command_ends_with_a_driver_that_is_killed(tmp_path):
+    driver = subprocess.Popen(
+        [sys.executable, "-c", WORKER], stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert driver.stdout is not None
+    command = int(driver.stdout.readline())
+    driver.kill()
+    driver.wait()
+    limit = monotonic() + 20
+    while _runs(command):
+        assert monotonic() < limit, "it goes on without its driver"
+        sleep(0.01)
+    driver.stdout.close()
+
+
+# A driver whose thread waits for a command that says its number and would sleep for a minute.
+WORKER = """
+import os, subprocess, sys
+from concurrent.futures import ThreadPoolExecutor
+from pipelines.fleet.task import _dying_with
+
+command = [sys.executable, "-c", "import os, time; print(os.getpid(), flush=True); time.sleep(60)"]
+pool = ThreadPoolExecutor(1)
+pool.submit(subprocess.run, command, preexec_fn=_dying_with(os.getpid())).result()
+"""
+
+
+def _runs(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def test_a_second_driver_of_a_folder_is_refused(scenes, tmp_path, capsys):
+    out = tmp_path / "out"
+    with folder_lock(out):
+        error = refused(capsys, "fleet", scenes, "--engine", "processes", "--out", out)
+    assert "another process is at work" in error
+    assert list(out.iterdir()) == []
+
+
 def test_slurm_scripts_run_each_task_and_collect_tells_what_is_missing(scenes, tmp_path, capsys):
     scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
     out = tmp_path / "out"
@@ -160,8 +264,7 @@ def test_slurm_scripts_run_each_task_and_collect_tells_what_is_missing(scenes, t
     assert len(scripts) == 3
     for script in scripts:
         subprocess.run(["bash", "-n", str(script)], check=True)
-    root = Path(__file__).resolve().parents[3]
-    environment = {**os.environ, "SLURM_ARRAY_TASK_ID": "1", "PYTHONPATH": str(root)}
+    environment = {**os.environ, "SLURM_ARRAY_TASK_ID": "1", "PYTHONPATH": str(ROOT)}
     subprocess.run(["bash", str(out / "stage-first.sh")], env=environment, check=True)
     record = read_record(f"{out}/b/first.json")
     assert record is not None and record["status"] == "done"
@@ -242,8 +345,7 @@ def test_an_address_without_a_cluster_is_refused_at_once(scenes, tmp_path, capsy
 @pytest.mark.slow
 def test_a_local_ray_cluster_runs_a_list(scenes, tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="ray is not installed")
-    root = str(Path(__file__).resolve().parents[3])
-    monkeypatch.setenv("PYTHONPATH", root)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     # Ray keeps a token there.
     monkeypatch.setenv("HOME", str(tmp_path))
     scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
