@@ -1,9 +1,10 @@
 """The similarity between a scan and what photographs saw, estimated from their shapes.
 
 Features of both surfaces (FPFH, R. B. Rusu et al., "Fast Point Feature Histograms for 3D
-registration", ICRA 2009) are matched for several scales, each set of matches gives a similarity by
-LO-RANSAC (pycolmap), and the best are refined by ICP with scale (Open3D). What is not clearly
-supported in the end is refused.
+registration", ICRA 2009) are matched for several scales, first of a few points, then of more; each
+set of matches gives a similarity by LO-RANSAC (pycolmap), and the best are refined by ICP with scale
+(Open3D). What is not clearly supported in the end is refused. How much is tried is limited by the
+points that features are computed of, not by a clock: the result is the same on a busy machine.
 """
 
 from __future__ import annotations
@@ -22,19 +23,32 @@ if TYPE_CHECKING:
 
 Float64 = NDArray[np.float64]
 
-# Points of a surface that features are computed of, about; most that it is known by; and most that
-# ICP and fitness look for partners of.
+# Cells of the photographs' surface that hold a point, about; most points that a surface is known by;
+# and most that ICP and fitness look for partners of.
 POINTS, KNOWN, COUNTED = 6000, 250_000, 8000
 # Fewer tell no shape.
 FEWEST = 300
-# In cells: radii of normals and features, the error of a match, and the steps of ICP.
-NORMALS, FEATURES, MATCH, STEPS = 2.0, 5.0, 1.5, (2.0, 1.0, 0.5)
+# Features are computed of one point in a cube of so many cells, the fewest points first. Finer ones
+# cost more and found less: a kitchen in a scan of four times its extent has 38 true matches at 2,
+# and at 1 more points than can be matched.
+LEVELS = (3.0, 2.0)
+# A placement is searched for with features of at most so many points of the scan at once, and in
+# all; 10,000 take about a second of processor time.
+MOST, BUDGET = 20_000, 200_000
+# Least share of the variance of a point's neighbourhood along its normal, the median, at which
+# points lie on no surface: 0.27 in a cloud of noise, 0.08 in a scan of a kitchen.
+VOLUME, LOOKED_AT = 0.2, 2000
+# Multiples of a level's cells: radii of normals and features, and the error of a match. In cells:
+# the steps of ICP.
+NORMALS, FEATURES, MATCH, STEPS = 2.0, 5.0, 1.5, (4.0, 2.0, 1.0, 0.5)
 # A placement fits a point within this share of a cell.
 TOLERANCE = 1 / 3
 # Steps of ICP for the placement that is taken.
 POLISHING = 200
 # Scales that are tried around the ratio of the extents, the likeliest first.
 SCALES = tuple(2.0 ** (k / 2) for k in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5))
+# Of scans of metric scenes: metres and millimetres.
+METRIC = (1.0, 0.001)
 # Random samples of matches, at most: with one true match in thirty, one sample hits on average.
 TRIALS = 30_000
 # A placement that so many points support needs no other scale beside it.
@@ -81,18 +95,30 @@ def register(
                 f"{len(surface.positions)} points of the {name} to place the scan by; expected "
                 f"{FEWEST}; give its placement"
             )
+    if (share := unevenness(scan)) > VOLUME:
+        raise DegenerateError(
+            f"the scan's points lie on no surface (a neighbourhood is {share:.2f} as thick as it is "
+            f"wide, expected less than {VOLUME}); expected a scan of surfaces; give its placement "
+            "if it is one"
+        )
     task = _Task(scan, photographed, seed=seed)
     there = task.judged(task.of_world(np.eye(4)), "as it is")
     if _support(there) >= least:
         return there
-    found = task.candidates((1.0,) if metric else ())
+    found = task.candidates(METRIC, least=least) if metric else []
     if not found or _support(found[0]) < least:
-        found = sorted([*found, *task.candidates(task.scales())], key=_support, reverse=True)
+        found = sorted([*found, *task.candidates(task.scales(), least=least)], key=_support)[::-1]
     if not found or _support(found[0]) < least:
-        why = f"the best fits {_support(found[0]):.0%}" if found else "none was found"
+        why = (
+            "none was found"
+            if not found
+            else (
+                f"the best fits {_support(found[0]):.0%} of the points within {task.tolerance:.3g}, "
+                f"expected {least:.0%}"
+            )
+        )
         raise DegenerateError(
-            f"no placement of the scan is supported: {why} of the points within "
-            f"{task.tolerance:.3g}, expected {least:.0%}; give its placement, or views that see "
+            f"no placement of the scan is supported: {why}; give its placement, or views that see "
             "more of what was scanned"
         )
     best = task.polished(found[0])
@@ -103,6 +129,30 @@ def register(
                 f"{_support(other):.2f}, {task.apart(best, other):.3g} apart); give its placement"
             )
     return best
+
+
+def unevenness(surface: Surface) -> float:
+    """How thick neighbourhoods of points are: 0 on a plane, towards 1/3 where points fill a volume.
+
+    Returns:
+        The smallest of the three variances of a neighbourhood as a share of their sum, the median.
+
+    >>> u, v = np.random.default_rng(0).random((2, 4000))
+    >>> round(unevenness(Surface(np.stack([u, v, 0 * u], axis=1))), 3)
+    0.0
+    """
+    import open3d as o3d
+
+    rng = np.random.default_rng(0)
+    positions = _known(surface, rng).positions
+    positions = positions - np.median(positions, axis=0)
+    cell = _cell(positions)
+    cloud = _cloud(positions).voxel_down_sample(cell)
+    cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamHybrid(2.5 * cell, NEIGHBOURS))
+    covariances = np.asarray(cloud.covariances)
+    covariances = covariances[rng.permutation(len(covariances))[:LOOKED_AT]]
+    variances = np.maximum(np.linalg.eigvalsh(covariances), 0)
+    return float(np.median(variances[:, 0] / np.maximum(variances.sum(axis=1), 1e-300)))
 
 
 def _support(placement: Placement) -> float:
@@ -132,7 +182,10 @@ class _Task:
             KDTree(self.scan.positions),
             KDTree(self.target.positions),
         )
-        self._target = _Features(self.target, self.cell, outward=False)
+        self._targets = {
+            level: _Features(self.target, level * self.cell, outward=False) for level in LEVELS
+        }
+        self._left = BUDGET
 
     def of_world(self, world_from_scan: Float64) -> Float64:
         """A placement of whole coordinates as one of those about the middles."""
@@ -150,40 +203,61 @@ class _Task:
         ratio = _extent(self.target.positions) / _extent(self.scan.positions)
         return tuple(ratio * scale for scale in SCALES)
 
-    def candidates(self, scales: tuple[float, ...]) -> list[Placement]:
-        """The best placements by features for some scales, refined, the best first."""
-        rough: list[tuple[float, Float64]] = []
-        for scale in scales:
-            for outward in (False, True) if self.scan.seen_from is None else (False,):
-                placed = self._by_features(scale, outward=outward)
-                if placed is not None:
-                    rough.append((max(self._fitness(placed, self.cell)[:2]), placed))
-            # Within a whole cell much fits by chance.
-            if any(fitness > CLEAR and self._clear(placed) for fitness, placed in rough):
+    def candidates(self, scales: tuple[float, ...], *, least: float) -> list[Placement]:
+        """The best placements by features for some scales, refined, the best first.
+
+        Args:
+            scales: world units per unit of the scan, the likeliest first.
+            least: support that needs no finer features.
+        """
+        found: list[Placement] = []
+        for level in LEVELS:
+            rough: list[tuple[float, Float64]] = []
+            for scale in scales:
+                for outward in (False, True) if self.scan.seen_from is None else (False,):
+                    placed = self._by_features(scale, level, outward=outward)
+                    if placed is None:
+                        continue
+                    fitness = max(self._fitness(placed, self.cell)[:2])
+                    if fitness <= CLEAR:
+                        rough.append((fitness, placed))
+                        continue
+                    # Within a whole cell much fits by chance.
+                    found.append(self._estimated(placed))
+                    if _support(found[-1]) >= CLEAR:
+                        return sorted(found, key=_support, reverse=True)
+            rough.sort(key=lambda entry: -entry[0])
+            found += [self._estimated(placed) for _, placed in rough[:REFINED]]
+            found.sort(key=_support, reverse=True)
+            if found and _support(found[0]) >= least:
                 break
-        rough.sort(key=lambda entry: -entry[0])
-        refined = [self.judged(self._refined(placed), "estimated") for _, placed in rough[:REFINED]]
-        return sorted(refined, key=_support, reverse=True)
+        return found
 
-    def _clear(self, placed: Float64) -> bool:
-        return _support(self.judged(self._refined(placed), "estimated")) >= CLEAR
+    def _estimated(self, placed: Float64) -> Placement:
+        return self.judged(self._refined(placed), "estimated")
 
-    def _by_features(self, scale: float, *, outward: bool) -> Float64 | None:
+    def _by_features(self, scale: float, level: float, *, outward: bool) -> Float64 | None:
         """A placement by matched features at about one scale; None where none is found."""
         import pycolmap
 
-        source = _Features(self.scan, self.cell / scale, outward=outward)
-        if len(source.points) < FEWEST // 3 or len(source.points) > 5 * POINTS:
+        if self._left <= 0:
             return None
-        ours, theirs = source.matches(self._target)
+        source, target = (
+            _Features(self.scan, level * self.cell / scale, outward=outward),
+            self._targets[level],
+        )
+        if not source.usable:
+            return None
+        self._left -= len(source.points)
+        ours, theirs = source.matches(target)
         if len(ours) < 10:
             return None
         options = pycolmap.RANSACOptions()
-        options.max_error = MATCH * self.cell
+        options.max_error = MATCH * level * self.cell
         options.random_seed = self.seed
         options.max_num_trials = TRIALS
         fit: Any = pycolmap.estimate_sim3d_robust(
-            source.points[ours], self._target.points[theirs], options
+            source.points[ours], target.points[theirs], options
         )
         if fit is None:
             return None
@@ -256,7 +330,8 @@ class _Features:
         self.points = np.asarray(cloud.points).copy()
         seen_from = np.asarray(cloud.normals).copy()
         self._features: o3d.pipelines.registration.Feature | None = None
-        if not FEWEST // 3 <= len(self.points) <= 5 * POINTS:
+        self.usable = FEWEST // 3 <= len(self.points) <= MOST
+        if not self.usable:
             return
         Param = o3d.geometry.KDTreeSearchParamHybrid
         cloud.normals = o3d.utility.Vector3dVector()

@@ -85,10 +85,13 @@ def merge(
         {"name": item.block.name, "run": str(item.run.path.resolve())} for item in runs
     ]
     directory = RunDirectory(out)
+    directory.check(identity, resume=resume)
+    plan = plan.posed
+    if not (resume and directory.reports()):
+        # Before the folder is made: a scan that is refused leaves none.
+        plan = replace(plan, scan=placed_scan(plan, console))
     with directory.open_or_resume(identity, resume=resume) as done:
-        plan = plan.posed
         if not done:
-            plan = replace(plan, scan=placed_scan(plan, console))
             _take_depth(plan, runs, directory)
         fitted = _fitted(plan, runs)
         plan = replace(plan, completer=BlockCompletions(targets))

@@ -94,7 +94,10 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
 
 def _check_texture(source: Source, path: Path) -> None:
     if path.suffix.lower() == ".ply":
-        raise OptionError(f"--texture: {path} is a PLY, which has none; give a .glb or .obj file")
+        raise OptionError(
+            f"--texture: {path} is to be a PLY; .glb and .obj take a texture, a .ply has vertex "
+            "colours alone; give --out one of these, or leave --texture out"
+        )
     if not (source.path / RECORD).is_file():
         raise OptionError(
             f"--texture: {source.path} is no run; expected a run's folder, whose project has the "

@@ -75,10 +75,12 @@ def reconstruct(
         state = "the run in it was left as it is" if exists else "no run was started in it"
         console.line(f"dry run: {out}: {state}")
         return out
+    directory.check(identity, resume=resume)
+    plan = plan.posed
+    if begun is None:
+        # Before the folder is made: a scan that is refused leaves none.
+        plan = replace(plan, scan=placed_scan(plan, console))
     with directory.open_or_resume(identity, resume=resume) as done:
-        plan = plan.posed
-        if not done:
-            plan = replace(plan, scan=placed_scan(plan, console))
         fitted = _fitted(plan, directory, done, console=console)
         drawn = complete_run(plan, directory, done, fitted=fitted, console=console, draw=draw)
         say_results(directory, drawn, console)

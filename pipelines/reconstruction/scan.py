@@ -56,21 +56,11 @@ class PlacedScan:
     placement: Placement
 
     def fuse_into(self, memory: SpatialMemory) -> tuple[FuseReport, dict[str, Any]]:
-        """Fuse it into round 0; returns what became of it, and its entry in the round's report.
-
-        Raises:
-            DegenerateError: all of it lies farther away than the memory's voxels reach.
-        """
+        """Fuse it into round 0; returns what became of it, and its entry in the round's report."""
         from gvtools.scans.fuse import fuse_scan
 
         report = fuse_scan(memory, self.scan, self.placement)
         scan = self.scan
-        if report.points and report.out_of_reach == report.points:
-            raise DegenerateError(
-                f"{scan.name}: all of its {report.points:,} points lie beyond the "
-                f"{memory.reach:.3g} scene units that voxels of {memory.voxel:g} reach from the "
-                "cameras; expected a scan around them; correct its placement (--cloud-placement)"
-            )
         return report, {
             "file": scan.name,
             "points": scan.count,
@@ -124,7 +114,29 @@ def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:
         except DegenerateError as error:
             raise DegenerateError(f"{options.file}: {error} (--cloud-placement)") from None
     console.line(f"{scan.name}: placement {placement.told()}")
+    _check_reach(scan, placement, plan)
     return PlacedScan(scan, placement)
+
+
+def _check_reach(scan: Scan, placement: Placement, plan: Plan) -> None:
+    """Refuse a scan that the memory cannot hold.
+
+    Raises:
+        DegenerateError: all of it lies farther away than the memory's voxels reach.
+    """
+    from gvtools.memory.store.voxel_index import MAX_VOXEL
+    from pipelines.reconstruction.voxel_edge import grid_frame
+
+    assert plan.config.voxel is not None
+    reach = MAX_VOXEL * plan.config.voxel
+    frame = grid_frame(plan.scene, plan.context)
+    away = np.abs(frame.from_world(placement.apply(scan.positions + scan.origin))).max(axis=1)
+    if away.min() > reach:
+        raise DegenerateError(
+            f"{scan.name}: all of its {len(scan):,} points lie beyond the {reach:.3g} scene units "
+            f"that voxels of {plan.config.voxel:g} reach from the cameras; expected a scan around "
+            "them; correct its placement (--cloud-placement)"
+        )
 
 
 def _told(scan: Scan) -> str:

@@ -6,6 +6,7 @@ from scan_files import FAR, surface
 from scipy.spatial.transform import Rotation
 
 from gvtools.errors import DegenerateError, OptionError
+from gvtools.scans import registration
 from gvtools.scans.placement import given_placement
 from gvtools.scans.registration import Surface, register
 
@@ -85,3 +86,26 @@ def test_a_given_similarity_is_read_from_numbers_and_files(tmp_path):
 def test_what_is_no_similarity_is_refused(text):
     with pytest.raises(OptionError, match=r"scan\.placement"):
         given_placement(text)
+
+
+@pytest.mark.parametrize("count", [2000, 60_000])
+def test_noise_is_refused_before_it_is_searched(count, monkeypatch):
+    monkeypatch.setattr(registration, "_Task", None)
+    noise = np.random.default_rng(1).uniform(-1, 1, (count, 3)) + FAR
+    with pytest.raises(DegenerateError, match=r"lie on no surface .* give its placement"):
+        register(Surface(noise), seen(surface(20_000)[0]), least=0.5, metric=True)
+
+
+def test_a_scan_in_millimetres_with_z_up_around_what_was_photographed():
+    scanned, photographed = surface(60_000, seed=2)[0], surface(40_000, seed=1)[0]
+    # The photographs saw a corner, a quarter of the floor.
+    photographed = photographed[(photographed[:, 0] < 2) & (photographed[:, 1] < 1.6)]
+    truth = np.eye(4)
+    truth[:3, :3] = 0.001 * np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    inverse = np.linalg.inv(truth)
+    found = register(
+        Surface(scanned @ inverse[:3, :3].T), seen(photographed), least=0.5, metric=True
+    )
+    assert found.scale == pytest.approx(0.001, rel=0.01)
+    there = found.apply(photographed @ inverse[:3, :3].T)
+    assert np.linalg.norm(there - photographed, axis=1).max() < 0.03

@@ -117,4 +117,4 @@ def test_what_cannot_be_placed_is_refused_in_one_line(runs, tmp_path, capsys, op
         ["reconstruct", project, "--context", "first:2", "--refine", "0", "--out", out, *options]
     )
     lines = capsys.readouterr().err.strip().splitlines()
-    assert status == 2 and said in lines[-1] and not (tmp_path / "out" / "memory.npz").exists()
+    assert status == 2 and said in lines[-1] and not (tmp_path / "out").exists()
