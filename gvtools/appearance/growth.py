@@ -7,21 +7,21 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, VALUES
 
-# A Gaussian fainter than this is removed.
+# Gaussians of a smaller opacity are removed.
 FAINTEST = 0.005
-# The two halves of a Gaussian are so much smaller than it was.
+# When a Gaussian is split, the halves' standard deviations are its own divided by this.
 SHRINK = 1.6
 
 
 class Population:
-    """Gaussians with what fitting remembers of each.
+    """The Gaussians of a fit, with the state that the optimiser keeps for each.
 
     Attributes:
         values: (N, VALUES) float32 parameters.
         moments: (2, N, VALUES) float32, Adam's running means.
         footprint: (N,) float32 width of a pixel where it lies, scene units.
-        pull: (N,) summed length of the gradient by its centre in pictures.
-        pulls: (N,) in how many pictures.
+        pull: (N,) sum over pictures of the length of the loss's gradient by the projected centre.
+        pulls: (N,) number of pictures in that sum.
     """
 
     def __init__(self, values: NDArray[np.float32], footprint: NDArray[np.float32]) -> None:
@@ -50,23 +50,23 @@ class Population:
         self._forget_pulls()
 
     def remove_faint(self) -> None:
-        """Remove Gaussians that hardly show."""
+        """Remove Gaussians of an opacity below FAINTEST."""
         self.keep(self.values[:, LOGIT] >= np.log(FAINTEST / (1 - FAINTEST)))
 
     def fade(self, share: float) -> None:
-        """Make all of them more transparent by a share of their opacity."""
+        """Reduce all opacities by a share of themselves."""
         opacity = (1 - share) / (1 + np.exp(-self.values[:, LOGIT]))
         self.values[:, LOGIT] = np.log(opacity / (1 - opacity))
 
     def grow(self, threshold: float, most: int, *, wide: float, rng: np.random.Generator) -> None:
-        """Double the Gaussians that pictures pull about most: they cover more than they can show.
+        """Split or clone the Gaussians with the largest gradients: they cover too much detail.
 
         Args:
-            threshold: least mean pull.
-            most: Gaussians there may be afterwards.
-            wide: standard deviation in pixels from which one is split into two smaller ones; a
-                smaller one gets a twin, which the next steps move away.
-            rng: places the halves.
+            threshold: least mean gradient by the projected centre, half a picture being 1.
+            most: number of Gaussians that there may be afterwards.
+            wide: standard deviation in pixels from which a Gaussian is split into two smaller ones;
+                a smaller Gaussian is cloned, and the next steps move the two apart.
+            rng: chooses the places of the halves.
         """
         pull = self.pull / np.maximum(self.pulls, 1)
         rows = np.flatnonzero(pull > threshold)

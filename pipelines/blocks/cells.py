@@ -1,4 +1,4 @@
-"""Where a project is cut: cells by camera centres, and what views see of each cell."""
+"""The cells that a project is cut into, and the views that see into a cell."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ if TYPE_CHECKING:
 
 Float64 = NDArray[np.float64]
 
-# Views of a block when their number decides how many blocks there are.
+# Context views for each block if the number of blocks is not given.
 VIEWS_PER_BLOCK = 150
-# Points that stand for what a view sees.
+# About so many points are sampled of what a view sees.
 SAMPLES = 400
-# Nearest views of each owner that help, whatever they see: depth is found by them.
+# So many nearest views of each of a block's own are helpers, whatever they see: stereo needs them.
 NEAREST = 4
 
 
 def cut_cells(centers: Float64, count: int) -> dict[str, Cell]:
     """Cells with about as many camera centres each, by name.
 
-    Space is halved again and again across the longest side of the centres that it holds, as
-    Hierarchical-3DGS cuts it by axis-parallel planes. A name tells the first and the second half of
-    the way that leads to the cell: "0_1".
+    An axis-parallel plane across the longest side of the centres' box divides them in two, then
+    each part is divided in the same way, as in Hierarchical-3DGS. A name such as "0_1" encodes the
+    path to the cell in this binary tree: the first half of its bits as a number, and the second.
 
     Args:
-        centers: (V, 3), world frame.
+        centers: (V, 3), world frame, scene units.
         count: how many cells.
 
     Raises:
@@ -55,7 +55,7 @@ def cut_cells(centers: Float64, count: int) -> dict[str, Cell]:
 
 
 def _halved(centers: Float64, cell: Cell, count: int, *, path: str) -> list[tuple[str, Cell]]:
-    """The cells that ``count`` blocks of the centres in a cell make, with the way to each."""
+    """Divide a cell into ``count`` cells; returns each with its path, "0" low and "1" high."""
     if count == 1:
         return [(path, cell)]
     inside = centers[cell.holds(centers)]
@@ -78,7 +78,7 @@ def _halved(centers: Float64, cell: Cell, count: int, *, path: str) -> list[tupl
 
 
 def _gap(values: Float64, rank: int) -> float | None:
-    """The middle of the gap nearest to a rank of the values; None where all are equal."""
+    """The middle between two different sorted values, nearest to a rank; None if all are equal."""
     ordered = np.sort(values)
     gaps = np.flatnonzero(np.diff(ordered) > 0) + 1
     if not len(gaps):
@@ -88,10 +88,10 @@ def _gap(values: Float64, rank: int) -> float | None:
 
 
 def seen_points(scene: Scene, names: Sequence[str]) -> dict[str, Float64]:
-    """Some points (N, 3), world frame, that stand for what each view sees.
+    """Points (N, 3), world frame, sampled of what each view sees.
 
-    Of its depth map or its sparse points; without either of the middle of its frustum, as deep as
-    the cameras spread.
+    From its sparse points, else from its depth map, else on a plane at half of the extent of the
+    cameras.
     """
     rows = {name: row for row, name in enumerate(scene.names)}
     points = scene.points
@@ -123,15 +123,15 @@ def helpers_of(
     cell: Cell, owners: Sequence[str], seen: Mapping[str, Float64], *,
     near: Mapping[str, Sequence[str]], overlap: float,
 ) -> tuple[str, ...]:  # fmt: skip
-    """The views of other cells that help a block.
+    """The helpers of a block: views of other cells that it holds, too.
 
     Args:
         cell: the block's.
-        owners: its own views.
+        owners: names of its own views.
         seen: see ``seen_points``, of all context views.
-        near: of each view the nearest others.
-        overlap: 0 to 1; a view helps where at least the share ``1 - overlap`` of what it sees lies
-            in the cell. At 0 none does, nor does a nearest view.
+        near: the nearest other views of each view.
+        overlap: 0 to 1; a view is a helper if at least the share ``1 - overlap`` of what it sees
+            lies in the cell. At 0 there are no helpers, not even nearest views.
     """
     if overlap == 0:
         return ()

@@ -39,28 +39,28 @@ def split(
     Args:
         scene: the project.
         out: a folder that is not there yet, or empty.
-        blocks: how many; None for one for each VIEWS_PER_BLOCK context views.
-        overlap: 0 to 1; a view helps another block where at least the share ``1 - overlap`` of what
-            it sees lies in that block's cell.
+        blocks: how many; None: one for each VIEWS_PER_BLOCK context views.
+        overlap: 0 to 1; a view is a helper of another block if at least the share ``1 - overlap``
+            of what it sees lies in that block's cell.
         context: selection of the given views; the others are the blocks' targets.
         layout: "projects" or "chunks", see ``pipelines.blocks.write``.
         refine_poses: refine the poses of RGB-D views, once for all blocks, as a run of the whole
             project would.
-        max_side: at what size, pixels: that of the runs.
-        reading: how the project is read, JSON-ready.
-        say: is told what is done.
+        max_side: longer side of pictures for that, pixels; that of the runs. None: as they are.
+        reading: how the project is read, JSON-ready; kept in the blocks.
+        say: is called with a line of text at each step.
 
     Returns:
         The blocks in order of their names.
 
     Raises:
-        GvError: what the project cannot be split by, or a folder that cannot be written.
+        GvError: a project that cannot be split so, or a folder that cannot be written.
     """
     if not 0 <= overlap <= 1:
         raise OptionError(f"overlap {overlap:g}; expected 0 to 1")
     names = tuple(sorted(select(scene.names, context)))
     others = tuple(sorted(set(scene.names) - set(names)))
-    # Cells go by the poses that were given, as do targets, wherever they are moved.
+    # Views belong to cells by their given poses, even if refinement moves them across a face.
     centers = scene.subset(names).cameras.centers
     count = blocks or max(1, -(-len(names) // VIEWS_PER_BLOCK))
     cells = cut_cells(centers, count)
@@ -102,10 +102,10 @@ def _posed(
     say: Callable[[str], None],
     max_side: int | None,
 ) -> Scene | None:
-    """The project in refined poses; None where those that were given stay."""
+    """The project with refined poses; None if the given ones are kept."""
     if scene.kind == "colmap":
         return None
-    # Without targets, a camera stands in that is not asked.
+    # ``refined`` needs a target; without any, the first view stands in, and its result is not used.
     targets = scene.subset(others or names[:1]).cameras
     found = poses.refined(reduced(scene, max_side), names, targets, say=say)
     if found is None:
@@ -115,7 +115,7 @@ def _posed(
 
 
 def _nearest(scene: Scene, names: tuple[str, ...]) -> dict[str, list[str]]:
-    """Of each view the nearest others."""
+    """Names of the NEAREST other views of each view."""
     cameras = scene.subset(names).cameras
     out = {}
     for row, name in enumerate(names):

@@ -38,10 +38,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="PROJECT", help="a new folder")
     parser.add_argument(
-        "--frames", type=int, metavar="N", help="of a video (as many as its motion asks for)"
+        "--frames",
+        type=int,
+        metavar="N",
+        help="how many to take of a video (one for each 7 %% of its width that the picture moves)",
     )
     parser.add_argument(
-        "--masks", type=Path, metavar="DIR", help="masks NAME.png: nothing is matched where black"
+        "--masks", type=Path, metavar="DIR", help="masks NAME.png: no features where black"
     )
     parser.add_argument(
         "--distance",
@@ -65,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--lens",
         choices=("auto", "perspective", "equirectangular", "fisheye"),
-        help="of the pictures (auto: what they look like); panoramas are cut into faces",
+        help="of the pictures (auto: recognised from them); panoramas are cut into faces",
     )
     add_rgbd_arguments(parser.add_argument_group("RGB-D recording"))
 

@@ -33,7 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="interpolate",
         metavar="PATH",
         help="orbit:N, spiral:N, interpolate:N (N frames, 120 by default), cameras (the captured "
-        "views), a TUM or KITTI file, or a project (PATH@SELECTION)",
+        "views), a TUM or KITTI file, a transforms.json such as 'gvtools view' saves, or a project "
+        "(the last two also PATH@SELECTION)",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help="FILE.mp4, FILE.gif or FILE.webp"

@@ -1,8 +1,8 @@
 """The Gaussians of an export: those that the run fitted, and the memory's points beside them.
 
-Fitted Gaussians show what photographs saw, so of the memory only generated points join them, and
-those of a scan that no photograph's lie beside. A memory
-without a fit is shown by its points alone: each becomes a round Gaussian.
+Fitted Gaussians show what photographs saw. Of the memory's points, generated ones are added, and
+scanned ones that have no photograph's observation near them. Without a fit all points are exported.
+Each point becomes a spherical Gaussian.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.voxel_levels import levels_above
 from pipelines.export.source import ExportOptions, Source, middle
 
-# Standard deviation of a point's Gaussian, in shares of the distance to the next point.
+# Standard deviation of a point's Gaussian, as a share of the distance to the next point.
 SPREAD = 0.6
-# Opacities of points, from those of hardly any confidence to those of most.
+# Opacity of a point at confidence 0, and towards which it grows with confidence.
 LEAST_OPACITY, MOST_OPACITY = 0.7, 0.99
-# Confidence of a view straight ahead, at which half of the way is gone.
+# Confidence at which the opacity is half-way between them.
 HALFWAY = 0.5
-# Files hold float32; where that is coarser than this share of the smallest Gaussians' sizes,
-# positions are counted from the middle of the scene.
+# Files hold float32. Where its rounding is more than the share ROUNDING of the size of small
+# Gaussians (the quantile SMALLEST), positions are relative to the middle of the scene.
 ROUNDING, SMALLEST = 0.1, 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """N Gaussians with the world's axes.
+    """N Gaussians with the axes of the world frame.
 
     Attributes:
-        values: (N, VALUES) float32, see appearance.splat.project_kernels; positions count from
-            ``origin``.
-        origin: (3,) float64, world frame, scene units; zero where float32 allows.
-        fitted: how many were fitted; the others are points of the memory.
-        further: fits of the run that are not among them.
-        rounds: (N,) int32, the round that each came with.
+        values: (N, VALUES) float32, see appearance.splat.project_kernels; positions are relative
+            to ``origin``.
+        origin: (3,) float64, world frame, scene units; zero if float32 is precise enough.
+        fitted: number of fitted ones, which come first; the others are points of the memory.
+        further: number of the run's other fits, which are left out.
+        rounds: (N,) int32, the round in which each was added.
     """
 
     values: NDArray[np.float32]
@@ -57,7 +57,7 @@ class Splats:
 
     @property
     def positions(self) -> NDArray[np.float32]:
-        """(N, 3) from ``origin``."""
+        """(N, 3) relative to ``origin``, scene units."""
         return self.values[:, :LOG_SCALE]
 
     @property
@@ -78,12 +78,12 @@ class Splats:
 
     @property
     def harmonics(self) -> NDArray[np.float32]:
-        """(N, H, 3) coefficients, H = 9; 1 where nothing depends on the direction."""
+        """(N, H, 3) coefficients; H = 9 (degree 2) with a fit, else 1 (one colour each)."""
         sh = self.values[:, SH:].reshape(len(self), -1, 3)
         return sh if self.fitted else sh[:, :1]
 
     def told(self) -> str:
-        """What they are, for the user."""
+        """A line of text for the user."""
         points = len(self) - self.fitted
         parts = [f"{self.fitted} fitted"] if self.fitted else []
         if points or not parts:
@@ -138,11 +138,14 @@ def splats_of(source: Source, options: ExportOptions) -> Splats:
 def _rounded(
     values: NDArray[np.float32], origin: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Positions as float32 in the world frame, or from a point near them where that is too coarse.
+    """Make positions relative to the world's origin, or to the scene's middle, see ROUNDING.
 
     Args:
-        values: (N, VALUES), positions from ``origin``; changed.
+        values: (N, VALUES), positions relative to ``origin``; is changed.
         origin: (3,) world frame.
+
+    Returns:
+        ``values``, and the (3,) origin that positions are relative to now.
     """
     positions = values[:, :LOG_SCALE].astype(np.float64) + origin
     sizes = np.exp(values[:, LOG_SCALE:QUATERNION].max(axis=1))
@@ -156,7 +159,7 @@ def _rounded(
 
 
 def unphotographed(memory: SpatialMemory) -> NDArray[np.bool_]:
-    """(N,) a scan's observations that have none of a photograph's within their spacing."""
+    """(N,) scanned observations without a photograph's observation within their spacing."""
     scanned = memory.scanned
     seen = ~(scanned | memory.generated)
     if not scanned.any() or not seen.any():
@@ -178,13 +181,13 @@ def _photographs(memory: SpatialMemory) -> Cameras:
 def of_points(
     source: Source, options: ExportOptions, *, among: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Round Gaussians of a memory's points, one a voxel.
+    """Spherical Gaussians of a memory's points, one for each voxel.
 
     Their size follows from the distance between points, their opacity from confidence.
 
     Returns:
-        (N, VALUES) float32 with the world's axes, positions from the memory's origin; and (N,)
-        int32, the round that each point came with.
+        (N, VALUES) float32 with the world's axes, positions relative to the memory's origin; and
+        (N,) int32, the round of each point.
 
     Raises:
         OptionError: nothing is left.
@@ -192,7 +195,7 @@ def of_points(
     memory = source.memory
     points = source.points(options, among=among)
     columns = memory.columns
-    # Where every voxel has its point, the next one is a voxel's edge away.
+    # The next point is at least about a voxel's edge away: each voxel has one.
     above = levels_above(columns.level[points.rows], points.edge / memory.voxel)
     edges = np.ldexp(points.edge, above)
     apart = np.maximum(columns.spacing[points.rows], edges)

@@ -1,6 +1,6 @@
-"""Triangles from a memory: by a TSDF volume of its own projections, or by Poisson reconstruction.
+"""Meshes of a memory: a TSDF of depth maps rendered from it, or Poisson reconstruction.
 
-Both are Open3D's. Everything is in the memory's frame, where float32 keeps its digits.
+Both are Open3D's. Coordinates are relative to the memory's own frame, where float32 is precise.
 """
 
 from __future__ import annotations
@@ -19,32 +19,33 @@ from gvtools.memory.thinning import thinned
 if TYPE_CHECKING:
     import open3d as o3d
 
-# Voxels of a mesh in those of the memory, and in the footprints of most of its points.
+# The edge of a mesh's voxels is at least PER_VOXEL edges of the memory's finest voxels, and
+# PER_FOOTPRINT times the quantile MOST of its observations' spacing.
 PER_VOXEL, PER_FOOTPRINT, MOST = 2.0, 1.0, 0.9
-# Open3D's blocks of voxels, a side; room is made for so many times those that hold a point (more is
-# made when it is needed), and for some at least.
+# Open3D's VoxelBlockGrid: voxels along a side of a block; it starts with room for ROOM times the
+# blocks that hold a point, and for LEAST_BLOCKS more, and grows when needed.
 BLOCK_SIDE, ROOM, LEAST_BLOCKS = 16, 3, 64
-# More blocks that hold a point, 82 kB each, do not fit the memory of a small machine.
+# More blocks that hold a point, of 82 kB each, do not fit the RAM of a small machine.
 MOST_BLOCKS = 30_000
-# By what voxels grow until the scene has few enough blocks.
+# Voxels grow by this factor until the scene has few enough blocks.
 WIDER = 1.25
-# Side of the pictures that show what a scanner saw around it [px].
+# Side of the six pictures in which a scanner's surroundings are rendered [px].
 FACE = 1024
-# What Open3D says of a picture without depth.
+# Open3D's message for a picture without depth.
 NOTHING = "No block is touched"
-# The signed distance is known so far from the surface, in voxels.
+# Truncation distance of the TSDF, in voxels.
 TRUNCATION = 4.0
-# A voxel counts that one view saw: its weight has to be above this.
+# Voxels of a larger weight are meshed: the weight is the number of views, so one is enough.
 LEAST_WEIGHT = 0.5
-# Beyond every depth, scene units.
+# A depth limit beyond every scene, scene units.
 FAR = 1e9
-# Neighbours that tell a normal; octree levels of Poisson's reconstruction, at most; and how far
-# from its points that surface is kept, in voxels.
+# Poisson: neighbours that a normal is estimated from, the most octree levels, and the distance from
+# the points at which the surface is cut off, in voxels.
 NEIGHBOURS, MOST_LEVELS, REACH = 24, 11, 3.0
 
 
 def mesh_voxel(memory: SpatialMemory) -> float:
-    """Edge of the voxels that a memory's mesh is made in, scene units."""
+    """Default edge of the voxels for a memory's mesh, scene units."""
     footprint = float(np.quantile(memory.columns.spacing, MOST))
     voxel = max(PER_VOXEL * memory.voxel, PER_FOOTPRINT * footprint)
     while _blocks(memory, BLOCK_SIDE * voxel) > MOST_BLOCKS:
@@ -55,16 +56,16 @@ def mesh_voxel(memory: SpatialMemory) -> float:
 def tsdf_mesh(
     memory: SpatialMemory, voxel: float, *, observed: bool = False
 ) -> o3d.t.geometry.TriangleMesh:
-    """The zero of a truncated signed distance, integrated over what the memory shows its own views.
+    """Integrate the memory's depth, rendered from its own views, into a TSDF, and mesh it.
 
     Args:
         memory: with at least one view.
         voxel: edge, scene units.
-        observed: leave out what a completer made, and its views.
+        observed: leave out generated points and views.
 
     Raises:
-        OptionError: so small voxels that there are too many.
-        DegenerateError: no triangle came out.
+        OptionError: ``voxel`` is so small that there would be too many.
+        DegenerateError: the mesh has no triangle.
     """
     import open3d as o3d
 
@@ -86,7 +87,7 @@ def tsdf_mesh(
         if observed:
             depth = np.where(shown.generated[0], np.float32(0), depth)
         local = memory.frame.seen_from(camera)
-        # Open3D counts pixels' centres as whole numbers.
+        # Open3D has the first pixel's centre at (0, 0), not (0.5, 0.5).
         K = local.K[0] - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         lens, pose = (
             o3d.core.Tensor(np.ascontiguousarray(x)) for x in (K, local.cam_from_world[0])
@@ -109,13 +110,13 @@ def tsdf_mesh(
 
 
 def _blocks(memory: SpatialMemory, edge: float) -> int:
-    """How many cubes of an edge hold a point of a memory."""
+    """Number of grid cubes of edge ``edge`` [scene units] that hold a point of a memory."""
     cells = np.floor(memory.columns.positions.astype(np.float64) / edge).astype(np.int64)
     return len(np.unique(cells, axis=0))
 
 
 def _ordered(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleMesh:
-    """The mesh with vertices and triangles in order of their places: threads make them in any."""
+    """The mesh with vertices and triangles sorted: Open3D's threads give them in any order."""
     import open3d as o3d
 
     positions, colors = mesh.vertex.positions.numpy(), mesh.vertex.colors.numpy()
@@ -123,7 +124,7 @@ def _ordered(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleMesh:
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
     faces = rank[mesh.triangle.indices.numpy()]
-    # Each triangle from its least vertex on, which leaves its side as it is.
+    # Begin each triangle with its least vertex; cyclic order, and so orientation, is unchanged.
     first = faces.argmin(axis=1)[:, None]
     faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
     faces = faces[np.lexsort(faces.T[::-1])]
@@ -135,7 +136,7 @@ def _ordered(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleMesh:
 
 
 def _cameras(memory: SpatialMemory, *, observed: bool) -> Iterator[Cameras]:
-    """The cameras of the memory's views, each once; all around where a scan has a station."""
+    """The cameras of the memory's views, each once; six around each station of a scan."""
     seen = set()
     for view in memory.views:
         camera = view.camera

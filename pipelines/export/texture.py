@@ -1,8 +1,8 @@
-"""A picture for a mesh's triangles, from the photographs of the memory's observed views.
+"""The texture of a mesh, from the photographs of the memory's observed views.
 
-Each two triangles share a square of the picture, in a few sizes. Unwrappers make prettier charts,
-but a mesh of noisy depth defeats them: Open3D's UVAtlas refuses its edges of three triangles, and
-xatlas takes 20 s for 50 000 triangles and is one more package.
+Each pair of triangles gets its own square of the texture, of one of a few sizes. Unwrapping would
+give larger connected charts, but fails on meshes of noisy depth: Open3D's UVAtlas refuses edges
+that three triangles share, and xatlas takes 20 s for 50 000 triangles and is one more package.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ if TYPE_CHECKING:
 Float32 = NDArray[np.float32]
 Shot = tuple[Cameras, NDArray[np.uint8]]
 
-# Sides of the squares [texels]. A triangle's legs are by RIM shorter than its square, so that
-# neither reading between texels nor the other triangle of the square colours its border.
+# Sides of the squares [texels]. A triangle's legs are RIM texels shorter than its square's side, so
+# that bilinear lookup at its border does not reach the square's other triangle.
 SIDES = np.array([6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64, 96, 128, 192, 256])
 RIM = 3.5
-# Texels whose places are computed together.
+# Texels whose positions are computed at a time.
 AT_ONCE = 500_000
-# Without a number of triangles, as many are made as have so many texels each.
+# Without --max-triangles a mesh is simplified until each triangle has so many texels.
 TEXELS = 80
-# A texel is seen where the mesh's own depth in the view is not nearer by more than this share.
+# A texel is hidden in a view if the mesh's depth there is smaller by more than this share.
 HIDDEN = 0.02
-# Near a border of the picture or a depth edge a photograph counts less [px]: there it shows
-# something else as soon as a pose errs.
+# Nearer than FADE to its border or EDGE to a depth edge [px], a photograph weighs less: with a pose
+# error it shows another surface there.
 FADE, EDGE = 24, 5
-# How strongly the best view outweighs the others: seams are blended, details are not.
+# Weights are raised to this power, so that the best view dominates and details are not blurred.
 SHARPEN = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """Where triangles lie in a picture.
+    """A texture and the triangles' places in it.
 
     Attributes:
-        corners: (F, 3, 2) float64, texels from the picture's upper left corner.
+        corners: (F, 3, 2) float64 x and y, texels from the texture's upper left corner.
         image: (S, S, 3) uint8.
     """
 
@@ -54,20 +54,20 @@ class Texture:
 
     @property
     def uv(self) -> NDArray[np.float64]:
-        """(F, 3, 2) from 0 to 1, counted from the lower left corner."""
+        """(F, 3, 2) texture coordinates from 0 to 1, from the lower left corner."""
         return np.array([0.0, 1.0]) + self.corners / len(self.image) * [1.0, -1.0]
 
 
 def textured(mesh: o3d.t.geometry.TriangleMesh, shots: Iterable[Shot], size: int) -> Texture:
-    """The texture of a mesh, as photographs show it; where none does, from vertex colours.
+    """The texture of a mesh from photographs, and from vertex colours where none sees it.
 
     Args:
         mesh: with vertex colours.
-        shots: cameras in the mesh's frame, and their pictures (H, W, 3) uint8.
-        size: side of the picture, texels.
+        shots: cameras in the mesh's frame, and their photographs (H, W, 3) uint8.
+        size: side of the texture, texels.
 
     Raises:
-        OptionError: more triangles than the picture holds.
+        OptionError: more triangles than the texture has room for.
     """
     vertices = mesh.vertex.positions.numpy().astype(np.float64)
     faces = mesh.triangle.indices.numpy()
@@ -80,7 +80,7 @@ def textured(mesh: o3d.t.geometry.TriangleMesh, shots: Iterable[Shot], size: int
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     sums = np.zeros((len(points), 4), np.float32)
-    # So little that any photograph outweighs it.
+    # Vertex colours get so small a weight that any photograph outweighs them.
     sums[:, :3], sums[:, 3] = 1e-9 * plain, 1e-9
     _add_photographs(
         sums, mesh, points, normals=normals[face[used]].astype(np.float32), shots=shots
@@ -91,12 +91,13 @@ def textured(mesh: o3d.t.geometry.TriangleMesh, shots: Iterable[Shot], size: int
 
 
 def atlas(triangles: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Places of triangles (F, 3, 3) in a picture: (F, 3, 2) texels.
+    """Texture positions (F, 3, 2), in texels, of the corners of triangles (F, 3, 3).
 
-    The longest edge becomes the diagonal of a square, whose side fits its length.
+    A triangle becomes half a square with its longest edge as the diagonal; the square's side is
+    chosen by the length of that edge.
 
     Raises:
-        OptionError: more than the picture holds.
+        OptionError: more triangles than the texture has room for.
     """
     lengths = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
     legs = lengths.max(axis=1) / np.sqrt(2)
@@ -108,7 +109,7 @@ def atlas(triangles: NDArray[np.float64], size: int) -> NDArray[np.float64]:
             f"--texture {size}: the mesh has {len(legs)} triangles; expected at most {most}; give "
             f"--max-triangles {size**2 // TEXELS} or a larger texture"
         )
-    # As many texels a scene unit as fit.
+    # Bisect the largest number of texels per scene unit that fits.
     low, high = 0.0, float(sides[-1] / max(legs.max(), 1e-12)) * 64
     for _ in range(40):
         middle = (low + high) / 2
@@ -149,7 +150,7 @@ def _placed(side: NDArray[np.int64], longest: NDArray[np.int64], size: int) -> N
 
 
 def _texels(corners: NDArray[np.float64], size: int) -> tuple[NDArray[np.int64], Float32]:
-    """(S, S) the triangle of each texel, -1 for none, and (S, S, 3) weights of its corners."""
+    """(S, S) the triangle of each texel, -1 for none, and (S, S, 3) barycentric coordinates."""
     face = np.full((size, size), -1, np.int64)
     weights = np.zeros((size, size, 3), np.float32)
     least = np.floor(corners.min(axis=1))
@@ -174,7 +175,7 @@ def _texels(corners: NDArray[np.float64], size: int) -> tuple[NDArray[np.int64],
 
 
 def _barycentric(corners: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(F, N, 3) weights of the corners (F, 3, 2) at the points (F, N, 2), moved inside."""
+    """(F, N, 3) barycentric coordinates of points (F, N, 2) in triangles (F, 3, 2), clipped."""
     a, b, c = (corners[:, None, k] for k in range(3))
     area = _cross(b - a, c - a)
     u, v = _cross(at - a, c - a) / area, _cross(b - a, at - a) / area
@@ -202,7 +203,10 @@ def _add_photographs(
     normals: Float32,
     shots: Iterable[Shot],
 ) -> None:
-    """Add to sums of weighted colours and weights (N, 4) what each photograph shows of points."""
+    """Add each photograph's colours of points (N, 3) to ``sums``.
+
+    ``sums`` (N, 4) holds the weighted sum of colours and the sum of weights.
+    """
     import cv2
     import open3d as o3d
 
@@ -237,7 +241,7 @@ def _add_photographs(
         cosine = facing[rows] / np.linalg.norm(local[rows], axis=1)
         weight = sharpness(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)) ** 0.25 * cosine / z[rows]
         weight = (weight * _trust(depth)[near[:, 1], near[:, 0]]) ** SHARPEN
-        # A picture of one line, which is as long as remap allows, per 30 000 texels.
+        # Texels as a picture of one column, in parts of 30 000: remap allows no more than 32 767.
         color = np.concatenate([
             cv2.remap(picture, column[a : a + 30_000, None], line[a : a + 30_000, None],
                       cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
@@ -248,7 +252,7 @@ def _add_photographs(
 
 
 def _trust(depth: Float32) -> Float32:
-    """(H, W) 0.05 to 1: how far pixels are from the picture's border and from depth edges."""
+    """(H, W) weights of pixels, 0.05 to 1, by the distance to the border and to depth edges."""
     import cv2
 
     known = np.where(np.isfinite(depth), depth, 0).astype(np.float32)

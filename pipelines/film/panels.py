@@ -23,13 +23,13 @@ from viz.run_view.render import picture_of
 
 Picture = NDArray[np.uint8]
 
-# memory: all that the run knows. observed: without what completers made. completed: with its holes
-# filled. depth: of the memory, near is red.
+# memory: the whole memory. observed: without completers' points. completed: the memory, holes
+# filled by ``inpaint``. depth: of the memory, near is red, far is blue.
 PANELS = ("memory", "observed", "completed", "depth")
-# So many frames of a path are completed and fused before the film is drawn, so that what is filled
-# looks the same from all frames.
+# For "completed", so many frames of the path are completed and fused before the film is drawn, so
+# that filled regions look the same from all frames.
 KEY_FRAMES = 12
-# Frames from which the range of a film's depth is taken, and its percentiles.
+# The colours of depth span these percentiles of the depth of so many frames.
 RANGE_FRAMES, RANGE = 9, (2.0, 98.0)
 
 
@@ -39,7 +39,7 @@ class FilmRenderer:
     Args:
         path: a run's folder or a memory file.
         cameras: of all frames, of one size.
-        up_to: the memory as it was after this round; None takes all.
+        up_to: draw the memory as it was after this round; None: after the last one.
     """
 
     def __init__(self, path: Path, cameras: Cameras, *, up_to: int | None = None) -> None:
@@ -47,10 +47,10 @@ class FilmRenderer:
         self.memory = load_memory(path, up_to=up_to)
         self.appearance: Appearance | None = load_appearance(path)
         self.projecting = 0.0
-        """Seconds spent on projecting the memory, appearance included."""
+        """Seconds spent on projecting the memory and drawing the Gaussians."""
 
     def frame(self, index: int, panels: Sequence[str]) -> Picture:
-        """One frame: (H, W, 3), its panels side by side."""
+        """(H, W, 3) one frame, its panels side by side."""
         pictures = [self._panel(index, panel) for panel in panels]
         return pictures[0] if len(pictures) == 1 else np.concatenate(pictures, axis=1)
 
@@ -96,7 +96,7 @@ class FilmRenderer:
 
     @cached_property
     def _observed(self) -> SpatialMemory:
-        """The memory before any completion: completions begin in round 1."""
+        """The memory after its first round, which holds observations only."""
         return load_memory(self.path, up_to=self.memory.rounds[0])
 
     @cached_property
@@ -120,7 +120,7 @@ class FilmRenderer:
 
     @cached_property
     def _range(self) -> tuple[float, float]:
-        """Nearest and farthest depth of the film's colours, scene units."""
+        """Depths at the ends of the colour map, scene units."""
         count = len(self.cameras)
         rows = np.unique(np.linspace(0, count - 1, min(RANGE_FRAMES, count)).round().astype(int))
         seen = [self.memory.project(self.cameras[int(row)]) for row in rows]

@@ -27,10 +27,10 @@ def film_cameras(memory: SpatialMemory, path: str, *, width: int | None = None) 
     """The cameras of a film's frames, all of one even size, as video coders need it.
 
     Args:
-        memory: its observed views are what ``orbit`` and the like go by; the first of them gives
-            intrinsics and size to all frames but those of a project.
+        memory: ``orbit`` and the like are computed from its observed views; the first of these
+            gives intrinsics and size to paths that have none.
         path: one of FORMS.
-        width: of the frames, pixels; None keeps the cameras' own.
+        width: of the frames, pixels; None keeps the cameras' width.
 
     Raises:
         OptionError: another form, no observed views, or a width below 16.
@@ -45,7 +45,7 @@ def film_cameras(memory: SpatialMemory, path: str, *, width: int | None = None) 
     first = cameras[0]
     columns, rows = int(first.width[0]), int(first.height[0])
     if (cameras.width != columns).any() or (cameras.height != rows).any():
-        # Views of several sizes: the first one's lens for all of them.
+        # A film has one size: all frames take the first camera's intrinsics and size.
         count = len(cameras)
         cameras = Cameras(
             np.repeat(first.K, count, axis=0), cameras.cam_from_world,

@@ -13,13 +13,13 @@ from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written
 
 SUFFIXES = (".mp4", ".gif", ".webp")
-# Of x264: 18 is hardly told from the source, 23 its default.
+# x264's constant rate factor: 18 is visually almost lossless, 23 is its default.
 QUALITY = 18
 WEBP_QUALITY = 80
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse a file that no film can be written to, before anything is drawn.
+    """Refuse a file name that no film can be written to, before anything is drawn.
 
     Raises:
         OptionError: another suffix than those of SUFFIXES, or PyAV is absent for an MP4.
@@ -62,7 +62,7 @@ def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -
     # "faststart" moves the index to the front, so that browsers play it while it loads.
     with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream = container.add_stream("libx264", rate=rate, options={"crf": str(QUALITY)})
-        # What every player takes.
+        # The pixel format that every player can decode.
         stream.pix_fmt = "yuv420p"
         for number, frame in enumerate(frames):
             if number == 0:

@@ -1,4 +1,4 @@
-"""Running a fleet: each scene's stages one after another, scenes side by side."""
+"""Running a fleet: the stages of a scene one after another, different scenes in parallel."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from pipelines.fleet.task import DONE, FAILED, finished, record_of
 def run_fleet(
     tasks: Sequence[Task], make_engine: Callable[[list[Task]], Engine], *, console: Console
 ) -> None:
-    """Run what is not finished; every task has a record in the end.
+    """Run all tasks that are not finished; at the end every task has a record.
 
-    A worker that dies, and a command that may succeed the next time, are begun again, up to the
-    stage's ``retries``; reconstruct goes on after its last whole round.
+    A task whose worker died, or whose command may succeed the next time, is restarted up to its
+    ``retries`` times; ``reconstruct`` resumes after its last complete round.
 
     Args:
         tasks: stage by stage.
-        make_engine: given the tasks that have to run; not called where there is none.
+        make_engine: makes an engine for the tasks that have to run; not called if there are none.
         console: shows progress.
     """
     before = {id(task): finished(task) for task in tasks}

@@ -1,4 +1,4 @@
-"""Who runs a fleet's tasks: processes of this machine, or Ray."""
+"""Engines, which run a fleet's tasks: processes of this machine, or a Ray cluster."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from pipelines.console import Console
 from pipelines.fleet.spec import Task
 from pipelines.fleet.task import FAILED, run_task
 
-# How long a wait lasts before progress is shown again, s.
+# Progress is updated at least this often [s].
 WAIT_S = 1.0
-# How long a cluster may take to accept a connection, s.
+# Time-out for connecting to a cluster [s].
 CONNECT_S = 10.0
 
 
@@ -25,22 +25,26 @@ class Engine(Protocol):
     """What the driver asks of an engine."""
 
     def submit(self, task: Task, attempt: int) -> Any:
-        """Begin a task; returns what stands for it."""
+        """Start or queue a task; returns a handle."""
 
     def finished(self, handles: Sequence[Any]) -> list[tuple[Any, dict[str, Any]]]:
-        """Those that ended, after waiting for one at most ``WAIT_S``; with their records."""
+        """Handles of tasks that ended, with their records; waits for one at most ``WAIT_S``."""
 
     def close(self) -> None:
-        """Let go of workers."""
+        """Release the workers."""
 
 
 def lost(reason: str) -> dict[str, Any]:
-    """What stands for a record where the worker could not write one."""
+    """The record of a task whose worker could not write one; it may be retried."""
     return {"status": FAILED, "reason": reason, "again": True}
 
 
 class Processes:
-    """As many tasks side by side as this machine has cores for the largest of them."""
+    """Processes of this machine.
+
+    As many at a time as there are cores for the task with the most ``cpus``; one at a time if any
+    task asks for a GPU.
+    """
 
     def __init__(self, tasks: Sequence[Task]) -> None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -49,18 +53,18 @@ class Processes:
         self._pool = ThreadPoolExecutor(1 if gpus else max(1, (cores or 1) // largest))
 
     def submit(self, task: Task, attempt: int) -> Future[dict[str, Any]]:
-        """Begin a task as soon as a core is free."""
+        """Queue a task; it starts when a worker is free."""
         return self._pool.submit(run_task, asdict(task), attempt)
 
     def finished(
         self, handles: Sequence[Future[dict[str, Any]]]
     ) -> list[tuple[Future[dict[str, Any]], dict[str, Any]]]:
-        """Those that ended."""
+        """See Engine.finished."""
         done, _ = wait(handles, timeout=WAIT_S, return_when=FIRST_COMPLETED)
         return [(handle, _result(handle)) for handle in done]
 
     def close(self) -> None:
-        """Let those that run end, and begin no other."""
+        """Start no other task, and wait for those that run."""
         self._pool.shutdown(cancel_futures=True)
 
 
@@ -72,7 +76,7 @@ def _result(handle: Future[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _check_reachable(address: str) -> None:
-    """Refuse an address where nothing listens, which Ray itself would try for a quarter of an hour.
+    """Refuse an address where nothing listens: Ray itself would retry for a quarter of an hour.
 
     Raises:
         ProjectError: it takes no connection within ``CONNECT_S``.
@@ -98,7 +102,7 @@ class Ray:
     """
 
     def __init__(self, tasks: Sequence[Task], *, address: str, console: Console) -> None:
-        # Of a cluster that has ended, address auto may still be known: 3 tries, not 20, 40 s each.
+        # "auto" may find the address of a cluster that has ended: try 3 times, not 20, 40 s each.
         os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "3")
         try:
             import ray
@@ -125,7 +129,7 @@ class Ray:
         self._check(tasks, address, console)
 
     def _check(self, tasks: Sequence[Task], address: str, console: Console) -> None:
-        """Say of tasks that fit no machine, which would wait for ever."""
+        """Warn of tasks that are too large for every node: they would wait for ever."""
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         for task in {task.stage: task for task in tasks}.values():
             asked = {"CPU": task.cpus, "GPU": task.gpus, "memory": task.memory_gb * 1e9}

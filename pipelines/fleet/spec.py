@@ -27,7 +27,7 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.settings import Settings
 from gvtools.untrusted import parse_yaml, read_text
 
-# Words in braces that a command may hold, beside the names of earlier stages.
+# Placeholders {WORD} that a command may hold, beside the names of earlier stages.
 WORDS = ("project", "name", "out")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
@@ -38,29 +38,30 @@ class Stage(Settings):
     section = "stages"
 
     command: str
-    """What follows ``gvtools``; {project}, {name}, {out} and names of earlier stages stand for the
-    scene's input, its name, this stage's folder, and the folders of those stages."""
+    """What follows ``gvtools``. {project}, {name}, {out} and {STAGE} of an earlier stage stand for
+    the scene's input, its name, this stage's folder, and the folder of that stage."""
     cpus: int = Field(1, ge=1)
     """Cores; also the number of threads that the command may use."""
     gpus: float = Field(0, ge=0)
-    """Cards; a part of one lets several commands share it."""
+    """GPUs; with a fraction, several commands share one."""
     memory_gb: float = Field(0, ge=0)
-    """Memory that has to be free [GB]; 0 asks for none."""
+    """RAM that the task reserves [GB]; 0 reserves none."""
     retries: int = Field(2, ge=0)
-    """How often a command is begun again that was killed, or whose machine was lost."""
+    """How often a command is restarted that was killed, failed with another status than 2 (wrong
+    input), or lost its machine."""
 
 
 class SceneEntry(Settings):
-    """An input, or several of a pattern."""
+    """One input, or all that match a pattern."""
 
     section = "scenes"
 
     project: str
     """A path (relative to the list), a pattern of folders, or an fsspec URL such as s3://."""
     name: str | None = None
-    """Of the results' folder; the last part of the path where it is not given."""
+    """Name of the results' folder; the last part of ``project`` if not given."""
     labels: dict[str, str] = Field(default_factory=dict)
-    """Labels of the Ray nodes that hold the data; others are taken where none of those is free."""
+    """Labels of preferred Ray nodes; while none of these is free, other nodes are used."""
 
 
 class FleetSpec(Settings):
@@ -83,13 +84,13 @@ class Task:
         stage: the stage's name.
         project: path or URL of the input.
         command: arguments of ``gvtools``, with words in braces.
-        before: names of earlier stages.
+        before: names of earlier stages, which have to be done.
         root: path or URL of the fleet's results.
         cpus: cores, and threads.
-        gpus: cards.
-        memory_gb: memory in GB.
-        retries: how often it may be begun again.
-        labels: of nodes that hold the data.
+        gpus: GPUs, or a fraction of one.
+        memory_gb: RAM, GB.
+        retries: how often it may be restarted.
+        labels: of preferred nodes.
     """
 
     scene: str

@@ -16,7 +16,7 @@ from pipelines.fleet.spec import is_url
 
 
 def scratch(url: str) -> Path:
-    """A folder on this machine that stands for a URL."""
+    """The local copy's folder for a URL, under GVTOOLS_FLEET_CACHE; it may not exist yet."""
     base = Path(
         os.environ.get("GVTOOLS_FLEET_CACHE", Path(tempfile.gettempdir()) / "gvtools-fleet")
     )
@@ -24,10 +24,10 @@ def scratch(url: str) -> Path:
 
 
 def fetched(place: str) -> Path:
-    """The path of a file or folder; that of a URL is copied to this machine, once.
+    """A local path of a file or folder; a URL is downloaded once and not looked at again.
 
     Raises:
-        OptionError: no driver of such URLs is installed.
+        OptionError: no fsspec driver for such URLs is installed.
         ProjectError: it cannot be read.
     """
     if not is_url(place):
@@ -38,7 +38,7 @@ def fetched(place: str) -> Path:
         part: Path | None = None
         try:
             local.parent.mkdir(parents=True, exist_ok=True)
-            # A name of its own: several tasks of a machine may fetch the same.
+            # A folder of its own: several tasks on this machine may download the same URL.
             part = Path(tempfile.mkdtemp(prefix=".part-", dir=local.parent))
             _fetch(files, remote, part / local.name)
             os.rename(part / local.name, local)
@@ -62,7 +62,7 @@ def _fetch(files: Any, remote: str, target: Path) -> None:
 
 
 def stored(folder: Path, place: str) -> None:
-    """Copy a finished folder to its URL; nothing to do where that is its path.
+    """Upload a finished folder to its URL; does nothing if ``place`` is a path.
 
     Raises:
         ProjectError: it cannot be written.
@@ -72,7 +72,7 @@ def stored(folder: Path, place: str) -> None:
     files, remote = _open(place)
     try:
         if files.exists(remote):
-            # Left by a copy that was interrupted.
+            # Left by an upload that was interrupted.
             files.rm(remote, recursive=True)
         for path in sorted(folder.rglob("*")):
             if path.is_file():
@@ -84,7 +84,7 @@ def stored(folder: Path, place: str) -> None:
 
 
 def read_record(place: str) -> dict[str, Any] | None:
-    """A JSON object; None where there is none, or a damaged one.
+    """A JSON object; None if the file is absent or damaged.
 
     Raises:
         ProjectError: the storage does not answer.
@@ -105,7 +105,7 @@ def read_record(place: str) -> dict[str, Any] | None:
 
 
 def write_record(place: str, data: dict[str, Any]) -> None:
-    """Write a JSON object whole.
+    """Write a JSON object; a file on disk appears only when complete.
 
     Raises:
         ProjectError: it cannot be written.
