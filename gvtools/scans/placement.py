@@ -52,7 +52,7 @@ class Placement:
         """(N, 3) points of the file's frame in the world."""
         return positions @ self.world_from_scan[:3, :3].T + self.world_from_scan[:3, 3]
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """A line of text for the user."""
         text = f"{self.how}, scale {self.scale:.6g}"
         if self.fitness is None:

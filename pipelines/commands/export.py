@@ -25,12 +25,12 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    told = "; ".join(
+    formats = "; ".join(
         f"{each.name}: {each.holds}" + (f" ({', '.join(each.suffixes)})" if each.suffixes else "")
         for each in FORMATS.values()
     )
     parser.add_argument("memory", type=Path, metavar="RUN_OR_MEMORY", help="a run or a memory.npz")
-    parser.add_argument("--format", choices=FORMATS, required=True, help=told)
+    parser.add_argument("--format", choices=FORMATS, required=True, help=formats)
     parser.add_argument(
         "--out",
         type=Path,

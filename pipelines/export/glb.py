@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.files import replaced_when_written
-from pipelines.export.source import ExportOptions, Source, middle, told
+from pipelines.export.source import ExportOptions, Source, middle, points_summary
 
 # Web viewers are slow beyond it.
 MAX_POINTS = 2_000_000
@@ -42,7 +42,7 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
         node=NODE,
         extras={"voxel": points.edge},
     )
-    return f"{told(points, source.memory)} in {path}, in the input's axes"
+    return f"{points_summary(points, source.memory)} in {path}, in the input's axes"
 
 
 def write_scene(

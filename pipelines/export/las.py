@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gvtools.files import replaced_when_written
-from pipelines.export.source import ExportOptions, Source, middle, told
+from pipelines.export.source import ExportOptions, Source, middle, points_summary
 
 POINT_FORMAT, VERSION = 7, "1.4"
 # Steps of coordinates in a voxel, at least, and the largest number of them.
@@ -61,4 +61,4 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
     cloud["scanned"] = memory.scanned[rows]
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
         cloud.write(file, do_compress=path.suffix.lower() == ".laz")
-    return f"{told(points, memory)} in {path}, coordinates in steps of {step:g}"
+    return f"{points_summary(points, memory)} in {path}, coordinates in steps of {step:g}"

@@ -19,7 +19,7 @@ from gvtools.errors import GvError
 from gvtools.files import replaced_when_written
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import Run, load_run
-from pipelines.export.source import ExportOptions, Source, told
+from pipelines.export.source import ExportOptions, Source, points_summary
 
 if TYPE_CHECKING:
     import rerun
@@ -96,7 +96,7 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
             shots += 1
         recording.flush()
         recording.disconnect()
-    return f"{told(points, memory)} and {shots} cameras in {path}"
+    return f"{points_summary(points, memory)} and {shots} cameras in {path}"
 
 
 def _log(

@@ -117,6 +117,6 @@ def middle(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     return (positions.min(axis=0) + positions.max(axis=0)) / 2
 
 
-def told(points: Points, memory: SpatialMemory) -> str:
+def points_summary(points: Points, memory: SpatialMemory) -> str:
     """How many points there are, for the user."""
     return f"{len(points.rows)} points of {len(memory)} observations (voxels of {points.edge:.4g})"

@@ -38,7 +38,7 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
     if splats.origin.any():
         comments.append("origin " + " ".join(repr(float(x)) for x in splats.origin))
     write_ply(path, vertices(splats), comments=tuple(comments))
-    return f"{splats.told()} in {path}"
+    return f"{splats.summary()} in {path}"
 
 
 def vertices(splats: Splats) -> NDArray[np.void]:

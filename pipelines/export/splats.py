@@ -82,7 +82,7 @@ class Splats:
         sh = self.values[:, SH:].reshape(len(self), -1, 3)
         return sh if self.fitted else sh[:, :1]
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """A line of text for the user."""
         points = len(self) - self.fitted
         parts = [f"{self.fitted} fitted"] if self.fitted else []

@@ -65,7 +65,7 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
     with replaced_when_written(path) as temporary:
         # Without a time, so that equal scenes give equal files.
         temporary.write_bytes(gzip.compress(data, mtime=0))
-    return f"{splats.told()} in {path}, positions in steps of {2.0**-fractional:.3g}"
+    return f"{splats.summary()} in {path}, positions in steps of {2.0**-fractional:.3g}"
 
 
 def packed(splats: Splats) -> tuple[bytes, int]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gvtools.files import replaced_when_written
-from pipelines.export.source import ExportOptions, Source, middle, told
+from pipelines.export.source import ExportOptions, Source, middle, points_summary
 
 # Viewers are slow beyond it.
 MAX_POINTS = 2_000_000
@@ -63,7 +63,7 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
     with replaced_when_written(path, suffix=path.suffix.lower()) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise OSError("USD wrote no file")
-    return f"{told(points, memory)} in {path}, in the input's axes"
+    return f"{points_summary(points, memory)} in {path}, in the input's axes"
 
 
 def _linear(colors: np.ndarray) -> np.ndarray:

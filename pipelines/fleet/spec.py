@@ -45,7 +45,7 @@ class Stage(Settings):
     gpus: float = Field(0, ge=0)
     """GPUs; with a fraction, several commands share one."""
     memory_gb: float = Field(0, ge=0)
-    """RAM that the task reserves [GB]; 0 reserves none."""
+    """RAM that the task reserves on Ray and Slurm [GB]; 0 reserves none."""
     retries: int = Field(2, ge=0)
     """How often a command is restarted that was killed, failed with another status than 2 (wrong
     input), or lost its machine."""

@@ -113,7 +113,7 @@ def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:
             )  # fmt: skip
         except DegenerateError as error:
             raise DegenerateError(f"{options.file}: {error} (--cloud-placement)") from None
-    console.line(f"{scan.name}: placement {placement.told()}")
+    console.line(f"{scan.name}: placement {placement.summary()}")
     _check_reach(scan, placement, plan)
     return PlacedScan(scan, placement)
 

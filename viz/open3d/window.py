@@ -183,7 +183,7 @@ class Open3dViewer:
         counts = self.run.counts(self.round)
         scale = f" ({' to '.join(self._legend.scale)})" if self._legend.scale else ""
         self._say(
-            f"round {self.round} of {self.run.last_round}: {counts.told()}; "
+            f"round {self.round} of {self.run.last_round}: {counts.summary()}; "
             f"{MODES[self.mode]}: {self._legend.text}{scale}"
         )
 

@@ -70,7 +70,7 @@ class Counts:
         """All observations."""
         return self.observed + self.generated + self.scanned
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """How many there are of each source, in words."""
         scanned = f"{self.scanned:,} scanned, " if self.scanned else ""
         return f"{self.observed:,} observed, {scanned}{self.generated:,} generated"

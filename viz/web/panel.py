@@ -134,7 +134,7 @@ class Panel:
         counts = run.counts(number)
         lines = [
             f"<b>{counts.total:,}</b> observations after round {number}",
-            counts.told(),
+            counts.summary(),
         ]
         if counts.voxels is not None:
             lines.append(f"{counts.voxels:,} voxels")

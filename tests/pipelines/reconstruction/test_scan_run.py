@@ -91,7 +91,7 @@ def test_viewers_tell_the_three_sources(runs):
 
     shown = ViewSource(runs / "with").read()
     counts = shown.counts(0)
-    assert counts.scanned > 0 and f"{counts.scanned:,} scanned" in counts.told()
+    assert counts.scanned > 0 and f"{counts.scanned:,} scanned" in counts.summary()
     assert not [camera.name for camera in shown.cameras if camera.name.startswith("scan/")]
     legend = shown.colors("source", np.arange(10)).legend
     assert [name for _, name in legend.swatches] == ["observed", "generated", "scanned"]
