@@ -26,8 +26,12 @@ CHUNK_BYTES = 1 << 26
 LEAST_HEADER, RECORD, LONG_RECORD = 227, 54, 60
 
 
-def open_las(path: Path) -> ScanFile:
+def open_las(path: Path, *, generated: bool = False) -> ScanFile:
     """A LAS or LAZ, its header read.
+
+    Args:
+        path: the file.
+        generated: whether points are kept that a completer made.
 
     Raises:
         MemoryFileError: no LAS, or one that is shorter than its header says.
@@ -50,7 +54,7 @@ def open_las(path: Path) -> ScanFile:
     def chunks() -> Iterator[Chunk]:
         with laspy.open(path) as reader:
             for points in reader.chunk_iterator(min(CHUNK, max(1, CHUNK_BYTES // max(size, 1)))):
-                yield _chunk(points)
+                yield _chunk(points, generated=generated)
 
     return ScanFile(path, count, (Station(path.stem),), chunks)
 
@@ -81,7 +85,10 @@ def _check_records(path: Path) -> None:
                 "file is truncated or damaged; save it again"
             )
     if head[104] & 0x80:
+        from gvtools.scans.laz import check_laz
+
         _check_pieces(path, at, size)
+        check_laz(path, at=at, point_bytes=struct.unpack_from("<H", head, 105)[0])
 
 
 def _long_records_fit(path: Path, at: int, count: int, *, size: int) -> bool:
@@ -126,7 +133,7 @@ def _check_pieces(path: Path, at: int, size: int) -> None:
         )
 
 
-def _chunk(points: laspy.ScaleAwarePointRecord) -> Chunk:
+def _chunk(points: laspy.ScaleAwarePointRecord, *, generated: bool) -> Chunk:
     names = set(points.point_format.dimension_names)
     positions = np.stack([np.asarray(points[axis], np.float64) for axis in "xyz"], axis=1)
     colors = None
@@ -135,7 +142,7 @@ def _chunk(points: laspy.ScaleAwarePointRecord) -> Chunk:
     chunk = Chunk(positions, colors, np.asarray(points["intensity"], np.float32))
     bad = np.asarray(points["withheld"]) != 0
     bad |= np.isin(np.asarray(points["classification"]), NOISE)
-    if GENERATED in names:
+    if GENERATED in names and not generated:
         made = np.asarray(points[GENERATED]) != 0
         chunk, bad = chunk.without(made, GENERATED), bad[~made]
     return chunk.without(bad, "withheld or noise")

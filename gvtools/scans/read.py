@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,12 @@ FARTHEST = 1e15
 WRONG = (KeyboardInterrupt, SystemExit, GeneratorExit)
 
 
-def open_scan(path: Path) -> ScanFile:
+def open_scan(path: Path, *, generated: bool = False) -> ScanFile:
     """The scan in a file, its header read and checked against the file's size.
 
     Args:
         path: PLY, LAS, LAZ, E57 or PCD, told by its suffix.
+        generated: whether points of a LAS that a completer made are kept.
 
     Raises:
         OptionError: another suffix, or a package that the format needs is not installed.
@@ -49,25 +51,28 @@ def open_scan(path: Path) -> ScanFile:
         elif suffix == ".e57":
             from gvtools.scans.e57 import open_e57 as open_
         else:
-            from gvtools.scans.las import open_las as open_
+            from gvtools.scans.las import open_las
+
+            open_ = partial(open_las, generated=generated)
         file = open_(path)
     if not file.count:
         raise MemoryFileError(f"{path}: no points in it; expected a scan")
     return file
 
 
-def read_scan(path: Path, *, most: int = MOST_POINTS) -> Scan:
+def read_scan(path: Path, *, most: int = MOST_POINTS, generated: bool = False) -> Scan:
     """The points of a scan, at most ``most``: beyond it one of each cell of a grid.
 
     Args:
         path: see ``open_scan``.
         most: at least 2.
+        generated: see ``open_scan``.
 
     Raises:
         OptionError: see ``open_scan``.
         MemoryFileError: see there, or no point has finite coordinates.
     """
-    file = open_scan(path)
+    file = open_scan(path, generated=generated)
     reading = _Reading(most)
     with _one_line(path):
         for chunk in file.chunks():

@@ -149,7 +149,9 @@ def _found_poses(found: Mapping[str, Any] | None) -> dict[str, Any]:
     """cam_from_world by name, of what the pose probe found; None where it found none."""
     known: dict[str, Any] = {}
     for view in nested(found, "views") or ():
-        pose = view["cam_from_world"]
+        if not isinstance(view, dict) or not isinstance(view.get("name"), str):
+            continue
+        pose = view.get("cam_from_world")
         try:
             known[view["name"]] = None if pose is None else rigid_transform(pose, what="")[0]
         except (GvError, TypeError, ValueError):

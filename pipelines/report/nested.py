@@ -10,5 +10,5 @@ def nested(data: Mapping[str, Any] | None, *keys: str) -> Any:
     """The value below the keys, one within the other; None where one of them is absent or null."""
     value: Any = data
     for key in keys:
-        value = value.get(key) if value else None
+        value = value.get(key) if isinstance(value, Mapping) else None
     return value

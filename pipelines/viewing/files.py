@@ -18,15 +18,13 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.export import splat, spz
 from pipelines.export.splats import Splats
 from pipelines.viewing.gaussians import shown_gaussians
+from pipelines.viewing.meshes import HEADER, load_mesh
+from pipelines.viewing.usd_points import GREY, read_usd
 from viz.run_view.gaussians import Surface
 from viz.run_view.view import MESH, POINTS, RENDERED, SPLATS, RunView
 
 if TYPE_CHECKING:
     import trimesh
-
-# As much of a PLY as tells what it holds.
-HEADER = 1 << 16
-GREY = 160
 
 
 def open_file(path: Path) -> RunView | None:
@@ -74,12 +72,10 @@ def _open_spz(path: Path) -> RunView:
 def _open_mesh(path: Path) -> RunView:
     import trimesh
 
-    loaded = trimesh.load_scene(path, process=False).to_geometry()
+    loaded = load_mesh(path)
     if isinstance(loaded, trimesh.PointCloud):
         colors = np.asarray(loaded.colors)[:, :3] if len(loaded.colors) else None
         return _points_view(path, np.asarray(loaded.vertices), colors)
-    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
-        raise MemoryFileError(f"{path}: no triangles and no points; expected either")
     vertices, colors = np.asarray(loaded.vertices, np.float64), _vertex_colors(loaded)
     surface = Surface(vertices, np.asarray(loaded.faces), colors)
     memory = _memory(path, vertices, colors)
@@ -97,43 +93,16 @@ def _vertex_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8]:
 
 
 def _open_las(path: Path) -> RunView:
-    import laspy
+    import laspy  # noqa: F401 (so that what is absent is named as of an export)
 
-    cloud = laspy.read(path)
-    colors = None
-    if "red" in cloud.point_format.dimension_names:
-        colors = np.stack([cloud.red, cloud.green, cloud.blue], axis=1)
-        # The standard has 16 bits; some software writes 8 into them.
-        colors = (colors >> 8 if colors.max(initial=0) > 255 else colors).astype(np.uint8)
-    return _points_view(path, np.asarray(cloud.xyz), colors)
+    from gvtools.scans.read import read_scan
+
+    scan = read_scan(path, generated=True)
+    return _points_view(path, scan.positions + scan.origin, scan.colors)
 
 
 def _open_usd(path: Path) -> RunView:
-    from pxr import Usd, UsdGeom
-
-    places, colors = [], []
-    cache = UsdGeom.XformCache()
-    # The stage has to outlive its prims.
-    stage = Usd.Stage.Open(str(path))
-    for prim in stage.Traverse():
-        if not prim.IsA(UsdGeom.Points):
-            continue
-        local = np.asarray(UsdGeom.Points(prim).GetPointsAttr().Get(), np.float64).reshape(-1, 3)
-        matrix = np.array(cache.GetLocalToWorldTransform(prim))
-        places.append(local @ matrix[:3, :3] + matrix[3, :3])
-        color = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
-        linear = np.full((1, 3), GREY / 255) if color is None else np.asarray(color, np.float64)
-        colors.append(np.broadcast_to(_srgb(linear), local.shape))
-    if not places:
-        raise MemoryFileError(f"{path}: no UsdGeom.Points; expected them")
-    return _points_view(path, np.concatenate(places), np.concatenate(colors))
-
-
-def _srgb(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Linear light as bytes of sRGB."""
-    linear = np.clip(linear, 0, 1)
-    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.rint(255 * curved).astype(np.uint8)
+    return _points_view(path, *read_usd(path))
 
 
 def _points_view(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) -> RunView:

@@ -270,6 +270,23 @@ def test_e57_whose_xml_would_take_too_much_is_refused(tmp_path, xml, said):
     assert said in refused(path)
 
 
+@pytest.mark.parametrize(("place", "said"), [("size", "at once"), ("layer", "in a piece of")])
+def test_laz_whose_pieces_would_take_too_much_is_refused(tmp_path, place, said):
+    import struct
+
+    path = write_las(tmp_path / "scan.laz", *surface(300))
+    data = path.read_bytes()
+    at, points = struct.unpack_from("<I", data, 96)[0], struct.unpack_from("<H", data, 105)[0]
+    # The compression's record has the size of pieces behind its options; a piece the lengths of its
+    # layers behind the first point and how many there are.
+    record = data.index(b"laszip encoded") + 52
+    where = record + 12 if place == "size" else at + 8 + points + 8
+    message = refused(
+        damaged(path, lambda d: d.__setitem__(slice(where, where + 4), b"\xff\xff\xff\x3f"))
+    )
+    assert said in message
+
+
 def test_errors_of_libraries_are_told_in_plain_words(tmp_path):
     pytest.importorskip("pye57")
     positions, _ = surface(300)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import os
 import struct
 import sys
@@ -117,6 +118,45 @@ def test_spz_that_unpacks_to_more_than_it_can_hold_is_refused(tmp_path):
     file.write_bytes(gzip.compress(header + bytes(20_000_000)))
     with pytest.raises(MemoryFileError, match="unpack to more"):
         spz.read(file)
+
+
+def write_glb(path: Path, tree: dict, body: bytes) -> Path:
+    text = json.dumps(tree).encode()
+    text = text.ljust(-(-len(text) // 4) * 4)
+    chunk = struct.pack("<I4s", len(text), b"JSON") + text
+    chunk += struct.pack("<I4s", len(body), b"BIN\0") + body
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunk)) + chunk)
+    return path
+
+
+@pytest.mark.parametrize("case", ["array", "count", "copies"])
+def test_a_glb_that_claims_more_than_it_holds_is_refused(tmp_path, case):
+    pytest.importorskip("trimesh")
+    body = np.random.default_rng(0).normal(size=(999, 3)).astype("<f4").tobytes()
+    count = 10**9 if case == "count" else 999
+    array = {"componentType": 5126, "type": "VEC3", "count": count, "bufferView": 0}
+    if case == "array":
+        del array["bufferView"]
+    nodes = [{"mesh": 0}] * (5000 if case == "copies" else 1)
+    tree = {
+        "asset": {"version": "2.0"}, "buffers": [{"byteLength": len(body)}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(body)}], "accessors": [array],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 0}]}], "nodes": nodes,
+        "scenes": [{"nodes": list(range(len(nodes)))}], "scene": 0,
+    }  # fmt: skip
+    said = {"array": "without data", "count": "items", "copies": "nodes draw"}[case]
+    with pytest.raises(MemoryFileError, match=said):
+        ViewSource(write_glb(tmp_path / "a.glb", tree, body)).read()
+
+
+def test_a_usd_that_names_other_files_is_refused(tmp_path):
+    pytest.importorskip("pxr")
+    (tmp_path / "a.usda").write_text(
+        '#usda 1.0\n(\n    subLayers = [@../secret.usda@]\n)\ndef Points "p"\n{\n'
+        "    point3f[] points = [(0, 0, 0)]\n}\n"
+    )
+    with pytest.raises(MemoryFileError, match="names other files"):
+        ViewSource(tmp_path / "a.usda").read()
 
 
 @pytest.mark.parametrize("version", [2, 3])

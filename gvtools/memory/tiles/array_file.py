@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 import zlib
 from collections.abc import Mapping
@@ -23,6 +24,7 @@ from gvtools.untrusted import regular
 
 MAGIC = b"gvtools arrays 1"
 ALIGNED = 64
+KINDS = re.compile("[<>|][biuf][1248]")
 _HEAD = struct.Struct("<II")
 
 
@@ -146,7 +148,8 @@ def _check_entry(kind: Any, shape: Any, at: Any) -> None:
         TypeError: see ValueError.
         ValueError: another type of numbers, or a shape or place that cannot be.
     """
-    known = np.dtype(kind).kind in "biuf" and isinstance(kind, str)
+    # Before NumPy sees it, which takes such texts for Python.
+    known = isinstance(kind, str) and KINDS.fullmatch(kind)
     numbers = [at, *shape]
     if not known or not all(type(n) is int and 0 <= n < 2**48 for n in numbers) or at % ALIGNED:
         raise ValueError(f"array of type {kind!r}, shape {shape!r} at {at!r}")

@@ -1,0 +1,132 @@
+"""Meshes and clouds in PLY, GLB and OBJ, read through trimesh under the guards of untrusted files.
+
+trimesh believes a header's counts, makes zeros for arrays that a GLB claims and does not hold, and
+copies a mesh as often as a GLB's nodes name it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gvtools.errors import MemoryFileError
+from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, parse_json, read_bytes
+
+if TYPE_CHECKING:
+    import trimesh
+
+# As much of a PLY as tells what it holds.
+HEADER = 1 << 16
+GLB, JSON = b"glTF", b"JSON"
+# What a vertex of a GLB takes in RAM, and how much there may be beside twice the file.
+VERTEX_BYTES, SPARE_BYTES = 128, 96 << 20
+
+
+def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
+    """The triangles or the points of a file, in one.
+
+    Raises:
+        MemoryFileError: neither, or a file that claims more than it holds.
+        ImportError: trimesh is not installed.
+    """
+    import trimesh
+
+    data = read_bytes(path)
+    if data.startswith(b"ply"):
+        _check_ply(path, data)
+    elif data.startswith(GLB):
+        _check_glb(path, data)
+    del data
+    with _small_pictures(path.stat().st_size):
+        scene = trimesh.load_scene(path, process=False, resolver=_beside(path))
+        loaded = scene.to_geometry()
+    points = isinstance(loaded, trimesh.PointCloud)
+    if not points and not (isinstance(loaded, trimesh.Trimesh) and len(loaded.faces)):
+        raise MemoryFileError(f"{path}: no triangles and no points; expected either")
+    if not np.isfinite(loaded.vertices).all():
+        raise MemoryFileError(f"{path}: vertices that are no finite numbers; save it again")
+    if not points:
+        faces = np.asarray(loaded.faces)
+        if faces.min() < 0 or faces.max() >= len(loaded.vertices):
+            raise MemoryFileError(f"{path}: a triangle of vertices that are not there")
+    return loaded
+
+
+def _beside(path: Path) -> Any:
+    """What reads files that ``path`` names: such as lie below its folder, and no pipes."""
+    from trimesh.resolvers import FilePathResolver
+
+    class Beside(FilePathResolver):
+        def get(self, name: str) -> bytes:
+            return read_bytes(self.absolute(name))
+
+    return Beside(str(path))
+
+
+@contextmanager
+def _small_pictures(size: int) -> Iterator[None]:
+    """Let no texture be opened whose pixels the file's size does not explain."""
+    from PIL import Image
+
+    before = Image.MAX_IMAGE_PIXELS
+    # Pillow refuses twice as many; a pixel takes up to four bytes.
+    Image.MAX_IMAGE_PIXELS = (PIXEL_BYTES + PIXEL_RATIO * size) // 8
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = before
+
+
+def _check_ply(path: Path, data: bytes) -> None:
+    """Refuse more elements than a file has bytes.
+
+    Raises:
+        MemoryFileError: see above.
+    """
+    for line in data[:HEADER].split(b"end_header")[0].splitlines():
+        words = line.split()
+        if words[:1] == [b"element"]:
+            number = words[2] if len(words) == 3 else b""
+            if not number.isdigit() or len(number) > 18 or int(number) > len(data):
+                raise MemoryFileError(
+                    f"{path}: {len(data)} bytes, but its header says {line[:60]!r}; the file is "
+                    "truncated or damaged; save it again"
+                )
+
+
+def _check_glb(path: Path, data: bytes) -> None:
+    """Refuse arrays that are not in the file, and more copies of meshes than it explains.
+
+    Raises:
+        MemoryFileError: see above.
+    """
+    try:
+        length, kind = struct.unpack_from("<I4s", data, 12)
+        if kind != JSON or 20 + length > len(data):
+            raise ValueError("no JSON in front")
+        tree = parse_json(data[20 : 20 + length])
+        counts = []
+        for accessor in tree.get("accessors", ()):
+            count = accessor["count"]
+            if type(count) is not int or not 0 <= count <= len(data):
+                raise ValueError(f"an array of {str(count)[:20]} items")
+            if "bufferView" not in accessor:
+                raise ValueError("an array without data")
+            counts.append(count)
+        sizes = [
+            sum(counts[part["attributes"]["POSITION"]] for part in mesh["primitives"])
+            for mesh in tree.get("meshes", ())
+        ]
+        nodes = tree.get("nodes", ())
+        drawn = sum(sizes[node["mesh"]] for node in nodes if "mesh" in node)
+        if drawn * VERTEX_BYTES > 2 * len(data) + SPARE_BYTES:
+            raise ValueError(f"nodes draw {drawn} vertices")
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError, struct.error) as error:
+        raise MemoryFileError(
+            f"{path}: no GLB of meshes or points ({error}); the file is damaged; save it again"
+        ) from None
