@@ -45,7 +45,7 @@ def joined(parts: Sequence[BlockAppearance], frame: LocalFrame) -> Appearance:
         parts: at least one.
         frame: that the Gaussians are to be in.
     """
-    gains = brightness([_log_gains(part) for part in parts])
+    gains = _centred(brightness([_log_gains(part) for part in parts]), parts)
     first = parts[0].appearance
     count = min(len(part.appearance.fits) for part in parts)
     fits = [
@@ -95,6 +95,17 @@ def brightness(parts: Sequence[dict[str, Float64]]) -> Float64:
     return np.asarray(found, np.float64)
 
 
+def _centred(gains: Float64, parts: Sequence[BlockAppearance]) -> Float64:
+    """The blocks' gains, such that the mean of all blocks' own photographs' gains is zero."""
+    own = [
+        log_gain + gain
+        for part, gain in zip(parts, gains, strict=True)
+        for name, log_gain in _log_gains(part).items()
+        if name in part.block.owners
+    ]
+    return gains - np.mean(own, axis=0) if own else gains
+
+
 def _log_gains(part: BlockAppearance) -> dict[str, Float64]:
     exposures = part.appearance.exposures
     if exposures is None or len(exposures.log_gains) != len(part.context):
@@ -112,9 +123,14 @@ def _in_cell(
         return gaussians.values[:0]
     out = turned(gaussians.values[inside], frame.axes.T @ gaussians.frame.axes)
     out[:, :LOG_SCALE] = frame.from_world(world[inside])
-    scale = np.exp(-gain)
+    return brighter(out, -gain)
+
+
+def brighter(values: NDArray[np.float32], log_gain: Float64) -> NDArray[np.float32]:
+    """(N, VALUES) Gaussians whose colours are multiplied by the exponential of (3,) logarithms."""
+    out, scale = values.copy(), np.exp(log_gain)
     sh = out[:, SH:].reshape(len(out), -1, 3) * scale
-    # Colours are 0.5 + their harmonics; it is the whole that is dimmed.
+    # Colours are 0.5 + their harmonics; it is the whole that changes.
     sh[:, 0] += 0.5 * (scale - 1) / HARMONICS[0]
     out[:, SH:] = sh.reshape(len(out), -1)
     return out
@@ -123,16 +139,21 @@ def _in_cell(
 def _exposures(
     parts: Sequence[BlockAppearance], gains: Float64, frame: LocalFrame
 ) -> Exposures | None:
-    """Exposures of all blocks' own photographs; None where a block has none."""
-    poses, logs, depths = [], [], []
+    """Exposures of all blocks' own photographs in order of their names, as a run has its context.
+
+    None where a block has none.
+    """
+    names, poses, logs, depths = [], [], [], []
     for part, gain in zip(parts, gains, strict=True):
         own, exposures = set(part.block.owners), part.appearance.exposures
         if exposures is None or len(exposures.poses) != len(part.context):
             return None
         mine = np.array([name in own for name in part.context])
         world = part.appearance.gaussians.frame.cam_from_world(exposures.poses[mine])
+        names += [name for name in part.context if name in own]
         poses.append(frame.cam_from_local(world))
         logs.append(exposures.log_gains[mine] + gain)
         depths.append(exposures.depth)
-    log_gains = np.concatenate(logs)
-    return Exposures(np.concatenate(poses), log_gains, float(np.median(depths)))
+    order = np.argsort(names)
+    log_gains = np.concatenate(logs)[order]
+    return Exposures(np.concatenate(poses)[order], log_gains, float(np.median(depths)))

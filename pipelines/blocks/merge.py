@@ -32,10 +32,11 @@ from gvtools.scenes.reading import open_recorded
 from gvtools.settings import dotted, with_values
 from pipelines.blocks.appearance import BlockAppearance, joined
 from pipelines.blocks.completions import BlockCompletions
+from pipelines.blocks.joint_fit import fitted_across
 from pipelines.blocks.runs import BlockRun, read_runs
 from pipelines.reconstruction.compile_kernels import compile_kernels
 from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
-from pipelines.reconstruction.run import Draw, complete_run, say_results
+from pipelines.reconstruction.run import Draw, complete_run, saved_fit, say_results
 from pipelines.reconstruction.scan import placed_scan
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.reconstruction.targets import Targets
@@ -93,7 +94,7 @@ def merge(
     with directory.open_or_resume(identity, resume=resume) as done:
         if not done:
             _take_depth(plan, runs, directory)
-        fitted = _fitted(plan, runs)
+        fitted = saved_fit(plan, directory) if done else _fitted(plan, runs, console)
         plan = replace(plan, completer=BlockCompletions(targets))
         drawn = complete_run(plan, directory, done, fitted=fitted, console=console, draw=draw)
     say_results(directory, drawn, console)
@@ -197,8 +198,8 @@ def _take_depth(plan: Plan, runs: Sequence[BlockRun], directory: RunDirectory) -
                 ) from error
 
 
-def _fitted(plan: Plan, runs: Sequence[BlockRun]) -> Fitted | None:
-    """The joined Gaussians; None where a block has none."""
+def _fitted(plan: Plan, runs: Sequence[BlockRun], console: Console) -> Fitted | None:
+    """The blocks' Gaussians, joined and fitted across faces; None where a block has none."""
     from pipelines.reconstruction.fitting import Fitted
     from pipelines.reconstruction.voxel_edge import grid_frame
 
@@ -211,9 +212,10 @@ def _fitted(plan: Plan, runs: Sequence[BlockRun]) -> Fitted | None:
         for item, fitted in zip(runs, found, strict=True)
     ]
     appearance = joined(parts, grid_frame(plan.scene, plan.context))
-    return Fitted(
+    fitted = Fitted(
         appearance,
         plan.poses,
         spread=any(fitted.spread for fitted in found),
         steps=min(fitted.steps for fitted in found),
     )
+    return fitted_across(plan, fitted, [item.block for item in runs], console=console)

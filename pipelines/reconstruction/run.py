@@ -127,13 +127,25 @@ def complete_run(
 
 def _fitted(plan: Plan, directory: RunDirectory, done: int, *, console: Console) -> Fitted | None:
     """Gaussians fitted now or by the attempt that is resumed; None where there are none."""
-    from pipelines.reconstruction.fitting import Fitted, fit_appearance
+    from pipelines.reconstruction.fitting import fit_appearance
 
     if done:
-        # None are there where none were wanted or could be fitted; ``gvtools refine`` adds them.
-        saved = directory.round_path(0) / APPEARANCE
-        return Fitted.load(saved).on(plan.config.device) if saved.exists() else None
+        return saved_fit(plan, directory)
     return fit_appearance(plan, console) if plan.config.refine.wanted else None
+
+
+def saved_fit(plan: Plan, directory: RunDirectory) -> Fitted | None:
+    """Gaussians that a resumed run's round 0 left; None where there are none.
+
+    None are there where none were wanted or could be fitted; ``gvtools refine`` adds them.
+
+    Raises:
+        MemoryFileError: damaged.
+    """
+    from pipelines.reconstruction.fitting import Fitted
+
+    saved = directory.round_path(0) / APPEARANCE
+    return Fitted.load(saved).on(plan.config.device) if saved.exists() else None
 
 
 def _empty_memory(plan: Plan, scratch: Path) -> SpatialMemory:

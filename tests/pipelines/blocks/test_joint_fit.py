@@ -1,0 +1,173 @@
+"""Blocks with fitted Gaussians: their merge fits further where blocks meet."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scan import write_scan
+
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.runs.folder import RunDirectory
+from gvtools.runs.poses import RunPoses
+from gvtools.runs.run import load_run
+from gvtools.scenes.blocks import Block
+from gvtools.scenes.project import open_project
+from gvtools.settings import with_values
+from pipelines.blocks import merge as merging
+from pipelines.blocks.joint_fit import fitted_across, rows_across
+from pipelines.blocks.merge import merge
+from pipelines.blocks.split import split
+from pipelines.blocks.write import read_blocks
+from pipelines.console import Console
+from pipelines.reconstruction import run
+from pipelines.reconstruction.fitting import Fitted
+from pipelines.reconstruction.plan import Plan
+from pipelines.reconstruction.settings import RunSettings
+
+QUIET = Console(quiet=True)
+CONTEXT, TARGETS = "not:every:6+3", "every:6+3"
+FIT = {"refine.steps": 16, "refine.most_gaussians": 800, "refine.poses": False, "rounds": 1}
+SAVED = "round_000/appearance.npz"
+
+
+def reconstruct(project: Path, out: Path, **values: object) -> Path:
+    config = with_values(RunSettings(), {**FIT, **values})
+    return run.reconstruct(open_project(project), config, out, console=QUIET)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scan, its unsplit run, its blocks, their runs and the merged run."""
+    folder = tmp_path_factory.mktemp("fitted")
+    scan = write_scan(folder / "scan", views=10)
+    reconstruct(scan, folder / "whole", context=CONTEXT, targets=TARGETS)
+    split(
+        open_project(scan), folder / "blocks", blocks=2, overlap=0.5, context=CONTEXT,
+        refine_poses=False,
+    )  # fmt: skip
+    for place, block in read_blocks(folder / "blocks"):
+        lists = {"context": f"@{place}/context.txt", "targets": f"@{place}/targets.txt"}
+        reconstruct(place, folder / "runs" / block.name, **lists)
+    merge(sorted((folder / "runs").iterdir()), folder / "merged", console=QUIET)
+    return folder
+
+
+def across(folder: Path) -> list[str]:
+    context = load_run(folder / "merged").context
+    blocks = [block for _, block in read_blocks(folder / "blocks")]
+    return [context[row] for row in rows_across(context, blocks)]
+
+
+def unfitted(folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> Fitted:
+    """The same merge without fitting further."""
+    with monkeypatch.context() as patch:
+        patch.setattr(merging, "fitted_across", lambda plan, joined, blocks, console: joined)
+        merge(sorted((folder / "runs").iterdir()), out, console=QUIET)
+    return Fitted.load(out / SAVED)
+
+
+def error(folder: Path, fit: Fitted) -> float:
+    """Mean squared difference from the photographs across faces."""
+    scene = open_project(folder / "scan")
+    return float(np.mean([
+        np.square(fit.appearance.picture(scene[name].camera).rgb
+                  - scene[name].load().rgb / np.float32(255)).mean()
+        for name in across(folder)
+    ]))  # fmt: skip
+
+
+def test_the_views_that_help_are_those_that_a_merge_fits_to(fitted: Path) -> None:
+    blocks = [block for _, block in read_blocks(fitted / "blocks")]
+    found, context = across(fitted), load_run(fitted / "merged").context
+    assert found == [name for name in context if any(name in b.helpers for b in blocks)]
+    assert 0 < len(found) < len(context)
+
+
+def test_pictures_across_faces_come_nearer_to_the_photographs(
+    fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = unfitted(fitted, tmp_path / "joined", monkeypatch)
+    after = Fitted.load(fitted / "merged" / SAVED)
+    assert error(fitted, after) < 0.95 * error(fitted, before)
+    # Half of the steps that a fit of its own would have; at the same poses.
+    assert after.steps - before.steps == FIT["refine.steps"] // 2
+    one, two = before.appearance.exposures, after.appearance.exposures
+    assert one is not None and two is not None
+    assert one.poses.tobytes() == two.poses.tobytes()
+    context, fitted_to = load_run(fitted / "merged").context, across(fitted)
+    for name, old, new in zip(context, one.log_gains, two.log_gains, strict=True):
+        assert (old == new).all() == (name not in fitted_to)
+
+
+def test_the_blocks_exposures_stand_in_the_order_of_the_context(fitted: Path) -> None:
+    exposures = Fitted.load(fitted / "merged" / SAVED).appearance
+    assert exposures.exposures is not None
+    frame = exposures.gaussians.frame
+    cameras = open_project(fitted / "scan").subset(load_run(fitted / "merged").context).cameras
+    given = frame.cam_from_local(cameras.cam_from_world)
+    assert np.allclose(exposures.exposures.poses, given, atol=1e-9)
+
+
+def test_observed_content_is_still_the_unsplit_runs_to_the_bit(fitted: Path) -> None:
+    one, two = (SpatialMemory.load(fitted / name / "memory.npz") for name in ("whole", "merged"))
+    for memory in (one, two):
+        memory.forget(round=1)
+    for name in ("positions", "colors", "confidence", "spacing", "round", "view", "level"):
+        assert getattr(one.columns, name).tobytes() == getattr(two.columns, name).tobytes(), name
+
+
+def test_a_resumed_merge_has_the_same_bytes_and_fits_no_second_time(
+    fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs, out = sorted((fitted / "runs").iterdir()), tmp_path / "merged"
+
+    def stop(*args: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "_finish", stop)
+        with pytest.raises(KeyboardInterrupt):
+            merge(runs, out, console=QUIET)
+    assert len(RunDirectory(out).reports()) == 2
+    monkeypatch.setattr(merging, "fitted_across", stop)
+    merge(runs, out, resume=True, console=QUIET)
+    for name in (SAVED, "memory.npz"):
+        assert (out / name).read_bytes() == (fitted / "merged" / name).read_bytes(), name
+
+
+def test_poses_and_brightness_stay_where_the_views_across_are_exposed_unlike_others(
+    fitted: Path, tmp_path: Path
+) -> None:
+    given: list[tuple[Plan, Fitted, list[Block]]] = []
+
+    def note(plan: Plan, joined: Fitted, blocks: list[Block], *, console: Console) -> Fitted:
+        given.append((plan, joined, blocks))
+        return joined
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(merging, "fitted_across", note)
+        merge(sorted((fitted / "runs").iterdir()), tmp_path / "merged", console=QUIET)
+    (plan, joined, blocks) = given[0]
+    refine = plan.config.refine.replaced(steps=2)
+    plan = replace(plan, config=plan.config.replaced(refine=refine))
+    cameras = plan.scene.subset(plan.context).cameras, plan.targets.cameras
+    poses = RunPoses(*(some.cam_from_world for some in cameras))
+    exposures = joined.appearance.exposures
+    assert exposures is not None
+    log_gains = np.zeros_like(exposures.log_gains)
+    log_gains[rows_across(plan.context, blocks)] = 0.5
+    appearance = replace(joined.appearance, exposures=replace(exposures, log_gains=log_gains))
+    found = fitted_across(
+        plan, replace(joined, appearance=appearance, poses=poses), blocks, console=QUIET
+    )
+    assert found.poses is poses
+    # One step changes next to nothing; a change of level would be a factor of 1.6.
+    assert found.appearance.exposures is not None
+    assert np.abs(found.appearance.exposures.log_gains - log_gains).max() < 0.05
+    camera = plan.scene[plan.context[0]].camera
+    one, two = (replace(some, exposures=None).picture(camera).rgb.mean() for some in
+                (appearance, found.appearance))  # fmt: skip
+    assert two == pytest.approx(one, rel=0.1)
