@@ -16,6 +16,8 @@ ARGS ?=
 demo: environment
 	$(BIN)/gvtools demo $(ARGS)
 
+# Where bytecode is written, workers and the commands that tests begin need not compile it again.
+test: export PYTHONDONTWRITEBYTECODE :=
 test: environment
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile \
 		--no-loadscope-reorder $(ARGS)

@@ -29,8 +29,8 @@ from pipelines.fleet.storage import fetched, read_record, stored
 from pipelines.fleet.task import _dying_with, record_of, run_task
 
 ROOT = Path(__file__).resolve().parents[3]
-# Quick, and needs no scene.
-QUICK = "weights list"
+# Quick, since it imports neither torch nor numba, and needs no scene.
+QUICK = "data list"
 LIST = """
 stages:
   first: {{command: "{first}", retries: 1}}
