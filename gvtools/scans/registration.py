@@ -1,10 +1,12 @@
-"""The similarity between a scan and what photographs saw, estimated from their shapes.
+"""The similarity between a scan and the photographs' points, estimated by registration.
 
 Features of both surfaces (FPFH, R. B. Rusu et al., "Fast Point Feature Histograms for 3D
-registration", ICRA 2009) are matched for several scales, first of a few points, then of more; each
-set of matches gives a similarity by LO-RANSAC (pycolmap), and the best are refined by ICP with scale
-(Open3D). What is not clearly supported in the end is refused. How much is tried is limited by the
-points that features are computed of, not by a clock: the result is the same on a busy machine.
+registration", ICRA 2009) are matched at several scales, first of few points, then of more. Each set
+of matches gives a similarity by LO-RANSAC (pycolmap), and the best are refined by ICP with scale
+(Open3D). A result that too few points support, or that is not unique, is refused. The search is
+limited by the number of points with features, not by time: it is the same on a busy machine.
+
+A cell is a cube such that about POINTS of them hold the photographs' points.
 """
 
 from __future__ import annotations
@@ -23,41 +25,40 @@ if TYPE_CHECKING:
 
 Float64 = NDArray[np.float64]
 
-# Cells of the photographs' surface that hold a point, about; most points that a surface is known by;
-# and most that ICP and fitness look for partners of.
+# About so many cells hold a point of the photographs; at most so many points of a surface are kept;
+# and of at most so many ICP and fitness seek the nearest neighbours.
 POINTS, KNOWN, COUNTED = 6000, 250_000, 8000
-# Fewer tell no shape.
+# Surfaces with fewer points are refused.
 FEWEST = 300
-# Features are computed of one point in a cube of so many cells, the fewest points first. Finer ones
-# cost more and found less: a kitchen in a scan of four times its extent has 38 true matches at 2,
-# and at 1 more points than can be matched.
+# Features are computed for one point in each cube of so many cells a side, coarse ones first. Finer
+# ones cost more and found less: a kitchen in a scan of four times its extent has 38 true matches at
+# 2, and at 1 more points than can be matched.
 LEVELS = (3.0, 2.0)
-# A placement is searched for with features of at most so many points of the scan at once, and in
-# all; 10,000 take about a second of processor time.
+# Limits of the scan's points with features, at one scale and level, and in the whole search; 10,000
+# take about a second of CPU time.
 MOST, BUDGET = 20_000, 200_000
-# Least share of the variance of a point's neighbourhood along its normal, the median, at which
-# points lie on no surface: 0.27 in a cloud of noise, 0.08 in a scan of a kitchen.
+# A scan whose ``unevenness`` is larger lies on no surface: 0.27 in a cloud of noise, 0.08 in a scan
+# of a kitchen. It is measured at so many points.
 VOLUME, LOOKED_AT = 0.2, 2000
-# Multiples of a level's cells: radii of normals and features, and the error of a match. In cells:
-# the steps of ICP.
+# In cubes of a level: radii of normals and features, RANSAC's inlier threshold. In cells: greatest
+# correspondence distances of ICP, step by step.
 NORMALS, FEATURES, MATCH, STEPS = 2.0, 5.0, 1.5, (4.0, 2.0, 1.0, 0.5)
-# A placement fits a point within this share of a cell.
+# A point supports a placement if the other surface has a point within this, in cells.
 TOLERANCE = 1 / 3
-# Steps of ICP for the placement that is taken.
-POLISHING = 200
-# Scales that are tried around the ratio of the extents, the likeliest first.
+POLISHING = 200  # iterations of ICP for the placement that is returned
+# Factors of the ratio of extents that are tried as scales, the likeliest first.
 SCALES = tuple(2.0 ** (k / 2) for k in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5))
-# Of scans of metric scenes: metres and millimetres.
+# Scales that are tried first in metric scenes: scans in metres and in millimetres.
 METRIC = (1.0, 0.001)
-# Random samples of matches, at most: with one true match in thirty, one sample hits on average.
+# Iterations of RANSAC: if one match in thirty is right, one sample of three in 27,000 is.
 TRIALS = 30_000
-# A placement that so many points support needs no other scale beside it.
+# At a fitness of at least this no further scale is tried.
 CLEAR = 0.8
-# Of the placements by features so many are refined.
+# Number of placements by features of a level that are refined by ICP.
 REFINED = 4
-# A runner-up with this share of the fitness, more than so many cells away, makes both doubtful.
+# The result is refused if one more than APART cells away has at least this share of its fitness.
 RIVAL, APART = 0.85, 3.0
-# Normals and features look at this many neighbours at most.
+# Features use at most so many neighbours.
 NEIGHBOURS = 100
 
 
@@ -67,7 +68,7 @@ class Surface:
 
     Attributes:
         positions: (N, 3) float64.
-        seen_from: (N, 3) float64, for each a place that it was seen from; None if unknown.
+        seen_from: (N, 3) float64, centre of a camera or scanner that saw each; None if unknown.
     """
 
     positions: Float64
@@ -80,14 +81,14 @@ def register(
     """The similarity from a scan's frame to the photographs' world.
 
     Args:
-        scan: in the file's frame.
-        photographed: in the world.
+        scan: in the file's frame and unit.
+        photographed: in the world, scene units.
         least: smallest fitness that is accepted, 0 to 1.
-        metric: whether both units are metres, most likely: that scale is tried first.
-        seed: of sampling.
+        metric: whether the world's unit is the metre: METRIC scales are then tried first.
+        seed: of random sampling.
 
     Raises:
-        DegenerateError: too few points, no placement that enough points support, or two.
+        DegenerateError: too few points, no surface, or not one placement with enough support.
     """
     for name, surface in (("scan", scan), ("photographs", photographed)):
         if len(surface.positions) < FEWEST:
@@ -97,9 +98,8 @@ def register(
             )
     if (share := unevenness(scan)) > VOLUME:
         raise DegenerateError(
-            f"the scan's points lie on no surface (a neighbourhood is {share:.2f} as thick as it is "
-            f"wide, expected less than {VOLUME}); expected a scan of surfaces; give its placement "
-            "if it is one"
+            "the scan's points lie on no surface (least share of the variance in a neighbourhood: "
+            f"{share:.2f}, expected less than {VOLUME}); give its placement if they do"
         )
     task = _Task(scan, photographed, seed=seed)
     there = task.judged(task.of_world(np.eye(4)), "as it is")
@@ -113,8 +113,8 @@ def register(
             "none was found"
             if not found
             else (
-                f"the best fits {_support(found[0]):.0%} of the points within {task.tolerance:.3g}, "
-                f"expected {least:.0%}"
+                f"the best fits {_support(found[0]):.0%} of the points within "
+                f"{task.tolerance:.3g}, expected {least:.0%}"
             )
         )
         raise DegenerateError(
@@ -132,10 +132,9 @@ def register(
 
 
 def unevenness(surface: Surface) -> float:
-    """How thick neighbourhoods of points are: 0 on a plane, towards 1/3 where points fill a volume.
+    """How far points are from lying on a surface: 0 on a plane, up to 1/3 if they fill a volume.
 
-    Returns:
-        The smallest of the three variances of a neighbourhood as a share of their sum, the median.
+    It is the median share of the smallest eigenvalue in the covariances of neighbourhoods.
 
     >>> u, v = np.random.default_rng(0).random((2, 4000))
     >>> round(unevenness(Surface(np.stack([u, v, 0 * u], axis=1))), 3)
@@ -156,13 +155,13 @@ def unevenness(surface: Surface) -> float:
 
 
 def _support(placement: Placement) -> float:
-    """The better of both fitnesses: one may have seen far more than the other."""
+    """The larger of both fitnesses: the one surface may extend far beyond the other."""
     assert placement.fitness is not None and placement.scan_fitness is not None
     return max(placement.fitness, placement.scan_fitness)
 
 
 class _Task:
-    """A scan and what was photographed, each about its own middle; cells are in world units."""
+    """Both surfaces in local frames, each around its own median; ``cell`` is in scene units."""
 
     def __init__(self, scan: Surface, photographed: Surface, *, seed: int) -> None:
         from scipy.spatial import KDTree
@@ -188,7 +187,7 @@ class _Task:
         self._left = BUDGET
 
     def of_world(self, world_from_scan: Float64) -> Float64:
-        """A placement of whole coordinates as one of those about the middles."""
+        """A world_from_scan (4, 4) as a placement between the local frames."""
         local = world_from_scan.copy()
         local[:3, 3] += world_from_scan[:3, :3] @ self.scan_middle - self.middle
         return local
@@ -204,11 +203,9 @@ class _Task:
         return tuple(ratio * scale for scale in SCALES)
 
     def candidates(self, scales: tuple[float, ...], *, least: float) -> list[Placement]:
-        """The best placements by features for some scales, refined, the best first.
+        """The best placements by features at some scales, refined by ICP, the best first.
 
-        Args:
-            scales: world units per unit of the scan, the likeliest first.
-            least: support that needs no finer features.
+        Finer levels are tried only while the support is below ``least``.
         """
         found: list[Placement] = []
         for level in LEVELS:
@@ -222,7 +219,7 @@ class _Task:
                     if fitness <= CLEAR:
                         rough.append((fitness, placed))
                         continue
-                    # Within a whole cell much fits by chance.
+                    # Fitness within a whole cell is high by chance: only that after ICP counts.
                     found.append(self._estimated(placed))
                     if _support(found[-1]) >= CLEAR:
                         return sorted(found, key=_support, reverse=True)
@@ -237,7 +234,7 @@ class _Task:
         return self.judged(self._refined(placed), "estimated")
 
     def _by_features(self, scale: float, level: float, *, outward: bool) -> Float64 | None:
-        """A placement by matched features at about one scale; None where none is found."""
+        """A placement by matched features with about this scale; None if none is found."""
         import pycolmap
 
         if self._left <= 0:
@@ -267,7 +264,7 @@ class _Task:
         return np.vstack([similarity.matrix(), [0, 0, 0, 1]])
 
     def polished(self, placement: Placement) -> Placement:
-        """A placement after more steps of ICP: its scale is found slowly."""
+        """A placement after more iterations of ICP, in which scale converges slowly."""
         local = self.of_world(placement.world_from_scan)
         local = self._refined(local, reach=(STEPS[-1], TOLERANCE), steps=POLISHING)
         return self.judged(local, placement.how)
@@ -275,13 +272,13 @@ class _Task:
     def _refined(
         self, placed: Float64, reach: tuple[float, ...] = STEPS, steps: int = 30
     ) -> Float64:
-        """ICP with scale, in ever smaller reach."""
+        """ICP with scale; ``reach``: its correspondence distances, in cells, one after another."""
         import open3d as o3d
 
         registration = o3d.pipelines.registration
         method = registration.TransformationEstimationPointToPoint(with_scaling=True)
-        # From the photographs to the scan, which is mostly the larger: each of their points has a
-        # partner there, and not the other way round.
+        # From the photographs to the scan: the scan is mostly the larger surface, so each of the
+        # photographs' points has a neighbour there, but not the other way round.
         inverse = np.linalg.inv(placed)
         scale = float(np.cbrt(np.linalg.det(placed[:3, :3])))
         source, target = _cloud(self.target_sample), _cloud(self.scan.positions)
@@ -294,12 +291,12 @@ class _Task:
         return np.linalg.inv(inverse)
 
     def judged(self, placed: Float64, how: str) -> Placement:
-        """A placement with its support."""
+        """A placement in world coordinates with its fitness."""
         fitness, scan_fitness, rmse = self._fitness(placed, self.tolerance)
         return Placement(self._to_world(placed), how, fitness, scan_fitness, rmse, self.tolerance)
 
     def _fitness(self, placed: Float64, tolerance: float) -> tuple[float, float, float]:
-        """Shares of the photographs' and of the scan's points with a partner, and their rmse."""
+        """Shares of the photographs' and of the scan's points that fit, and the former's RMSE."""
         scale = float(np.cbrt(np.linalg.det(placed[:3, :3])))
         inverse = np.linalg.inv(placed)
         back = self.target_sample @ inverse[:3, :3].T + inverse[:3, 3]
@@ -311,20 +308,23 @@ class _Task:
         return float(inside.mean()), share, rmse
 
     def apart(self, one: Placement, other: Placement) -> float:
-        """How far two placements put the scan's points apart, the median in world units."""
+        """Median distance between the scan's points in two placements, scene units."""
         points = self.source_sample + self.scan_middle
         return float(np.median(np.linalg.norm(one.apply(points) - other.apply(points), axis=1)))
 
 
 class _Features:
-    """A surface's points, one a cell, with their features."""
+    """A surface's points, one for each cube of edge ``cell``, with FPFH features.
+
+    ``outward`` turns normals away from where points were seen, or from the origin.
+    """
 
     def __init__(self, surface: Surface, cell: float, *, outward: bool) -> None:
         import open3d as o3d
 
         whole = _cloud(surface.positions)
         if surface.seen_from is not None:
-            # Averaged along with the points.
+            # As normals, which voxel_down_sample averages along with the points.
             whole.normals = o3d.utility.Vector3dVector(surface.seen_from)
         cloud = whole.voxel_down_sample(cell)
         self.points = np.asarray(cloud.points).copy()
@@ -337,7 +337,7 @@ class _Features:
         cloud.normals = o3d.utility.Vector3dVector()
         cloud.estimate_normals(Param(NORMALS * cell, NEIGHBOURS // 3))
         normals = np.asarray(cloud.normals)
-        # Without viewpoints: a room is seen from its middle, an object from around it.
+        # Without viewpoints: a room is seen from the origin, its middle, an object from outside.
         towards = (seen_from if len(seen_from) else np.zeros(3)) - self.points
         turned = (normals * towards).sum(axis=1) < 0
         normals[turned != outward] *= -1
@@ -347,7 +347,7 @@ class _Features:
         )
 
     def matches(self, other: _Features) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of both that are most alike, in both directions."""
+        """Rows of points whose features are each other's nearest."""
         import open3d as o3d
 
         if self._features is None or other._features is None:
@@ -366,20 +366,20 @@ def _moved(surface: Surface, middle: Float64) -> Surface:
 
 
 def _cell(positions: Float64) -> float:
-    """Edge of the cells of which about POINTS hold a point."""
+    """Edge of the cells such that about POINTS of them hold a point."""
     edge = _extent(positions) / 50
     for _ in range(8):
         cells = np.unique(np.floor(positions / edge).astype(np.int64), axis=0)
         ratio = len(cells) / min(POINTS, len(positions) / 2)
         if 0.7 < ratio < 1.4:
             break
-        # Surfaces: the cells go with the square.
+        # The number of cells on a surface goes with 1 / edge².
         edge *= float(np.sqrt(ratio))
     return edge
 
 
 def _extent(positions: Float64) -> float:
-    """The diagonal of the box around most points."""
+    """The diagonal of the box between the 2 % and 98 % quantiles of the coordinates."""
     return float(np.linalg.norm(np.ptp(np.percentile(positions, [2, 98], axis=0), axis=0))) or 1.0
 
 
