@@ -203,13 +203,14 @@ def _views_without_depth(scene: Scene) -> list[Finding]:
     if not without:
         return []
     if len(scene) < 2:
-        message = "the only view has no depth, and one photograph is none to compute it from"
+        message = "the only view has no depth, and depth cannot be computed from one photograph"
         return [Finding("warning", message)]
-    which = "none" if without == len(scene) else f"{len(scene) - without}"
-    message = (
-        f"{which} of the {len(scene)} views has recorded depth; a run computes the others' from "
-        "the photographs (plane-sweep stereo)"
-    )
+    if without == len(scene):
+        which, whose = f"none of the {len(scene)} views has recorded depth", "it"
+    else:
+        which = f"recorded depth in {len(scene) - without} of the {len(scene)} views"
+        whose = "that of the others"
+    message = f"{which}; a run computes {whose} from the photographs (plane-sweep stereo)"
     return [Finding("info", message)]
 
 

@@ -83,7 +83,9 @@ def test_depth_that_a_run_computes_is_told(tmp_path):
     assert message.startswith("none of the 3 views has recorded depth; a run computes")
     ((level, message),) = depth_findings(replace(scene, views=(bare[0], *scene.views[1:])))
     assert level == "info"
-    assert message.startswith("2 of the 3 views has recorded depth")
+    assert message.startswith(
+        "recorded depth in 2 of the 3 views; a run computes that of the others"
+    )
     ((level, message),) = depth_findings(replace(scene, views=bare[:1]))
     assert level == "warning"
     assert "one photograph" in message
