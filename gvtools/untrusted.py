@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, Protocol
 
 from gvtools.errors import ProjectError
 
@@ -246,6 +246,13 @@ def unpack_gzip(data: bytes, most: int) -> bytes:
     return found
 
 
+class SupportsRead(Protocol):
+    """What unpacks as it is read."""
+
+    def read(self, size: int, /) -> bytes:
+        """Read on."""
+
+
 class LimitedReader:
     """A stream of which no more than a number of bytes can be read.
 
@@ -254,7 +261,7 @@ class LimitedReader:
         most: bytes.
     """
 
-    def __init__(self, stream: IO[bytes], most: int) -> None:
+    def __init__(self, stream: SupportsRead, most: int) -> None:
         self.stream, self.left = stream, most
 
     def read(self, size: int) -> bytes:

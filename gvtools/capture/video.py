@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gvtools.capture.photographs import sharpness
 from gvtools.errors import OptionError, ProjectError
+from gvtools.untrusted import regular
 
 # Frames are compared at this width. [pixels]
 WIDTH = 320
@@ -92,12 +93,16 @@ def _measure(
     """(N,) motion up to each frame, in widths, (N,) sharpness of each, and N as announced."""
     import cv2
 
+    try:
+        size = regular(path).stat().st_size
+    except OSError as error:
+        raise ProjectError(f"{path}: {error.strerror or error}; expected a video") from None
     # What FFmpeg says of a damaged file is said by the errors here, in words that help.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         raise ProjectError(
-            f"{path}: no video that OpenCV reads ({path.stat().st_size} bytes); it may have been "
+            f"{path}: no video that OpenCV reads ({size} bytes); it may have been "
             "cut off: copy it again, or convert it to H.264 in MP4"
         )
     moved, sharp = [0.0], []

@@ -44,7 +44,7 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
     del data
     with _small_pictures(path.stat().st_size):
         scene = trimesh.load_scene(path, process=False, resolver=_beside(path))
-        loaded = scene.to_geometry()
+        loaded: Any = scene.to_geometry()
     points = isinstance(loaded, trimesh.PointCloud)
     if not points and not (isinstance(loaded, trimesh.Trimesh) and len(loaded.faces)):
         raise MemoryFileError(f"{path}: no triangles and no points; expected either")
@@ -54,7 +54,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
         faces = np.asarray(loaded.faces)
         if faces.min() < 0 or faces.max() >= len(loaded.vertices):
             raise MemoryFileError(f"{path}: a triangle of vertices that are not there")
-    return loaded
+    found: trimesh.Trimesh | trimesh.PointCloud = loaded
+    return found
 
 
 def _beside(path: Path) -> Any:

@@ -39,7 +39,8 @@ def python(*words: str, **more: Any) -> subprocess.CompletedProcess[str]:
 
 def test_what_once_failed_is_read_or_refused():
     # In a process of its own: a reader that crashes would take the tests with it.
-    names = [reader.name for reader in READERS]
+    # USD starts a process for each read; tests/viz/test_view_files.py reads it.
+    names = [reader.name for reader in READERS if "USD" not in reader.name]
     names += [reader.name for reader in data_sets() if entries(reader.name)]
     done = python("-m", "hostile.corpus", *names)
     assert done.returncode == 0, done.stderr[-3000:]
