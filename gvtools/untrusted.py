@@ -32,8 +32,8 @@ UNPACKED_BYTES, UNPACKED_RATIO = 192 << 20, 2
 PIXEL_BYTES, PIXEL_RATIO = 80 << 20, 200
 # Integers of more digits are larger than any float.
 MOST_INTEGER = 300
-# Of a YAML text with its aliases written out.
-MOST_NODES = 100_000
+# Of a YAML text, whose parser needs seconds for a megabyte, and with its aliases written out.
+MOST_CHARACTERS, MOST_NODES = 400_000, 100_000
 # Numbers of more digits than this are none.
 MOST_DIGITS = 400
 
@@ -126,7 +126,8 @@ def parse_yaml(text: str) -> Any:
     r"""The value of a YAML text: plain data, whose aliases stand for MOST_NODES values at most.
 
     Raises:
-        ValueError: no YAML, a tag of anything but plain data, aliases of themselves or of too much.
+        ValueError: no YAML, too long, a tag of anything but plain data, aliases of themselves or
+            of too much.
 
     >>> parse_yaml("a: &x [1, two]\nb: *x")
     {'a': [1, 'two'], 'b': [1, 'two']}
@@ -137,6 +138,8 @@ def parse_yaml(text: str) -> Any:
     """
     import yaml
 
+    if len(text) > MOST_CHARACTERS:
+        raise ValueError(f"{len(text)} characters; expected at most {MOST_CHARACTERS}")
     try:
         value = yaml.safe_load(text)
         if _nodes(value, {}) > MOST_NODES:

@@ -15,6 +15,7 @@ scenes:
 from __future__ import annotations
 
 import glob
+import os
 import re
 import shlex
 from dataclasses import dataclass
@@ -202,7 +203,15 @@ def _expanded(entry: SceneEntry, folder: Path) -> list[SceneEntry]:
     if is_url(entry.project):
         name = entry.name or entry.project.rstrip("/").rpartition("/")[2]
         return [entry.replaced(name=name)]
-    path = str((folder / Path(entry.project).expanduser()).absolute())
+    try:
+        path = str((folder / Path(entry.project).expanduser()).absolute())
+        os.stat(path)
+    except (OSError, RuntimeError, ValueError) as error:
+        # What is not there may be a pattern; what no file can have as its name is neither.
+        if not isinstance(error, FileNotFoundError):
+            raise OptionError(
+                f"scenes: {entry.project[:80]!r} ({error}); expected a path"
+            ) from None
     if glob.has_magic(entry.project):
         found = sorted(place for place in glob.glob(path) if Path(place).is_dir())
         if not found:

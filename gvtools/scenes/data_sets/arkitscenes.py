@@ -115,7 +115,7 @@ def _pincams(folder: Path) -> dict[int, LensParameters]:
         try:
             width, height, *K = (float(word) for word in read_text(path).split())
             lenses[round(_stamp(path.name) * 1000)] = pinhole_lens(K, (int(width), int(height)))
-        except (OSError, ValueError):
+        except (OSError, OverflowError, ValueError):
             continue  # as if it were absent
     return lenses
 

@@ -61,7 +61,10 @@ def _rows(path: Path) -> Float64:
         raise ProjectError(f"{path}: {error}; expected an array of N x 17 numbers") from None
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise ProjectError(f"{path}: shape {rows.shape}; expected N x 17")
-    return rows[:, :15].reshape(-1, 3, 5)
+    rows = rows[:, :15].reshape(-1, 3, 5)
+    if not np.isfinite(rows[..., 4]).all():
+        raise ProjectError(f"{path}: a picture's size or focal length is not finite; copy it again")
+    return rows
 
 
 def _picture(row: Float64, file: Path) -> PosedPicture:
