@@ -18,7 +18,9 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gvtools.capture.matching import SEED, all_flat, match_pictures, verified
+import numpy as np
+
+from gvtools.capture.matching import SEED, flat_pairs, match_pictures, only_turned, verified
 from gvtools.errors import ProjectError
 
 if TYPE_CHECKING:
@@ -42,6 +44,9 @@ REFINED_FROM = 8
 # Observations with a larger reprojection error are dropped [px]: COLMAP's projection of fisheye
 # models is not finite near 90 degrees off the axis.
 LOST = 64.0
+# Where each pair is explained by a plane, models whose rays meet at less are made up [degrees]: 3
+# of a camera that only turned, 10 of a walk past something almost flat.
+STEEP = 5.0
 
 Say = Callable[[str], object]
 
@@ -56,7 +61,8 @@ class Mapped:
         others: names of the pictures of each further model, the largest model first.
         matching: how pairs were chosen, in words.
         pairs: number of verified matches of each pair of pictures, by their names.
-        explained: share of these matches that became points of the model, 0 to 1.
+        explained: share of the matches of pairs in one model that became points, 0 to 1.
+        flat: every pair is explained by a plane, so that intrinsics hang by little.
     """
 
     model: pycolmap.Reconstruction
@@ -65,6 +71,7 @@ class Mapped:
     matching: str
     pairs: Mapping[tuple[str, str], int]
     explained: float
+    flat: bool = False
 
 
 def find_cameras(
@@ -116,13 +123,9 @@ def find_cameras(
                 "of the same; expected neighbours that share at least half of what they show; "
                 "take more pictures between these, and sharp ones"
             )
-        if all_flat(database):
-            raise ProjectError(
-                f"{source or images}: {len(pairs)} pairs of pictures overlap, and each shows the "
-                "other's plane alone: the camera only turned or zoomed, or the scene is flat; "
-                "expected views from different places of something with depth; take pictures "
-                "while walking"
-            )
+        flat = flat_pairs(database)
+        if only_turned(flat):
+            raise _no_depth(source or images, len(pairs))
         say(f"finding cameras from {len(pairs)} pairs that overlap")
         found = _map(database, images, work, pairs=pairs, refine=not rigs, say=say)
     if not found:
@@ -134,11 +137,35 @@ def find_cameras(
         )
     how, models, share = found
     largest, *rest = sorted(models, key=lambda model: -model.num_reg_images())
+    if flat and _angle(largest) < STEEP:
+        raise _no_depth(source or images, len(pairs))
     others = tuple(
         tuple(sorted(image.name for image in model.images.values() if image.has_pose))
         for model in rest
     )
-    return Mapped(largest, how, others, matching, pairs=pairs, explained=share)
+    return Mapped(
+        largest, how, others, matching, pairs=pairs, explained=share, flat=bool(flat)
+    )  # fmt: skip
+
+
+def _no_depth(source: Path, pairs: int) -> ProjectError:
+    return ProjectError(
+        f"{source}: {pairs} pairs of pictures overlap, and each shows the other's plane alone: the "
+        "camera only turned or zoomed, or the scene is flat; expected views from different places "
+        "of something with depth; take pictures while walking"
+    )
+
+
+def _angle(model: pycolmap.Reconstruction) -> float:
+    """Degrees between the outermost rays to a point, the median of all points."""
+    centers = {key: image.projection_center() for key, image in model.images.items()
+               if image.has_pose}  # fmt: skip
+    angles = []
+    for point in model.points3D.values():
+        rays = np.array([centers[seen.image_id] for seen in point.track.elements]) - point.xyz
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+    return float(np.median(angles)) if angles else 0.0
 
 
 def _map(
@@ -155,7 +182,7 @@ def _map(
     ``refine``: whether to refine intrinsics; those of faces, and their rotations, are fixed.
 
     Returns:
-        "global" or "incremental", its models, and ``explained`` of the largest of them.
+        "global" or "incremental", its models, and what they explain.
     """
     import pycolmap
 
@@ -170,7 +197,7 @@ def _map(
         refine=refine,
     )  # fmt: skip
     if models:
-        share = explained(_largest(models), pairs)
+        share = _explained_by(models, pairs)
         best = "global", models, share
         if share >= ENOUGH:
             return best
@@ -190,14 +217,29 @@ def _map(
         options=pipeline, refine=refine,
     )  # fmt: skip
     if models:
-        share = explained(_largest(models), pairs)
+        share = _explained_by(models, pairs)
         if best is None or share > best[2]:
             best = "incremental", models, share
     return best
 
 
-def _largest(models: Sequence[pycolmap.Reconstruction]) -> pycolmap.Reconstruction:
-    return max(models, key=lambda model: model.num_reg_images())
+def _explained_by(
+    models: Sequence[pycolmap.Reconstruction], pairs: Mapping[tuple[str, str], int]
+) -> float:
+    """Share of the verified matches that became points of the largest model.
+
+    Pairs of which another model has both pictures are of another place, and are no fault of it.
+    """
+    largest, *rest = sorted(models, key=lambda model: -model.num_reg_images())
+    elsewhere = [
+        {image.name for image in model.images.values() if image.has_pose} for model in rest
+    ]
+    own = {
+        pair: n
+        for pair, n in pairs.items()
+        if not any(names.issuperset(pair) for names in elsewhere)
+    }
+    return explained(largest, own)
 
 
 def explained(model: pycolmap.Reconstruction, pairs: Mapping[tuple[str, str], int]) -> float:

@@ -30,6 +30,20 @@ FOCAL, FOCAL_35MM = 0x920A, 0xA405
 GPS_LATITUDE, GPS_LONGITUDE, GPS_ALTITUDE = 2, 4, 6
 # Quality of a JPEG that had to be turned.
 JPEG_QUALITY = 97
+# Pictures that cameras write and Pillow does not read.
+FOREIGN = (
+    ".heic",
+    ".heif",
+    ".avif",
+    ".dng",
+    ".cr2",
+    ".cr3",
+    ".nef",
+    ".arw",
+    ".raf",
+    ".orf",
+    ".rw2",
+)
 # Pictures are judged at this height, and one whose sharpness is below this share of the median's is
 # called blurred. [pixels]
 JUDGED_HEIGHT, BLURRED = 480, 0.15
@@ -71,6 +85,11 @@ def find_photographs(folder: Path) -> tuple[list[Photograph], list[Finding]]:
         for path in folder.rglob("*")
         if path.suffix.lower() in PICTURES and not path.name.startswith(".") and path.is_file()
     ]
+    foreign = [
+        path.relative_to(folder).as_posix()
+        for path in sorted(folder.rglob("*"))
+        if path.suffix.lower() in FOREIGN and not path.name.startswith(".")
+    ]
     paths.sort(key=lambda path: natural_key(path.relative_to(folder).as_posix()))
     found: list[Photograph] = []
     damaged: list[str] = []
@@ -94,6 +113,12 @@ def find_photographs(folder: Path) -> tuple[list[Photograph], list[Finding]]:
         for names, reason in ((damaged, "cannot be read"), (copies, "are copies of others"))
         if names
     ]
+    if foreign:
+        text = (
+            f"{len(foreign)} pictures are HEIC, AVIF or raw: left out ({named(foreign)}); convert "
+            "them to JPEG"
+        )
+        findings.append(Finding("warning", text))
     if len(found) < 2:
         met = "; ".join(finding.message for finding in findings)
         raise ProjectError(

@@ -311,6 +311,12 @@ def _report(
         sizes = ", ".join(str(len(names)) for names in mapped.others)
         text = f"further models of {sizes} pictures do not connect to the largest: not kept"
         met.append(Finding("warning", text))
+    if mapped.flat:
+        text = (
+            "each pair of pictures is explained by a plane: focal length and depth hang by little; "
+            "look at the picture of the cameras, and take more pictures from the side"
+        )
+        met.append(Finding("warning", text))
     if mapped.explained < DOUBTFUL:
         text = (
             f"{mapped.explained:.0%} of the matches became points: the cameras are doubtful; look "

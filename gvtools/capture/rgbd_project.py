@@ -25,12 +25,14 @@ from gvtools.capture.rgbd_frames import RgbdFrames
 from gvtools.capture.rgbd_poses import Found, find_poses
 from gvtools.errors import ProjectError
 from gvtools.files import link_or_copy, write_json
+from gvtools.scenes.images import UNREADABLE
 from gvtools.scenes.photographs import named
 from gvtools.scenes.rgbd import SIDECAR, resolve_options, rgbd_scene
-from gvtools.scenes.rgbd_recording import Recording, RgbdOptions
+from gvtools.scenes.rgbd_recording import Recording, RgbdFrame, RgbdOptions
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.sevenscenes import INTRINSICS
 from gvtools.scenes.unposed import LOOKS_LIKE, read_unposed
+from gvtools.untrusted import open_picture
 
 Float64 = NDArray[np.float64]
 
@@ -149,10 +151,33 @@ def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene, 
             f"{source}: {len(recording.frames)} frames with picture and depth; expected at least "
             "two that overlap; look whether names of pictures and depth maps belong together"
         )
+    unreadable = [frame.name for frame in recording.frames if not _readable(frame)]
+    if unreadable:
+        text = (
+            f"{len(unreadable)} of {len(recording.frames)} frames have a picture or depth map that "
+            f"cannot be read: left out ({named(unreadable)}); copy these again"
+        )
+        met = [*met, Finding("warning", text)]
+        kept = [frame for frame in recording.frames if frame.name not in set(unreadable)]
+        if len(kept) < 2:
+            raise ProjectError(f"{source}: {text}; expected at least two that overlap")
+        recording = replace(recording, frames=kept)
     recording = replace(recording, findings=[*met, *recording.findings])
     scene = rgbd_scene(recording, resolved)
     frames = {frame.name: frame for frame in recording.frames}
     return replace(recording, frames=[frames[name] for name in scene.names]), scene, resolved
+
+
+def _readable(frame: RgbdFrame) -> bool:
+    """Whether both of a frame's files can be decoded."""
+    try:
+        for path in (frame.color, frame.depth):
+            if path is not None:
+                with open_picture(path) as picture:
+                    picture.load()
+    except UNREADABLE:
+        return False
+    return True
 
 
 def _names(recording: Recording) -> list[str]:

@@ -109,14 +109,12 @@ def register(
     if not found or _support(found[0]) < least:
         found = sorted([*found, *task.candidates(task.scales(), least=least)], key=_support)[::-1]
     if not found or _support(found[0]) < least:
-        why = (
-            "none was found"
-            if not found
-            else (
+        why = "none was found"
+        if found:
+            why = (
                 f"the best fits {_support(found[0]):.0%} of the points within "
                 f"{task.tolerance:.3g}, expected {least:.0%}"
             )
-        )
         raise DegenerateError(
             f"no placement of the scan is supported: {why}; give its placement, or views that see "
             "more of what was scanned"

@@ -126,13 +126,14 @@ def _capture(path: Path) -> str:
     return f"find the cameras first: gvtools capture {shlex.quote(str(path))} --out PROJECT"
 
 
+def is_recording(folder: Path) -> bool:
+    """Whether a folder holds colour, depth and poses, going by its files' names."""
+    return any(layout.matches(folder) for layout in (*LAYOUTS, *PHONES))
+
+
 def is_project(folder: Path) -> bool:
     """Whether ``open_project`` would take the folder for a project, going by its files' names."""
-    return (
-        find_model(folder) is not None
-        or (folder / TRANSFORMS).is_file()
-        or any(layout.matches(folder) for layout in (*LAYOUTS, *PHONES))
-    )
+    return find_model(folder) is not None or (folder / TRANSFORMS).is_file() or is_recording(folder)
 
 
 def _nearest(path: Path) -> str:

@@ -59,7 +59,9 @@ def calibrated(root: Path, options: RgbdOptions, *, frames: Sequence[RgbdFrame])
     elif (folder / "intrinsic_color.txt").is_file():
         K = load_matrix(folder / "intrinsic_color.txt", (4, 4), (3, 3))[:3, :3]
     else:
-        raise ProjectError(f"{folder}: no intrinsic_color.txt; export it, or give color_K")
+        raise ProjectError(
+            f"{folder}: no intrinsic_color.txt; export it, or give color_K (--color-intrinsics)"
+        )
     depth_K = color_from_depth = None
     if (folder / "intrinsic_depth.txt").is_file():
         depth_K = load_matrix(folder / "intrinsic_depth.txt", (4, 4), (3, 3))[:3, :3]

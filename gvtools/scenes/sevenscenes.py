@@ -54,7 +54,7 @@ def intrinsics(root: Path, options: RgbdOptions) -> NDArray[np.float64]:
     if path is None and options.color_K is None:
         raise ProjectError(
             f"{root}: no {INTRINSICS} there or in the parent folder; expected three lines "
-            "'fx 0 cx', '0 fy cy', '0 0 1'; write it, or give color_K"
+            "'fx 0 cx', '0 fy cy', '0 0 1'; write it, or give color_K (--color-intrinsics)"
         )
     return np.asarray(options.color_K) if path is None else load_matrix(path, (3, 3))
 

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         GvError: nothing that can be used, or no place to write to.
     """
     from gvtools.capture.project import capture_photographs
-    from gvtools.scenes.project import BAG, VIDEOS
+    from gvtools.scenes.project import BAG, VIDEOS, is_recording
     from gvtools.scenes.unposed import count_unposed
 
     if not args.input.exists():
@@ -104,6 +104,10 @@ def run(args: argparse.Namespace, console: Console) -> None:
         raise OptionError(
             f"{args.input}: no folder of colour and depth; expected none of the options of RGB-D "
             f"recordings ({', '.join(reading)})"
+        )
+    if args.input.is_dir() and is_recording(args.input):
+        raise ProjectError(
+            f"{args.input}: has poses and depth already; give it to gvtools reconstruct as it is"
         )
     report = capture_photographs(
         args.input, args.out, frames=args.frames, masks=args.masks, distance=args.distance,

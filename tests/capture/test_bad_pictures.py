@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,9 +12,11 @@ import pycolmap
 import pytest
 from command_line import refused
 from PIL import Image, ImageFilter
+from scipy.spatial.transform import Rotation
 
-from gvtools.capture.mapping import find_cameras
+from gvtools.capture.mapping import _explained_by, find_cameras
 from gvtools.capture.masks import complete_masks
+from gvtools.capture.matching import only_turned
 from gvtools.capture.photographs import copy_upright, find_photographs
 from gvtools.capture.project import capture_photographs
 from gvtools.errors import ProjectError
@@ -105,6 +108,78 @@ def test_a_camera_that_only_turned_is_told(texture: Image.Image, tmp_path: Path)
             images, [[f"{index}.png" for index in range(4)]],
             work=tmp_path / "work", source=Path("away"),
         )  # fmt: skip
+
+
+def walls(texture: Image.Image, folder: Path, poses: list[tuple[float, float]]) -> None:
+    """Pictures of a wall at distance 1, from places and turns about the vertical axis."""
+    folder.mkdir()
+    K, wall = (np.array([[f, 0, w], [0, f, h], [0, 0, 1.0]]) for f, w, h in
+               ((320, 160, 120), (480, 480, 240)))  # fmt: skip
+    for index, (x, angle) in enumerate(poses):
+        cos, sin = np.cos(angle), np.sin(angle)
+        turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+        moved = np.eye(3) - np.outer([x, 0.1 * (index % 2), 0], [0, 0, 1])
+        seen = cv2.warpPerspective(
+            np.asarray(texture), K @ turn @ moved @ np.linalg.inv(wall), (320, 240)
+        )
+        Image.fromarray(seen).save(folder / f"{index}.png")
+
+
+def test_a_walk_past_something_flat_is_kept_and_told(texture: Image.Image, tmp_path: Path) -> None:
+    places = [0.15 * (index - 2.5) for index in range(6)]
+    walls(texture, tmp_path / "photos", [(x, np.arctan(x)) for x in places])
+    report = capture_photographs(tmp_path / "photos", tmp_path / "out")
+    assert len(report.registered) == 6
+    said = [finding.message for finding in report.findings if finding.level == "warning"]
+    assert len(said) == 1 and said[0].startswith("each pair of pictures is explained by a plane")
+    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
+    centers = {image.name: image.projection_center() for image in model.images.values()}
+    found = np.array([centers[f"{index}.png"] for index in range(6)])
+    true = np.array([[x, 0.1 * (index % 2), 0] for index, x in enumerate(places)])
+    similarity = pycolmap.estimate_sim3d(found, true)
+    there = np.array([similarity * place for place in found])
+    assert np.linalg.norm(there - true, axis=1).max() < 0.02
+
+
+def test_a_turn_is_told_from_a_walk_by_its_homographies() -> None:
+    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    turned, walked = [], []
+    for step in range(1, 6):
+        R = Rotation.from_euler("yx", [3.0 * step, step], degrees=True).as_matrix()
+        away = np.outer([0.05 * step, 0, 0], [0.1, 0, 1])
+        turned.append((2.5 * K @ R @ np.linalg.inv(K), (320, 240)))
+        walked.append((K @ (R - away) @ np.linalg.inv(K), (320, 240)))
+    assert only_turned(turned) and not only_turned(walked) and not only_turned([])
+
+
+def test_matches_of_another_place_are_no_fault_of_the_model() -> None:
+    def model(names: list[str], points: int) -> SimpleNamespace:
+        images = {
+            key: SimpleNamespace(image_id=key, name=name, has_pose=True)
+            for key, name in enumerate(names)
+        }
+        track = SimpleNamespace(elements=[SimpleNamespace(image_id=key) for key in images])
+        return SimpleNamespace(
+            images=images, num_reg_images=lambda: len(names),
+            points3D={key: SimpleNamespace(track=track) for key in range(points)},
+        )  # fmt: skip
+
+    models = [model(["c", "d"], 10), model(["a", "b", "e"], 90)]
+    pairs = {("a", "b"): 100, ("c", "d"): 50, ("b", "d"): 20}
+    assert _explained_by(models, pairs) == pytest.approx(90 / 120)
+    assert _explained_by(models[1:], pairs) == pytest.approx(90 / 170)
+
+
+def test_pictures_of_phones_that_are_not_read_are_named(
+    texture: Image.Image, tmp_path: Path
+) -> None:
+    (tmp_path / "IMG_1.HEIC").write_bytes(b"ftypheic")
+    with pytest.raises(ProjectError, match=r"1 pictures are HEIC.*IMG_1\.HEIC.* to JPEG"):
+        find_photographs(tmp_path)
+    for index in range(2):
+        texture.crop((40 * index, 0, 40 * index + 480, 360)).save(tmp_path / f"{index}.png")
+    (only,) = find_photographs(tmp_path)[1]
+    assert "left out (IMG_1.HEIC)" in only.message
 
 
 def test_a_video_that_was_cut_off(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

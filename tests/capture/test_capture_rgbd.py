@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tiny_scan
 from command_line import refused
+from phone_exports import stray_scanner
 from rgbd_walk import FOCAL, HEIGHT, WIDTH, pictures, walk, write_redwood, write_sevenscenes
 from rgbd_walk import write_tum as write_tum_walk
 
@@ -139,6 +140,28 @@ def test_frames_that_do_not_connect_are_left_out_and_named(walked, tmp_path, cap
     assert list(report["left_out"]) == ["frame-000004.color.png"]
     assert not (tmp_path / "project/frame-000004.color.png").exists()
     assert worst_centre(tmp_path / "project", poses[[0, 1, 2, 3, 5]]) < 0.01
+
+
+def test_frames_that_cannot_be_read_are_left_out_and_named(walked, tmp_path, capsys) -> None:
+    root = write_sevenscenes(tmp_path / "room", *(part[:6] for part in walked[1:]))
+    colors, depths = sorted(root.glob("*.color.*")), sorted(root.glob("*.depth.png"))
+    depths[2].write_bytes(depths[2].read_bytes()[:200])
+    colors[4].write_bytes(b"")
+    assert main(["capture", str(root), "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr()
+    assert "2 of 6 frames have a picture or depth map that cannot be read" in said.out + said.err
+    kept = [colors[index].name for index in (0, 1, 3, 5)]
+    assert list(open_project(tmp_path / "out").names) == kept
+    for path in colors[1:]:
+        path.write_bytes(b"")
+    line = refused(capsys, "capture", root, "--out", tmp_path / "none")
+    assert "5 of 6 frames" in line and "copy these again" in line
+
+
+def test_a_phone_export_with_poses_is_no_capture(tmp_path, capsys) -> None:
+    stray_scanner(tmp_path / "walk")
+    line = refused(capsys, "capture", tmp_path / "walk", "--out", tmp_path / "out")
+    assert "has poses and depth already; give it to gvtools reconstruct" in line
 
 
 def test_features_start_pairs_that_motion_alone_does_not(walked, recording) -> None:
