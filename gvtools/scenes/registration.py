@@ -43,7 +43,7 @@ def register_depth(
         pixel's centre.
 
     Raises:
-        ShapeError: an array of another shape.
+        ShapeError: an array of another shape, or a K of the depth camera that has no inverse.
     """
     z = np.ascontiguousarray(depth, np.float32)
     K_depth, K_color = np.asarray(depth_K, np.float64), np.asarray(color_K, np.float64)
@@ -55,6 +55,8 @@ def register_depth(
             f"color_from_depth {transform.shape}; expected (h, w), (3, 3), (3, 3), (4, 4)"
         )
     # homogeneous colour pixel = z * A @ (u, v, 1) + b
+    if not (np.isfinite(K_depth).all() and np.linalg.matrix_rank(K_depth) == 3):
+        raise ShapeError(f"registration: the depth camera's K {K_depth.tolist()} has no inverse")
     A = K_color @ transform[:3, :3] @ np.linalg.inv(K_depth)
     b = K_color @ transform[:3, 3]
     inverse = np.zeros((height, width), np.float32)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
+from gvtools.untrusted import UNPACKED_BYTES, UNPACKED_RATIO, regular
 
 if TYPE_CHECKING:
     import h5py
@@ -31,10 +32,28 @@ def hdf5_file(path: Path) -> Iterator[h5py.File]:
             f"{path}: HDF5 is read with h5py, which is absent; pip install 'gvtools[data]'"
         ) from None
     try:
-        with h5py.File(path, "r") as file:
+        with h5py.File(regular(path), "r") as file:
             yield file
-    except (OSError, KeyError, RuntimeError, ValueError) as error:
+    except (OSError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
         raise _unreadable(path, error) from None
+
+
+def read_dataset(path: Path, found: Any) -> NDArray[Any]:
+    """What a data set of an HDF5 file holds.
+
+    Args:
+        path: the file.
+        found: of h5py.
+
+    Raises:
+        ValueError: no data set, or one that claims more than its file can hold.
+    """
+    size = path.stat().st_size
+    if not hasattr(found, "nbytes"):
+        raise ValueError("a group; expected an array")
+    if found.nbytes > UNPACKED_RATIO * size + UNPACKED_BYTES:
+        raise ValueError(f"an array of shape {found.shape} in {size} bytes")
+    return np.asarray(found[()])
 
 
 def hdf5_array(path: Path, key: str) -> NDArray[Any]:
@@ -50,7 +69,7 @@ def hdf5_array(path: Path, key: str) -> NDArray[Any]:
     with hdf5_file(path) as file:
         if key not in file:
             raise KeyError(f"holds {', '.join(list(file)[:5]) or 'nothing'}; expected {key!r}")
-        return np.asarray(file[key][()])
+        return read_dataset(path, file[key])
 
 
 def exr_channel(path: Path, channels: tuple[str, ...]) -> NDArray[np.float32]:

@@ -133,7 +133,12 @@ def _idr(folder: Path) -> list[PosedPicture]:
     pictures = []
     for number in sorted(matrices):
         image = by_number.get(number, home / f"{number:06d}.png")
-        camera = decomposed(matrices[number])
+        try:
+            camera = decomposed(matrices[number])
+        except ValueError as error:  # of NumPy's linear algebra, too
+            raise ProjectError(
+                f"{folder / NPZ}: {prefix}{number} is no projection matrix ({error}); copy it again"
+            ) from None
         pictures.append(posed_picture(image.name, image, camera, sizes=SIZES, unit=MILLIMETRES))
     return pictures
 

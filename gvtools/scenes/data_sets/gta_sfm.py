@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.data_sets.array_files import hdf5_array, hdf5_file
+from gvtools.scenes.data_sets.array_files import hdf5_array, hdf5_file, read_dataset
 from gvtools.scenes.data_sets.drawn import NO_LENS, drawn_lens
 from gvtools.scenes.data_sets.layouts import Layout
 from gvtools.scenes.data_sets.posed_pictures import PosedPicture, natural, posed_scene
@@ -67,7 +67,9 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
         matches = [match for match in map(KEY.fullmatch, file) if match]
         present = {match[0] for match in matches}
         frames = sorted({int(match[2]) for match in matches})
-        size = _size(file[f"image_{i}"][()] for i in frames if f"image_{i}" in present)
+        size = _size(
+            read_dataset(path, file[f"image_{i}"]) for i in frames if f"image_{i}" in present
+        )
         for i in frames:
             image, depth, pose, K = (f"{part}_{i}" for part in ("image", "depth", "pose", "K"))
             posed = pose in present and K in present
@@ -76,8 +78,10 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
                     image,
                     # A path that is not there says that the picture is not.
                     path if image in present else path / image,
-                    drawn_lens(file[K][()][[0, 1, 0, 1], [0, 1, 2, 2]], size) if posed else NO_LENS,
-                    np.asarray(file[pose][()], np.float64) if posed else None,
+                    drawn_lens(read_dataset(path, file[K])[[0, 1, 0, 1], [0, 1, 2, 2]], size)
+                    if posed
+                    else NO_LENS,
+                    np.asarray(read_dataset(path, file[pose]), np.float64) if posed else None,
                     path if depth in present else path / depth,
                     partial(hdf5_depth, key=depth),
                     read=partial(hdf5_picture, key=image),

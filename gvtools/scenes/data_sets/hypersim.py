@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.data_sets.array_files import read_dataset
 from gvtools.scenes.data_sets.layouts import Layout
 from gvtools.scenes.data_sets.posed_pictures import (
     OPENCV_FROM_OPENGL,
@@ -274,7 +275,7 @@ def _projection(parameters: dict[str, str]) -> tuple[Float64, tuple[int, int], l
         size = [
             int(float(parameters[f"settings_output_img_{side}"])) for side in ("width", "height")
         ]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise ProjectError(f"{PARAMETERS}: {error}; copy the file again") from None
     return uv, (size[0], size[1]), []
 
@@ -298,9 +299,9 @@ def _metres_per_unit(path: Path, parameters: dict[str, str]) -> float:
 def _hdf5(path: Path) -> Float64:
     """The array ``dataset`` of an HDF5 file, with its stored shape and type."""
     try:
-        with _h5py().File(path, "r") as file:
-            return np.asarray(file["dataset"])
-    except (OSError, KeyError) as error:
+        with _h5py().File(regular(path), "r") as file:
+            return read_dataset(path, file["dataset"])
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
         raise ProjectError(f"{path}: unreadable ({error}); copy it again") from None
 
 

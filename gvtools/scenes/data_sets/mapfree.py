@@ -41,6 +41,8 @@ def _scenes(root: Path) -> tuple[str, ...]:
 def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
     folder = root / scene
     lenses = _table(folder / INTRINSICS, 6)
+    if any(not np.isfinite(values).all() for values in lenses.values()):
+        raise ProjectError(f"{folder / INTRINSICS}: numbers that are not finite; copy it again")
     poses = _table(folder / POSES, 7) if (folder / POSES).is_file() else {}
     depths = _depth_maps(folder)
     pictures = []

@@ -32,6 +32,7 @@ from gvtools.scenes.transforms_frame import LensParameters
 from gvtools.untrusted import read_text, regular
 
 SPLITS = ("train", "validation", "test")
+LONGEST = 10_000  # of an address
 VIDEOS = (".mp4", ".mkv", ".webm", ".mov")
 COLUMNS = 19  # time stamp, six of the lens, twelve of the pose
 
@@ -68,8 +69,11 @@ def _videos(root: Path, split: str) -> Iterator[Path]:
 
 def _address(path: Path) -> str:
     """The video's name in its address: ``watch?v=NAME``, or the last part of the path."""
-    with regular(path).open(encoding="utf-8", errors="replace") as file:
-        parts = urlsplit(file.readline().strip())
+    try:
+        with regular(path).open(encoding="utf-8", errors="replace") as file:
+            parts = urlsplit(file.readline(LONGEST).strip())
+    except (OSError, ValueError):
+        return ""  # as if it had none; its poses are refused where they are read
     return parse_qs(parts.query).get("v", [parts.path.rpartition("/")[2]])[0]
 
 

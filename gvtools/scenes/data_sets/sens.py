@@ -91,8 +91,10 @@ class SensFile:
                 color_code, depth_code, *sizes = _unpack(file, "<iiIIII")
                 shift, count = _unpack(file, "<fQ")
                 frames = _index(file, count, path.stat().st_size)
-        except (OSError, struct.error) as error:
+        except (OSError, OverflowError, ValueError, struct.error) as error:
             raise ProjectError(f"{path}: no readable .sens file ({error}); copy it again") from None
+        if not shift > 0:
+            raise ProjectError(f"{path}: {shift:g} depth steps a metre; expected a positive number")
         if color_code not in COLOR_CODES or depth_code not in (ZLIB_USHORT, RAW_USHORT):
             raise ProjectError(
                 f"{path}: colour of compression {color_code} and depth of {depth_code}; expected "

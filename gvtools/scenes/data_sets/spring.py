@@ -57,6 +57,10 @@ def spring_depth(path: Path, *, focal: float, sky: Path | None) -> NDArray[np.fl
     if sky is not None:
         mask = read_mask(sky)
         times = disparity.shape[0] // mask.shape[0]
+        if times not in (1, 2) or tuple(times * n for n in mask.shape) != disparity.shape:
+            raise ProjectError(
+                f"{sky}: {mask.shape}; expected {disparity.shape}, or half of it; copy it again"
+            )
         disparity[np.repeat(np.repeat(mask, times, axis=0), times, axis=1)] = 0
     middle = halved(disparity)
     # Nearer to nothing than any disparity is, it gives no depth that float32 holds.

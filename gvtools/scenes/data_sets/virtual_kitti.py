@@ -12,6 +12,8 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from gvtools.scenes.data_sets.drawn import (
     NO_LENS,
     drawn_lens,
@@ -56,7 +58,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
         {
             int(row[0]): row[2:]
             for row in number_table(path, columns, header=True)
-            if row[1] == number
+            if row[1] == number and np.isfinite(row[0])
         }
         for path, columns in ((texts / "extrinsic.txt", 18), (texts / "intrinsic.txt", 6))
     )
