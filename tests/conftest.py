@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from figures import unpainted_figures
 from hypothesis import settings
 from shared_data import shared_folder
 
@@ -116,3 +117,10 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def unpainted() -> Iterator[None]:
+    """Figures and reports of runs are made, and not painted."""
+    with unpainted_figures():
+        yield

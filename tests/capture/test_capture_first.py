@@ -19,6 +19,8 @@ from pipelines.commands import capture
 from pipelines.commands.capture_first import open_or_capture
 from pipelines.console import Console
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:

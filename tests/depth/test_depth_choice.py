@@ -24,6 +24,8 @@ from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 from gvtools.scenes.sevenscenes import read_sevenscenes
 from pipelines.cli import main
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 class Computed:
     """A source that always has 2."""

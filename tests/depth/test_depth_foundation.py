@@ -26,6 +26,8 @@ from gvtools.scenes.scene import Scene
 from gvtools.scenes.sevenscenes import read_sevenscenes
 from pipelines.cli import main
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 # What the stand-in's unit is, in scene units of the cameras that it sees.
 UNIT = 1.7
 

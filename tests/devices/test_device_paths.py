@@ -11,7 +11,7 @@ from device_paths import ELSEWHERE, PATHS
 from posed_cuda import posed_cuda
 
 pytest.importorskip("diffusers", reason="the extra wan is not installed")
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "unpainted")
 
 ROOT = Path(__file__).parents[2]
 

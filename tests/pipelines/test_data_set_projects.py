@@ -17,6 +17,8 @@ from gvtools.runs.run import load_run
 from gvtools.scenes.reading import open_recorded
 from pipelines.cli import main
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 ADDRESS = "spec:7-Scenes:wall/seq-01"
 
 

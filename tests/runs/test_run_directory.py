@@ -16,6 +16,8 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.folder import RunDirectory
 from pipelines.cli import main
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 RUN = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2", "--quiet")
 
 

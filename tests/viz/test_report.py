@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from browser import Browser, open_browser
 from command_line import refused
+from figures import unpainted_figures
 
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.scenes.project import open_project
@@ -66,7 +68,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def page(small_run):
-    return written(small_run)
+    return written(small_run, painted=True)
 
 
 @pytest.fixture
@@ -75,8 +77,9 @@ def own(small_run, tmp_path):
     return Path(shutil.copytree(small_run, tmp_path / "run"))
 
 
-def written(run: Path, *more: object) -> Page:
-    assert main(["report", str(run), "--quiet", *map(str, more)]) == 0
+def written(run: Path, *more: object, painted: bool = False) -> Page:
+    with nullcontext() if painted else unpainted_figures():
+        assert main(["report", str(run), "--quiet", *map(str, more)]) == 0
     return Page(run / "report.html")
 
 
@@ -260,7 +263,8 @@ def test_no_text_of_a_users_files_becomes_markup(own, tmp_path):
         sheets=Sheets([SheetRow(evil, tiles)], evil),
         poses=replace(report.poses, note=evil, errors=[(evil, 1.0, None)]),
     )  # fmt: skip
-    (tmp_path / "evil.html").write_text(report_html(report), encoding="utf-8")
+    with unpainted_figures():
+        (tmp_path / "evil.html").write_text(report_html(report), encoding="utf-8")
     page = Page(tmp_path / "evil.html")
     assert "script" not in page.tags
     assert all(address.startswith(("data:", "#")) for address in page.addresses)

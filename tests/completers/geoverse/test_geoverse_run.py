@@ -15,7 +15,7 @@ from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.cli import main
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "unpainted")
 
 OPTIONS = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2")
 

@@ -23,6 +23,8 @@ from pipelines.benchmark.methods import parse_methods
 from pipelines.benchmark.pictures import masked_figures, object_mask, pictures_folder
 from pipelines.benchmark.scenes import picture_size, prepared, split_of_scene
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 def cell(root, out, **changes) -> Cell:
     values = {"benchmark": "few-view", "root": root, "scene": "scan", "views": 3, "seconds": None,

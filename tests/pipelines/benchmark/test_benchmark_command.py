@@ -20,6 +20,8 @@ from gvtools.scenes.project import open_project
 from pipelines.benchmark import cells, measure
 from pipelines.cli import main
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 VIEWS = 12
 # Of 12 views, 0 and 8 are targets; of the 10 others, places 0, 4.5 (to even) and 9.
 CONTEXT = [f"frame-{i:06d}" for i in (1, 5, 11)]

@@ -26,6 +26,8 @@ from pipelines.console import Console
 from pipelines.reconstruction import run
 from pipelines.reconstruction.settings import RunSettings
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 QUIET = Console(quiet=True)
 # The last view sees what no other does.
 CONTEXT, TARGETS = "not:every:6+3", "every:6+3"

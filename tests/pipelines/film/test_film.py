@@ -14,6 +14,8 @@ from pipelines.cli import main
 from pipelines.film.panels import FilmRenderer, captioned
 from pipelines.film.path import film_cameras
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:

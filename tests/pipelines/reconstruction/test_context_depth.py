@@ -18,6 +18,8 @@ from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.cli import main
 from pipelines.reconstruction.depth_cache import colored
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3", "--quiet")
 ALL = ("--set", "savings.depth_from_memory=none")
 

@@ -38,6 +38,8 @@ from pipelines.reconstruction.run import _empty_memory, reconstruct
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.reconstruction.voxel_edge import grid_frame
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "depth=auto",
             "fusion.max_psnr_drop_db=none", "refine.most_gaussians=2000")  # fmt: skip
 FITTED, POSES = "round_000/appearance.npz", "round_000/poses.npz"

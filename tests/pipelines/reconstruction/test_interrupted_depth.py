@@ -21,6 +21,8 @@ from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import DegenerateError
 from pipelines.cli import main
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 RUN = ("--context", "every:2", "--targets", "range:1-1", "--completer", "none", "--depth",
        "plane-sweep", "--voxel", "0.03", "--quiet")  # fmt: skip
 VIEWS = 6

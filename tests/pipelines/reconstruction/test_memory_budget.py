@@ -23,6 +23,8 @@ from pipelines.reconstruction import run_round
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SETTINGS = (
     "context=first:3", "targets=range:3-5", "views_per_round=2", "completer=inpaint",
     "refine.steps=0", "savings.pixel_binning=0", "fusion.max_psnr_drop_db=none",

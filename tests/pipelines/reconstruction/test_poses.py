@@ -22,6 +22,8 @@ from pipelines.reconstruction import poses
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "refine.steps=0")
 POSES = "round_000/poses.npz"
 

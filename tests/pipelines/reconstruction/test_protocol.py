@@ -12,6 +12,8 @@ from gvtools.settings import dotted, with_values
 from pipelines.cli import main
 from pipelines.reconstruction.settings import PAPER, RunSettings
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 @pytest.mark.parametrize("profile", RunSettings.presets["profile"])
 def test_every_setting_of_the_protocol_holds_with_every_profile(profile):

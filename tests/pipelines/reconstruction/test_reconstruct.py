@@ -23,6 +23,8 @@ from pipelines.console import Console
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SETTINGS = ("context=first:2", "targets=range:2-5", "views_per_round=2", "completer=inpaint")
 
 

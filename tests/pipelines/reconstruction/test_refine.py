@@ -29,6 +29,8 @@ from pipelines.reconstruction.refine import refine
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "completer=inpaint")
 QUIET = Console(quiet=True)
 APPEARANCE = "round_000/appearance.npz"

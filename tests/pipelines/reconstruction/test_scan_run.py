@@ -12,6 +12,8 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.run import load_run
 from pipelines.cli import main
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SCALE = 2.0
 
 

@@ -16,7 +16,7 @@ from gvtools.completers.geoverse import from_pretrained
 from gvtools.training import tune as tuning
 from pipelines.cli import main
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "unpainted")
 
 VIEWS = ("--context", "first:6", "--targets", "range:7-8", "--views-per-round", "1")
 CORE = ("--completer", "geoverse", "--set", "effort.inpaint_below=0", "--refine", "0")

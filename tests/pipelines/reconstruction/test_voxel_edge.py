@@ -18,6 +18,8 @@ from gvtools.scenes.sevenscenes import read_sevenscenes
 from pipelines.cli import main
 from pipelines.reconstruction.voxel_edge import automatic_voxel
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 class Never:
     """A source that must not be asked."""

@@ -18,6 +18,8 @@ from pipelines.reconstruction.settings import RunSettings
 from pipelines.tradeoff.sweep import EQUAL
 from pipelines.tradeoff.trial import applied
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 # Another edge than the first guess, as if it had been measured.
 WIDER = ("--set", "fusion.voxel_scale=1.25", "--set", "refine.seconds=0")
 
