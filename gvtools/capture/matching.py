@@ -228,7 +228,7 @@ def flat_pairs(database: Path) -> list[tuple[NDArray[np.float64], tuple[int, int
     for number, geometry in zip(numbers, geometries, strict=True):
         if not len(geometry.inlier_matches):
             continue
-        if geometry.config not in flat:
+        if geometry.config not in flat or geometry.H is None:
             return []
         found.append((geometry.H, sizes[pycolmap.pair_id_to_image_pair(number)[0]]))
     return found

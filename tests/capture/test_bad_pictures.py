@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -153,7 +154,7 @@ def test_a_turn_is_told_from_a_walk_by_its_homographies() -> None:
 
 
 def test_matches_of_another_place_are_no_fault_of_the_model() -> None:
-    def model(names: list[str], points: int) -> SimpleNamespace:
+    def model(names: list[str], points: int) -> Any:
         images = {
             key: SimpleNamespace(image_id=key, name=name, has_pose=True)
             for key, name in enumerate(names)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -90,7 +91,7 @@ def test_what_only_people_read_is_written_anew(run, whole):
     json.loads((run / "metrics.json").read_text())
 
 
-OWN = {
+OWN: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "metrics.json": (load_run, ("report",)),
     "memory.ply": (load_memory, ("export", "--format", "ply", "--out", "copy.ply")),
 }

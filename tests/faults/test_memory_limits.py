@@ -34,7 +34,7 @@ def _completed(weights: str, spare: int | None) -> dict:
         counts.append(len(guidance))
         return complete(context, guidance, seed=seed)
 
-    completer.complete = counted
+    completer.complete = counted  # type: ignore[method-assign]
     if spare is not None:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         limit = pages * resource.getpagesize() + spare

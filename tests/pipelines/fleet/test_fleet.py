@@ -189,11 +189,13 @@ def test_a_merge_goes_on_where_an_attempt_stopped(tmp_path, monkeypatch):
         stages={"join": {"command": "merge {project} --out {out}"}}, scenes=[{"project": "a"}]
     )
     (task,) = plan(spec, str(tmp_path / "o"), folder=tmp_path)
-    words = []
-    monkeypatch.setattr(
-        "pipelines.fleet.task.subprocess.run",
-        lambda command, **_: words.append(command) or subprocess.CompletedProcess([], 1),
-    )
+    words: list[list[str]] = []
+
+    def failing(command, **_):
+        words.append(command)
+        return subprocess.CompletedProcess([], 1)
+
+    monkeypatch.setattr("pipelines.fleet.task.subprocess.run", failing)
     run_task(asdict(task))
     (tmp_path / "o" / "a" / "join").mkdir()
     run_task(asdict(task))
