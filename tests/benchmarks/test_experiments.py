@@ -108,7 +108,10 @@ def weights(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("training")
     torch.set_num_threads(1)
     steps = [f"{name}.optimizer.steps=2" for name in ("encoder", "denoiser", "reflow")]
-    settings = [part for text in (*steps, "encoder.statistics=1") for part in ("--set", text)]
+    pool = ("data.pool=8", f"data.cache={out / 'pool'}")
+    settings = [
+        part for text in (*steps, "encoder.statistics=1", *pool) for part in ("--set", text)
+    ]
     options = ["--out", str(out), "--sheets", "0", "--quiet", "--device", "cpu"]
     assert run_command(["train", "micro", *options, *settings]) == 0
     return out

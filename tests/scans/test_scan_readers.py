@@ -328,7 +328,7 @@ def test_cut_and_flipped_files_end_in_one_line(tmp_path, suffix):
         path.write_bytes(whole[: int(share * len(whole))])
         refused(path)
     rng = np.random.default_rng(0)
-    for _ in range(40):
+    for _ in range(20):
         data = bytearray(whole)
         for at in rng.integers(0, min(len(data), 600), 3):
             data[at] = rng.integers(0, 256)

@@ -52,7 +52,7 @@ def trained(tmp_path_factory) -> Path:
     """All stages, a few steps each."""
     out = tmp_path_factory.mktemp("training")
     torch.set_num_threads(1)
-    assert train(out, "encoder", *steps("encoder", 12)) == 0
+    assert train(out, "encoder", *steps("encoder", 24)) == 0
     assert train(out, "denoiser", *steps("denoiser", 6)) == 0
     assert train(out, "reflow", *steps("reflow", 3)) == 0
     assert train(out, "heads", *steps("heads", 4)) == 0
@@ -62,7 +62,7 @@ def trained(tmp_path_factory) -> Path:
 
 def test_the_loss_falls_and_every_stage_leaves_weights_that_load(trained):
     records = read_log(trained / "encoder")
-    assert records[-1]["step"] == 12
+    assert records[-1]["step"] == 24
     assert records[-1]["loss"] < records[0]["loss"]
     encoder = from_pretrained(trained / "encoder" / "weights")
     assert not encoder.config.trained
@@ -158,9 +158,9 @@ def test_a_training_without_that_stage_says_so(tmp_path, capsys):
 
 def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
     again = tmp_path / "again"
-    assert train(again, "encoder", *steps("encoder", 12), "--until", "5") == 0
+    assert train(again, "encoder", *steps("encoder", 24), "--until", "9") == 0
     assert not (again / "encoder" / "weights").exists()
-    assert train(again, "encoder", *steps("encoder", 12), "--resume") == 0
+    assert train(again, "encoder", *steps("encoder", 24), "--resume") == 0
     whole, parts = weights_of(trained / "encoder"), weights_of(again / "encoder")
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
@@ -208,7 +208,7 @@ def test_a_killed_training_goes_on_to_the_uninterrupted_one(tmp_path):
 def test_finished_stages_are_left_as_they_are(trained, tmp_path, capsys):
     """Else the next stage, whose state names its start by its bytes, might not go on."""
     shutil.copytree(trained, tmp_path / "out")
-    out, counts = tmp_path / "out", {"encoder": 12, "denoiser": 6, "reflow": 3, "heads": 4}
+    out, counts = tmp_path / "out", {"encoder": 24, "denoiser": 6, "reflow": 3, "heads": 4}
     counts["refiner"] = 3
     files = sorted(path for path in out.rglob("*") if path.is_file())
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
@@ -288,10 +288,10 @@ def test_batches_across_different_context_counts_are_refused_at_once(tmp_path, c
 
 
 def test_a_training_is_not_mixed_with_another(trained, tmp_path, capsys):
-    assert train(trained, "encoder", *steps("encoder", 12)) == 2
+    assert train(trained, "encoder", *steps("encoder", 24)) == 2
     assert "--resume" in capsys.readouterr().err
-    assert train(trained, "encoder", *steps("encoder", 13), "--resume") == 2
-    assert "options.optimizer.steps = 12, now 13" in capsys.readouterr().err
+    assert train(trained, "encoder", *steps("encoder", 25), "--resume") == 2
+    assert "options.optimizer.steps = 24, now 25" in capsys.readouterr().err
     assert train(tmp_path / "new", "denoiser") == 2
     assert "run --stage encoder first" in capsys.readouterr().err
     assert train(tmp_path / "new", "encoder", "--set", "encoder.optimizer.stepz=3") == 2
@@ -347,7 +347,7 @@ def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
     whole = (trained / "refiner" / "weights" / "geoverse.safetensors").stat().st_size
     assert (out / "geoverse.safetensors").stat().st_size < 0.6 * whole
     settings = json.loads((out / "training_encoder.json").read_text())
-    assert settings["encoder"]["optimizer"]["steps"] == 12 and settings["data"]["cache"] is None
+    assert settings["encoder"]["optimizer"]["steps"] == 24 and settings["data"]["cache"] is None
     last = json.loads((out / "log_reflow.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 3
     shutil.copytree(trained, tmp_path / "again")
