@@ -29,7 +29,7 @@ from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.images import UNREADABLE
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
-from gvtools.untrusted import open_picture
+from gvtools.untrusted import open_picture, regular
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -100,7 +100,7 @@ def read_picture(path: Path, *, group: int, row: int) -> Frame:
         OptionError: pyarrow is not installed.
     """
     try:
-        with _parquet().ParquetFile(path) as file:
+        with _parquet().ParquetFile(regular(path)) as file:
             seen = 0
             for batch in file.iter_batches(
                 batch_size=PICTURES_AT_ONCE, row_groups=[group], columns=[IMAGE]
@@ -117,7 +117,7 @@ def read_picture(path: Path, *, group: int, row: int) -> Frame:
 def _rows(path: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, int, dict[str, Any]]]:
     """Row group, row within it, and the values of the columns that a file has."""
     try:
-        with _parquet().ParquetFile(path) as file:
+        with _parquet().ParquetFile(regular(path)) as file:
             known = set(file.schema_arrow.names)
             wanted = [name for name in columns if name in known]
             for group in range(file.num_row_groups):
@@ -142,7 +142,7 @@ def _calibrations(path: Path) -> dict[int, tuple[LensParameters, Float64 | None]
         try:
             *shared, k3 = (float(record[name]) for name in names)
             size = int(record[sides[0]]), int(record[sides[1]])
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, OverflowError, TypeError, ValueError):
             continue  # a camera without intrinsics: its pictures are left out and counted
         lens = LensParameters("FULL_OPENCV", (*shared, k3, 0.0, 0.0, 0.0), size)
         rig[int(record[CAMERA])] = lens, _transform(record.get(extrinsic))
