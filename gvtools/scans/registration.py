@@ -6,43 +6,49 @@ of matches gives a similarity by LO-RANSAC (pycolmap), and the best are refined 
 (Open3D). A result that too few points support, or that is not unique, is refused. The search is
 limited by the number of points with features, not by time: it is the same on a busy machine.
 
-A cell is a cube such that about POINTS of them hold the photographs' points.
+A cell is a cube such that about 6,000 of them hold the photographs' points.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import DegenerateError
 from gvtools.scans.placement import Placement
-
-if TYPE_CHECKING:
-    import open3d as o3d
+from gvtools.scans.surface import (
+    Features,
+    Surface,
+    cell_of,
+    cloud_of,
+    extent_of,
+    known,
+    moved,
+    rows_of,
+    unevenness,
+)
 
 Float64 = NDArray[np.float64]
 
-# About so many cells hold a point of the photographs; at most so many points of a surface are kept;
-# and of at most so many ICP and fitness seek the nearest neighbours.
-POINTS, KNOWN, COUNTED = 6000, 250_000, 8000
 # Surfaces with fewer points are refused.
 FEWEST = 300
+# ICP and fitness seek the nearest neighbours of at most so many points.
+COUNTED = 8000
 # Features are computed for one point in each cube of so many cells a side, coarse ones first. Finer
 # ones cost more and found less: a kitchen in a scan of four times its extent has 38 true matches at
 # 2, and at 1 more points than can be matched.
 LEVELS = (3.0, 2.0)
-# Limits of the scan's points with features, at one scale and level, and in the whole search; 10,000
-# take about a second of CPU time.
-MOST, BUDGET = 20_000, 200_000
+# Limit of the scan's points with features in the whole search; 10,000 take about a second of CPU
+# time.
+BUDGET = 200_000
 # A scan whose ``unevenness`` is larger lies on no surface: 0.27 in a cloud of noise, 0.08 in a scan
-# of a kitchen. It is measured at so many points.
-VOLUME, LOOKED_AT = 0.2, 2000
-# In cubes of a level: radii of normals and features, RANSAC's inlier threshold. In cells: greatest
-# correspondence distances of ICP, step by step.
-NORMALS, FEATURES, MATCH, STEPS = 2.0, 5.0, 1.5, (4.0, 2.0, 1.0, 0.5)
+# of a kitchen.
+VOLUME = 0.2
+# RANSAC's inlier threshold, in cubes of a level; greatest correspondence distances of ICP, step by
+# step, in cells.
+MATCH, STEPS = 1.5, (4.0, 2.0, 1.0, 0.5)
 # A point supports a placement if the other surface has a point within this, in cells.
 TOLERANCE = 1 / 3
 POLISHING = 200  # iterations of ICP for the placement that is returned
@@ -50,6 +56,8 @@ POLISHING = 200  # iterations of ICP for the placement that is returned
 SCALES = tuple(2.0 ** (k / 2) for k in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5))
 # Scales that are tried first in metric scenes: scans in metres and in millimetres.
 METRIC = (1.0, 0.001)
+# A scale that differs by less from one of them becomes it, if this share of the support stays.
+NEAR, AS_WELL = 0.02, 0.98
 # Iterations of RANSAC: if one match in thirty is right, one sample of three in 27,000 is.
 TRIALS = 30_000
 # At a fitness of at least this no further scale is tried.
@@ -58,21 +66,6 @@ CLEAR = 0.8
 REFINED = 4
 # The result is refused if one more than APART cells away has at least this share of its fitness.
 RIVAL, APART = 0.85, 3.0
-# Features use at most so many neighbours.
-NEIGHBOURS = 100
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Points of a surface.
-
-    Attributes:
-        positions: (N, 3) float64.
-        seen_from: (N, 3) float64, centre of a camera or scanner that saw each; None if unknown.
-    """
-
-    positions: Float64
-    seen_from: Float64 | None = None
 
 
 def register(
@@ -120,6 +113,8 @@ def register(
             "more of what was scanned"
         )
     best = task.polished(found[0])
+    if metric:
+        best = task.in_units(best)
     for other in found[1:]:
         if _support(other) > RIVAL * _support(best) and task.apart(best, other) > APART * task.cell:
             raise DegenerateError(
@@ -127,29 +122,6 @@ def register(
                 f"{_support(other):.2f}, {task.apart(best, other):.3g} apart); give its placement"
             )
     return best
-
-
-def unevenness(surface: Surface) -> float:
-    """How far points are from lying on a surface: 0 on a plane, up to 1/3 if they fill a volume.
-
-    It is the median share of the smallest eigenvalue in the covariances of neighbourhoods.
-
-    >>> u, v = np.random.default_rng(0).random((2, 4000))
-    >>> round(unevenness(Surface(np.stack([u, v, 0 * u], axis=1))), 3)
-    0.0
-    """
-    import open3d as o3d
-
-    rng = np.random.default_rng(0)
-    positions = _known(surface, rng).positions
-    positions = positions - np.median(positions, axis=0)
-    cell = _cell(positions)
-    cloud = _cloud(positions).voxel_down_sample(cell)
-    cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamHybrid(2.5 * cell, NEIGHBOURS))
-    covariances = np.asarray(cloud.covariances)
-    covariances = covariances[rng.permutation(len(covariances))[:LOOKED_AT]]
-    variances = np.maximum(np.linalg.eigvalsh(covariances), 0)
-    return float(np.median(variances[:, 0] / np.maximum(variances.sum(axis=1), 1e-300)))
 
 
 def _support(placement: Placement) -> float:
@@ -166,21 +138,21 @@ class _Task:
 
         self.seed = seed
         rng = np.random.default_rng(seed)
-        scan, photographed = _known(scan, rng), _known(photographed, rng)
+        scan, photographed = known(scan, rng), known(photographed, rng)
         self.scan_middle = np.median(scan.positions, axis=0)
         self.middle = np.median(photographed.positions, axis=0)
-        self.scan = _moved(scan, self.scan_middle)
-        self.target = _moved(photographed, self.middle)
-        self.cell = _cell(self.target.positions)
+        self.scan = moved(scan, self.scan_middle)
+        self.target = moved(photographed, self.middle)
+        self.cell = cell_of(self.target.positions)
         self.tolerance = TOLERANCE * self.cell
-        self.source_sample = self.scan.positions[_rows(self.scan, COUNTED, rng)]
-        self.target_sample = self.target.positions[_rows(self.target, COUNTED, rng)]
+        self.source_sample = self.scan.positions[rows_of(self.scan, COUNTED, rng)]
+        self.target_sample = self.target.positions[rows_of(self.target, COUNTED, rng)]
         self._scan_tree, self._target_tree = (
             KDTree(self.scan.positions),
             KDTree(self.target.positions),
         )
         self._targets = {
-            level: _Features(self.target, level * self.cell, outward=False) for level in LEVELS
+            level: Features(self.target, level * self.cell, outward=False) for level in LEVELS
         }
         self._left = BUDGET
 
@@ -197,7 +169,7 @@ class _Task:
 
     def scales(self) -> tuple[float, ...]:
         """Scales to try, world units per unit of the scan."""
-        ratio = _extent(self.target.positions) / _extent(self.scan.positions)
+        ratio = extent_of(self.target.positions) / extent_of(self.scan.positions)
         return tuple(ratio * scale for scale in SCALES)
 
     def candidates(self, scales: tuple[float, ...], *, least: float) -> list[Placement]:
@@ -238,7 +210,7 @@ class _Task:
         if self._left <= 0:
             return None
         source, target = (
-            _Features(self.scan, level * self.cell / scale, outward=outward),
+            Features(self.scan, level * self.cell / scale, outward=outward),
             self._targets[level],
         )
         if not source.usable:
@@ -264,22 +236,41 @@ class _Task:
     def polished(self, placement: Placement) -> Placement:
         """A placement after more iterations of ICP, in which scale converges slowly."""
         local = self.of_world(placement.world_from_scan)
-        local = self._refined(local, reach=(STEPS[-1], TOLERANCE), steps=POLISHING)
+        local = self._refined(local, (STEPS[-1], TOLERANCE), steps=POLISHING)
         return self.judged(local, placement.how)
 
+    def in_units(self, placement: Placement) -> Placement:
+        """A placement at exactly one of METRIC, if its scale is near that and the support stays."""
+        unit = min(METRIC, key=lambda unit: abs(np.log(placement.scale / unit)))
+        if abs(placement.scale / unit - 1) > NEAR:
+            return placement
+        local = self.of_world(placement.world_from_scan)
+        # Scaled about the middle of the photographs' points.
+        middle = np.linalg.inv(local)[:3, 3]
+        local[:3, :3] *= unit / placement.scale
+        local[:3, 3] = -local[:3, :3] @ middle
+        local = self._refined(local, (STEPS[-1], TOLERANCE), steps=POLISHING, scaled=False)
+        exact = self.judged(local, placement.how)
+        return exact if _support(exact) >= AS_WELL * _support(placement) else placement
+
     def _refined(
-        self, placed: Float64, reach: tuple[float, ...] = STEPS, steps: int = 30
+        self,
+        placed: Float64,
+        reach: tuple[float, ...] = STEPS,
+        *,
+        steps: int = 30,
+        scaled: bool = True,
     ) -> Float64:
-        """ICP with scale; ``reach``: its correspondence distances, in cells, one after another."""
+        """After ICP, with scale or without, at ever smaller correspondence distances."""
         import open3d as o3d
 
         registration = o3d.pipelines.registration
-        method = registration.TransformationEstimationPointToPoint(with_scaling=True)
+        method = registration.TransformationEstimationPointToPoint(with_scaling=scaled)
         # From the photographs to the scan: the scan is mostly the larger surface, so each of the
         # photographs' points has a neighbour there, but not the other way round.
         inverse = np.linalg.inv(placed)
         scale = float(np.cbrt(np.linalg.det(placed[:3, :3])))
-        source, target = _cloud(self.target_sample), _cloud(self.scan.positions)
+        source, target = cloud_of(self.target_sample), cloud_of(self.scan.positions)
         ends = registration.ICPConvergenceCriteria(1e-9, 1e-9, steps)
         for step in reach:
             result = registration.registration_icp(
@@ -309,90 +300,3 @@ class _Task:
         """Median distance between the scan's points in two placements, scene units."""
         points = self.source_sample + self.scan_middle
         return float(np.median(np.linalg.norm(one.apply(points) - other.apply(points), axis=1)))
-
-
-class _Features:
-    """A surface's points, one for each cube of edge ``cell``, with FPFH features.
-
-    ``outward`` turns normals away from where points were seen, or from the origin.
-    """
-
-    def __init__(self, surface: Surface, cell: float, *, outward: bool) -> None:
-        import open3d as o3d
-
-        whole = _cloud(surface.positions)
-        if surface.seen_from is not None:
-            # As normals, which voxel_down_sample averages along with the points.
-            whole.normals = o3d.utility.Vector3dVector(surface.seen_from)
-        cloud = whole.voxel_down_sample(cell)
-        self.points = np.asarray(cloud.points).copy()
-        seen_from = np.asarray(cloud.normals).copy()
-        self._features: o3d.pipelines.registration.Feature | None = None
-        self.usable = FEWEST // 3 <= len(self.points) <= MOST
-        if not self.usable:
-            return
-        Param = o3d.geometry.KDTreeSearchParamHybrid
-        cloud.normals = o3d.utility.Vector3dVector()
-        cloud.estimate_normals(Param(NORMALS * cell, NEIGHBOURS // 3))
-        normals = np.asarray(cloud.normals)
-        # Without viewpoints: a room is seen from the origin, its middle, an object from outside.
-        towards = (seen_from if len(seen_from) else np.zeros(3)) - self.points
-        turned = (normals * towards).sum(axis=1) < 0
-        normals[turned != outward] *= -1
-        cloud.normals = o3d.utility.Vector3dVector(normals)
-        self._features = o3d.pipelines.registration.compute_fpfh_feature(
-            cloud, Param(FEATURES * cell, NEIGHBOURS)
-        )
-
-    def matches(self, other: _Features) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows of points whose features are each other's nearest."""
-        import open3d as o3d
-
-        if self._features is None or other._features is None:
-            return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        pairs = np.asarray(
-            o3d.pipelines.registration.correspondences_from_features(
-                self._features, other._features, mutual_filter=True, mutual_consistency_ratio=0.0
-            )
-        )
-        return pairs[:, 0].astype(np.int64), pairs[:, 1].astype(np.int64)
-
-
-def _moved(surface: Surface, middle: Float64) -> Surface:
-    seen = surface.seen_from
-    return Surface(surface.positions - middle, None if seen is None else seen - middle)
-
-
-def _cell(positions: Float64) -> float:
-    """Edge of the cells such that about POINTS of them hold a point."""
-    edge = _extent(positions) / 50
-    for _ in range(8):
-        cells = np.unique(np.floor(positions / edge).astype(np.int64), axis=0)
-        ratio = len(cells) / min(POINTS, len(positions) / 2)
-        if 0.7 < ratio < 1.4:
-            break
-        # The number of cells on a surface goes with 1 / edge².
-        edge *= float(np.sqrt(ratio))
-    return edge
-
-
-def _extent(positions: Float64) -> float:
-    """The diagonal of the box between the 2 % and 98 % quantiles of the coordinates."""
-    return float(np.linalg.norm(np.ptp(np.percentile(positions, [2, 98], axis=0), axis=0))) or 1.0
-
-
-def _known(surface: Surface, rng: np.random.Generator) -> Surface:
-    rows, seen = _rows(surface, KNOWN, rng), surface.seen_from
-    return Surface(surface.positions[rows], None if seen is None else seen[rows])
-
-
-def _rows(surface: Surface, most: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Rows of at most so many points."""
-    count = len(surface.positions)
-    return rng.choice(count, most, replace=False) if count > most else np.arange(count)
-
-
-def _cloud(positions: Float64) -> o3d.geometry.PointCloud:
-    import open3d as o3d
-
-    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(positions))

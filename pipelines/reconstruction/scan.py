@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
     from gvtools.scans.placement import Placement
     from gvtools.scans.points import Scan
-    from gvtools.scans.registration import Surface
+    from gvtools.scans.surface import Surface
     from pipelines.console import Console
     from pipelines.reconstruction.plan import Plan
 
@@ -150,7 +150,7 @@ def _told(scan: Scan) -> str:
 
 
 def _surface(scan: Scan) -> Surface:
-    from gvtools.scans.registration import Surface
+    from gvtools.scans.surface import Surface
 
     centers = [station.center for station in scan.stations]
     if any(center is None for center in centers):
@@ -164,7 +164,7 @@ def photographed(plan: Plan) -> Surface:
     Raises:
         DegenerateError: neither is there.
     """
-    from gvtools.scans.registration import Surface
+    from gvtools.scans.surface import Surface
 
     scene, positions, seen_from = plan.scene, list[NDArray[Any]](), list[NDArray[Any]]()
     rng = np.random.default_rng(plan.config.seed)

@@ -22,6 +22,7 @@ from gvtools.capture.photographs import copy_upright, find_photographs
 from gvtools.capture.project import capture_photographs
 from gvtools.errors import ProjectError
 from gvtools.procedural.room_sample import write_room
+from gvtools.similarity import fit_similarity
 
 
 @pytest.fixture(scope="module")
@@ -137,8 +138,7 @@ def test_a_walk_past_something_flat_is_kept_and_told(texture: Image.Image, tmp_p
     centers = {image.name: image.projection_center() for image in model.images.values()}
     found = np.array([centers[f"{index}.png"] for index in range(6)])
     true = np.array([[x, 0.1 * (index % 2), 0] for index, x in enumerate(places)])
-    similarity = pycolmap.estimate_sim3d(found, true)
-    there = np.array([similarity * place for place in found])
+    there = fit_similarity(found, true).apply(found)
     assert np.linalg.norm(there - true, axis=1).max() < 0.02
 
 
