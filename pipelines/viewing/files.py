@@ -47,10 +47,9 @@ def open_file(path: Path) -> RunView | None:
     except GvError:
         raise
     except Exception as error:  # Readers of other packages raise what they please.
-        text = str(error) or type(error).__name__
         raise MemoryFileError(
-            f"{path}: cannot be read as {suffix} ({text.splitlines()[0]}); expected a file as "
-            "gvtools export writes it"
+            f"{path}: cannot be read as {suffix} ({type(error).__name__}); expected a file as "
+            "gvtools export writes it; export it again"
         ) from error
 
 
