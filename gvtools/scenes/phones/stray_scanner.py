@@ -38,6 +38,8 @@ from gvtools.untrusted import regular
 
 NAME = "Stray Scanner"
 VIDEO, ODOMETRY, MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
+# Of a recording: a year at a thousand a second.
+MOST_FRAMES = 3e10
 PLACE, TURN = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 LENS = ("fx", "fy", "cx", "cy")
 
@@ -98,7 +100,7 @@ def read_odometry(path: Path) -> list[dict[str, float]]:
             except (AttributeError, TypeError, ValueError):
                 continue  # a device without that value leaves it empty
         # A broken last line, of an export that was cut off, has no frame number.
-        if np.isfinite(row.get("frame", np.nan)):
+        if abs(row.get("frame", np.nan)) < MOST_FRAMES:
             rows.append(row)
     if not rows:
         raise ProjectError(
