@@ -59,8 +59,11 @@ class Appearance:
                 for values in np.split(loaded.values, np.cumsum(counts)[:-1])
             )
             numbers = ("near", "blend", "poses", "log_gains", "depth")
-            if not all(np.isfinite(data[name]).all() for name in numbers):
-                raise ValueError("NaN or infinity")
+            for name in numbers:
+                if data[name].dtype.kind not in "fiu" or not np.isfinite(data[name]).all():
+                    raise ValueError(f"{name} holds no finite numbers")
+            if data["blend"].shape != (2,):
+                raise ValueError(f"blend of shape {data['blend'].shape}")
             blend = Blend(*data["blend"].tolist())
             exposures = Exposures(data["poses"], data["log_gains"], float(data["depth"]))
             count = len(exposures.poses)

@@ -124,6 +124,7 @@ class Gaussians:
             if (
                 values.ndim != 2
                 or values.shape[1] != VALUES
+                or values.dtype.kind != "f"
                 or not np.isfinite(values.astype(np.float32)).all()
             ):
                 raise ValueError(f"values {values.shape}")

@@ -80,8 +80,8 @@ class ArrayFile:
                 if head[: len(MAGIC)] != MAGIC or len(head) < start:
                     raise MemoryFileError(f"{path}: not a file of arrays of gvtools")
                 length, self.checksum = _HEAD.unpack(head[len(MAGIC) :])
-                header = file.read(length)
-            size = path.stat().st_size
+                size = path.stat().st_size
+                header = file.read(min(length, size))
         except OSError as error:
             raise MemoryFileError(f"{path}: cannot be read ({error.strerror})") from None
         if len(header) != length or zlib.crc32(header) != self.checksum:
