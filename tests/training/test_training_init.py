@@ -81,7 +81,6 @@ def training(tmp_path_factory) -> str:
     data = json.loads((SHIPPED / "micro.json").read_text())
     for stage in STAGES:
         data[stage]["optimizer"]["steps"] = 1
-    data["data"] = {**data["data"], "pool": 24, "cache": str(folder / "pool")}
     # As ``base``: a model without a refiner.
     del data["refiner"]
     (folder / "training.json").write_text(json.dumps({**data, "model": "model.json"}))

@@ -22,8 +22,12 @@ from gvtools.scenes.scene import Scene, View
 OPTIONS = StereoOptions(levels=2, speckle=20)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.006])
-@pytest.mark.parametrize("shading", ["ramp", "bowl"])
+# Each shading and each noise once; the other pairs with --runslow.
+@pytest.mark.parametrize(
+    ("shading", "noise"),
+    [("ramp", 0.0), ("bowl", 0.006), pytest.param("ramp", 0.006, marks=pytest.mark.slow),
+     pytest.param("bowl", 0.0, marks=pytest.mark.slow)],
+)  # fmt: skip
 def test_shaded_walls_are_not_guessed(shading, noise):
     scene = niche_scene(shading, noise)
     view = scene["v2"]
