@@ -12,6 +12,7 @@ import json
 import os
 import stat
 import struct
+import sys
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -351,6 +352,8 @@ def read_array(stream: IO[bytes], size: int) -> NDArray[Any]:
     data = stream.read(count * dtype.itemsize)
     if len(data) != count * dtype.itemsize:
         raise ValueError(f"an array that ends early, of shape {shape} and type {dtype}")
+    if dtype.kind == "U" and (np.frombuffer(data, f"{dtype.byteorder}u4") > sys.maxunicode).any():
+        raise ValueError("an array of texts whose signs are none")
     flat: np.ndarray[Any, Any] = np.frombuffer(bytearray(data), dtype, count)
     return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
 

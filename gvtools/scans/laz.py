@@ -17,8 +17,9 @@ from gvtools.errors import MemoryFileError
 NAME, NUMBER, RECORD = b"laszip encoded", 22204, 54
 # A piece's points beside the file's own size, bytes.
 PIECE_BYTES = 1 << 26
-# Where the compressor's kind and its items stand in the record; the kind that has layers.
-ITEMS, LAYERED = 32, 3
+# Where the items of a point are listed in the record, and the compressor's kind before them: in
+# pieces, or in pieces with layers. Files in one piece, of LASzip's first version, are not read.
+ITEMS, PIECES, LAYERED = 32, 2, 3
 # Layers of an item by its type; extra bytes have one each.
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 EXTRA = 14
@@ -48,12 +49,15 @@ def check_laz(path: Path, *, at: int, point_bytes: int) -> None:
             raise _damaged(path, f"says {description.item_size()} and {point_bytes} bytes a point")
         if not description.uses_variable_size_chunks():
             _check_points(path, description.chunk_size(), point_bytes, size=size)
+        layers = _layers(record)
+        kind = struct.unpack_from("<H", record)[0]
+        if kind != (LAYERED if layers else PIECES):
+            raise _damaged(path, f"is compressed in the way {kind}, which is not read")
         file.seek(at)
         table = [(int(points), int(length)) for points, length in _table(file, description)]
         begin = at + 8
         if begin + sum(length for _, length in table) > size:
             raise _damaged(path, "holds less than its table of compressed points says")
-        layers = _layers(record)
         for points, length in table:
             if description.uses_variable_size_chunks():
                 _check_points(path, points, point_bytes, size=size)
@@ -97,8 +101,8 @@ def _record(file: IO[bytes]) -> bytes | None:
 
 
 def _layers(record: bytes) -> int:
-    """How many layers each piece has; 0 for those without."""
-    if len(record) < ITEMS + 2 or struct.unpack_from("<H", record)[0] != LAYERED:
+    """How many layers each piece has; 0 for points of the older formats, which have none."""
+    if len(record) < ITEMS + 2:
         return 0
     total = 0
     for k in range(struct.unpack_from("<H", record, ITEMS)[0]):

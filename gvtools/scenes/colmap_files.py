@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import ProjectError
-from gvtools.untrusted import read_bytes, read_text, regular
+from gvtools.untrusted import number_key, read_bytes, read_text, regular
 
 if TYPE_CHECKING:
     import pycolmap
@@ -240,6 +240,6 @@ def text_names(folder: Path) -> dict[int, str]:
         if line.strip() and not line.startswith("#"):
             row = line.split(maxsplit=9)
             if len(row) == 10 and row[0].isdecimal():
-                names[int(row[0])] = row[9].strip()
+                names[number_key(row[0])] = row[9].strip()
             next(rest, None)
     return names

@@ -215,6 +215,11 @@ def camera_of(
         )
     width, height = (int(value) for value in size)
     values = [float(value) for value in params]
+    if not 1 <= min(width, height) <= max(width, height) <= MOST_PIXELS:
+        raise ProjectError(
+            f"{what}: {model} of {width}x{height} pixels; expected a possible size; solve or "
+            "export the model again"
+        )
     camera = pycolmap.Camera(model=model, width=width, height=height, params=values)
     wrong = _impossible(camera)
     if wrong:

@@ -95,4 +95,9 @@ def _resized(points: SparsePoints, model: ColmapModel, scene: Scene) -> SparsePo
     )[points.view_index]
     flat = np.concatenate([points.xy, np.ones((len(points.xy), 1))], axis=1)
     xy = np.einsum("nij,nj->ni", change, flat)
+    if not np.isfinite(xy).all():
+        raise ProjectError(
+            f"{model.files.folder}: detections and cameras that do not belong together; download "
+            "the model again"
+        )
     return replace(points, xy=xy[:, :2])

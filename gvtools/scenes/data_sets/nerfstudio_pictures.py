@@ -29,7 +29,10 @@ def nerfstudio_pictures(
     data = load_frames(file)
     pictures = []
     for key in keys:
-        for i, frame in enumerate(data.get(key) or []):
+        listed = data.get(key) or []
+        if not isinstance(listed, list) or not all(isinstance(frame, dict) for frame in listed):
+            raise ProjectError(f"{file}: {key} is no list of frames; download it again")
+        for i, frame in enumerate(listed):
             what = f"{file}, {key} {i}"
             named = frame.get("file_path")
             if not isinstance(named, str) or not named:

@@ -30,7 +30,7 @@ from gvtools.scenes.photographs import (
 )
 from gvtools.scenes.scene import Finding, Frame, Scene, natural_key
 from gvtools.scenes.transforms_frame import LensParameters
-from gvtools.scenes.undistort import Undistortion, undistortion
+from gvtools.scenes.undistort import Undistortion, camera_of, undistortion
 from gvtools.untrusted import named_file
 
 Float64 = NDArray[np.float64]
@@ -96,15 +96,16 @@ def pinhole_lens(K: Sequence[float] | Float64, size: tuple[int, int]) -> LensPar
 def scaled_lens(lens: LensParameters, size: tuple[int, int]) -> LensParameters:
     """The camera of the same picture resampled to ``size`` (width and height, pixels).
 
+    Raises:
+        ProjectError: of an impossible camera.
+
     >>> scaled_lens(pinhole_lens([500, 500, 320, 240], (640, 480)), (320, 240)).values
     (250.0, 250.0, 160.0, 120.0)
     """
-    import pycolmap
-
     if tuple(size) == lens.size:
         return lens
-    (w, h), (width, height) = lens.size, size
-    camera = pycolmap.Camera(model=lens.model, width=w, height=h, params=list(lens.values))
+    width, height = size
+    camera = camera_of(lens.model, lens.values, lens.size, what="a picture's camera")
     camera.rescale(int(width), int(height))
     values = tuple(float(value) for value in camera.params)
     return LensParameters(lens.model, values, (int(width), int(height)))

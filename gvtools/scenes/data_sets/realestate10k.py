@@ -106,8 +106,10 @@ def _rows(path: Path) -> Float64:
         raise ProjectError(
             f"{path}: {error}; expected an address, then {COLUMNS} numbers a line"
         ) from None
-    if rows.ndim != 2 or rows.shape[1] != COLUMNS:
-        raise ProjectError(f"{path}: {rows.shape} numbers; expected {COLUMNS} a line")
+    if rows.ndim != 2 or rows.shape[1] != COLUMNS or not np.isfinite(rows[:, 0]).all():
+        raise ProjectError(
+            f"{path}: {rows.shape} numbers; expected {COLUMNS} a line, of which the first is a time"
+        )
     return rows
 
 

@@ -47,6 +47,8 @@ def video_header(path: Path) -> VideoHeader:
         elif container.duration is not None:
             seconds = container.duration / 1e6
         rate = stream.average_rate or stream.guessed_rate or 30
+        if min(stream.width, stream.height) < 1:
+            raise ProjectError(f"{path}: pictures of no size; expected a video; copy it again")
         return VideoHeader((stream.width, stream.height), seconds, float(1 / rate))
 
 
