@@ -71,6 +71,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
     _check(args)
     if args.run.suffix.lower() == SUFFIX:
+        if args.screenshot is not None or args.open3d:
+            raise OptionError(
+                f"{args.run}: recordings open in rerun's own viewer; leave --screenshot and "
+                "--open3d out"
+            )
         open_recording(args.run, host=args.host, port=args.port)
         return
     source, mode = ViewSource(args.run, project=args.project), args.color or "color"

@@ -229,6 +229,8 @@ def test_a_package_that_is_not_there_is_named(exported, monkeypatch, capsys):
 def test_a_recording_goes_to_reruns_own_viewer(tmp_path, monkeypatch, capsys):
     file = tmp_path / "-run.rrd"
     assert "no such file" in refused(capsys, "view", tmp_path / "absent.rrd")
+    line = refused(capsys, "view", file, "--screenshot", tmp_path / "a.png")
+    assert "rerun's own viewer; leave --screenshot" in line
     file.write_bytes(b"RRF2")
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
     monkeypatch.setenv("PATH", "")
