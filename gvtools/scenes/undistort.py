@@ -217,8 +217,8 @@ def camera_of(
     values = [float(value) for value in params]
     if not 1 <= min(width, height) <= max(width, height) <= MOST_PIXELS:
         raise ProjectError(
-            f"{what}: {model} of {width}x{height} pixels; expected a possible size; solve or "
-            "export the model again"
+            f"{what}: {model} {width}x{height} has an impossible size; expected pixels; solve "
+            "or export the model again"
         )
     camera = pycolmap.Camera(model=model, width=width, height=height, params=values)
     wrong = _impossible(camera)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hostile import judge
+from hostile.__main__ import ONE_THREAD
 from hostile.corpus import CORPUS, entries
 from hostile.judge import FAILED, OTHER, REFUSED, SAME, Bench
 from hostile.mutations import Special, mutated
@@ -32,7 +33,7 @@ def python(*words: str, **more: Any) -> subprocess.CompletedProcess[str]:
     threads = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     path = f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'fixtures'}"
     return subprocess.run(
-        [sys.executable, *words], env={**os.environ, **threads, "PYTHONPATH": path},
+        [sys.executable, *words], env={**os.environ, **ONE_THREAD, **threads, "PYTHONPATH": path},
         capture_output=True, text=True, cwd=ROOT, **more,
     )  # fmt: skip
 

@@ -29,7 +29,7 @@ from gvtools.scenes.shards.index import (
     sha256_of,
 )
 from gvtools.scenes.shards.members import decoded
-from gvtools.untrusted import named_file, read_bytes, regular
+from gvtools.untrusted import is_file, named_file, read_bytes, regular
 
 AGAIN = "copy it again, or run gvtools data shards again"
 
@@ -120,7 +120,7 @@ def verify(folder: Path, *, progress: Callable[[str], None] = lambda text: None)
 
 
 def _check_size(tar: Path, listed: ListedShard) -> None:
-    if not tar.is_file():
+    if not is_file(tar):
         raise ProjectError(f"{tar}: no such file; {INDEX} lists it; {AGAIN}")
     size = tar.stat().st_size
     if size != listed.bytes:
