@@ -155,7 +155,7 @@ def _filled(
             link(file.path, path)
         rows = order[ends[i] : ends[i + 1]].astype(np.int32)
         segments = read_segments(file)
-        check(file, len(rows) == segments.count)
+        check(file, len(rows) == segments.count and file.meta.get("count") == count)
         check(file, np.array_equal(local[rows], np.arange(len(rows))))
         check_segments(file, segments, len(memory.views))
         start[rows], length[rows] = segments.start[: len(rows)], segments.length[: len(rows)]
