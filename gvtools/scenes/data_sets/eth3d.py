@@ -25,7 +25,7 @@ from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.photographs import Depth
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.undistort import Undistortion
-from gvtools.untrusted import regular
+from gvtools.untrusted import is_file, regular
 
 UNDISTORTED, ORIGINAL = "dslr_calibration_undistorted", "dslr_calibration_jpg"
 DEPTH = Path("ground_truth_depth") / "dslr_images"
@@ -65,7 +65,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
 
 
 def _has_pictures(folder: Path, model: ColmapModel) -> bool:
-    return any((folder / "images" / image.name).is_file() for image in model.images)
+    return any(is_file(folder / "images" / image.name) for image in model.images)
 
 
 def _with_depth(

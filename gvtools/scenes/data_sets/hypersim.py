@@ -154,9 +154,12 @@ def turned_pinhole(cam_from_uv: Float64, size: tuple[int, int]) -> TurnedPinhole
         size: width and height of the picture, pixels.
 
     Raises:
-        ProjectError: the projection is mirrored.
+        ProjectError: the projection is mirrored, or has no inverse.
     """
     width, height = size
+    finite = np.isfinite(cam_from_uv).all() and min(size) >= 1
+    if not finite or np.linalg.matrix_rank(cam_from_uv) < 3:
+        raise ProjectError(f"{PARAMETERS}: a projection without inverse; copy the file again")
     uv_from_pixel = np.array([[2 / width, 0, -1], [0, -2 / height, 1], [0, 0, 1]])
     ray = np.diag([1.0, -1, -1]) @ np.asarray(cam_from_uv, np.float64) @ uv_from_pixel
     rotation, upper = np.linalg.qr(ray)

@@ -39,7 +39,7 @@ from gvtools.scenes.data_sets.spec import DataSetSpec
 from gvtools.scenes.images import read_depth
 from gvtools.scenes.rgbd_recording import MILLIMETRES
 from gvtools.scenes.scene import Scene
-from gvtools.untrusted import read_json
+from gvtools.untrusted import is_file, read_json
 
 POSES = "pose_intrinsic_imu.json"
 UNDISTORTED = Path("nerfstudio") / "transforms_undistorted.json"
@@ -84,12 +84,12 @@ def _dslr(folder: Path) -> Scene:
 
 
 def _with_mask(picture: PosedPicture, folder: Path) -> PosedPicture:
-    mask = folder / Path(picture.name).with_suffix(".png").name
-    return replace(picture, mask=mask) if mask.is_file() else picture
+    mask = folder / f"{Path(picture.name).stem}.png"
+    return replace(picture, mask=mask) if is_file(mask) else picture
 
 
 def _with_depth(picture: PosedPicture, folder: Path) -> PosedPicture:
-    depth = folder / Path(picture.name).with_suffix(".png").name
+    depth = folder / f"{Path(picture.name).stem}.png"
     return replace(picture, depth=depth, read_depth=partial(read_depth, unit=MILLIMETRES))
 
 

@@ -65,6 +65,7 @@ def spring_depth(path: Path, *, focal: float, sky: Path | None) -> NDArray[np.fl
     middle = halved(disparity)
     # Nearer to nothing than any disparity is, it gives no depth that float32 holds.
     near = middle > LEAST_DISPARITY
+    near &= focal * BASELINE / np.where(near, middle, 1) < np.finfo(np.float32).max
     depth = np.divide(focal * BASELINE, middle, out=np.zeros_like(middle), where=near)
     return depth.astype(np.float32)
 
