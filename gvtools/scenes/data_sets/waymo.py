@@ -120,6 +120,8 @@ def _rows(path: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, int, dict
         with _parquet().ParquetFile(regular(path)) as file:
             known = set(file.schema_arrow.names)
             wanted = [name for name in columns if name in known]
+            if lost := {CAMERA, TIME}.intersection(columns) - known:
+                raise ValueError(f"without the column {min(lost)}")
             for group in range(file.num_row_groups):
                 row = 0
                 for batch in file.iter_batches(
@@ -128,7 +130,7 @@ def _rows(path: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, int, dict
                     for record in batch.to_pylist():
                         yield group, row, record
                         row += 1
-    except (OSError, ValueError) as error:
+    except (OSError, NotImplementedError, ValueError) as error:
         raise ProjectError(f"{path}: no readable Parquet file ({error}); copy it again") from None
 
 
