@@ -69,7 +69,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
     try:
         frames = [int(frame) for frame in _json(info)["split"][number]]
         poses, lenses = _cameras(_json(path), len(frames))
-    except (ValueError, KeyError, IndexError, TypeError) as error:
+    except (ValueError, KeyError, IndexError, OverflowError, TypeError) as error:
         raise ProjectError(
             f"{path}: does not fit {info.name} ({type(error).__name__}: {error}); expected quats, "
             "trans, focals, cx and cy of the split's frames; download both again"
