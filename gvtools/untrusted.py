@@ -123,8 +123,12 @@ def read_json(path: Path) -> Any:
     return parse_json(read_text(path))
 
 
-def parse_yaml(text: str) -> Any:
+def parse_yaml(text: str, *, most: int = MOST_CHARACTERS) -> Any:
     r"""The value of a YAML text: plain data, whose aliases stand for MOST_NODES values at most.
+
+    Args:
+        text: of a file.
+        most: characters that it may have.
 
     Raises:
         ValueError: no YAML, too long, a tag of anything but plain data, aliases of themselves or
@@ -139,8 +143,8 @@ def parse_yaml(text: str) -> Any:
     """
     import yaml
 
-    if len(text) > MOST_CHARACTERS:
-        raise ValueError(f"{len(text)} characters; expected at most {MOST_CHARACTERS}")
+    if len(text) > most:
+        raise ValueError(f"{len(text)} characters; expected at most {most}")
     try:
         value = yaml.safe_load(text)
         if _nodes(value, {}) > MOST_NODES:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.io.tile_folder import INDEX
-from gvtools.runs.layout import APPEARANCE, MEMORY, round_folder, saved_memory
+from gvtools.runs.layout import APPEARANCE, MEMORY, POINTS, RECORD, round_folder, saved_memory
 from gvtools.runs.sums import check_sums
 
 if TYPE_CHECKING:
@@ -45,7 +45,9 @@ def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
 
     memory: SpatialMemory
     if path.suffix.lower() == ".ply":
-        check_sums(path.parent, (path.name,))
+        # Sums beside a PLY of somebody else's are none of a run.
+        if path.name == POINTS and (path.parent / RECORD).is_file():
+            check_sums(path.parent, (path.name,))
         memory = SpatialMemory.from_ply(path)
     else:
         saved = memory_path(path)

@@ -89,15 +89,15 @@ def register(
                 f"{len(surface.positions)} points of the {name} to place the scan by; expected "
                 f"{FEWEST}; give its placement"
             )
+    task = _Task(scan, photographed, seed=seed)
+    there = task.judged(task.of_world(np.eye(4)), "as it is")
+    if _support(there) >= least:
+        return there
     if (share := unevenness(scan)) > VOLUME:
         raise DegenerateError(
             "the scan's points lie on no surface (least share of the variance in a neighbourhood: "
             f"{share:.2f}, expected less than {VOLUME}); give its placement if they do"
         )
-    task = _Task(scan, photographed, seed=seed)
-    there = task.judged(task.of_world(np.eye(4)), "as it is")
-    if _support(there) >= least:
-        return there
     found = task.candidates(METRIC, least=least) if metric else []
     if not found or _support(found[0]) < least:
         found = sorted([*found, *task.candidates(task.scales(), least=least)], key=_support)[::-1]

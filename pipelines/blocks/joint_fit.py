@@ -96,7 +96,7 @@ def _options(refine: FitOptions, views: int, *, fits: int) -> FitOptions:
     """Options of each of some fits that share the time, or the steps, there is for views."""
     share = SHARE / fits
     if refine.seconds is not None:
-        return refine.replaced(poses=False, seconds=share * refine.seconds)
+        return refine.replaced(poses=False, seconds=share * refine.seconds, steps=None)
     return refine.replaced(poses=False, steps=max(1, round(share * refine.steps_for(views))))
 
 

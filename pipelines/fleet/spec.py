@@ -28,6 +28,8 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.settings import Settings
 from gvtools.untrusted import parse_yaml, read_text
 
+# Characters of a list: about a hundred thousand scenes.
+LONGEST = 8_000_000
 # Placeholders {WORD} that a command may hold, beside the names of earlier stages.
 WORDS = ("project", "name", "out")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
@@ -120,7 +122,7 @@ def read_list(path: Path) -> FleetSpec:
         OptionError: a key or value is wrong.
     """
     try:
-        data: Any = parse_yaml(read_text(path))
+        data: Any = parse_yaml(read_text(path), most=LONGEST)
     except OSError as error:
         raise ProjectError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError as error:

@@ -19,7 +19,7 @@ from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend, best_blend
 from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit import CONTINUED, Fit
-from gvtools.appearance.fit_options import STEPS_PER_VIEW, converged_steps
+from gvtools.appearance.fit_options import MOST_STEPS, STEPS_PER_VIEW, converged_steps
 from gvtools.appearance.fits import LEAST_SHARE, MOST_FITS, run_fits
 from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
@@ -170,7 +170,8 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     if earlier is not None and not fit.begin:
         fits = _worth_adding(fits, earlier)
     found = _fitted(fits, plan, earlier)
-    _warn_of_few_steps(found, plan, console)
+    if earlier is None:
+        _warn_of_few_steps(found, plan, console)
     return found
 
 
@@ -179,7 +180,7 @@ def _warn_of_few_steps(fitted: Fitted, plan: Plan, console: Console) -> None:
 
     Recorded depth keeps surfaces where they are, however short the fit.
     """
-    usual = STEPS_PER_VIEW * len(plan.context)
+    usual = min(STEPS_PER_VIEW * len(plan.context), MOST_STEPS)
     if not _recorded(plan) and fitted.steps < SHORT * usual:
         console.warn(
             f"{fitted.steps} steps of a fit to {len(plan.context)} photographs; expected about "

@@ -91,7 +91,7 @@ def test_what_is_no_similarity_is_refused(text):
 
 @pytest.mark.parametrize("count", [2000, 60_000])
 def test_noise_is_refused_before_it_is_searched(count, monkeypatch):
-    monkeypatch.setattr(registration, "_Task", None)
+    monkeypatch.setattr(registration._Task, "candidates", None)
     noise = np.random.default_rng(1).uniform(-1, 1, (count, 3)) + FAR
     with pytest.raises(DegenerateError, match=r"lie on no surface .* give its placement"):
         register(Surface(noise), seen(surface(20_000)[0]), least=0.5, metric=True)
