@@ -32,8 +32,11 @@ MAX_FEATURES, MAX_SIDE = 8192, 1600
 SEED = 1
 # Focal lengths that are tried, in lengths of the longer side, and how far homographies may be from
 # rotations (Frobenius norm of R^T R - 1, the median of all pairs): 0.016 of a camera that turned,
-# 0.10 of one that moved by a quarter of the distance before something almost flat.
-FOCALS, TURNED = np.geomspace(0.4, 20, 40), 0.04
+# 0.10 of one that moved by a quarter of the distance before something almost flat. Seen by a long
+# lens, a sideways walk is almost a rotation, too, but its miss is 1.4 of its motion (the norm of
+# R - 1), where a rotation's is noise: expected below SHARE, for motions above STILL at a focal
+# length of one side.
+FOCALS, TURNED, SHARE, STILL = np.geomspace(0.4, 20, 40), 0.04, 0.5, 0.01
 
 Say = Callable[[str], object]
 
@@ -246,18 +249,28 @@ def only_turned(pairs: Sequence[tuple[NDArray[np.float64], tuple[int, int]]]) ->
     >>> K = np.array([[1.0, 0, 320], [0, 1, 240], [0, 0, 1]])
     >>> only_turned([(K @ turned_by_2 @ np.linalg.inv(K), (640, 480))])
     True
+    >>> only_turned([(np.array([[1.0, 0, 32], [0, 1, 0], [0, 0, 1]]), (640, 480))])  # sideways
+    False
     """
-    misses = []
+    found = []
     for H, (width, height) in pairs:
         centred = np.array([[1.0, 0, width / 2], [0, 1, height / 2], [0, 0, 1]])
         moved = np.linalg.inv(centred) @ H @ centred
         scale = np.cbrt(np.linalg.det(moved))
         if scale:
-            misses.append([_from_rotation(moved / scale, f * max(width, height)) for f in FOCALS])
-    return bool(misses) and float(np.median(misses, axis=0).min()) < TURNED
+            side = max(width, height)
+            still = _from_rotation(moved / scale, side)[1] < STILL
+            tried = [_from_rotation(moved / scale, focal * side) for focal in FOCALS]
+            found.append([(miss, 0.0 if still else miss / motion) for miss, motion in tried])
+    if not found:
+        return False
+    misses, shares = np.median(found, axis=0).T
+    return bool(((misses < TURNED) & (shares < SHARE)).any())
 
 
-def _from_rotation(H: NDArray[np.float64], focal: float) -> float:
+def _from_rotation(H: NDArray[np.float64], focal: float) -> tuple[float, float]:
+    """How far a homography is from a rotation, and how far from the identity (Frobenius norms)."""
     K = np.diag([focal, focal, 1.0])
     turn = np.linalg.inv(K) @ H @ K
-    return float(np.linalg.norm(turn.T @ turn - np.eye(3)))
+    miss = float(np.linalg.norm(turn.T @ turn - np.eye(3)))
+    return miss, max(float(np.linalg.norm(turn - np.eye(3))), 1e-9)
