@@ -28,8 +28,8 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.settings import Settings
 from gvtools.untrusted import parse_yaml, read_text
 
-# Characters of a list: about a hundred thousand scenes.
-LONGEST = 8_000_000
+# Characters of a list, about 30,000 scenes; more of YAML would take longer than 10 s to read.
+LONGEST = 2_000_000
 # Placeholders {WORD} that a command may hold, beside the names of earlier stages.
 WORDS = ("project", "name", "out")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
