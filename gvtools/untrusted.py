@@ -124,7 +124,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_yaml(text: str, *, most: int = MOST_CHARACTERS) -> Any:
-    r"""The value of a YAML text: plain data, whose aliases stand for MOST_NODES values at most.
+    r"""The value of a YAML text: plain data, with no more values than a long text holds.
 
     Args:
         text: of a file.
@@ -147,8 +147,9 @@ def parse_yaml(text: str, *, most: int = MOST_CHARACTERS) -> Any:
         raise ValueError(f"{len(text)} characters; expected at most {most}")
     try:
         value = yaml.safe_load(text)
-        if _nodes(value, {}) > MOST_NODES:
-            raise ValueError(f"aliases stand for more than {MOST_NODES} values")
+        limit = max(MOST_NODES, most // 8)
+        if _nodes(value, {}) > limit:
+            raise ValueError(f"aliases stand for more than {limit} values")
         return value
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
