@@ -60,11 +60,15 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
 
 def _beside(path: Path) -> Any:
     """What reads files that ``path`` names: such as lie below its folder, and no pipes."""
+    from PIL import Image
     from trimesh.resolvers import FilePathResolver
 
     class Beside(FilePathResolver):
         def get(self, name: str) -> bytes:
-            return read_bytes(self.absolute(name))
+            data = read_bytes(self.absolute(name))
+            # A texture in a file of its own may have the pixels that this file explains.
+            Image.MAX_IMAGE_PIXELS = max(Image.MAX_IMAGE_PIXELS or 0, _most_pixels(len(data)))
+            return data
 
     return Beside(str(path))
 
@@ -75,12 +79,17 @@ def _small_pictures(size: int) -> Iterator[None]:
     from PIL import Image
 
     before = Image.MAX_IMAGE_PIXELS
-    # Pillow refuses twice as many; a pixel takes up to four bytes.
-    Image.MAX_IMAGE_PIXELS = (PIXEL_BYTES + PIXEL_RATIO * size) // 8
+    Image.MAX_IMAGE_PIXELS = _most_pixels(size)
     try:
         yield
     finally:
         Image.MAX_IMAGE_PIXELS = before
+
+
+def _most_pixels(size: int) -> int:
+    """Half of the pixels that a file of so many bytes may hold: Pillow refuses twice as many."""
+    # A pixel takes up to four bytes.
+    return (PIXEL_BYTES + PIXEL_RATIO * size) // 8
 
 
 def _check_ply(path: Path, data: bytes) -> None:
