@@ -63,7 +63,7 @@ PARTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "smoothness of surfaces": ({}, {"gvtools.appearance.fit.SMOOTH": 0.0}),
     "dropout of Gaussians": ({}, {"gvtools.appearance.fit.LEFT_OUT": 0.0}),
     "fading of opacities": ({}, {"gvtools.appearance.fit.FADING": 0.0}),
-    "swept depth to begin with": ({}, {"pipelines.reconstruction.fit_inputs.ENOUGH_POINTS": 0}),
+    "swept depth to begin with": ({}, {"pipelines.reconstruction.fit_inputs.FEW_POINTS": 0}),
     "depth of the Gaussians (a plane sweep instead)": (
         {},
         {"pipelines.reconstruction.fitting.Fitted.applied": _with_swept_depth},

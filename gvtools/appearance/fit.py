@@ -334,8 +334,11 @@ class Fit:
     def _loss_gradient(self, number: int, picture: Splat, view: ReducedView) -> NDArray[np.float32]:
         """(5, H, W) gradient of the loss, times the number of pixels to avoid tiny numbers."""
         options, pixels = self.options, view.weight.size
-        gain = self.cameras.gain(number)
-        shown = picture.image[:3] * gain[:, None, None]
+        gain, alpha = self.cameras.gain(number), picture.image[4]
+        # Another colour behind the Gaussians in each step: only opaque surfaces match photographs
+        # then, while over black a photograph's dark parts could be fitted by stopping less light.
+        behind = self.rng.random(3, np.float32)[:, None, None]
+        shown = (picture.image[:3] + (1 - alpha) * behind) * gain[:, None, None]
         # SSIM compares windows: masked pixels take the rendered colour as their target, so that
         # they add nothing to the loss of pixels near them.
         masked = self.views[number].mask is not None
@@ -346,6 +349,7 @@ class Fit:
         self._errors.append(float(((shown - target) ** 2 * view.weight).mean()))
         self.cameras.step_gain(number, (gradient[:3] * shown).sum(axis=(1, 2)) / pixels)
         gradient[:3] *= gain[:, None, None]
+        gradient[4] = -(gradient[:3] * behind).sum(axis=0)
         add_depth(picture.image, view, gradient, weight=options.depth)
         if view.depth is None:
             add_bending(picture.image, view.target, gradient, weight=SMOOTH)
