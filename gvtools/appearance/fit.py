@@ -37,11 +37,9 @@ from gvtools.kernels import in_threads
 SIZES = ((0.0, 4), (0.2, 2), (0.6, 1))
 # Each degree of the spherical harmonics joins after so much progress.
 DEGREE_EVERY = 0.12
-# Until GROWTH_END, Gaussians are added every GROWTH_SHARE of progress (GROWTH_SHARE_FEW with fewer
-# than FEW photographs), at least FEWEST_BETWEEN steps apart, since fewer tell too little of where
-# they are needed, and at most MOST_BETWEEN steps apart.
-GROWTH_END, FEWEST_BETWEEN, MOST_BETWEEN = 0.55, 25, 100
-GROWTH_SHARE, GROWTH_SHARE_FEW, FEW = 0.13, 0.25, 10
+# Until GROWTH_END, Gaussians are added every GROWTH_SHARE of progress, at least FEWEST_BETWEEN steps
+# apart, since fewer tell too little of where they are needed, and at most MOST_BETWEEN steps apart.
+GROWTH_END, GROWTH_SHARE, FEWEST_BETWEEN, MOST_BETWEEN = 0.55, 0.13, 25, 100
 # Early steps are quick because pictures are small: shares of the steps that are made (OF_STEPS) and
 # of the time that is over by then (OF_TIME), with straight lines between.
 OF_STEPS, OF_TIME = (0.0, 0.5, 0.86, 1.0), (0.0, 0.2, 0.6, 1.0)
@@ -61,10 +59,10 @@ VALIDATION_EVERY, VALIDATION_ENDS, MOST_VALIDATION = 8, 0.75, 5
 # LEFT_OUT / number of photographs, at most MOST_LEFT_OUT. Otherwise Gaussians behind others would
 # get no gradient from few viewing directions. After "DropGaussian" (Park et al. 2025).
 LEFT_OUT, MOST_LEFT_OUT = 1.2, 0.5
-# With few photographs, all opacities shrink by this share at each step; gradients restore those
-# that photographs need. The others vanish, above all floaters close to the cameras. After
+# With fewer than FEW photographs, all opacities shrink by FADING at each step; gradients restore
+# those that photographs need. The others vanish, above all floaters close to the cameras. After
 # "Binocular-Guided 3D Gaussian Splatting" (Han et al. 2024).
-FADING = 0.003
+FEW, FADING = 10, 0.003
 # The backward pass skips blocks of 16 pixels to which a Gaussian adds less light than this in all:
 # a tenth less time for the same pictures.
 FAINT = 0.01
@@ -141,7 +139,6 @@ class Fit:
         self._left_out = 0.0 if self.recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
         self._fading = len(self.views) < FEW and not self.recorded
         self._grown = (0, begin)
-        self._growth_share = GROWTH_SHARE_FEW if len(self.views) < FEW else GROWTH_SHARE
         self._order: list[int] = []
         self._reduced: dict[int, ReducedView] = {}
         self._factor = 0
@@ -250,7 +247,7 @@ class Fit:
             self.population.fade(FADING)
         self._note_pulls(lens, seen, rows)
         since = self.steps - self._grown[0]
-        periods = int(share / self._growth_share) - int(self._grown[1] / self._growth_share)
+        periods = int(share / GROWTH_SHARE) - int(self._grown[1] / GROWTH_SHARE)
         due = since >= FEWEST_BETWEEN and periods > 0
         if due or since >= MOST_BETWEEN:
             self._grown = (self.steps, share)

@@ -11,7 +11,7 @@ STEPS_PER_VIEW, FEWEST_STEPS, MOST_STEPS = 15, 300, 1200
 # A fit has converged after so many steps for each photograph, at least CONVERGED_LEAST; with
 # recorded depth at least CONVERGED_LEAST_RECORDED, since depth keeps surfaces where they are, so
 # that more steps go on helping.
-CONVERGED_PER_VIEW, CONVERGED_LEAST, CONVERGED_LEAST_RECORDED = 80, 400, 3000
+CONVERGED_PER_VIEW, CONVERGED_LEAST, CONVERGED_LEAST_RECORDED = 110, 400, 3000
 # Gaussians are added up to PER_STEP for each step of the fit: more are not fitted in time. Without
 # recorded depth there are at most PER_VIEW for each photograph: more fit the photographs closely
 # and look wrong from other directions.
@@ -36,7 +36,8 @@ class FitOptions(Settings):
     """How many steps, where no time is given; none: 15 for each photograph, at least 300 and at
     most 1200, which take about as long as the rest of a run; 0 leaves the memory's own colours."""
     most_gaussians: int = Field(200_000, ge=1)
-    """How many there may be."""
+    """How many there may be, those of all fits that are averaged together. ``gvtools refine`` may add
+    as many again."""
     growth: float = Field(2e-4, gt=0)
     """Gaussians are split or doubled where the mean length of the loss's gradient by their centre
     in the picture (half a picture being 1) is above this; less gives more of them."""

@@ -19,6 +19,8 @@ MOST_FITS = 6
 LEAST_GAIN = 0.05
 # A further fit begins only if at least this share of the first one's time, or steps, is left.
 LEAST_SHARE = 0.5
+# Nor does one if fewer Gaussians are left to it than this share of the first one's.
+LEAST_GAUSSIANS = 0.25
 
 
 def run_fits(
@@ -29,9 +31,10 @@ def run_fits(
 ) -> list[Fit]:
     """Run a fit; if it converges before its time or its steps are over, run further ones.
 
-    No more are made when the time or the steps are over, when there are ``MOST_FITS``, or when the
-    last one raised the PSNR of validation photographs by less than ``LEAST_GAIN``. A fit that
-    continues an earlier one (``Fit.begin`` above 0) is run alone.
+    No more are made when the time, the steps or the Gaussians that the options allow are used up,
+    when there are ``MOST_FITS``, or when the last one raised the PSNR of validation photographs by
+    less than ``LEAST_GAIN``. A fit that continues an earlier one (``Fit.begin`` above 0) is run
+    alone.
 
     Args:
         first: has not been run.
@@ -61,9 +64,13 @@ def run_fits(
         left = budget - used()
         if left < LEAST_SHARE * taken or left <= 0:
             break
+        room = options.most_gaussians - sum(len(fit.population) for fit in kept)
+        if room < max(LEAST_GAUSSIANS * len(first.population), len(first.start)):
+            break
         # The rest is shared evenly by as many fits as fit into it.
         part = left / max(round(left / taken), 1)
-        more = options.replaced(**({"seconds": part} if timed else {"steps": round(part)}))
+        length = {"seconds": part} if timed else {"steps": round(part)}
+        more = options.replaced(most_gaussians=room, **length)
         fit = first.again(len(made), more)
         made.append(fit)
         fit.run(clock=clock, report=tell)

@@ -51,6 +51,15 @@ def test_each_fit_chooses_anew_and_all_can_be_repeated():
     assert values == [fit.gaussians.values.tobytes() for fit in other]
 
 
+def test_all_fits_together_have_no_more_gaussians_than_allowed():
+    alone = len(run_fits(fit_of(steps=10))[0].population)
+    for most in (3 * alone, 3 * alone - 1):
+        fits = run_fits(fit_of(steps=900, most_gaussians=most))
+        assert len(fits) == most // alone
+        assert sum(len(fit.population) for fit in fits) <= most
+    assert len(run_fits(fit_of(steps=900, most_gaussians=alone))) == 1
+
+
 def test_progress_grows_to_the_end():
     told: list[float] = []
     run_fits(fit_of(steps=30), report=lambda fit, share: told.append(share))
