@@ -136,6 +136,5 @@ def applied(picture: Picture, guidance: Guidance, *, blend: Blend) -> Guidance:
     Depth, and what is valid, generated and how confident, stays the memory's.
     """
     where = guidance.valid[0] & ~guidance.scanned[0] & picture.solid
-    shown = picture.over(guidance.rgb[0])
-    rgb = blended(shown, guidance.rgb[0], where, blend=blend)
+    rgb = blended(picture.rgb, guidance.rgb[0], where, blend=blend)
     return replace(guidance, rgb=rgb[None])

@@ -37,8 +37,8 @@ from gvtools.kernels import in_threads
 SIZES = ((0.0, 4), (0.2, 2), (0.6, 1))
 # Each degree of the spherical harmonics joins after so much progress.
 DEGREE_EVERY = 0.12
-# Until GROWTH_END, Gaussians are added every GROWTH_SHARE of progress, at least FEWEST_BETWEEN steps
-# apart, since fewer tell too little of where they are needed, and at most MOST_BETWEEN steps apart.
+# Until GROWTH_END, Gaussians are added every GROWTH_SHARE of progress, at least FEWEST_BETWEEN
+# steps apart, since fewer tell too little of where they are needed, at most MOST_BETWEEN apart.
 GROWTH_END, GROWTH_SHARE, FEWEST_BETWEEN, MOST_BETWEEN = 0.55, 0.13, 25, 100
 # Early steps are quick because pictures are small: shares of the steps that are made (OF_STEPS) and
 # of the time that is over by then (OF_TIME), with straight lines between.
@@ -334,7 +334,8 @@ class Fit:
         gain, alpha = self.cameras.gain(number), picture.image[4]
         # Another colour behind the Gaussians in each step: only opaque surfaces match photographs
         # then, while over black a photograph's dark parts could be fitted by stopping less light.
-        behind = self.rng.random(3, np.float32)[:, None, None]
+        # With recorded depth, this costs 0.3 dB in cameras far from all photographs (demo room).
+        behind = self.rng.random((3, 1, 1), np.float32) * (view.depth is None)
         shown = (picture.image[:3] + (1 - alpha) * behind) * gain[:, None, None]
         # SSIM compares windows: masked pixels take the rendered colour as their target, so that
         # they add nothing to the loss of pixels near them.

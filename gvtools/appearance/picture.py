@@ -18,8 +18,10 @@ SOLID = 0.5
 class Picture:
     """What one camera sees.
 
+    Colours are over black: darker where Gaussians stop less than all light.
+
     Attributes:
-        rgb: (H, W, 3) float32 from 0 to 1, over black: darker where Gaussians stop less light.
+        rgb: (H, W, 3) float32 from 0 to 1.
         alpha: (H, W) float32, the share of light that they stop.
     """
 
@@ -38,15 +40,6 @@ class Picture:
         rgb = splat.image[:3] if gain is None else splat.image[:3] * gain[:, None, None]
         rgb = np.clip(rgb, 0, 1).transpose(1, 2, 0)
         return cls(np.ascontiguousarray(rgb), alpha)
-
-    def over(self, behind: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(H, W, 3) colours with others, (H, W, 3) from 0 to 1, behind the Gaussians.
-
-        >>> half = Picture(np.full((1, 1, 3), 0.2, np.float32), np.full((1, 1), 0.5, np.float32))
-        >>> round(float(half.over(np.ones((1, 1, 3), np.float32))[0, 0, 0]), 2)
-        0.7
-        """
-        return np.minimum(self.rgb + (1 - self.alpha)[..., None] * behind, np.float32(1))
 
     @property
     def solid(self) -> NDArray[np.bool_]:

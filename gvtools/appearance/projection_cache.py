@@ -87,5 +87,5 @@ class CachedProjection:
         """
         if self._picture is None:
             return rgb
-        shown = self._picture.over(rgb[0])
-        return np.where(guidance.valid[0][..., None], rgb[0], shown)[None]
+        where = ~guidance.valid[0] & self._picture.solid
+        return np.where(where[..., None], self._picture.rgb, rgb[0])[None]

@@ -143,8 +143,7 @@ class Fitted:
             where = guidance.valid[0] & ~guidance.scanned[0] & picture.solid
             if frame.mask is not None:
                 where &= frame.mask
-            memory_rgb = guidance.rgb[0]
-            yield picture.over(memory_rgb), memory_rgb, where, frame.rgb / np.float32(255)
+            yield picture.rgb, guidance.rgb[0], where, frame.rgb / np.float32(255)
 
 
 def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = None) -> Fitted | None:
