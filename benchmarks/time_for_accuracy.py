@@ -22,6 +22,9 @@ from typing import Any
 
 import numpy as np
 
+# Scenes side by side in the plot.
+ACROSS = 4
+
 
 @dataclass(frozen=True)
 class Case:
@@ -218,8 +221,11 @@ def _write(rows: list[dict[str, Any]], out: Path) -> None:
         )
     (out / "table.md").write_text("\n".join(lines) + "\n")
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    figure, axes = plt.subplots(2, -(-len(scenes) // 2), figsize=(3.2 * -(-len(scenes) // 2), 6),
-                                squeeze=False)  # fmt: skip
+    lines_of_axes = -(-len(scenes) // ACROSS)
+    size = 3.2 * ACROSS, 2.7 * lines_of_axes + 0.4
+    figure, axes = plt.subplots(lines_of_axes, ACROSS, figsize=size, squeeze=False)
+    for axis in axes.ravel()[len(scenes) :]:
+        axis.set_axis_off()
     for axis, scene in zip(axes.ravel(), scenes, strict=False):
         for method, label in (("gvtools", "gvtools"), ("splatting", "plain Gaussian splatting")):
             mine = [row for row in rows if (row["scene"], row["method"]) == (scene, method)]
@@ -235,8 +241,8 @@ def _write(rows: list[dict[str, Any]], out: Path) -> None:
         axis.set_title(scene.replace(" views", " photographs"), fontsize=9)
         axis.set_xlabel("processor time [s]", fontsize=8)
         axis.set_ylabel("PSNR [dB]", fontsize=8)
-    axes[0, 0].legend(fontsize=7, loc="lower right")
-    figure.tight_layout()
+    figure.tight_layout(rect=(0, 0.05, 1, 1))
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="lower center", ncols=3, fontsize=9)
     figure.savefig(out / "front.png", dpi=110)
     plt.close(figure)
 
