@@ -160,6 +160,7 @@ def test_without_the_perceptual_network_its_figure_is_null_with_the_reason(
         assert row["psnr"] is not None
 
 
+@pytest.mark.slow
 def test_poses_compares_with_constant_answers(weights, tmp_path):
     found = experiment("poses", weights, tmp_path)["true pictures, cameras told"]
     assert 0 <= found["rotation_deg_median"] <= 180

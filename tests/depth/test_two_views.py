@@ -18,7 +18,7 @@ from gvtools.scenes.stereo_sample import write_motorcycle
 pytest_plugins = ("wall_fixtures",)
 
 
-@pytest.mark.parametrize("step", [(0.2, 0, 0), (0, -0.15, 0)])
+@pytest.mark.parametrize("step", [(0.2, 0, 0), pytest.param((0, -0.15, 0), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("second_turn", [(0, 0, 0), (1.5, -2, 1)])
 def test_depth_is_exact_in_both_views(textures, step, second_turn):
     views, depths = [], []

@@ -30,6 +30,7 @@ def sevenscenes(folder: Path, spec: str) -> list[PosedPicture]:
     return pictures
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_held_out_photographs_from_five_views(shared: Path) -> None:
     folder = shared / "data" / "sevenscenes_reg"

@@ -59,6 +59,7 @@ def test_a_matrix_of_scores_would_be_seen():
     assert largest.count == 2 * 512 * 512
 
 
+@pytest.mark.slow
 def test_the_denoiser_with_video_keys_and_with_the_control_branch():
     model, prepared = conditions()
     state = torch.randn(1, VIEWS, micro.CHANNELS, *GRID)

@@ -68,7 +68,11 @@ def _free_networks(request: pytest.FixtureRequest):  # type: ignore[no-untyped-d
         depth_anything.cache_clear()
 
 
-@pytest.mark.parametrize(("name", "case"), cases("da3_"))
+@pytest.mark.parametrize(
+    ("name", "case"),
+    # The smaller networks have every part of the base one.
+    [pytest.param(*c, marks=pytest.mark.slow) if "base" in c[0] else c for c in cases("da3_")],
+)
 def test_depth_anything(name: str, case: int) -> None:
     oracle_depth_anything_cases.check_case(*depth_anything(name), case)
 

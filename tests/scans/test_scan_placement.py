@@ -26,7 +26,7 @@ def seen(positions):
     return Surface(positions, np.broadcast_to(SEEN_FROM, positions.shape))
 
 
-@pytest.mark.parametrize("stations", [True, False])
+@pytest.mark.parametrize("stations", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_scan_in_another_frame_and_unit_is_placed_by_its_shape(stations):
     truth = similarity()
     photographed = surface(20_000, seed=1)[0]

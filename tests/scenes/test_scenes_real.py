@@ -35,7 +35,7 @@ def models_own_error(folder):
     return np.concatenate(errors).mean()
 
 
-@pytest.mark.parametrize("form", ["sparse/0", "sparse_txt"])
+@pytest.mark.parametrize("form", ["sparse/0", pytest.param("sparse_txt", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("name", "published"), [("fox_colmap", 0.595), ("sceaux_colmap", 0.310), ("fern_colmap", 0.722)]
 )
@@ -50,7 +50,9 @@ def test_reprojection_stays_at_the_models_own_error(shared, name, published, for
     assert np.isfinite(reprojection_errors(scene)).all()
 
 
-@pytest.mark.parametrize("name", ["fox_colmap", "sceaux_colmap", "fern_colmap"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("fox_colmap", marks=pytest.mark.slow), "sceaux_colmap", "fern_colmap"]
+)
 def test_workspace_written_undistorted_by_pycolmap_reads_alike(shared, name, tmp_path):
     import pycolmap
 

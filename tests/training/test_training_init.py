@@ -146,6 +146,7 @@ def test_a_training_that_learns_nothing_leaves_what_gld_is(gld, published, train
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_from_gld_without_the_encoders_stage(
     published, training, tmp_path, capsys
 ):
@@ -160,6 +161,7 @@ def test_a_training_goes_on_from_gld_without_the_encoders_stage(
     assert trained.level1.depth_embedder.proj.weight.any()
 
 
+@pytest.mark.slow
 def test_ones_own_start_is_that_of_the_first_stage(published, training, tmp_path, capsys):
     own = tmp_path / "own"
     save_pretrained(from_pretrained(published, config=small_base()), own)

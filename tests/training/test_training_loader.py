@@ -106,6 +106,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_one_line(tmp_path):
     (tmp_path / "parent.py").write_text(_DEATH)
     root = Path(__file__).resolve().parents[2]

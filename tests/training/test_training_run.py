@@ -173,6 +173,7 @@ LATER = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", LATER)
 def test_a_later_stage_resumes_exactly_as_well(trained, tmp_path, stage):
     before, count = LATER[stage]

@@ -179,6 +179,7 @@ def test_worse_weights_are_not_kept(scan, weights, tmp_path, monkeypatch, capsys
     assert json.loads((out / "tuning.json").read_text())["kept"] is False
 
 
+@pytest.mark.slow
 def test_weights_are_trained_in_full_precision_whatever_the_run_completes_in(
     scan, weights, tmp_path
 ):
@@ -195,6 +196,7 @@ def test_weights_are_trained_in_full_precision_whatever_the_run_completes_in(
     assert same(kept["float32"], kept["bfloat16"])
 
 
+@pytest.mark.slow
 def test_the_clock_ends_it(scan, weights, tmp_path):
     figures = tmp_path / "figures.json"
     out = tmp_path / "out"

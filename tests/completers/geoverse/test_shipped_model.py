@@ -37,6 +37,7 @@ def test_a_completer_without_weights_uses_it():
     assert config_of(SHIPPED).trained and not completer.notes
 
 
+@pytest.mark.slow
 def test_its_rays_give_back_the_cameras_that_it_was_told():
     found, _ = poses.run(ExperimentOptions(scenes=3))
     figures = found["true pictures, cameras told"]

@@ -97,6 +97,7 @@ def test_blank_surfaces_stay_unknown():
     assert (found.depth[x < 0.15] > 0).mean() > 0.8
 
 
+@pytest.mark.slow
 def test_reduced_pictures_give_depth_at_full_size(slanted):
     found = swept(slanted.scene, options=OPTIONS.replaced(max_side=96))
     assert found.depth.shape == (120, 160)

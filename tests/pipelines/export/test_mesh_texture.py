@@ -60,6 +60,7 @@ def test_few_triangles_show_the_photographs(scene, reconstructed_run, tmp_path, 
         assert error(mesh, view) < 0.7 * error(trimesh.load(plain, process=False), view)
 
 
+@pytest.mark.slow
 def test_triangles_lie_apart_and_larger_ones_have_more_texels():
     rng = np.random.default_rng(0)
     scale = rng.choice([0.01, 0.05, 0.2], size=(300, 1, 1))

@@ -55,6 +55,7 @@ def pictures(run: Path) -> list[bytes]:
     return [path.read_bytes() for path in sorted(run.glob("round_*/generated_*.png"))]
 
 
+@pytest.mark.slow
 def test_a_run_completes_with_its_tuned_weights(run, scan, weights, tmp_path):
     record = json.loads((run / "run.json").read_text())
     assert record["settings"]["tune"] == {"minutes": 0.0, "steps": 3}
