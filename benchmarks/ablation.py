@@ -32,7 +32,7 @@ SCENES = {
 }
 # Parts that a scene has no use for are not taken away there.
 FEW_VIEWS = ("several fits", "dropout of Gaussians", "fading of opacities")
-PHOTOGRAPHS = ("swept depth to begin with", "depth of the Gaussians (a plane sweep instead)")
+PHOTOGRAPHS = ("depth of the Gaussians (a plane sweep instead)",)
 DEPTH = ("pose refinement", "depth in the loss", "check of depth by other views")
 UNUSED = {
     "fox": (*FEW_VIEWS, *DEPTH),
@@ -63,7 +63,6 @@ PARTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "smoothness of surfaces": ({}, {"gvtools.appearance.fit.SMOOTH": 0.0}),
     "dropout of Gaussians": ({}, {"gvtools.appearance.fit.LEFT_OUT": 0.0}),
     "fading of opacities": ({}, {"gvtools.appearance.fit.FADING": 0.0}),
-    "swept depth to begin with": ({}, {"pipelines.reconstruction.fit_inputs.FEW_POINTS": 0}),
     "depth of the Gaussians (a plane sweep instead)": (
         {},
         {"pipelines.reconstruction.fitting.Fitted.applied": _with_swept_depth},

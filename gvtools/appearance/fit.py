@@ -197,7 +197,10 @@ class Fit:
 
     @property
     def psnr(self) -> float:
-        """PSNR of the last 50 steps' photographs, each before its step, at its size then [dB]."""
+        """PSNR of the last 50 steps' photographs, each before its step, at its size then [dB].
+
+        Where surfaces are not opaque yet, the random colour behind them lowers it.
+        """
         return _psnr(float(np.mean(self._errors[-50:])) if self._errors else 1.0)
 
     def validation_psnr(self) -> float | None:
@@ -335,8 +338,11 @@ class Fit:
         # Another colour behind the Gaussians in each step: only opaque surfaces match photographs
         # then, while over black a photograph's dark parts could be fitted by stopping less light.
         # With recorded depth, this costs 0.3 dB in cameras far from all photographs (demo room).
-        behind = self.rng.random((3, 1, 1), np.float32) * (view.depth is None)
-        shown = (picture.image[:3] + (1 - alpha) * behind) * gain[:, None, None]
+        behind = np.zeros((3, 1, 1), np.float32)
+        if view.depth is None:
+            behind = self.rng.random((3, 1, 1), np.float32)
+        lit = picture.image[:3] * gain[:, None, None]
+        shown = lit + (1 - alpha) * behind
         # SSIM compares windows: masked pixels take the rendered colour as their target, so that
         # they add nothing to the loss of pixels near them.
         masked = self.views[number].mask is not None
@@ -345,9 +351,9 @@ class Fit:
         in_threads(kernels.loss_gradient, 3, shown, target, view.weight, options.ssim, gradient)
         gradient *= pixels
         self._errors.append(float(((shown - target) ** 2 * view.weight).mean()))
-        self.cameras.step_gain(number, (gradient[:3] * shown).sum(axis=(1, 2)) / pixels)
-        gradient[:3] *= gain[:, None, None]
+        self.cameras.step_gain(number, (gradient[:3] * lit).sum(axis=(1, 2)) / pixels)
         gradient[4] = -(gradient[:3] * behind).sum(axis=0)
+        gradient[:3] *= gain[:, None, None]
         add_depth(picture.image, view, gradient, weight=options.depth)
         if view.depth is None:
             add_bending(picture.image, view.target, gradient, weight=SMOOTH)

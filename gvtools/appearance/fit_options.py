@@ -36,8 +36,8 @@ class FitOptions(Settings):
     """How many steps, where no time is given; none: 15 for each photograph, at least 300 and at
     most 1200, which take about as long as the rest of a run; 0 leaves the memory's own colours."""
     most_gaussians: int = Field(200_000, ge=1)
-    """How many there may be, all fits whose pictures are averaged together; ``gvtools refine`` may
-    add as many again."""
+    """How many there may be, all fits of a run together; each ``gvtools refine`` may add as many
+    again."""
     growth: float = Field(2e-4, gt=0)
     """Gaussians are split or doubled where the mean length of the loss's gradient by their centre
     in the picture (half a picture being 1) is above this; less gives more of them."""

@@ -17,10 +17,9 @@ from gvtools.appearance.picture import mean_picture
 MOST_FITS = 6
 # No further fit is made when the last one raised the PSNR of validation photographs by less [dB].
 LEAST_GAIN = 0.05
-# A further fit begins only if at least this share of the first one's time, or steps, is left.
+# A further fit begins only if at least this share of the first one's time, or steps, and of its
+# Gaussians is left.
 LEAST_SHARE = 0.5
-# Nor does one if fewer Gaussians are left to it than this share of the first one's.
-LEAST_GAUSSIANS = 0.25
 
 
 def run_fits(
@@ -65,10 +64,11 @@ def run_fits(
         if left < LEAST_SHARE * taken or left <= 0:
             break
         room = options.most_gaussians - sum(len(fit.population) for fit in kept)
-        if room < max(LEAST_GAUSSIANS * len(first.population), len(first.start)):
+        if room < max(LEAST_SHARE * len(first.population), len(first.start)):
             break
-        # The rest is shared evenly by as many fits as fit into it.
-        part = left / max(round(left / taken), 1)
+        # The rest is shared evenly by as many fits as fit into it, by time and by Gaussians.
+        fits_left = min(round(left / taken), room // max(len(first.population), len(first.start)))
+        part = left / max(fits_left, 1)
         length = {"seconds": part} if timed else {"steps": round(part)}
         more = options.replaced(most_gaussians=room, **length)
         fit = first.again(len(made), more)

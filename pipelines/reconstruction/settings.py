@@ -122,7 +122,8 @@ class RunSettings(Settings):
             # The defaults.
             "balanced": {},
             "accurate": {**ACCURATE, "refine.seconds": 300.0},
-            # Fitting ends long before that: when a further fit no longer improves the pictures.
+            # Fitting ends long before that: when a further fit no longer improves the pictures, or
+            # all Gaussians that may be are used up.
             "finest": {**ACCURATE, "refine.seconds": 3600.0},
         },
         "protocol": {"gvtools": {}, "paper": PAPER},
