@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.time_for_accuracy import _lifted
+from benchmarks.scenes import _lifted
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene, View

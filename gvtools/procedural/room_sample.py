@@ -87,7 +87,7 @@ def write_room(
     if is_written(folder, record):
         return sample
     room, cameras, rng = room_views(seed, views, width=width, height=height)
-    write_sample(folder, _photographed(room, cameras, rng), record=record)
+    write_sample(folder, photographed(room, cameras, rng), record=record)
     return sample
 
 
@@ -171,13 +171,17 @@ def _path(
     )
 
 
-def _photographed(
-    room: ProceduralScene, cameras: Cameras, rng: np.random.Generator
+def photographed(
+    room: ProceduralScene,
+    cameras: Cameras,
+    rng: np.random.Generator,
+    *,
+    per_view: int = POINTS_PER_VIEW,
 ) -> SampleContent:
-    """Pictures, depth, and noisy detections of surface points in them."""
+    """Pictures, depth, and noisy detections of surface points in them, ``per_view`` or fewer."""
     light, depth = radiance(room.geometry, room.look, cameras)
     images = developed(light, room.key / float(light.mean()))
-    points, colors = _detected(cameras, images, depth, rng)
+    points, colors = _detected(cameras, images, depth, rng, per_view=per_view)
     point_index, view_index, xy = _tracks(cameras, depth, points)
     xy += rng.normal(0, DETECTION_NOISE, xy.shape)
     kept, point_index = np.unique(point_index, return_inverse=True)
@@ -192,13 +196,18 @@ def _photographed(
 
 
 def _detected(
-    cameras: Cameras, images: NDArray[np.uint8], depth: Float32, rng: np.random.Generator
+    cameras: Cameras,
+    images: NDArray[np.uint8],
+    depth: Float32,
+    rng: np.random.Generator,
+    *,
+    per_view: int,
 ) -> tuple[Float64, NDArray[np.uint8]]:
     """Surface points where the pictures have detail: positions and colours."""
     points, colors = [], []
     for view, image in enumerate(images):
         chance = np.hypot(*np.gradient(image.astype(np.float64).mean(-1))).ravel() + 0.2
-        count = min(POINTS_PER_VIEW, chance.size // 4)
+        count = min(per_view, chance.size // 4)
         chosen = rng.choice(chance.size, count, False, chance / chance.sum())
         y, x = np.divmod(np.sort(chosen), image.shape[1])
         local = cameras.rays(view)[y, x] * depth[view, y, x, None]
