@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.blending import Blend, blended
 from gvtools.appearance.exposures import Exposures
+from gvtools.appearance.free_space import free_depth, hanging
 from gvtools.appearance.gaussians import UNREADABLE, Gaussians
 from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.median_depth import median_depth
@@ -31,6 +32,8 @@ class Appearance:
         others: of further fits to the same photographs, in the same frame; pictures are averaged.
         near: nothing nearer is drawn, scene units.
         blend: how much of the memory's colours is taken.
+        surface: (N, 3) points on surfaces, in the Gaussians' frame; what hangs before them is not
+            shown, see free_space. None shows all.
         splatter: draws the Gaussians.
     """
 
@@ -40,6 +43,7 @@ class Appearance:
     splatter: type[Splat] = Splat
     others: tuple[Gaussians, ...] = ()
     exposures: Exposures | None = None
+    surface: NDArray[np.float32] | None = None
 
     @classmethod
     def load(cls, path: Path) -> Appearance:
@@ -58,7 +62,11 @@ class Appearance:
                 Gaussians(values, frame=loaded.frame)
                 for values in np.split(loaded.values, np.cumsum(counts)[:-1])
             )
-            numbers = ("near", "blend", "poses", "log_gains", "depth")
+            # Earlier versions knew no surfaces.
+            surface = np.asarray(data.setdefault("surface", np.zeros((0, 3), np.float32)))
+            if surface.ndim != 2 or surface.shape[1] != 3:
+                raise ValueError(f"surface of shape {surface.shape}")
+            numbers = ("near", "blend", "poses", "log_gains", "depth", "surface")
             for name in numbers:
                 if data[name].dtype.kind not in "fiu" or not np.isfinite(data[name]).all():
                     raise ValueError(f"{name} holds no finite numbers")
@@ -73,6 +81,7 @@ class Appearance:
             return cls(
                 first, float(data["near"]), blend, others=tuple(others),
                 exposures=exposures if count else None,
+                surface=surface.astype(np.float32) if len(surface) else None,
             )  # fmt: skip
         except UNREADABLE as error:
             raise MemoryFileError(f"{path}: no readable appearance ({error})") from None
@@ -91,6 +100,7 @@ class Appearance:
             "origin": self.gaussians.frame.origin,
             "axes": self.gaussians.frame.axes,
             "near": self.near,
+            "surface": np.zeros((0, 3), np.float32) if self.surface is None else self.surface,
             "blend": [self.blend.share, self.blend.tolerance],
             "poses": exposures.poses if exposures else np.zeros((0, 4, 4)),
             "log_gains": exposures.log_gains if exposures else np.zeros((0, 3)),
@@ -105,7 +115,9 @@ class Appearance:
         """What a camera sees, a batch of one, by each fit."""
         pose, lens = self._pose_and_lens(camera)
         gain = self.exposures.at(pose) if self.exposures else None
-        return [Picture.of(self.splatter(fit.values, lens), gain=gain) for fit in self.fits]
+        return [
+            Picture.of(self.splatter(self._shown(fit, lens), lens), gain=gain) for fit in self.fits
+        ]
 
     def depth(self, camera: Cameras) -> NDArray[np.float32]:
         """(H, W) z-depth that a camera sees, scene units; 0 where no fit has a surface.
@@ -117,7 +129,7 @@ class Appearance:
             camera: a batch of one, in the world's frame.
         """
         lens = self._pose_and_lens(camera)[1]
-        depths = np.array([median_depth(fit.values, lens) for fit in self.fits])
+        depths = np.array([median_depth(self._shown(fit, lens), lens) for fit in self.fits])
         ordered = np.sort(np.where(depths > 0, depths, np.float32(np.inf)), axis=0)
         middle = np.maximum((depths > 0).sum(axis=0) - 1, 0) // 2
         found = np.take_along_axis(ordered, middle[None], axis=0)[0]
@@ -128,6 +140,13 @@ class Appearance:
         pose = self.gaussians.frame.cam_from_local(camera.cam_from_world)[0]
         size = (int(camera.width[0]), int(camera.height[0]))
         return pose, Lens.of(pose, camera.K[0], size=size, near=self.near)
+
+    def _shown(self, fit: Gaussians, lens: Lens) -> NDArray[np.float32]:
+        """(M, VALUES) the Gaussians of a fit that do not hang in the free space of a camera."""
+        if self.surface is None:
+            return fit.values
+        free = free_depth(self.surface, lens)
+        return fit.values if free is None else fit.values[~hanging(fit.values, lens, free)]
 
 
 def applied(picture: Picture, guidance: Guidance, *, blend: Blend) -> Guidance:

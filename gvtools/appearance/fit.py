@@ -7,6 +7,7 @@ scale.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -20,6 +21,7 @@ from gvtools.appearance.depth_loss import add_depth
 from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit_options import FitOptions, converged_steps, most_gaussians
 from gvtools.appearance.fit_views import FitView, ReducedView, pixel_width, reduced
+from gvtools.appearance.free_space import free_depth, hanging
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.growth import Population
 from gvtools.appearance.picture import Picture
@@ -55,6 +57,9 @@ REST, REST_BEGINS = 0.1, 0.75
 # Validation photographs: one of VALIDATION_EVERY, at most MOST_VALIDATION, are not fitted until
 # VALIDATION_ENDS (progress), so that they tell how well the others predict them.
 VALIDATION_EVERY, VALIDATION_ENDS, MOST_VALIDATION = 8, 0.75, 5
+# At these parts of the progress, all at the full size, a fit for a time asks whether validation
+# photographs gained LEAST_TENTH [dB] since the last time.
+GAIN_CHECKS, LEAST_TENTH = (0.6, 0.65, 0.7), 0.025
 # Dropout: without recorded depth, each step ignores a random share of the Gaussians, progress times
 # LEFT_OUT / number of photographs, at most MOST_LEFT_OUT. Otherwise Gaussians behind others would
 # get no gradient from few viewing directions. After "DropGaussian" (Park et al. 2025).
@@ -77,6 +82,8 @@ LEAST_GAIN = 0.1
 POSE_CHECKS = (0.3, 0.6)
 # Where Gaussians are added, those at least so wide are split, smaller ones are cloned [px].
 WIDE = 2.0
+# Gaussians in a photograph's free space lose this share of their opacity at each step on it.
+HANGING_FADE = 0.3
 
 
 class Fit:
@@ -100,6 +107,7 @@ class Fit:
         options: FitOptions | None = None,
         seed: int = 0,
         begin: float = 0.0,
+        surface: NDArray[np.float32] | None = None,
         splatter: type[Splat] = Splat,
     ) -> None:
         """Prepare a fit.
@@ -111,6 +119,8 @@ class Fit:
             seed: of the order of photographs and of where Gaussians are added.
             begin: progress at which the fit begins, above 0 where ``start`` was fitted to the same
                 photographs before; there are no validation photographs then.
+            surface: (N, 3) points on surfaces: nothing may hang before them, see free_space. None
+                allows Gaussians everywhere.
             splatter: draws the Gaussians.
         """
         self.start, self.seed, self.splatter = start, seed, splatter
@@ -128,7 +138,10 @@ class Fit:
             exposure=self.options.exposure,
         )
         self.near = 0.02 * self.cameras.depth
+        self.surface = surface
         self.steps = 0
+        self._ended = threading.Event()
+        self._last_gain = -np.inf
         self.predicted: dict[int, Picture] = {}
         self.begin = begin
         # The limit of Gaussians does not count those of an earlier fit.
@@ -138,6 +151,7 @@ class Fit:
         # Recorded depth fixes Gaussians along the ray, as photographs from more directions would.
         self._left_out = 0.0 if self.recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
         self._fading = len(self.views) < FEW and not self.recorded
+        self._free = [self._free_of(view) for view in self.views]
         self._grown = (0, begin)
         self._order: list[int] = []
         self._reduced: dict[int, ReducedView] = {}
@@ -151,6 +165,15 @@ class Fit:
         """As fitted so far."""
         return Gaussians(self.population.values, frame=self.frame)
 
+    def end(self) -> None:
+        """End ``run``, and that of fits made by ``again``, after the step at work."""
+        self._ended.set()
+
+    @property
+    def ended(self) -> bool:
+        """Whether ``end`` was called."""
+        return self._ended.is_set()
+
     def again(self, number: int, options: FitOptions) -> Fit:
         """A new fit from the same start at the poses of this one, which has ended.
 
@@ -162,7 +185,11 @@ class Fit:
         views = [replace(v, cam_from_local=p) for v, p in zip(self.views, poses, strict=True)]
         kept = options.replaced(poses=False)
         seed = self.seed + number
-        return Fit(self.start, views, options=kept, seed=seed, splatter=self.splatter)
+        fit = Fit(
+            self.start, views, options=kept, seed=seed, surface=self.surface, splatter=self.splatter
+        )
+        fit._ended = self._ended
+        return fit
 
     def run(
         self,
@@ -172,25 +199,36 @@ class Fit:
     ) -> None:
         """Fit for the time or the number of steps that the options give, or until it converged.
 
+        In a fit for a time, what is left until validation photographs join is skipped when they
+        stop gaining. ``end`` ends it after the step at work.
+
         Args:
             clock: tells seconds.
             report: is called now and then, and at the end, with the share that is done, 0 to 1.
         """
-        options, began = self.options, clock()
+        limit, began = self.options.limit, clock()
         most = np.inf if self.begin else self.converged_after
-        if options.seconds is None:
-            most = min(options.steps_for(len(self.views)), most)
-        while True:
+        if limit is None:
+            most = min(self.options.steps or 0, most)
+        skipped, checks = 0.0, list(GAIN_CHECKS)
+        while not self.ended:
             over = self.steps / most if most else 1.0
             if not self.begin:
                 over = float(np.interp(over, OF_STEPS, OF_TIME))
-            if options.seconds is not None:
-                over = max(over, (clock() - began) / max(options.seconds, 1e-9))
+            if limit is not None:
+                over = max(over, (clock() - began) / max(limit, 1e-9)) + skipped
             if over >= 1:
                 break
+            if limit is not None and self._validation and checks and over >= checks[0]:
+                checks = [share for share in checks if share > over]
+                if not self._gains():
+                    skipped, checks = skipped + max(VALIDATION_ENDS - over, 0), []
+                    continue
             self.step(self.begin + (1 - self.begin) * over)
             if self.steps % 50 == 0:
                 report(over)
+        if self._validation:
+            self._add_validation()
         self._check_poses()
         self._reduced = {}
         report(1.0)
@@ -214,6 +252,14 @@ class Fit:
             self._validation_psnr.append(-self._error(row, shown))
             return float(np.mean(self._validation_psnr[-len(self._validation) :]))
         return self.psnr_of(self.predicted) if self.predicted else None
+
+    def _gains(self) -> bool:
+        """Whether validation photographs gained since the last call."""
+        before = self._last_gain
+        rows = self._validation
+        self._last_gain = self.psnr_of({r: self._picture(r, self.cameras.given[r]) for r in rows})
+        # What cannot be measured is no reason to end.
+        return not self._last_gain < before + LEAST_TENTH
 
     def psnr_of(self, pictures: Mapping[int, Picture]) -> float:
         """Mean PSNR of rendered pictures against their photographs, by their numbers [dB]."""
@@ -248,6 +294,10 @@ class Fit:
         )  # fmt: skip
         if self._fading:
             self.population.fade(FADING)
+        free = self._free[number]
+        if free is not None:
+            hang = hanging(self.population.values, lens, free, rows=seen)
+            self.population.fade(HANGING_FADE, seen[hang])
         self._note_pulls(lens, seen, rows)
         since = self.steps - self._grown[0]
         periods = int(share / GROWTH_SHARE) - int(self._grown[1] / GROWTH_SHARE)
@@ -259,10 +309,18 @@ class Fit:
                 self.population.grow(self.options.growth, most, wide=WIDE, rng=self.rng)
             self.population.remove_faint()
 
+    def _lens(self, view: FitView) -> Lens:
+        size = view.rgb.shape[1::-1]
+        return Lens.of(view.cam_from_local, view.K, size=(size[0], size[1]), near=self.near)
+
+    def _free_of(self, view: FitView) -> NDArray[np.float32] | None:
+        """See ``free_depth``; None without points."""
+        return None if self.surface is None else free_depth(self.surface, self._lens(view))
+
     def _most_gaussians(self, share: float) -> int:
         """Limit of the number of Gaussians at a progress of ``share``."""
-        steps: float = self.options.steps_for(len(self.views))
-        if self.options.seconds is not None:
+        steps: float = self.options.steps or self.converged_after
+        if self.options.limit is not None:
             over = (share - self.begin) / (1 - self.begin)
             made = over if self.begin else float(np.interp(over, OF_TIME, OF_STEPS))
             steps = self.steps / made
@@ -305,7 +363,10 @@ class Fit:
         height, width = view.rgb.shape[:2]
         lens = Lens.of(pose, view.K, size=(width, height), near=self.near)
         gain = self._exposures().at(pose)
-        return Picture.of(self.splatter(self.population.values, lens), gain=gain)
+        values, free = self.population.values, self._free[number]
+        if free is not None:
+            values = values[~hanging(values, lens, free)]
+        return Picture.of(self.splatter(values, lens), gain=gain)
 
     def _exposures(self) -> Exposures:
         """Exposures of the photographs that are fitted, without the validation photographs."""

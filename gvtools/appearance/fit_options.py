@@ -6,8 +6,8 @@ from pydantic import Field
 
 from gvtools.settings import Settings
 
-# Steps of a fit whose length is not given: for each photograph, at least and at most.
-STEPS_PER_VIEW, FEWEST_STEPS, MOST_STEPS = 15, 300, 1200
+# A fit whose length is not given takes at most so long [s].
+MOST_SECONDS = 120.0
 # A fit has converged after so many steps for each photograph, at least CONVERGED_LEAST; with
 # recorded depth at least CONVERGED_LEAST_RECORDED, since depth keeps surfaces where they are, so
 # that more steps go on helping.
@@ -21,8 +21,8 @@ PER_STEP, PER_VIEW = 65, 8000
 class FitOptions(Settings):
     """How Gaussians are fitted to photographs.
 
-    >>> FitOptions().steps_for(40), FitOptions(steps=100).steps_for(40)
-    (600, 100)
+    >>> FitOptions().limit, FitOptions(steps=100).limit, FitOptions(seconds=30.0).limit
+    (120.0, None, 30.0)
     >>> FitOptions(seconds=0.0).wanted
     False
     """
@@ -30,11 +30,12 @@ class FitOptions(Settings):
     section = "refine"
 
     seconds: float | None = Field(None, ge=0)
-    """How long they are fitted; none counts steps instead, which gives the same result every time;
-    0 leaves the memory's own colours. [s]"""
+    """How long they are fitted at most, with the depth that the fit begins with; none: 120, or by
+    ``steps``. It ends before, when photographs that are left out gain next to nothing; 0 leaves the
+    memory's own colours. [s]"""
     steps: int | None = Field(None, ge=0)
-    """How many steps, where no time is given; none: 15 for each photograph, at least 300 and at
-    most 1200, which take about as long as the rest of a run; 0 leaves the memory's own colours."""
+    """How many steps, where no time is given: the same result every time; 0 leaves the memory's own
+    colours."""
     most_gaussians: int = Field(200_000, ge=1)
     """How many there may be, all fits of a run together; each ``gvtools refine`` may add as many
     again."""
@@ -56,11 +57,12 @@ class FitOptions(Settings):
         """Whether there is time or a step for it."""
         return self.seconds != 0 if self.seconds is not None else self.steps != 0
 
-    def steps_for(self, views: int) -> int:
-        """How many steps a fit of so many photographs makes, where no time is given."""
-        if self.steps is not None:
-            return self.steps
-        return min(max(STEPS_PER_VIEW * views, FEWEST_STEPS), MOST_STEPS)
+    @property
+    def limit(self) -> float | None:
+        """How long they are fitted at most [s]; None counts steps."""
+        if self.seconds is None and self.steps is None:
+            return MOST_SECONDS
+        return self.seconds
 
 
 def converged_steps(views: int, *, recorded: bool) -> int:

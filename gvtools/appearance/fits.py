@@ -45,10 +45,9 @@ def run_fits(
         The fits to average, the first one first: a fit that lowered that PSNR is left out.
     """
     options, began = first.options, clock()
-    timed = options.seconds is not None
-    # In seconds where a time is given, else in steps.
-    budget = options.seconds if timed else options.steps_for(len(first.views))
-    assert budget is not None
+    timed = options.limit is not None
+    # In seconds, or in steps where these are given.
+    budget = options.limit if options.limit is not None else float(options.steps or 0)
     made, kept = [first], [first]
 
     def used() -> float:
@@ -59,7 +58,7 @@ def run_fits(
 
     first.run(clock=clock, report=tell)
     taken = used()
-    while len(made) < MOST_FITS and not first.begin:
+    while len(made) < MOST_FITS and not (first.begin or first.ended):
         left = budget - used()
         if left < LEAST_SHARE * taken or left <= 0:
             break
@@ -75,7 +74,8 @@ def run_fits(
         made.append(fit)
         fit.run(clock=clock, report=tell)
         gain = _gain(kept, fit)
-        if gain is None or gain > 0:
+        # Without validation photographs, a fit that was ended early would only blur the others.
+        if gain > 0 if gain is not None else not fit.ended:
             kept.append(fit)
         if gain is not None and gain < LEAST_GAIN:
             break

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,10 +55,10 @@ class Population:
         """Remove Gaussians of an opacity below FAINTEST."""
         self.keep(self.values[:, LOGIT] >= np.log(FAINTEST / (1 - FAINTEST)))
 
-    def fade(self, share: float) -> None:
-        """Reduce all opacities by a share of themselves."""
-        opacity = (1 - share) / (1 + np.exp(-self.values[:, LOGIT]))
-        self.values[:, LOGIT] = np.log(opacity / (1 - opacity))
+    def fade(self, share: float, rows: Any = slice(None)) -> None:
+        """Reduce all opacities, or those of some rows, by a share of themselves."""
+        opacity = (1 - share) / (1 + np.exp(-self.values[rows, LOGIT]))
+        self.values[rows, LOGIT] = np.log(opacity / (1 - opacity))
 
     def grow(self, threshold: float, most: int, *, wide: float, rng: np.random.Generator) -> None:
         """Split or clone the Gaussians with the largest gradients: they cover too much detail.

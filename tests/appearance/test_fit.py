@@ -132,21 +132,41 @@ def test_a_fit_ends_when_it_has_converged(views, monkeypatch, options):
 
 
 @pytest.mark.parametrize(
-    ("options", "views", "steps", "wanted"),
+    ("options", "limit", "wanted"),
     [
-        ({}, 4, 300, True),
-        ({}, 40, 600, True),
-        ({}, 400, 1200, True),
-        ({"steps": 7}, 400, 7, True),
-        ({"steps": 0}, 9, 0, False),
-        ({"steps": 5, "seconds": 0.0}, 9, 5, False),
-        ({"steps": 0, "seconds": 3.0}, 9, 0, True),
+        ({}, 120.0, True),
+        ({"steps": 7}, None, True),
+        ({"steps": 0}, None, False),
+        ({"steps": 5, "seconds": 0.0}, 0.0, False),
+        ({"steps": 0, "seconds": 3.0}, 3.0, True),
     ],
 )
-def test_steps_follow_the_number_of_photographs_unless_given(options, views, steps, wanted):
+def test_a_fit_takes_two_minutes_at_most_unless_told_otherwise(options, limit, wanted):
     given = FitOptions(**options)
-    assert given.steps_for(views) == steps
-    assert given.wanted == wanted
+    assert (given.limit, given.wanted) == (limit, wanted)
+
+
+def test_a_fit_skips_what_its_validation_photographs_gain_nothing_by(monkeypatch):
+    def steps_until_its_end(gains):
+        monkeypatch.setattr(Fit, "_gains", lambda self: gains)
+        now = iter(range(1000))
+        views = photographs(walk(8))
+        fit = Fit(rough_gaussians(), views, options=FitOptions(seconds=100.0))
+        fit.run(clock=lambda: float(next(now)))
+        assert fit.predicted
+        return fit.steps
+
+    # The part from 0.6 to 0.75 of the time, in which photographs have all of their size.
+    assert steps_until_its_end(True) - steps_until_its_end(False) == pytest.approx(15, abs=4)
+
+
+def test_a_fit_that_is_ended_keeps_what_it_has():
+    fit = Fit(rough_gaussians(), photographs(walk(8)), options=FitOptions(steps=100))
+    fit.run(report=lambda share: fit.end())
+    assert fit.steps == 50 and fit.ended
+    # Validation photographs are judged all the same, and no other fit begins.
+    assert set(fit.predicted) == set(validation_rows(8))
+    assert fit.again(1, FitOptions(steps=9)).ended
 
 
 def test_masked_pixels_do_not_matter(views):
