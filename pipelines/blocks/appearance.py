@@ -65,9 +65,17 @@ def joined(parts: Sequence[BlockAppearance], frame: LocalFrame) -> Appearance:
         float(np.average([blend.tolerance for blend in blends], weights=weights)),
     )
     near = min(part.appearance.near for part in parts)
+    surfaces = [
+        frame.from_world(part.appearance.gaussians.frame.to_world(part.appearance.surface))
+        for part in parts if part.appearance.surface is not None
+    ]  # fmt: skip
+    # Surfaces of one block say nothing of what is before them in another.
+    all_known = len(surfaces) == len(parts)
+    surface = np.concatenate(surfaces).astype(np.float32) if all_known else None
     return Appearance(
-        fits[0], near, blend, first.splatter, tuple(fits[1:]), _exposures(parts, gains, frame)
-    )
+        fits[0], near, blend, first.splatter, tuple(fits[1:]), _exposures(parts, gains, frame),
+        surface,
+    )  # fmt: skip
 
 
 def brightness(parts: Sequence[dict[str, Float64]]) -> Float64:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 # Of the time, or the steps, that a run would fit to these views for.
 SHARE = 0.5
+# Photographs that are read at once where no steps are given.
+MOST_VIEWS = 1200
 
 
 def rows_across(context: Sequence[str], blocks: Sequence[Block]) -> list[int]:
@@ -53,8 +55,8 @@ def fitted_across(
     rows, whole = rows_across(plan.context, blocks), joined.appearance
     if not rows or whole.exposures is None:
         return joined
-    options = _options(plan.config.refine, len(rows), fits=len(whole.fits))
-    rows = list(evenly_spread(rows, options.steps_for(len(rows))))
+    options = _options(plan.config.refine, fits=len(whole.fits))
+    rows = list(evenly_spread(rows, options.steps or MOST_VIEWS))
     console.line(f"fitting: {len(rows)} of {len(plan.context)} views see across blocks")
     some = replace(
         plan,
@@ -92,12 +94,12 @@ def fitted_across(
     )
 
 
-def _options(refine: FitOptions, views: int, *, fits: int) -> FitOptions:
-    """Options of each of some fits that share the time, or the steps, there is for views."""
+def _options(refine: FitOptions, *, fits: int) -> FitOptions:
+    """Options of each of some fits that share the time, or the steps, there is."""
     share = SHARE / fits
-    if refine.seconds is not None:
-        return refine.replaced(poses=False, seconds=share * refine.seconds, steps=None)
-    return refine.replaced(poses=False, steps=max(1, round(share * refine.steps_for(views))))
+    if refine.limit is not None:
+        return refine.replaced(poses=False, seconds=share * refine.limit, steps=None)
+    return refine.replaced(poses=False, steps=max(1, round(share * (refine.steps or 0))))
 
 
 def _brighter(gaussians: Gaussians, log_gain: NDArray[np.float64]) -> Gaussians:

@@ -204,7 +204,16 @@ def _fitted(plan: Plan, runs: Sequence[BlockRun], console: Console) -> Fitted | 
     from pipelines.reconstruction.voxel_edge import grid_frame
 
     files = [round_folder(item.run.path, 0) / APPEARANCE for item in runs]
-    if not all(file.exists() for file in files):
+    without = [
+        str(item.run.path) for item, file in zip(runs, files, strict=True) if not file.exists()
+    ]
+    if without:
+        if len(without) < len(runs):
+            console.warn(
+                f"{len(without)} of {len(runs)} blocks have no fitted Gaussians, first "
+                f"{without[0]}: "
+                "those of the others are left out; give all blocks more time to fit, or none"
+            )
         return None
     found = [Fitted.load(file).on(plan.config.device) for file in files]
     parts = [

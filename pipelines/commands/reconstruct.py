@@ -69,8 +69,8 @@ def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) ->
         "--refine",
         type=float,
         metavar="SECONDS",
-        help="fit Gaussians to the photographs so long; 0: not at all (default: about as long as "
-        "the rest takes)",
+        help="fit Gaussians to the photographs at most so long; 0: not at all (default: as long as "
+        "photographs that are left out gain by it, at most 120)",
     )
     parser.add_argument(
         "--tune",

@@ -82,9 +82,11 @@ class DepthCache:
                         "run again with another --out"
                     ) from error
             else:
-                if failed:
-                    self.failed[view.name] = failed
-                return depth_map
+                # An attempt's Gaussians may not be used any more.
+                if not (self._unfinished and depth_map.source == FittedDepth.name):
+                    if failed:
+                        self.failed[view.name] = failed
+                    return depth_map
         try:
             substitute = None if is_recorded(self.source, view) else self._fallback(view, frame)
             depth_map = substitute or self.source.depth(self.scene, view, frame)

@@ -8,40 +8,53 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import NDArray
 
 from gvtools.appearance.fit_views import FitView
 from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.splat.project_kernels import LOG_SCALE
 from gvtools.appearance.start import from_depth, from_points, pixels_with_depth
-from gvtools.depth.choice import is_estimated, rough_source
-from gvtools.depth.source import is_recorded
+from gvtools.depth.choice import is_estimated
+from gvtools.depth.source import DepthMap, is_recorded
 from gvtools.errors import DegenerateError, ShapeError
-from gvtools.scenes.scene import Frame, View
+from gvtools.scenes.images import resize_nearest
+from gvtools.scenes.reduced import reduced
+from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.view_selection import evenly_spread
 from pipelines.reconstruction.prefetch import prefetch
 
 if TYPE_CHECKING:
-    from gvtools.depth.source import DepthSource
     from gvtools.memory.store.local_frame import LocalFrame
     from pipelines.console import Console
     from pipelines.reconstruction.plan import Plan
 
 # Fewer than FEW_POINTS sparse points are made up to ENOUGH_POINTS by pixels with depth, by a
-# network or a plane sweep of at most SWEPT_VIEWS views. With points that three to seven photographs
-# detected, held-out pictures gain 1.3 to 2.8 dB by this; with 25,000 instead of 10,000 up to 0.8 dB
-# less. A sweep takes as long as hundreds of steps: where there are 9,000 points, these gain more.
-FEW_POINTS, ENOUGH_POINTS, SWEPT_VIEWS = 5_000, 10_000, 12
+# network or a plane sweep. With points that three to seven photographs detected, held-out pictures
+# gain 1.3 to 2.8 dB by this; with 25,000 instead of 10,000 up to 0.8 dB less.
+FEW_POINTS, ENOUGH_POINTS = 5_000, 10_000
+# Longer side at which photographs are swept, and at which they enter the memory after a fit, which
+# has their colours [px].
+SWEPT_SIDE = 320
+# A view takes about so long to sweep at 0.1 megapixels, all cores together [s]; a fit for a given
+# time takes at most SWEEP_SHARE of it for the sweep, by smaller pictures or else without.
+SWEEP_SECONDS, SWEEP_SHARE, SMALL_SIDE = 0.8, 0.15, 160
+# So many views are swept however little time there is, where a fit has few points to begin with.
+FEWEST_SWEPT = 12
 # A fit needs at least so many sparse points and pixels with depth together.
 FEWEST_POINTS = 100
 
 
-def fit_views(plan: Plan, frame: LocalFrame, console: Console) -> list[FitView]:
-    """The context's photographs, with recorded or estimated depth where the run takes one.
+def fit_views(
+    plan: Plan, frame: LocalFrame, console: Console, *, sweep: Sweep | None = None
+) -> list[FitView]:
+    """The context's photographs, with recorded or estimated depth where there is some.
 
     Args:
         plan: of the run.
         frame: poses and Gaussians are fitted in its coordinates.
         console: is told of views without an estimate.
+        sweep: gives an estimate of depth.
     """
     views = [plan.scene[name] for name in plan.context]
     poses = frame.cam_from_local(plan.scene.subset(plan.context).cameras.cam_from_world)
@@ -50,27 +63,28 @@ def fit_views(plan: Plan, frame: LocalFrame, console: Console) -> list[FitView]:
         FitView(
             loaded.rgb, view.camera.K[0], pose, loaded.mask,
             loaded.depth if is_recorded(plan.source, view) else None,
-            _estimate(plan, view, loaded, console=console),
+            _estimate(plan, view, loaded, sweep=sweep, console=console),
         )
         for view, pose, loaded in zip(views, poses, frames, strict=True)
     ]  # fmt: skip
 
 
 def _estimate(
-    plan: Plan, view: View, frame: Frame, *, console: Console
+    plan: Plan, view: View, frame: Frame, *, sweep: Sweep | None, console: Console
 ) -> NDArray[np.float32] | None:
-    """(H, W) depth estimated by a network, scene units, if the run's depth source is one.
-
-    Plane-sweep depth is not used as a loss: it holds no more information than the photographs, and
-    where it is unsure, a fit to it loses up to 0.4 dB.
-    """
-    if not is_estimated(plan.source, view):
+    """(H, W) estimated depth, scene units: by a network if that is the run's source, or a sweep."""
+    if is_estimated(plan.source, view):
+        try:
+            return plan.source.depth(plan.scene, view, frame).depth
+        except DegenerateError as error:
+            console.warn(f"{view.name} is fitted without an estimate of its depth: {error}")
+            return None
+    if sweep is None or not sweep.covers(view):
         return None
-    try:
-        return plan.source.depth(plan.scene, view, frame).depth
-    except DegenerateError as error:
-        console.warn(f"{view.name} is fitted without an estimate of its depth: {error}")
-        return None
+    with suppress(DegenerateError):
+        depth = sweep.depth(sweep.scene, sweep.scene[view.name], None).depth
+        return resize_nearest(depth, frame.rgb.shape[1], frame.rgb.shape[0])
+    return None
 
 
 def first_gaussians(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians:
@@ -90,9 +104,8 @@ def first_gaussians(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> 
         positions, colors = frame.from_world(points.positions), points.colors
     if len(positions) < FEW_POINTS:
         estimated = [replace(v, depth=v.estimate) for v in views if v.estimate is not None]
-        lifted = estimated or _swept(plan, views)
         missing = ENOUGH_POINTS - len(positions)
-        more = pixels_with_depth(lifted, seed=seed, count=missing)
+        more = pixels_with_depth(estimated, seed=seed, count=missing)
         positions = np.concatenate([positions, more[0]])
         colors = np.concatenate([colors, more[1]])
     if len(positions) < FEWEST_POINTS:
@@ -103,22 +116,75 @@ def first_gaussians(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> 
     return from_points(positions, colors, frame=frame, most=most)
 
 
-def _swept(plan: Plan, views: Sequence[FitView]) -> list[FitView]:
-    """At most SWEPT_VIEWS views with plane-sweep depth; views that overlap no other are skipped."""
-    from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+def known_surface(start: Gaussians, views: Sequence[FitView]) -> NDArray[np.float32] | None:
+    """(N, 3) points on surfaces, which nothing may hang before; None where depth is recorded.
 
-    if len(plan.context) < 2:
-        return []
-    source: DepthSource = PlaneSweepStereo(
-        plan.scene, options=plan.config.stereo, views=plan.context
-    )
-    if len(views) > SWEPT_VIEWS:
-        # At a coarse size: depth is swept for the neighbours of each view, too.
-        source = rough_source(plan.scene, source)
-    swept = []
-    for name, view in evenly_spread(list(zip(plan.context, views, strict=True)), SWEPT_VIEWS):
-        frame = Frame(view.rgb, None, view.mask)
-        with suppress(DegenerateError):
-            depth = source.depth(plan.scene, plan.scene[name], frame).depth
-            swept.append(replace(view, depth=depth))
-    return swept
+    Recorded depth keeps Gaussians on surfaces by itself, and where only some views have it, it
+    tells nothing of what the others see.
+
+    Args:
+        start: Gaussians at sparse points and pixels with depth.
+        views: of the fit; their estimates tell of surfaces without sparse points.
+    """
+    if any(view.depth is not None for view in views):
+        return None
+    estimated = [replace(v, depth=v.estimate) for v in views if v.estimate is not None]
+    more = pixels_with_depth(estimated, seed=0, count=ENOUGH_POINTS)[0]
+    return np.concatenate([start.values[:, :LOG_SCALE], more.astype(np.float32)])
+
+
+class Sweep:
+    """Plane-sweep depth of a run's photographs, at a size that its fit has time for.
+
+    Each view is swept once, when it is asked for.
+
+    Attributes:
+        scene: the project at that size.
+    """
+
+    name = "plane-sweep"
+
+    def __init__(self, plan: Plan, side: int, names: Sequence[str]) -> None:
+        from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+
+        self.scene = reduced(plan.scene, side)
+        stereo = plan.config.stereo
+        options = stereo.replaced(max_side=min(stereo.max_side, side))
+        self._source = PlaneSweepStereo(self.scene, options=options, views=plan.context)
+        self._names, self._kept = frozenset(names), dict[str, DepthMap]()
+
+    @classmethod
+    def of(cls, plan: Plan, *, begins: bool = True) -> Sweep | None:
+        """The sweep of a run; None if it has other depth, one view, or too little time.
+
+        Args:
+            plan: of the run.
+            begins: whether a new fit needs points to begin with; with few, some views are swept
+                even if there is no time for all.
+        """
+        recorded = any(is_recorded(plan.source, plan.scene[name]) for name in plan.context)
+        estimated = any(is_estimated(plan.source, plan.scene[name]) for name in plan.context)
+        if recorded or estimated or len(plan.context) < 2:
+            return None
+        few = plan.scene.points is None or len(plan.scene.points.positions) < FEW_POINTS
+        limit, views = plan.config.refine.limit, len(plan.context)
+        for side in (SWEPT_SIDE, SMALL_SIDE):
+            each = SWEEP_SECONDS * (side / SWEPT_SIDE) ** 2 / get_num_threads()
+            if limit is not None:
+                views = int(SWEEP_SHARE * limit / each)
+            if views >= len(plan.context):
+                return cls(plan, side, plan.context)
+        if not (few and begins):
+            return None
+        return cls(plan, SMALL_SIDE, list(evenly_spread(plan.context, max(views, FEWEST_SWEPT))))
+
+    def depth(self, scene: Scene, view: View, frame: Frame | None) -> DepthMap:
+        """The depth of a view of ``scene``; see ``DepthSource.depth``."""
+        if view.name not in self._kept:
+            view = self.scene[view.name]
+            self._kept[view.name] = self._source.depth(self.scene, view, view.load())
+        return self._kept[view.name]
+
+    def covers(self, view: View) -> bool:
+        """The context's views, or those of them that there is time for."""
+        return view.name in self._names

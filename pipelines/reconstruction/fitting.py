@@ -6,10 +6,14 @@ memory is then built with, and because it gives photographs their depth.
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +23,7 @@ from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend, best_blend
 from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit import CONTINUED, Fit
-from gvtools.appearance.fit_options import MOST_STEPS, STEPS_PER_VIEW, converged_steps
+from gvtools.appearance.fit_options import converged_steps
 from gvtools.appearance.fits import LEAST_SHARE, MOST_FITS, run_fits
 from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
@@ -31,7 +35,14 @@ from gvtools.runs.poses import RunPoses
 from gvtools.scenes.reduced import reduced
 from gvtools.untrusted import load_arrays
 from pipelines.reconstruction import poses as run_poses
-from pipelines.reconstruction.fit_inputs import first_gaussians, fit_views
+from pipelines.reconstruction.fit_inputs import (
+    SWEPT_SIDE,
+    Sweep,
+    first_gaussians,
+    fit_views,
+    known_surface,
+)
+from pipelines.reconstruction.fit_verdict import Verdict, verdict
 from pipelines.reconstruction.voxel_edge import grid_frame
 
 if TYPE_CHECKING:
@@ -45,12 +56,11 @@ SAY_EVERY = 5.0
 # Least tolerance of the blend with recorded depth. In targets far from all views Gaussians are
 # smeared and the memory is right; validation photographs are too near to other views to show it.
 WITH_DEPTH = 0.4
-# A warning tells of a fit of less than this share of the usual steps. With 50, 100 and 600 steps,
-# 44 photographs have 18.8, 21.1 and 29.1 dB in held-out pictures, and 27.3 without a fit.
-SHORT = 0.5
-# Longer side at which photographs with fitted depth are fused into the memory [px]: the memory then
-# only decides which pixels are known; their colours come from the Gaussians.
-EVIDENCE_SIDE = 320
+# A warning tells of a fit of fewer steps for each photograph. With 50, 100 and 600 steps, 44
+# photographs have 18.8, 21.1 and 29.1 dB in held-out pictures, and 27.3 without a fit.
+SHORT = 7.5
+# A fit whose validation photographs stopped gaining makes this share of its steps or more.
+SKIPPED = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +73,8 @@ class Fitted:
         spread: whether targets take the pose corrections of the context views near them.
         predicted: pictures of validation photographs as rendered before these joined, by view.
         steps: of the first fit, including those of an earlier fit that it continued.
+        sweep: depth that the fit was held to; not kept in files.
+        verdict: how it stands to the memory's own colours; not kept in files.
     """
 
     appearance: Appearance
@@ -70,9 +82,11 @@ class Fitted:
     spread: bool = False
     predicted: Mapping[str, Picture] = field(default_factory=dict)
     steps: int = 0
+    sweep: Sweep | None = None
+    verdict: Verdict | None = None
 
     def save(self, path: Path) -> None:
-        """Write it, without ``predicted``, into one file."""
+        """Write it, without what is not kept, into one file."""
         arrays = {**self.appearance.arrays(), "spread": self.spread, "steps": self.steps}
         if self.poses is not None:
             arrays |= self.poses.arrays
@@ -99,15 +113,18 @@ class Fitted:
         return replace(self, appearance=replace(self.appearance, splatter=splatter_on(device)))
 
     def applied(self, plan: Plan) -> Plan:
-        """The plan with refined poses, and the Gaussians' depth where views have none."""
+        """The plan with refined poses, and the Gaussians' depth where views have none.
+
+        A source of depth that the user named is kept.
+        """
         if self.poses is not None:
             plan = run_poses.applied(self.poses, plan)
         scene, source = plan.scene, plan.source
-        if isinstance(source, RecordedDepth):
+        if isinstance(source, RecordedDepth) or plan.config.depth != "auto":
             return plan
-        fitted = FittedDepth(self.appearance)
+        fitted = FittedDepth(self.appearance, self.sweep)
         some = any(is_recorded(source, scene[name]) for name in plan.context)
-        evidence = scene if some else reduced(scene, EVIDENCE_SIDE)
+        evidence = scene if some else reduced(scene, SWEPT_SIDE)
         factor = _size(scene, plan.context) / _size(evidence, plan.context)
         assert plan.config.voxel is not None
         return replace(
@@ -157,21 +174,35 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     Raises:
         OptionError: an earlier fit has converged, and the time or steps are too few for another.
     """
+    began = time.perf_counter()
     plan = _posed(plan, earlier)
+    sweep = Sweep.of(plan, begins=earlier is None)
     if earlier is None or _converged(plan, earlier):
-        fit = _new_fit(plan, console, earlier)
+        fit = _new_fit(plan, console, earlier, sweep=sweep)
     else:
-        fit = _continued_fit(plan, earlier, console)
+        fit = _continued_fit(plan, earlier, console, sweep=sweep)
     if fit is None:
         return None
+    limit = fit.options.limit
+    if limit is not None:
+        left = max(limit - (time.perf_counter() - began), limit / 2)
+        fit.options = fit.options.replaced(seconds=left)
     if fit.splatter is GsplatSplat:
         console.line("fitting: on the CUDA device, by gsplat")
     fits: Sequence[Fit] = _run(fit, console)
     if earlier is not None and not fit.begin:
         fits = _worth_adding(fits, earlier)
-    found = _fitted(fits, plan, earlier)
+    found = replace(_fitted(fits, plan, earlier), sweep=sweep)
     if earlier is None:
-        _warn_of_few_steps(found, plan, console)
+        judged = verdict(found.predicted, plan, sweep) if found.predicted and sweep else None
+        if judged is not None:
+            console.line(f"colours: {judged}")
+            if not judged.fit_is_used:
+                console.warn("the fit is not used: give it more time by --refine")
+                return None
+            found = replace(found, verdict=judged)
+        else:
+            _warn_of_few_steps(found, plan, console)
     return found
 
 
@@ -180,11 +211,11 @@ def _warn_of_few_steps(fitted: Fitted, plan: Plan, console: Console) -> None:
 
     Recorded depth keeps surfaces where they are, however short the fit.
     """
-    usual = min(STEPS_PER_VIEW * len(plan.context), MOST_STEPS)
-    if not _recorded(plan) and fitted.steps < SHORT * usual:
+    needed = round(SHORT * len(plan.context))
+    if not _recorded(plan) and fitted.steps < needed:
         console.warn(
-            f"{fitted.steps} steps of a fit to {len(plan.context)} photographs; expected about "
-            f"{usual}; pictures may be worse than without a fit; give more --refine seconds, or "
+            f"{fitted.steps} steps of a fit to {len(plan.context)} photographs; expected at least "
+            f"{needed}; pictures may be worse than without a fit; give more --refine seconds, or "
             "--refine 0 for none"
         )
 
@@ -205,7 +236,9 @@ def _worth_adding(fits: Sequence[Fit], earlier: Fitted) -> Sequence[Fit]:
     return long[: MOST_FITS - len(earlier.appearance.fits)]
 
 
-def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None:
+def _new_fit(
+    plan: Plan, console: Console, earlier: Fitted | None, *, sweep: Sweep | None
+) -> Fit | None:
     """A new fit; after an earlier one, at its poses and with another random seed."""
     frame = grid_frame(plan.scene, plan.context)
     options, seed = plan.config.refine, plan.config.seed
@@ -217,26 +250,31 @@ def _new_fit(plan: Plan, console: Console, earlier: Fitted | None) -> Fit | None
             )
         frame = earlier.appearance.gaussians.frame
         options, seed = options.replaced(poses=False), seed + len(earlier.appearance.fits)
-    views = fit_views(plan, frame, console)
+    views = fit_views(plan, frame, console, sweep=sweep)
     try:
         start = first_gaussians(plan, views, frame)
     except GvError as error:
         console.warn(f"no Gaussians are fitted: {error}")
         return None
-    return Fit(start, views, options=options, seed=seed, splatter=splatter_on(plan.config.device))
+    surface = known_surface(start, views) if earlier is None else earlier.appearance.surface
+    return Fit(
+        start, views, options=options, seed=seed, surface=surface,
+        splatter=splatter_on(plan.config.device),
+    )  # fmt: skip
 
 
 def _converged(plan: Plan, earlier: Fitted) -> bool:
     """Whether an earlier fit has converged: further steps would gain less than another fit."""
-    return earlier.steps >= converged_steps(len(plan.context), recorded=_recorded(plan))
+    needed = converged_steps(len(plan.context), recorded=_recorded(plan))
+    return earlier.steps >= SKIPPED * needed
 
 
-def _continued_fit(plan: Plan, earlier: Fitted, console: Console) -> Fit:
+def _continued_fit(plan: Plan, earlier: Fitted, console: Console, *, sweep: Sweep | None) -> Fit:
     start = earlier.appearance.gaussians
-    views, seed = fit_views(plan, start.frame, console), plan.config.seed
+    views, seed = fit_views(plan, start.frame, console, sweep=sweep), plan.config.seed
     fit = Fit(
-        start, views, options=plan.config.refine, seed=seed,
-        begin=CONTINUED, splatter=splatter_on(plan.config.device),
+        start, views, options=plan.config.refine, seed=seed, begin=CONTINUED,
+        surface=earlier.appearance.surface, splatter=splatter_on(plan.config.device),
     )  # fmt: skip
     fit.cameras.spread = earlier.spread
     if earlier.appearance.exposures is not None:
@@ -261,6 +299,30 @@ def _posed(plan: Plan, earlier: Fitted | None) -> Plan:
     return run_poses.applied(earlier.poses, plan)
 
 
+@contextmanager
+def _ended_by_ctrl_c(fit: Fit, console: Console) -> Iterator[None]:
+    """Ctrl-C ends the fit and keeps what is fitted; the second time it ends the run, as ever.
+
+    Where nothing can be told of it, or somebody else takes it, it does what it always did.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if console.quiet or not main or before is not signal.default_int_handler:
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        fit.end()
+        signal.signal(signal.SIGINT, before)
+        console.line("fitting: ended by Ctrl-C; the run goes on with it; again to end the run")
+
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _run(first: Fit, console: Console) -> list[Fit]:
     """Run a fit and further ones, and print progress."""
     began, told = time.perf_counter(), 0.0
@@ -277,7 +339,8 @@ def _run(first: Fit, console: Console) -> list[Fit]:
                 f"{len(fit.population):,} Gaussians, {fit.psnr:.2f} dB{left_out}"
             )
 
-    fits = run_fits(first, report=say)
+    with _ended_by_ctrl_c(first, console):
+        fits = run_fits(first, report=say)
     if first.cameras.with_poses:
         console.line(f"fitting: {first.cameras.summary()}")
     if len(fits) > 1:
@@ -299,7 +362,9 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
     log_gains = cameras.log_gains - cameras.log_gains.mean(axis=0)
     exposures = Exposures(cameras.poses(), log_gains, cameras.depth)
     found = Fitted(
-        Appearance(sets[0], first.near, blend, first.splatter, tuple(sets[1:]), exposures),
+        Appearance(
+            sets[0], first.near, blend, first.splatter, tuple(sets[1:]), exposures, first.surface
+        ),
         predicted={
             plan.context[row]: mean_picture([fit.predicted[row] for fit in fits])
             for row in first.predicted

@@ -76,8 +76,9 @@ def refine(
         fitted = fit_appearance(plan, console, earlier=earlier)
         if fitted is None:
             raise ProjectError(
-                f"{path}: no Gaussians can be fitted to its context; expected photographs "
-                "with sparse points or recorded depth; the run is as it was"
+                f"{path}: no Gaussians can be fitted to its context that show more than the "
+                "memory; expected photographs with sparse points or recorded depth, and time for "
+                "a fit; the run is as it was"
             )
         directory = RunDirectory(folder)
         history = [*run.record.get(REFINED, []), asked]

@@ -101,6 +101,7 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         ("rounds", str(done) if done == planned else f"{done} of {planned}"),
         ("completer", str(config["completer"])),
         *([("scan", scan_line(reports[0]["scan"]))] if reports[0].get("scan") else []),
+        *([("colours", reports[0]["colours"])] if reports[0].get("colours") else []),
         ("voxel", f"{config['voxel']:g} scene units"),
         ("seed", str(config["seed"])),
         ("gvtools", str(record["versions"].get("gvtools", "?"))),
