@@ -21,6 +21,8 @@ EXAMPLES = (
     "gvtools tradeoff colmap/ --out runs/quick --budget 5m --targets every:8+4",
 )
 SPLIT = {"context": "every:2", "targets": "every:2+1"}
+# Of a sweep [s]; with a budget of a run, the time of so many runs.
+LIMIT, RUNS = 900.0, 5
 UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 
 
@@ -51,9 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--limit",
-        default="15m",
         metavar="TIME",
-        help="of the whole sweep: trials that would not fit are left out and named (%(default)s)",
+        help="of the whole sweep: trials that would not fit are left out and named (five times "
+        "--budget, at most 15m, its default)",
     )
     add_scene_arguments(parser)
 
@@ -78,12 +80,19 @@ def run(args: argparse.Namespace, console: Console) -> None:
     if args.out.exists() and not args.out.is_dir():
         raise OptionError(f"--out {args.out}: is a file; give a folder")
     budget = None if args.budget is None else parse_seconds("--budget", args.budget)
-    limit = parse_seconds("--limit", args.limit)
-    config = asked_for(args)
+    limit = min(LIMIT, LIMIT if budget is None else RUNS * budget)
+    if args.limit is not None:
+        limit = parse_seconds("--limit", args.limit)
+    config = _within(asked_for(args), budget)
     scene, plan = _planned(args, config, console)
     config = config.replaced(voxel=plan.config.voxel, memory=plan.config.memory)
     planned = planned_trials(
-        plan, {name: changes(config, asked_for(args, name)) for name in config.presets["profile"]}
+        plan,
+        {
+            name: changes(config, _within(asked_for(args, name), budget))
+            for name in config.presets["profile"]
+        },
+        budget=budget,
     )
     with folder_lock(args.out):
         identity = run_identity(plan, reading_of(args))
@@ -106,6 +115,14 @@ def run(args: argparse.Namespace, console: Console) -> None:
         changed = changes(RunSettings(), applied(config, chosen.settings))
         write_json(file, {k: changed[k] for k in changed if k not in ("context", "targets")})
         console.line(f"gvtools reconstruct ... --config {file}; more results in {args.out}")
+
+
+def _within(config: RunSettings, budget: float | None) -> RunSettings:
+    """The settings with a fit that leaves half of the budget to the rest of a run."""
+    limit = config.refine.limit
+    if budget is None or limit is None or limit <= budget / 2:
+        return config
+    return config.replaced(refine=config.refine.replaced(seconds=budget / 2))
 
 
 def _planned(args: argparse.Namespace, config: RunSettings, console: Console) -> tuple[Scene, Plan]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,9 @@ Settings = Mapping[str, Any]
 START = "start"
 
 
-def planned_trials(plan: Plan, profiles: Mapping[str, Settings]) -> dict[str, Settings]:
+def planned_trials(
+    plan: Plan, profiles: Mapping[str, Settings], *, budget: float | None = None
+) -> dict[str, Settings]:
     """Settings of each trial by its label, the start first; those that are like another are absent.
 
     Every trial completes pictures of the start's size.
@@ -24,12 +27,13 @@ def planned_trials(plan: Plan, profiles: Mapping[str, Settings]) -> dict[str, Se
     Args:
         plan: of a run with the settings that the sweep starts from and a voxel edge.
         profiles: settings that make the start to each of them.
+        budget: seconds of a run; longer fits are not planned.
     """
     trials: dict[str, Settings] = {
         f"profile {name}": {key: value for key, value in settings.items() if key != "max_side"}
         for name, settings in profiles.items()
     }
-    for key, values in _values(plan).items():
+    for key, values in _values(plan, budget or math.inf).items():
         trials |= {f"{key} {_shown(value)}": {key: value} for value in values}
     differing: dict[str, Settings] = {START: {}}
     made = [plan.config]
@@ -41,7 +45,7 @@ def planned_trials(plan: Plan, profiles: Mapping[str, Settings]) -> dict[str, Se
     return differing
 
 
-def _values(plan: Plan) -> dict[str, tuple[Any, ...]]:
+def _values(plan: Plan, budget: float) -> dict[str, tuple[Any, ...]]:
     """Values worth a trial, by the setting's name, cheapest first."""
     config = plan.config
     voxel, far = config.voxel, config.memory.voxels_per_footprint
@@ -57,7 +61,8 @@ def _values(plan: Plan) -> dict[str, tuple[Any, ...]]:
         "views_per_round": (3, 6, 12),
     }
     if config.refine.wanted:
-        values["refine.seconds"] = (0.0, 20.0, 60.0, 180.0)
+        fits = (0.0, 20.0, 60.0, 180.0)
+        values["refine.seconds"] = tuple(seconds for seconds in fits if seconds < budget)
     if config.completer != "none":
         values["fusion.min_confidence"] = (0.35, 0.08, 0.0)
     if config.completer == "geoverse":
