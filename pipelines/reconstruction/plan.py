@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 # Processor seconds: of a view's plane sweep whole and as a fit needs it, of a view with recorded
 # depth, of a megapixel that is lifted, of a target; and what a run takes whatever it does [s].
 SWEPT, SWEPT_SMALL, RECORDED, LIFTED, COMPLETED, START = 2.2, 0.7, 0.5, 1.0, 2.0, 4.0
+# A fit whose length is not given takes at most so long if no photographs can be left out to tell
+# whether it gains [s].
+UNJUDGED = 30.0
 # From this share of sparse points that the context's views alone would not give, the run says so:
 # fox without every eighth view 0.01, one in eight alone 0.82.
 TOLD_FROM = 0.1
@@ -103,6 +106,7 @@ def make_plan(
     Raises:
         GvError: settings that the project cannot serve.
     """
+    from gvtools.appearance.fit import validation_rows
     from gvtools.completers.base import create
     from gvtools.depth.choice import choose_source
     from gvtools.depth.source import RecordedDepth
@@ -154,6 +158,10 @@ def make_plan(
     if config.voxel is None:
         posed = scene if found is None else with_poses(scene, context, found.context)
         config = _with_voxel(config, posed, context, source=chosen.source, say=say)
+    if (config.refine.seconds, config.refine.steps) == (None, None) and not validation_rows(
+        len(context)
+    ):
+        config = config.replaced(refine=config.refine.replaced(seconds=UNJUDGED))
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = config.replaced(rounds=len(schedule))
     weights = [*getattr(chosen.source, "files", ()), *completer.files]
