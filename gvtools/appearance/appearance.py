@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.blending import Blend, blended
 from gvtools.appearance.exposures import Exposures
-from gvtools.appearance.free_space import free_depth, hanging
+from gvtools.appearance.free_space import floaters, free_depth
 from gvtools.appearance.gaussians import UNREADABLE, Gaussians
 from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.median_depth import median_depth
@@ -32,7 +32,7 @@ class Appearance:
         others: of further fits to the same photographs, in the same frame; pictures are averaged.
         near: nothing nearer is drawn, scene units.
         blend: how much of the memory's colours is taken.
-        surface: (N, 3) points on surfaces, in the Gaussians' frame; what hangs before them is not
+        surface: (N, 3) points on surfaces, in the Gaussians' frame; what floats before them is not
             shown, see free_space. None shows all.
         splatter: draws the Gaussians.
     """
@@ -115,9 +115,7 @@ class Appearance:
         """What a camera sees, a batch of one, by each fit."""
         pose, lens = self._pose_and_lens(camera)
         gain = self.exposures.at(pose) if self.exposures else None
-        return [
-            Picture.of(self.splatter(self._shown(fit, lens), lens), gain=gain) for fit in self.fits
-        ]
+        return [Picture.of(self.splatter(values, lens), gain=gain) for values in self._shown(lens)]
 
     def depth(self, camera: Cameras) -> NDArray[np.float32]:
         """(H, W) z-depth that a camera sees, scene units; 0 where no fit has a surface.
@@ -129,7 +127,7 @@ class Appearance:
             camera: a batch of one, in the world's frame.
         """
         lens = self._pose_and_lens(camera)[1]
-        depths = np.array([median_depth(self._shown(fit, lens), lens) for fit in self.fits])
+        depths = np.array([median_depth(values, lens) for values in self._shown(lens)])
         ordered = np.sort(np.where(depths > 0, depths, np.float32(np.inf)), axis=0)
         middle = np.maximum((depths > 0).sum(axis=0) - 1, 0) // 2
         found = np.take_along_axis(ordered, middle[None], axis=0)[0]
@@ -141,12 +139,13 @@ class Appearance:
         size = (int(camera.width[0]), int(camera.height[0]))
         return pose, Lens.of(pose, camera.K[0], size=size, near=self.near)
 
-    def _shown(self, fit: Gaussians, lens: Lens) -> NDArray[np.float32]:
-        """(M, VALUES) the Gaussians of a fit that do not hang in the free space of a camera."""
-        if self.surface is None:
-            return fit.values
-        free = free_depth(self.surface, lens)
-        return fit.values if free is None else fit.values[~hanging(fit.values, lens, free)]
+    def _shown(self, lens: Lens) -> list[NDArray[np.float32]]:
+        """(M, VALUES) of each fit the Gaussians that do not float in the camera's free space."""
+        free = None if self.surface is None else free_depth(self.surface, lens)
+        every = [fit.values for fit in self.fits]
+        if free is None:
+            return every
+        return [values[~floaters(values, lens, free)] for values in every]
 
 
 def applied(picture: Picture, guidance: Guidance, *, blend: Blend) -> Guidance:

@@ -21,7 +21,7 @@ from gvtools.appearance.depth_loss import add_depth
 from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit_options import FitOptions, converged_steps, most_gaussians
 from gvtools.appearance.fit_views import FitView, ReducedView, pixel_width, reduced
-from gvtools.appearance.free_space import free_depth, hanging
+from gvtools.appearance.free_space import floaters, free_depth
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.growth import Population
 from gvtools.appearance.picture import Picture
@@ -58,8 +58,8 @@ REST, REST_BEGINS = 0.1, 0.75
 # VALIDATION_ENDS (progress), so that they tell how well the others predict them.
 VALIDATION_EVERY, VALIDATION_ENDS, MOST_VALIDATION = 8, 0.75, 5
 # At these parts of the progress, all at the full size, a fit for a time asks whether validation
-# photographs gained LEAST_TENTH [dB] since the last time.
-GAIN_CHECKS, LEAST_TENTH = (0.6, 0.65, 0.7), 0.025
+# photographs gained LEAST_STAGE_GAIN [dB] since the last time.
+GAIN_CHECKS, LEAST_STAGE_GAIN = (0.6, 0.65, 0.7), 0.025
 # Dropout: without recorded depth, each step ignores a random share of the Gaussians, progress times
 # LEFT_OUT / number of photographs, at most MOST_LEFT_OUT. Otherwise Gaussians behind others would
 # get no gradient from few viewing directions. After "DropGaussian" (Park et al. 2025).
@@ -83,7 +83,7 @@ POSE_CHECKS = (0.3, 0.6)
 # Where Gaussians are added, those at least so wide are split, smaller ones are cloned [px].
 WIDE = 2.0
 # Gaussians in a photograph's free space lose this share of their opacity at each step on it.
-HANGING_FADE = 0.3
+FLOATER_FADE = 0.3
 
 
 class Fit:
@@ -119,7 +119,7 @@ class Fit:
             seed: of the order of photographs and of where Gaussians are added.
             begin: progress at which the fit begins, above 0 where ``start`` was fitted to the same
                 photographs before; there are no validation photographs then.
-            surface: (N, 3) points on surfaces: nothing may hang before them, see free_space. None
+            surface: (N, 3) points on surfaces: nothing may float before them, see free_space. None
                 allows Gaussians everywhere.
             splatter: draws the Gaussians.
         """
@@ -140,8 +140,8 @@ class Fit:
         self.near = 0.02 * self.cameras.depth
         self.surface = surface
         self.steps = 0
-        self._ended = threading.Event()
-        self._last_gain = -np.inf
+        self._stop = threading.Event()
+        self._last_psnr = -np.inf
         self.predicted: dict[int, Picture] = {}
         self.begin = begin
         # The limit of Gaussians does not count those of an earlier fit.
@@ -165,14 +165,14 @@ class Fit:
         """As fitted so far."""
         return Gaussians(self.population.values, frame=self.frame)
 
-    def end(self) -> None:
-        """End ``run``, and that of fits made by ``again``, after the step at work."""
-        self._ended.set()
+    def stop(self) -> None:
+        """Stop ``run``, and that of fits made by ``again``, after the step at work."""
+        self._stop.set()
 
     @property
-    def ended(self) -> bool:
-        """Whether ``end`` was called."""
-        return self._ended.is_set()
+    def stopped(self) -> bool:
+        """Whether ``stop`` was called."""
+        return self._stop.is_set()
 
     def again(self, number: int, options: FitOptions) -> Fit:
         """A new fit from the same start at the poses of this one, which has ended.
@@ -188,7 +188,7 @@ class Fit:
         fit = Fit(
             self.start, views, options=kept, seed=seed, surface=self.surface, splatter=self.splatter
         )
-        fit._ended = self._ended
+        fit._stop = self._stop
         return fit
 
     def run(
@@ -200,7 +200,7 @@ class Fit:
         """Fit for the time or the number of steps that the options give, or until it converged.
 
         In a fit for a time, what is left until validation photographs join is skipped when they
-        stop gaining. ``end`` ends it after the step at work.
+        stop gaining. ``stop`` ends it after the step at work.
 
         Args:
             clock: tells seconds.
@@ -211,7 +211,7 @@ class Fit:
         if limit is None:
             most = min(self.options.steps or 0, most)
         skipped, checks = 0.0, list(GAIN_CHECKS)
-        while not self.ended:
+        while not self.stopped:
             over = self.steps / most if most else 1.0
             if not self.begin:
                 over = float(np.interp(over, OF_STEPS, OF_TIME))
@@ -255,11 +255,11 @@ class Fit:
 
     def _gains(self) -> bool:
         """Whether validation photographs gained since the last call."""
-        before = self._last_gain
+        before = self._last_psnr
         rows = self._validation
-        self._last_gain = self.psnr_of({r: self._picture(r, self.cameras.given[r]) for r in rows})
+        self._last_psnr = self.psnr_of({r: self._picture(r, self.cameras.given[r]) for r in rows})
         # What cannot be measured is no reason to end.
-        return not self._last_gain < before + LEAST_TENTH
+        return not self._last_psnr < before + LEAST_STAGE_GAIN
 
     def psnr_of(self, pictures: Mapping[int, Picture]) -> float:
         """Mean PSNR of rendered pictures against their photographs, by their numbers [dB]."""
@@ -296,8 +296,8 @@ class Fit:
             self.population.fade(FADING)
         free = self._free[number]
         if free is not None:
-            hang = hanging(self.population.values, lens, free, rows=seen)
-            self.population.fade(HANGING_FADE, seen[hang])
+            floating = floaters(self.population.values, lens, free, rows=seen)
+            self.population.fade(FLOATER_FADE, seen[floating])
         self._note_pulls(lens, seen, rows)
         since = self.steps - self._grown[0]
         periods = int(share / GROWTH_SHARE) - int(self._grown[1] / GROWTH_SHARE)
@@ -365,7 +365,7 @@ class Fit:
         gain = self._exposures().at(pose)
         values, free = self.population.values, self._free[number]
         if free is not None:
-            values = values[~hanging(values, lens, free)]
+            values = values[~floaters(values, lens, free)]
         return Picture.of(self.splatter(values, lens), gain=gain)
 
     def _exposures(self) -> Exposures:

@@ -58,7 +58,7 @@ def run_fits(
 
     first.run(clock=clock, report=tell)
     taken = used()
-    while len(made) < MOST_FITS and not (first.begin or first.ended):
+    while len(made) < MOST_FITS and not (first.begin or first.stopped):
         left = budget - used()
         if left < LEAST_SHARE * taken or left <= 0:
             break
@@ -74,8 +74,8 @@ def run_fits(
         made.append(fit)
         fit.run(clock=clock, report=tell)
         gain = _gain(kept, fit)
-        # Without validation photographs, a fit that was ended early would only blur the others.
-        if gain > 0 if gain is not None else not fit.ended:
+        # Without validation photographs, a fit that was stopped early would only blur the others.
+        if gain > 0 if gain is not None else not fit.stopped:
             kept.append(fit)
         if gain is not None and gain < LEAST_GAIN:
             break

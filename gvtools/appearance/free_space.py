@@ -1,6 +1,6 @@
-"""Free space: what lies between a camera and the nearest surface that is known along its rays.
+"""Free space between a camera and the nearest known surfaces, and the Gaussians that float in it.
 
-Gaussians that hang there match the photographs that they were fitted to and are fog in all others.
+Floaters match the photographs that they were fitted to and are fog in all others.
 Only the space before every known surface in a part of the picture counts as free: points that one
 photograph detected through a gap, or past a thing without texture, say nothing about what is
 before them.
@@ -60,7 +60,7 @@ def free_depth(points: NDArray[np.float32], lens: Lens) -> NDArray[np.float32] |
     return np.where(known, SHARE * nearest, UNKNOWN_SHARE * filled).astype(np.float32)
 
 
-def hanging(
+def floaters(
     values: NDArray[np.float32],
     lens: Lens,
     free: NDArray[np.float32],
@@ -81,12 +81,14 @@ def hanging(
         rows = np.arange(len(values))
     out = np.empty(len(rows), np.bool_)
     scale = CELLS / max(lens.width, lens.height)
-    in_threads(_hang, len(rows), rows, values[:, :LOG_SCALE], lens.numbers, scale, free, out)
+    in_threads(
+        _find_floaters, len(rows), rows, values[:, :LOG_SCALE], lens.numbers, scale, free, out
+    )
     return out
 
 
 @compiled()
-def _hang(first, last, rows, positions, camera, scale, free, out):
+def _find_floaters(first, last, rows, positions, camera, scale, free, out):
     bottom, right = free.shape[0] - 1, free.shape[1] - 1
     c = camera
     for j in range(first, last):

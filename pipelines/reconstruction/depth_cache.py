@@ -70,9 +70,7 @@ class DepthCache:
             ProjectError: a kept file is damaged, or cannot be written.
         """
         path = self._file[view.name]
-        # An interrupted attempt fitted other Gaussians.
-        stale = self._unfinished and self.source.name == FittedDepth.name
-        if path.exists() and not stale:
+        if path.exists():
             try:
                 depth_map, failed = read_context_depth(path, frame.rgb.shape[:2])
             except UNREADABLE as error:
@@ -82,7 +80,7 @@ class DepthCache:
                         "run again with another --out"
                     ) from error
             else:
-                # An attempt's Gaussians may not be used any more.
+                # An interrupted attempt fitted other Gaussians.
                 if not (self._unfinished and depth_map.source == FittedDepth.name):
                     if failed:
                         self.failed[view.name] = failed

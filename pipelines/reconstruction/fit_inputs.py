@@ -117,7 +117,7 @@ def first_gaussians(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> 
 
 
 def known_surface(start: Gaussians, views: Sequence[FitView]) -> NDArray[np.float32] | None:
-    """(N, 3) points on surfaces, which nothing may hang before; None where depth is recorded.
+    """(N, 3) points on surfaces, which nothing may float before; None where depth is recorded.
 
     Recorded depth keeps Gaussians on surfaces by itself, and where only some views have it, it
     tells nothing of what the others see.

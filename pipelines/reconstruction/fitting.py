@@ -42,7 +42,7 @@ from pipelines.reconstruction.fit_inputs import (
     fit_views,
     known_surface,
 )
-from pipelines.reconstruction.fit_verdict import Verdict, verdict
+from pipelines.reconstruction.fit_validation import FitValidation, validate_fit
 from pipelines.reconstruction.voxel_edge import grid_frame
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Fitted:
         predicted: pictures of validation photographs as rendered before these joined, by view.
         steps: of the first fit, including those of an earlier fit that it continued.
         sweep: depth that the fit was held to; not kept in files.
-        verdict: how it stands to the memory's own colours; not kept in files.
+        validation: how it compares to the memory's own colours; not kept in files.
     """
 
     appearance: Appearance
@@ -83,7 +83,7 @@ class Fitted:
     predicted: Mapping[str, Picture] = field(default_factory=dict)
     steps: int = 0
     sweep: Sweep | None = None
-    verdict: Verdict | None = None
+    validation: FitValidation | None = None
 
     def save(self, path: Path) -> None:
         """Write it, without what is not kept, into one file."""
@@ -194,13 +194,15 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         fits = _worth_adding(fits, earlier)
     found = replace(_fitted(fits, plan, earlier), sweep=sweep)
     if earlier is None:
-        judged = verdict(found.predicted, plan, sweep) if found.predicted and sweep else None
-        if judged is not None:
-            console.line(f"colours: {judged}")
-            if not judged.fit_is_used:
+        validation = (
+            validate_fit(found.predicted, plan, sweep) if found.predicted and sweep else None
+        )
+        if validation is not None:
+            console.line(f"colours: {validation}")
+            if not validation.fit_is_used:
                 console.warn("the fit is not used: give it more time by --refine")
                 return None
-            found = replace(found, verdict=judged)
+            found = replace(found, validation=validation)
         else:
             _warn_of_few_steps(found, plan, console)
     return found
@@ -300,7 +302,7 @@ def _posed(plan: Plan, earlier: Fitted | None) -> Plan:
 
 
 @contextmanager
-def _ended_by_ctrl_c(fit: Fit, console: Console) -> Iterator[None]:
+def _stopped_by_ctrl_c(fit: Fit, console: Console) -> Iterator[None]:
     """Ctrl-C ends the fit and keeps what is fitted; the second time it ends the run, as ever.
 
     Where nothing can be told of it, or somebody else takes it, it does what it always did.
@@ -312,7 +314,7 @@ def _ended_by_ctrl_c(fit: Fit, console: Console) -> Iterator[None]:
         return
 
     def end(number: int, frame: FrameType | None) -> None:
-        fit.end()
+        fit.stop()
         signal.signal(signal.SIGINT, before)
         console.line("fitting: ended by Ctrl-C; the run goes on with it; again to end the run")
 
@@ -339,7 +341,7 @@ def _run(first: Fit, console: Console) -> list[Fit]:
                 f"{len(fit.population):,} Gaussians, {fit.psnr:.2f} dB{left_out}"
             )
 
-    with _ended_by_ctrl_c(first, console):
+    with _stopped_by_ctrl_c(first, console):
         fits = run_fits(first, report=say)
     if first.cameras.with_poses:
         console.line(f"fitting: {first.cameras.summary()}")

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 SWEPT, SWEPT_SMALL, RECORDED, LIFTED, COMPLETED, START = 2.2, 0.7, 0.5, 1.0, 2.0, 4.0
 # A fit whose length is not given takes at most so long if no photographs can be left out to tell
 # whether it gains [s].
-UNJUDGED = 30.0
+UNVALIDATED_SECONDS = 30.0
 # From this share of sparse points that the context's views alone would not give, the run says so:
 # fox without every eighth view 0.01, one in eight alone 0.82.
 TOLD_FROM = 0.1
@@ -161,7 +161,7 @@ def make_plan(
     if (config.refine.seconds, config.refine.steps) == (None, None) and not validation_rows(
         len(context)
     ):
-        config = config.replaced(refine=config.refine.replaced(seconds=UNJUDGED))
+        config = config.replaced(refine=config.refine.replaced(seconds=UNVALIDATED_SECONDS))
     schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
     config = config.replaced(rounds=len(schedule))
     weights = [*getattr(chosen.source, "files", ()), *completer.files]

@@ -219,8 +219,8 @@ def _run_rounds(
                     fitted = fitted.with_best_blend(plan, memory)
                     fitted.save(folder / APPEARANCE)
                     targets.appearance = fitted.appearance
-                    report["colours"] = str(fitted.verdict or fitted.appearance.blend)
-                    if fitted.verdict is None:
+                    report["colours"] = str(fitted.validation or fitted.appearance.blend)
+                    if fitted.validation is None:
                         console.line(f"colours: {report['colours']}")
                 write_json(folder / REPORT, report)
             console.line(_round_line(report))

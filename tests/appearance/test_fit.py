@@ -160,13 +160,13 @@ def test_a_fit_skips_what_its_validation_photographs_gain_nothing_by(monkeypatch
     assert steps_until_its_end(True) - steps_until_its_end(False) == pytest.approx(15, abs=4)
 
 
-def test_a_fit_that_is_ended_keeps_what_it_has():
+def test_a_fit_that_is_stopped_keeps_what_it_has():
     fit = Fit(rough_gaussians(), photographs(walk(8)), options=FitOptions(steps=100))
-    fit.run(report=lambda share: fit.end())
-    assert fit.steps == 50 and fit.ended
+    fit.run(report=lambda share: fit.stop())
+    assert fit.steps == 50 and fit.stopped
     # Validation photographs are judged all the same, and no other fit begins.
     assert set(fit.predicted) == set(validation_rows(8))
-    assert fit.again(1, FitOptions(steps=9)).ended
+    assert fit.again(1, FitOptions(steps=9)).stopped
 
 
 def test_masked_pixels_do_not_matter(views):

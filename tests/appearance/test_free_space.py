@@ -11,7 +11,7 @@ from splat_scene import HEIGHT, WIDTH, K, photographs, pose, rough_gaussians, wa
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.fit_options import FitOptions
-from gvtools.appearance.free_space import SHARE, UNKNOWN_SHARE, free_depth, hanging
+from gvtools.appearance.free_space import SHARE, UNKNOWN_SHARE, floaters, free_depth
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, VALUES
 from gvtools.appearance.splat.splat import Lens
@@ -50,7 +50,7 @@ def test_without_a_surface_in_the_picture_nothing_is_free():
     assert free_depth(np.zeros((0, 3), np.float32), lens_at(np.eye(4))) is None
 
 
-def test_what_hangs_is_before_the_surface_and_not_behind_the_camera_or_it():
+def test_floaters_are_before_the_surface_and_not_behind_the_camera_or_it():
     surface = np.array([point(WIDTH / 2, HEIGHT / 2, 2.0)], np.float32)
     lens = lens_at(np.eye(4))
     values = np.zeros((4, VALUES), np.float32)
@@ -59,10 +59,10 @@ def test_what_hangs_is_before_the_surface_and_not_behind_the_camera_or_it():
         point(WIDTH / 2, HEIGHT / 2, 1.0), point(WIDTH / 2, HEIGHT / 2, 1.9),
         [0, 0, -1], point(2 * WIDTH, HEIGHT / 2, 0.5),
     ]  # fmt: skip
-    found = hanging(values, lens, free_of(surface, lens))
+    found = floaters(values, lens, free_of(surface, lens))
     assert found.tolist() == [True, False, False, True]
     rows = np.array([3, 1])
-    assert hanging(values, lens, free_of(surface, lens), rows=rows).tolist() == [True, False]
+    assert floaters(values, lens, free_of(surface, lens), rows=rows).tolist() == [True, False]
 
 
 def fog(count=40):
@@ -86,8 +86,8 @@ def test_a_fit_clears_free_space_and_a_picture_does_not_show_it():
         fit.run()
         lens = lens_at(pose(0.0))
         found = fit.gaussians.values
-        hang = hanging(found, lens, free_of(surface, lens))
-        kept[name] = (1 / (1 + np.exp(-found[hang, LOGIT]))).sum()
+        floating = floaters(found, lens, free_of(surface, lens))
+        kept[name] = (1 / (1 + np.exp(-found[floating, LOGIT]))).sum()
     assert kept["free"] < 0.1 * kept["all"]
     camera = Cameras(K[None], pose(0.0)[None], np.array([WIDTH]), np.array([HEIGHT]), ("a",))
     shown = Appearance(both, 0.01, surface=surface)

@@ -33,7 +33,7 @@ from gvtools.settings import with_texts
 from pipelines.console import Console
 from pipelines.reconstruction import fit_inputs, fitting
 from pipelines.reconstruction.fit_inputs import Sweep, first_gaussians, fit_views
-from pipelines.reconstruction.fit_verdict import verdict
+from pipelines.reconstruction.fit_validation import validate_fit
 from pipelines.reconstruction.fitting import Fitted, fit_appearance
 from pipelines.reconstruction.plan import Plan, make_plan
 from pipelines.reconstruction.run import _empty_memory, reconstruct
@@ -184,7 +184,7 @@ def test_both_ways_to_fit_nothing_give_the_same_files(scan, tmp_path):
 def test_photographs_alone_get_depth_by_the_gaussians(tmp_path, monkeypatch, points):
     """With sparse points, and without any: then a plane sweep tells where to begin."""
     # So short a fit is not as good as the memory.
-    monkeypatch.setattr(fitting, "verdict", lambda *args: None)
+    monkeypatch.setattr(fitting, "validate_fit", lambda *args: None)
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=points)
     out = run(scan, tmp_path / "run", STEPS)
     fitted = Fitted.load(out / FITTED)
@@ -201,7 +201,7 @@ def test_photographs_alone_get_depth_by_the_gaussians(tmp_path, monkeypatch, poi
 @pytest.mark.parametrize(("steps", "told"), [(20, True), (80, False)])
 def test_a_fit_too_short_for_its_photographs_is_told(tmp_path, monkeypatch, capsys, steps, told):
     # Where nothing judges it.
-    monkeypatch.setattr(fitting, "verdict", lambda *args: None)
+    monkeypatch.setattr(fitting, "validate_fit", lambda *args: None)
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=300)
     plan = planned(scan, f"refine.steps={steps}")
     fit_appearance(plan, Console())
@@ -406,12 +406,12 @@ def test_a_fit_worse_than_the_memory_is_not_used(tmp_path, monkeypatch, capsys):
     view = plan.scene["view_3.png"]
     truth = (view.load().rgb / 255).astype(np.float32)
     alpha = np.ones(truth.shape[:2], np.float32)
-    good = verdict({view.name: Picture(truth, alpha)}, plan, sweep)
+    good = validate_fit({view.name: Picture(truth, alpha)}, plan, sweep)
     assert good is not None and good.fit_is_used
-    bad = verdict({view.name: Picture(0 * truth, alpha)}, plan, sweep)
+    bad = validate_fit({view.name: Picture(0 * truth, alpha)}, plan, sweep)
     assert bad is not None and not bad.fit_is_used
     assert good.gaussians > good.memory > bad.memory > 15 > bad.gaussians
-    monkeypatch.setattr(fitting, "verdict", lambda *args: bad)
+    monkeypatch.setattr(fitting, "validate_fit", lambda *args: bad)
     assert fit_appearance(plan, Console()) is None
     told = capsys.readouterr()
     assert "colours: the memory's own" in told.out and "the fit is not used" in told.err
@@ -421,9 +421,9 @@ def test_ctrl_c_ends_a_fit_and_a_second_one_the_run(capsys):
     start = Gaussians(np.zeros((1, VALUES), np.float32))
     view = FitView(np.zeros((16, 16, 3), np.uint8), np.diag([16.0, 16.0, 1.0]), np.eye(4))
     fit, before = Fit(start, [view]), signal.getsignal(signal.SIGINT)
-    with fitting._ended_by_ctrl_c(fit, Console()):
+    with fitting._stopped_by_ctrl_c(fit, Console()):
         signal.raise_signal(signal.SIGINT)
-        assert fit.ended
+        assert fit.stopped
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before

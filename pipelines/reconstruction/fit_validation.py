@@ -1,4 +1,4 @@
-"""Whether a fit is worth using: Gaussians and the memory alone predict photographs left out."""
+"""Validation of a fit: its Gaussians and the memory alone predict photographs that it left out."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 # The memory's colours must be better by so much, divided by the number of photographs that judge:
 # pictures of one that is at the border of the others differ by 2 dB from fit to fit [dB].
-CLEARLY = 3.0
+MARGIN = 3.0
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """How well photographs that a fit left out are predicted, at the size of its sweep.
+class FitValidation:
+    """PSNR of a fit's validation photographs, at the size of its sweep.
 
     Attributes:
         gaussians: PSNR of the Gaussians' pictures [dB].
         memory: of the memory's own colours, and the Gaussians' where it knows nothing [dB].
         photographs: how many they are.
 
-    >>> Verdict(20.0, 20.1, 5).fit_is_used, str(Verdict(18.0, 20.0, 5))
-    (True, "the memory's own (photographs left out: 20.00 dB, Gaussians 18.00 dB)")
+    >>> FitValidation(20.0, 20.1, 5).fit_is_used, str(FitValidation(18.0, 20.0, 5))
+    (True, "the memory's own (validation photographs: 20.00 dB, Gaussians 18.00 dB)")
     """
 
     gaussians: float
@@ -45,22 +45,24 @@ class Verdict:
     @property
     def fit_is_used(self) -> bool:
         """Whether the Gaussians are not clearly worse."""
-        return self.memory <= self.gaussians + CLEARLY / self.photographs
+        return self.memory <= self.gaussians + MARGIN / self.photographs
 
     def __str__(self) -> str:
         if self.fit_is_used:
             return (
-                f"Gaussians (photographs left out: {self.gaussians:.2f} dB, the memory's own "
+                f"Gaussians (validation photographs: {self.gaussians:.2f} dB, the memory's own "
                 f"colours {self.memory:.2f} dB)"
             )
         return (
-            f"the memory's own (photographs left out: {self.memory:.2f} dB, Gaussians "
+            f"the memory's own (validation photographs: {self.memory:.2f} dB, Gaussians "
             f"{self.gaussians:.2f} dB)"
         )
 
 
-def verdict(predicted: Mapping[str, Picture], plan: Plan, sweep: Sweep) -> Verdict | None:
-    """Judge a fit by its validation photographs; None where the memory shows nothing of them.
+def validate_fit(
+    predicted: Mapping[str, Picture], plan: Plan, sweep: Sweep
+) -> FitValidation | None:
+    """Predict the validation photographs both ways; None where the memory shows nothing of them.
 
     Args:
         predicted: pictures of them before they joined the fit, by view.
@@ -103,7 +105,7 @@ def verdict(predicted: Mapping[str, Picture], plan: Plan, sweep: Sweep) -> Verdi
     if not known:
         return None
     gaussians, own_colors = -10 * np.log10(np.maximum(squares / pixels, 1e-10))
-    return Verdict(float(gaussians), float(own_colors), len(predicted))
+    return FitValidation(float(gaussians), float(own_colors), len(predicted))
 
 
 def _averaged(rgb: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
