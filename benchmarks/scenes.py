@@ -161,9 +161,9 @@ def _run(case: Case, project: Path, clock: str, out: Path) -> dict[str, Any]:
     elif budget:
         # What the rest of a run takes, about: views with recorded depth have their poses refined.
         views, recorded = len(_selected(project, case.context)), _has_depth(project)
-        rest = 6.0 + 0.9 * views if recorded else 10.0 + 0.2 * views
-        # A fit keeps 1.75 cores busy.
-        command += ["--refine", f"{max(budget - rest, 5.0) / 1.75:g}"]
+        rest = 4.0 + 0.8 * views if recorded else 8.0 + 0.17 * views
+        # A fit keeps 1.65 cores busy.
+        command += ["--refine", f"{max(budget - rest, 5.0) / 1.65:g}"]
     seconds = _seconds(command)
     figures = json.loads((out / "metrics.json").read_text())
     appearance = out / "round_000" / "appearance.npz"

@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from skimage.filters import gaussian
 
 Float32 = NDArray[np.float32]
 
@@ -86,6 +86,9 @@ def best_blend(
 
 def _difference(shown: Float32, memory: Float32, where: NDArray[np.bool_]) -> Float32:
     """(H, W) greatest difference of the blurred colours over the pixels ``where``."""
-    known = where.astype(np.float32)
-    change = gaussian(np.where(where[..., None], memory - shown, 0), BLUR, channel_axis=2)
-    return np.abs(change).max(axis=2) / np.maximum(gaussian(known, BLUR), np.float32(1e-3))
+    change = np.dstack([memory - shown, np.ones_like(where, np.float32)])
+    change[~where] = 0
+    blurred = cv2.GaussianBlur(change, (0, 0), BLUR, borderType=cv2.BORDER_REPLICATE)
+    red, green, blue, known = np.abs(blurred).transpose(2, 0, 1)
+    most = np.maximum(np.maximum(red, green), blue)
+    return np.asarray(most / np.maximum(known, np.float32(1e-3)))

@@ -25,7 +25,7 @@ from gvtools.appearance.free_space import floaters, free_depth
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.growth import Population
 from gvtools.appearance.picture import Picture
-from gvtools.appearance.pose_check import prediction_error
+from gvtools.appearance.pose_check import compared, prediction_error
 from gvtools.appearance.sample import Sample
 from gvtools.appearance.smooth_depth import add_bending
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH, VALUES
@@ -58,8 +58,9 @@ REST, REST_BEGINS = 0.1, 0.75
 # VALIDATION_ENDS (progress), so that they tell how well the others predict them.
 VALIDATION_EVERY, VALIDATION_ENDS, MOST_VALIDATION = 8, 0.75, 5
 # At these parts of the progress, all at the full size, a fit for a time asks whether validation
-# photographs gained LEAST_STAGE_GAIN [dB] since the last time.
-GAIN_CHECKS, LEAST_STAGE_GAIN = (0.6, 0.65, 0.7), 0.025
+# photographs gained LEAST_STAGE_GAIN [dB] since the last time. Before it made the share GAINS_UNTIL
+# of the steps to convergence it gains, whatever a few photographs say.
+GAIN_CHECKS, LEAST_STAGE_GAIN, GAINS_UNTIL = (0.6, 0.65, 0.7), 0.025, 0.25
 # Dropout: without recorded depth, each step ignores a random share of the Gaussians, progress times
 # LEFT_OUT / number of photographs, at most MOST_LEFT_OUT. Otherwise Gaussians behind others would
 # get no gradient from few viewing directions. After "DropGaussian" (Park et al. 2025).
@@ -155,6 +156,7 @@ class Fit:
         self._grown = (0, begin)
         self._order: list[int] = []
         self._reduced: dict[int, ReducedView] = {}
+        self._compared: list[ReducedView] | None = None
         self._factor = 0
         self._errors: list[float] = []
         # PSNR of one validation photograph for each call of ``validation_psnr``.
@@ -255,8 +257,9 @@ class Fit:
 
     def _gains(self) -> bool:
         """Whether validation photographs gained since the last call."""
-        before = self._last_psnr
-        rows = self._validation
+        if self.steps < GAINS_UNTIL * self.converged_after:
+            return True
+        before, rows = self._last_psnr, self._validation
         self._last_psnr = self.psnr_of({r: self._picture(r, self.cameras.given[r]) for r in rows})
         # What cannot be measured is no reason to end.
         return not self._last_psnr < before + LEAST_STAGE_GAIN
@@ -332,8 +335,10 @@ class Fit:
     def _check_poses(self) -> None:
         """Restore the given poses unless refined ones predict neighbouring photographs better."""
         if self.cameras.with_poses:
-            before = prediction_error(self.views, self.cameras.given)
-            after = prediction_error(self.views, self.cameras.poses())
+            if self._compared is None:
+                self._compared = compared(self.views)
+            before = prediction_error(self._compared, self.cameras.given)
+            after = prediction_error(self._compared, self.cameras.poses())
             if not after < before * (1 - LEAST_BETTER):
                 self.cameras.give_back()
 

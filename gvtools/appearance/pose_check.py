@@ -19,8 +19,13 @@ SMALLER, NEIGHBOURS, PIXELS = 2, 2, 4
 FEWEST = 25
 
 
+def compared(views: Sequence[FitView]) -> list[ReducedView]:
+    """Views as ``prediction_error`` compares them: smaller, without their noise."""
+    return [_blurred(reduced(view, SMALLER)) for view in views]
+
+
 def prediction_error(
-    views: Sequence[FitView],
+    small: Sequence[ReducedView],
     poses: NDArray[np.float64],
     *,
     at: NDArray[np.float64] | None = None,
@@ -31,12 +36,11 @@ def prediction_error(
     median passes over. NaN where no pair overlaps.
 
     Args:
-        views: at least two, with depth.
+        small: at least two, with depth; see ``compared``.
         poses: (V, 4, 4) of the cameras, in the frame of the views.
         at: (V, 4, 4) where each camera is when it is compared with the others; None: at its pose.
     """
     at = poses if at is None else at
-    small = [_blurred(reduced(view, SMALLER)) for view in views]
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     depths = np.concatenate([view.depth.ravel() for view in small if view.depth is not None])
     known = depths[depths > 0]
@@ -50,7 +54,7 @@ def prediction_error(
             - poses[:, 2, :3] @ poses[row, 2, :3]
         )
         apart[row] = np.inf
-        for other in np.argsort(apart, kind="stable")[: min(NEIGHBOURS, len(views) - 1)]:
+        for other in np.argsort(apart, kind="stable")[: min(NEIGHBOURS, len(small) - 1)]:
             y, x = (each[::PIXELS] for each in np.nonzero((view.depth > 0) & (view.weight > 0.5)))
             rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))]).T @ np.linalg.inv(view.K).T
             points = rays * view.depth[y, x, None]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.camera_corrections import LEAST_BETTER, mean_near, moved
 from gvtools.appearance.fit_views import FitView
-from gvtools.appearance.pose_check import prediction_error
+from gvtools.appearance.pose_check import compared, prediction_error
 from gvtools.appearance.pose_graph import agreeing_poses
 
 
@@ -68,7 +68,8 @@ def refined_poses(views: Sequence[FitView]) -> RefinedPoses | None:
     if len(views) < 2:
         return None
     poses = agreeing_poses(views)
-    before, after = prediction_error(views, given), prediction_error(views, poses)
+    small = compared(views)
+    before, after = prediction_error(small, given), prediction_error(small, poses)
     if not after < before * (1 - LEAST_BETTER):
         return None
     depth = np.concatenate([view.depth[::8, ::8].ravel() for view in views])  # type: ignore[index]
@@ -81,7 +82,7 @@ def refined_poses(views: Sequence[FitView]) -> RefinedPoses | None:
         moved(pose, mean_near(pose, given, motions, depth=typical, but=[row]))
         for row, pose in enumerate(given)
     ]
-    near = prediction_error(views, poses, at=np.stack(alike))
-    away = prediction_error(views, poses, at=given)
+    near = prediction_error(small, poses, at=np.stack(alike))
+    away = prediction_error(small, poses, at=given)
     spread = near < away * (1 - LEAST_BETTER)
     return RefinedPoses(given, poses, typical, spread=spread, errors=(before, after))

@@ -75,7 +75,7 @@ def write_context_depth(
     with replaced_when_written(path.with_suffix(".png")) as temporary:
         write_png(temporary, picture)
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(
+        np.savez(
             file,
             depth=depth_map.depth,
             confidence=depth_map.confidence,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 ROUND_TRIP_TOLERANCE = 0.05
 # Of a side of a picture; its border is walked where a lens is undistorted.
 MOST_PIXELS = 200_000
+# Cameras whose positions in the recorded picture are kept, six bytes a pixel.
+KEPT = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,16 +76,12 @@ class Undistortion:
 
     def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(h, w, 3) uint8 recorded picture as (H, W, 3) uint8 of the pinhole camera, bilinear."""
-        import pycolmap
+        import cv2
 
         if self.untouched:
             return rgb
-        bitmap, _ = pycolmap.undistort_image(
-            pycolmap.UndistortCameraOptions(),
-            pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)),
-            self.source,
-        )
-        return np.asarray(bitmap.to_array(), np.uint8)
+        # Twenty times as fast as pycolmap's own, whose colours differ by one level at most.
+        return np.asarray(cv2.remap(rgb, *_positions(self), cv2.INTER_LINEAR), np.uint8)
 
     def nearest(self, array: NDArray[Any]) -> NDArray[Any]:
         """(h, w) recorded values as (H, W) of the pinhole camera, by nearest pixel.
@@ -120,17 +118,30 @@ class Undistortion:
     @cached_property
     def _source_pixel(self) -> NDArray[np.int32]:
         """(H, W) int32, the flat index of the recorded pixel seen by each pixel; -1 for none."""
+        source = self.source_positions()
+        w, h = self.source_size
+        with np.errstate(invalid="ignore"):
+            inside = np.all((source >= 0) & (source < (w, h)), axis=2)
+        pixel = np.floor(np.where(inside[..., np.newaxis], source, 0)).astype(np.int32)
+        return np.where(inside, pixel[..., 1] * w + pixel[..., 0], -1)
+
+    def source_positions(self) -> NDArray[np.float64]:
+        """(H, W, 2) where the centre of each pixel is in the recorded picture, pixels."""
         width, height = self.size
         y, x = np.mgrid[:height, :width] + 0.5
         ray = np.ones((width * height, 3))
         ray[:, 0] = ((x - self.K[0, 2]) / self.K[0, 0]).ravel()
         ray[:, 1] = ((y - self.K[1, 2]) / self.K[1, 1]).ravel()
-        source = np.asarray(self.source.img_from_cam(ray))
-        w, h = self.source_size
-        with np.errstate(invalid="ignore"):
-            inside = np.all((source >= 0) & (source < (w, h)), axis=1)
-        pixel = np.floor(np.where(inside[:, np.newaxis], source, 0)).astype(np.int32)
-        return np.where(inside, pixel[:, 1] * w + pixel[:, 0], -1).reshape(height, width)
+        return np.asarray(self.source.img_from_cam(ray)).reshape(height, width, 2)
+
+
+@lru_cache(maxsize=KEPT)
+def _positions(lens: Undistortion) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Where the pixels are in the recorded picture, as OpenCV wants it: in fixed point."""
+    import cv2
+
+    at = np.nan_to_num(lens.source_positions() - 0.5, nan=-1e4).astype(np.float32)
+    return cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)
 
 
 def undistortion(

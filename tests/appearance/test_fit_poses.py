@@ -11,7 +11,7 @@ from splat_scene import photographs, picture, pose, pose_errors, rough_gaussians
 from gvtools.appearance.camera_corrections import CameraCorrections, moved
 from gvtools.appearance.fit import VALIDATION_ENDS, Fit, validation_rows
 from gvtools.appearance.fit_options import FitOptions
-from gvtools.appearance.pose_check import prediction_error
+from gvtools.appearance.pose_check import compared, prediction_error
 from gvtools.appearance.start import from_depth
 from gvtools.memory.store.local_frame import LocalFrame
 
@@ -111,7 +111,8 @@ def test_neighbours_corrections_are_taken_only_if_validation_gains(views, truth,
 def test_true_poses_predict_neighbours_better_than_wrong_ones(views, truth):
     rng = np.random.default_rng(0)
     wrong = np.stack([moved(each, rng.normal(0, 0.02, 6)) for each in truth])
-    assert prediction_error(views, truth) < 0.7 * prediction_error(views, wrong)
+    small = compared(views)
+    assert prediction_error(small, truth) < 0.7 * prediction_error(small, wrong)
 
 
 def test_views_that_do_not_overlap_predict_nothing(views):
@@ -119,8 +120,8 @@ def test_views_that_do_not_overlap_predict_nothing(views):
     away[1, :3, 3] = [-900, 0, 0]
     away[2, :3, 3] = [900, 0, 0]
     back_to_back = np.stack([pose(0.0), np.diag([-1.0, 1.0, -1.0, 1.0])])
-    assert np.isnan(prediction_error(views[:2], back_to_back))
-    assert np.isnan(prediction_error(views[:3], away))
+    assert np.isnan(prediction_error(compared(views[:2]), back_to_back))
+    assert np.isnan(prediction_error(compared(views[:3]), away))
 
 
 def test_corrections_have_mean_zero_and_a_limit(truth):

@@ -1,7 +1,9 @@
 # mypy: no-check-untyped-defs
 from __future__ import annotations
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
 from scenes_workspace import HEIGHT, LENSES, WIDTH, ramp
 
@@ -74,3 +76,13 @@ def test_impossible_cameras(model, params, size, told):
         undistortion(model, params, size, what="camera 7")
     assert str(error.value).startswith("camera 7: ")
     assert "\n" not in str(error.value)
+
+
+def test_colours_are_those_of_pycolmap():
+    lens = undistortion("OPENCV", (80, 80, 48, 32, -0.2, 0.05, 0.01, 0.0), (96, 64), what="test")
+    noise = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
+    picture = cv2.GaussianBlur(noise, (0, 0), 1.0)
+    options = pycolmap.UndistortCameraOptions()
+    bitmap, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(picture), lens.source)
+    apart = np.abs(lens.image(picture).astype(int) - bitmap.to_array())[lens._source_pixel >= 0]
+    assert np.quantile(apart, 0.99) <= 1
