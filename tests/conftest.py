@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,22 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         gpu = pytest.mark.skip(reason="needs a CUDA device; torch sees none")
         for item in gpu_items:
             item.add_marker(gpu)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Garbage is sought in what tests make, not in the million objects that imports have made.
+
+    To look through those costs seconds while files are collected, and then the better part of a
+    second every few dozen tests; what tests import themselves is why it is done less often, too.
+    """
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.set_threshold(10_000, 10, 10)
+        gc.enable()
 
 
 def _cuda() -> bool:

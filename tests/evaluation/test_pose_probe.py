@@ -104,14 +104,12 @@ def test_unrelated_pictures_fail_and_say_why(probe: PoseProbe, take: Take) -> No
         assert found.rotation_error_deg is None and found.residual is None
 
 
-def test_a_picture_that_two_poses_explain_is_ambiguous(
-    context: list[PosedPicture], take: Take
-) -> None:
+def test_a_picture_that_two_poses_explain_is_ambiguous(probe: PoseProbe, take: Take) -> None:
     # Left half from one place, right half from another: each half has its own pose.
     camera, other = camera_at((-0.3, 0.0, 0.2)), camera_at((0.4, 0.0, 0.2), turn=(0, 0, 30))
     rgb = take(camera).rgb.copy()
     rgb[:, WIDTH // 2 :] = take(other).rgb[:, WIDTH // 2 :]
-    found = PoseProbe(context).locate(PosedPicture("torn", camera, rgb))
+    found = probe.locate(PosedPicture("torn", camera, rgb))
     assert found.status.startswith("failed: ambiguous"), found
     assert found.rival >= 0.5 * found.inliers
 
