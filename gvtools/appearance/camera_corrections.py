@@ -167,6 +167,12 @@ def moved(pose: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.
     return Se3.exp(torch.from_numpy(motion)[None]).matrix()[0].detach().numpy() @ pose
 
 
+def motions_between(given: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(V, 6) shift and turn from poses (V, 4, 4) to others, on the camera's side."""
+    change = torch.from_numpy(poses @ np.linalg.inv(given))
+    return np.asarray(Se3.from_matrix(change).log().detach())
+
+
 def _adam(moments: NDArray, gradient: NDArray, step: int) -> NDArray[np.float64]:
     """The direction of a step of Adam; ``moments`` (2, ...) are updated."""
     moments[0] += 0.1 * (gradient - moments[0])

@@ -109,7 +109,7 @@ def find_cameras(
     """
     import pycolmap
 
-    with _quiet():
+    with quiet():
         pycolmap.set_random_seed(SEED)
         say(f"finding features in {sum(map(len, cameras))} pictures")
         database, matching = match_pictures(
@@ -190,7 +190,7 @@ def _map(
     settings.random_seed = SEED
     if not refine:
         settings.mapper.refine_sensor_from_rig = False
-        _fix_cameras(settings.mapper.bundle_adjustment)
+        fix_cameras(settings.mapper.bundle_adjustment)
     best = None
     models = _models(
         pycolmap.global_mapping, database, images, out=work / "global", options=settings,
@@ -292,7 +292,7 @@ def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     if not refine:
-        _fix_cameras(options)
+        fix_cameras(options)
     _adjust(model, options)
     images = [image for image in model.images.values() if image.has_pose]
     counts = [sum(image.camera_id == camera for image in images) for camera in model.cameras]
@@ -303,7 +303,7 @@ def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
     model.update_point_3d_errors()
 
 
-def _fix_cameras(options: pycolmap.BundleAdjustmentOptions) -> None:
+def fix_cameras(options: pycolmap.BundleAdjustmentOptions) -> None:
     """Hold intrinsics, and the relative poses of a rig's cameras, fixed."""
     options.refine_focal_length = False
     options.refine_extra_params = False
@@ -323,7 +323,7 @@ def _adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOp
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keep COLMAP's log off the terminal; what fails is raised or reported by the caller."""
     import pycolmap
 

@@ -75,7 +75,7 @@ def match_pictures(
         if group[0] in given:
             reader.camera_model, reader.camera_params = given[group[0]]
         if learned is None:
-            _extract(database, images, group, masks=masks, reader=reader)
+            extract(database, images, group, masks=masks, reader=reader)
         else:
             pycolmap.import_images(
                 database, images, pycolmap.CameraMode.SINGLE, image_names=list(group),
@@ -101,23 +101,39 @@ def match_pictures(
         chosen = [(a, b) for a, b in chosen if frame[a] != frame[b]]
     say(f"matching {len(chosen)} pairs")
     learned_matching.write_matches(database, features, chosen, matcher=learned, say=say)
-    pycolmap.verify_matches(database, _listed(chosen, work), _verification())
+    pycolmap.verify_matches(database, listed(chosen, work), verification())
     return database, how
 
 
-def _extract(
+def extract(
     database: Path,
     images: Path,
     names: Sequence[str],
     *,
     masks: Path | None,
     reader: pycolmap.ImageReaderOptions,
+    side: int = MAX_SIDE,
+    features: int = MAX_FEATURES,
+    first_octave: int = -1,
 ) -> None:
+    """Find SIFT features of some pictures.
+
+    Args:
+        database: where they go.
+        images: folder of the pictures.
+        names: in it.
+        masks: folder of masks, black where no feature may be.
+        reader: COLMAP's options of cameras.
+        side: longer side that pictures are reduced to before, pixels.
+        features: at most so many of a picture.
+        first_octave: -1 doubles pictures before; 0 takes a quarter of the time.
+    """
     import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = MAX_SIDE
-    options.sift.max_num_features = MAX_FEATURES
+    options.max_image_size = side
+    options.sift.max_num_features = features
+    options.sift.first_octave = first_octave
     if masks is not None:
         reader.mask_path = masks
     pycolmap.extract_features(
@@ -141,16 +157,16 @@ def _match(
     if count <= EXHAUSTIVE:
         say(f"matching all {count * (count - 1) // 2} pairs")
         pycolmap.match_exhaustive(
-            database, matching_options=options, verification_options=_verification()
+            database, matching_options=options, verification_options=verification()
         )
         return "all pairs"
     pairs, how = _chosen(sift_descriptors(database), EXHAUSTIVE, in_order=in_order)
     say(f"matching {len(pairs)} pairs")
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = _listed(pairs, work)
+    pairing.match_list_path = listed(pairs, work)
     pycolmap.match_image_pairs(
         database, matching_options=options, pairing_options=pairing,
-        verification_options=_verification(),
+        verification_options=verification(),
     )  # fmt: skip
     return how
 
@@ -182,14 +198,15 @@ def _chosen(
     return sorted(pairs), how
 
 
-def _listed(pairs: Sequence[tuple[str, str]], work: Path) -> Path:
+def listed(pairs: Sequence[tuple[str, str]], work: Path) -> Path:
     """A file with the pairs, as COLMAP reads them."""
     file = work / "pairs.txt"
     file.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
     return file
 
 
-def _verification() -> pycolmap.TwoViewGeometryOptions:
+def verification() -> pycolmap.TwoViewGeometryOptions:
+    """COLMAP's options of verifying matches, the same every time."""
     import pycolmap
 
     options = pycolmap.TwoViewGeometryOptions()

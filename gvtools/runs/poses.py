@@ -25,10 +25,12 @@ class RunPoses:
     Attributes:
         context: (C, 4, 4) cam_from_world, in the order of the run's context.
         targets: (V, 4, 4) of the targets.
+        by_features: whether features told them, to a fraction of a pixel.
     """
 
     context: NDArray[np.float64]
     targets: NDArray[np.float64]
+    by_features: bool = False
 
     def save(self, path: Path) -> None:
         """Write them into one file."""
@@ -38,7 +40,11 @@ class RunPoses:
     @property
     def arrays(self) -> dict[str, Any]:
         """As ``load`` finds them in a file, which may hold more."""
-        return {"context_poses": self.context, "target_poses": self.targets}
+        return {
+            "context_poses": self.context,
+            "target_poses": self.targets,
+            "poses_by_features": self.by_features,
+        }
 
     @classmethod
     def load(cls, path: Path) -> RunPoses | None:
@@ -51,7 +57,10 @@ class RunPoses:
             data = load_arrays(path)
             if "context_poses" not in data:
                 return None
-            poses = cls(*(_rigid(data[name], name) for name in ("context_poses", "target_poses")))
+            context, targets = (
+                _rigid(data[name], name) for name in ("context_poses", "target_poses")
+            )
+            poses = cls(context, targets, bool(data.get("poses_by_features", False)))
         except (*UNREADABLE, ShapeError) as error:
             raise MemoryFileError(
                 f"{path}: expected refined poses; found none: {error}; start the run again with "

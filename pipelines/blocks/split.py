@@ -107,7 +107,8 @@ def _posed(
         return None
     # ``refined`` needs a target; without any, the first view stands in, and its result is not used.
     targets = scene.subset(others or names[:1]).cameras
-    found = poses.refined(reduced(scene, max_side), names, targets, say=say)
+    recorded = all(scene[name].has_depth for name in names)
+    found = poses.refined(reduced(scene, max_side), names, targets, recorded=recorded, say=say)
     if found is None:
         return None
     moved = with_poses(scene, names, found.context)

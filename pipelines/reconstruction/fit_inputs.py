@@ -150,6 +150,8 @@ class Sweep:
         self.scene = reduced(plan.scene, side)
         stereo = plan.config.stereo
         options = stereo.replaced(max_side=min(stereo.max_side, side))
+        if plan.poses is not None and plan.poses.by_features:
+            options = options.replaced(align=False)
         self._source = PlaneSweepStereo(self.scene, options=options, views=plan.context)
         self._names, self._kept = frozenset(names), dict[str, DepthMap]()
 

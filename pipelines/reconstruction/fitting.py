@@ -23,7 +23,7 @@ from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend, best_blend
 from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit import CONTINUED, Fit
-from gvtools.appearance.fit_options import converged_steps
+from gvtools.appearance.fit_options import FitOptions, converged_steps
 from gvtools.appearance.fits import LEAST_SHARE, MOST_FITS, run_fits
 from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
@@ -243,7 +243,7 @@ def _new_fit(
 ) -> Fit | None:
     """A new fit; after an earlier one, at its poses and with another random seed."""
     frame = grid_frame(plan.scene, plan.context)
-    options, seed = plan.config.refine, plan.config.seed
+    options, seed = _options(plan), plan.config.seed
     if earlier is not None:
         if len(earlier.appearance.fits) >= MOST_FITS:
             raise OptionError(
@@ -265,6 +265,13 @@ def _new_fit(
     )  # fmt: skip
 
 
+def _options(plan: Plan) -> FitOptions:
+    """Options of a fit, which leaves poses that features told."""
+    by_features = plan.poses is not None and plan.poses.by_features
+    options = plan.config.refine
+    return options.replaced(poses=options.poses and not by_features)
+
+
 def _converged(plan: Plan, earlier: Fitted) -> bool:
     """Whether an earlier fit has converged: further steps would gain less than another fit."""
     needed = converged_steps(len(plan.context), recorded=_recorded(plan))
@@ -275,7 +282,7 @@ def _continued_fit(plan: Plan, earlier: Fitted, console: Console, *, sweep: Swee
     start = earlier.appearance.gaussians
     views, seed = fit_views(plan, start.frame, console, sweep=sweep), plan.config.seed
     fit = Fit(
-        start, views, options=plan.config.refine, seed=seed, begin=CONTINUED,
+        start, views, options=_options(plan), seed=seed, begin=CONTINUED,
         surface=earlier.appearance.surface, splatter=splatter_on(plan.config.device),
     )  # fmt: skip
     fit.cameras.spread = earlier.spread

@@ -148,13 +148,22 @@ def make_plan(
     chosen = choose_source(
         scene, context, config.depth, stereo=config.stereo, foundation=config.da3
     )
+    recorded = (
+        scene.kind != "colmap"
+        and isinstance(chosen.source, RecordedDepth)
+        and all(scene[name].has_depth for name in context)
+    )
     found = None
     if round_0 is not None:
         found = poses.saved(round_0, context, targets.cameras)
-    elif (
-        config.refine.poses and scene.kind != "colmap" and isinstance(chosen.source, RecordedDepth)
-    ):
-        found = poses.refined(scene, context, targets.cameras, say=say)
+    elif config.refine.poses:
+        found = poses.refined(scene, context, targets.cameras, recorded=recorded, say=say)
+    if found is not None and found.by_features and not recorded:
+        # Depth is computed at the poses that the memory is built with.
+        chosen = choose_source(
+            with_poses(scene, context, found.context), context, config.depth,
+            stereo=config.stereo.replaced(align=False), foundation=config.da3,
+        )  # fmt: skip
     if config.voxel is None:
         posed = scene if found is None else with_poses(scene, context, found.context)
         config = _with_voxel(config, posed, context, source=chosen.source, say=say)

@@ -1,4 +1,4 @@
-"""Before everything else: the poses of RGB-D views, which come from a tracker, are refined."""
+"""Refinement of a run's poses, before everything else: those of trackers err by pixels."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from gvtools.appearance.fit_views import FitView
 from gvtools.runs.layout import POSES
 from gvtools.runs.poses import RunPoses, posed, with_poses
+from gvtools.scenes.reduced import reduced
 from pipelines.reconstruction.prefetch import prefetch
 from pipelines.reconstruction.voxel_edge import grid_frame
 
@@ -33,30 +34,42 @@ def refined(
     context: Sequence[str],
     targets: Cameras,
     *,
+    recorded: bool = True,
     say: Callable[[str], None] | None = None,
 ) -> RunPoses | None:
     """Poses on which the context agrees; None where the given ones stay.
 
     Args:
         scene: the project.
-        context: names of its views; only where all have recorded depth are they refined.
+        context: names of its views.
         targets: move like the context near them, if that errs alike.
+        recorded: whether depth is recorded: it tells the scale, and poses where features do not.
         say: is told what was found.
     """
-    views = [scene[name] for name in context]
-    if not all(view.has_depth for view in views):
-        return None
     from gvtools.appearance.refined_poses import refined_poses
+    from gvtools.capture.pose_adjustment import SIDE, adjusted_poses, tracks_of
 
+    scene = reduced(scene, SIDE)
     # Lengths stay small there, also in a world whose origin is far away.
     frame = grid_frame(scene, context)
-    given = frame.cam_from_local(scene.subset(context).cameras.cam_from_world)
-    frames = prefetch(lambda view: view.load(), views)
-    result = refined_poses([
-        FitView(loaded.rgb, view.camera.K[0], pose, loaded.mask, loaded.depth)
-        for view, pose, loaded in zip(views, given, frames, strict=True)
-    ])  # fmt: skip
-    if say is not None:
+    views = [scene[name] for name in context]
+    given = scene.subset(context).cameras
+    given = posed(given, frame.cam_from_local(given.cam_from_world))
+    tracks = tracks_of(scene, context, frame)
+    if not recorded and tracks is not None and tracks.exact(given):
+        return None
+    frames = list(prefetch(lambda view: view.load(), views))
+    adjusted = adjusted_poses(frames, given, tracks=tracks)
+    if recorded:
+        fitted = [
+            FitView(loaded.rgb, view.camera.K[0], pose, loaded.mask, loaded.depth)
+            for view, pose, loaded in zip(views, given.cam_from_world, frames, strict=True)
+        ]
+        poses = None if adjusted is None else adjusted.scaled(frames, given)
+        result = (None if poses is None else refined_poses(fitted, poses)) or refined_poses(fitted)
+    else:
+        result = None if adjusted is None else adjusted.refined(given)
+    if say is not None and (recorded or result is not None):
         same = "as given; no others agree better with neighbouring views"
         say(f"poses: {same if result is None else result}")
     if result is None:
@@ -65,6 +78,7 @@ def refined(
     return RunPoses(
         frame.cam_from_world(result.poses),
         frame.cam_from_world(np.array(moved).reshape(-1, 4, 4)),
+        result.by_features,
     )
 
 

@@ -15,6 +15,7 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import LOGIT
 from gvtools.cameras import Cameras
 from gvtools.depth.fitted_depth import LEAST_CONFIDENCE, OPAQUE, FittedDepth
+from gvtools.depth.source import DepthMap
 from gvtools.guidance import Guidance
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.scenes.scene import Frame
@@ -109,3 +110,57 @@ def test_fitted_depth_is_what_opaque_gaussians_show_trusted_by_the_look(solid):
     expected = np.maximum(np.exp(-np.square(off / 0.12)), LEAST_CONFIDENCE)
     np.testing.assert_allclose(found.confidence[:, :10], expected, rtol=1e-5)
     assert found.confidence[:, :10].min() == np.float32(LEAST_CONFIDENCE)
+
+
+SHAPE = (int(CAMERA.height[0]), int(CAMERA.width[0]))
+
+
+class _Maps:
+    """Depth maps of views, by name."""
+
+    name = "maps"
+
+    def __init__(self, maps):
+        self.maps = maps
+
+    def covers(self, view):
+        return view.name in self.maps
+
+    def depth(self, scene, view, frame):
+        depth = np.full(SHAPE, self.maps[view.name], np.float32)
+        return DepthMap(depth, np.ones_like(depth), self.name)
+
+
+@pytest.mark.parametrize(
+    ("maps", "confidence"),
+    [
+        ({}, 0.35),
+        ({"one": WALL}, 0.82),
+        ({"one": 1.5 * WALL}, 0.25),
+        ({"one": WALL, "two": WALL, "three": WALL}, 0.93),
+        ({"two": WALL, "three": 1.5 * WALL}, 0.82),
+    ],
+)
+def test_confidence_is_by_the_depth_maps_that_agree(solid, maps, confidence):
+    rgb = np.zeros((*SHAPE, 3), np.uint8)
+    views = [SimpleNamespace(name=name, camera=CAMERA, load=lambda: Frame(rgb, None, None))
+             for name in ("one", "two", "three")]  # fmt: skip
+    cameras = Cameras(
+        np.repeat(CAMERA.K, 3, axis=0), np.repeat(CAMERA.cam_from_world, 3, axis=0),
+        *(np.repeat(size, 3) for size in (CAMERA.width, CAMERA.height)), ("one", "two", "three"),
+    )  # fmt: skip
+    scene: Any = SimpleNamespace(
+        views=views,
+        subset=lambda names: SimpleNamespace(
+            cameras=cameras[[cameras.names.index(name) for name in names]]
+        ),
+    )
+    appearance = Appearance(solid, 0.05)
+    found = FittedDepth(appearance, _Maps(maps)).depth(scene, views[0], views[0].load())
+    plain = appearance.depth(CAMERA)
+    middle = np.abs(plain / WALL - 1) < 0.01
+    middle &= appearance.picture(CAMERA).alpha > OPAQUE
+    assert middle.mean() > 0.05
+    known = found.confidence[middle]
+    assert np.isclose(known, confidence, atol=1e-4).mean() > 0.6
+    np.testing.assert_allclose(found.depth[middle], WALL, rtol=0.011)

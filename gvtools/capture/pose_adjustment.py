@@ -1,0 +1,383 @@
+"""Bundle adjustment of poses that are given: by SIFT of neighbouring pictures, or by known tracks.
+
+Poses of a phone's or a sensor's tracker miss what pictures show by several pixels, which blurs all
+that is made of them. Features tell poses to a fraction of a pixel; intrinsics stay as they are.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.appearance.camera_corrections import mean_near, motions_between, moved
+from gvtools.appearance.refined_poses import RefinedPoses
+from gvtools.cameras import Cameras
+from gvtools.capture.mapping import fix_cameras, quiet
+from gvtools.capture.matching import SEED, extract, listed, verification
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.scenes.scene import Frame, Scene
+from gvtools.similarity import align_poses
+from gvtools.view_selection import nearest_views
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Float64 = NDArray[np.float64]
+
+# More pictures take minutes.
+MOST_VIEWS = 150
+# Features of a picture, the longer side at which they are found [px], and neighbours that each
+# picture is matched with.
+FEATURES, SIDE, NEIGHBOURS = 2048, 640, 8
+# Reprojection errors up to which points stay, round by round [px].
+ROUNDS = (12.0, 8.0, 4.0)
+# A view that sees fewer points moves like its neighbours; with fewer points nothing is told.
+LEAST_SEEN, LEAST_POINTS = 20, 100
+# Tracks that miss by less, in the median, are those of poses that were adjusted to them [px].
+EXACT = 1.0
+# More known points than this tell no more; those of the longest tracks count.
+MOST_POINTS = 20_000
+# Poses are taken where they lower the median error to this share, and are rounded to so many
+# digits, so that they are the same every time.
+BETTER, DIGITS = 0.7, 9
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Points and where pictures show them.
+
+    Attributes:
+        positions: (N, 3) in the world of the cameras.
+        point: (M,) the point of each detection.
+        view: (M,) its camera.
+        xy: (M, 2) where it is [px].
+    """
+
+    positions: Float64
+    point: NDArray[np.int64]
+    view: NDArray[np.int64]
+    xy: Float64
+
+    def misses(self, cameras: Cameras, poses: Float64) -> Float64:
+        """(M,) distances of detections from where cameras at some poses see their points [px]."""
+        local = self.depths(poses, whole=True)
+        seen = np.einsum("mij,mj->mi", cameras.K[self.view], local)
+        ahead = local[:, 2] > 0
+        xy = seen[:, :2] / np.where(ahead, local[:, 2], 1)[:, None]
+        return np.where(ahead, np.linalg.norm(xy - self.xy, axis=1), np.inf)
+
+    def depths(self, poses: Float64, *, whole: bool = False) -> Float64:
+        """(M,) z-depth of each detection's point, or (M, 3) the ``whole`` point in the camera."""
+        pose = poses[self.view]
+        local = np.einsum("mij,mj->mi", pose[:, :3, :3], self.positions[self.point])
+        local += pose[:, :3, 3]
+        return local if whole else local[:, 2]
+
+    def exact(self, cameras: Cameras) -> bool:
+        """Whether poses are the best that features tell: a model was adjusted to them before."""
+        return float(np.median(self.misses(cameras, cameras.cam_from_world))) < EXACT
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedPoses:
+    """Poses on which features agree.
+
+    Attributes:
+        poses: (V, 4, 4) camera from world, together where the given ones are.
+        tracks: of the features, in that world.
+        errors: median reprojection error with the given poses and with these [px].
+    """
+
+    poses: Float64
+    tracks: Tracks
+    errors: tuple[float, float]
+
+    def scaled(self, frames: Sequence[Frame], given: Cameras) -> Float64 | None:
+        """(V, 4, 4) the poses at the scale of recorded depth; None where that tells none."""
+        z, recorded = self.tracks.depths(self.poses), np.zeros(len(self.tracks.xy))
+        for row, frame in enumerate(frames):
+            mine = self.tracks.view == row
+            x, y = self.tracks.xy[mine].astype(int).T
+            if frame.depth is not None:
+                height, width = frame.depth.shape
+                recorded[mine] = frame.depth[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+        both = (recorded > 0) & (z > 0)
+        if both.sum() < LEAST_POINTS:
+            return None
+        poses = self.poses.copy()
+        poses[:, :3, 3] *= np.median(recorded[both] / z[both])
+        return (poses @ align_poses(poses, given.cam_from_world)).round(DIGITS)
+
+    def refined(self, given: Cameras) -> RefinedPoses:
+        """With whether other cameras err like the views near them."""
+        before, depth = given.cam_from_world, float(np.median(self.tracks.depths(self.poses)))
+        found = RefinedPoses(before, self.poses, depth, False, self.errors, True, True)
+        motions = found.motions
+        alike = np.stack([
+            moved(pose, mean_near(pose, before, motions, depth=depth, but=[row]))
+            for row, pose in enumerate(before)
+        ])  # fmt: skip
+        near, away = (
+            float(np.median(self.tracks.misses(given, poses))) for poses in (alike, before)
+        )
+        return replace(found, spread=near < BETTER * away)
+
+
+def adjusted_poses(
+    frames: Sequence[Frame], cameras: Cameras, *, tracks: Tracks | None = None
+) -> AdjustedPoses | None:
+    """Adjust poses to what pictures show; None where the given ones are as good, or nothing tells.
+
+    Args:
+        frames: pixels of the views.
+        cameras: their cameras, without skew.
+        tracks: known ones, as those of a project's sparse points; None finds features.
+    """
+    if not 2 <= len(frames) <= MOST_VIEWS or cameras.K[:, 0, 1].any():
+        return None
+    with quiet():
+        if tracks is None:
+            with tempfile.TemporaryDirectory() as folder:
+                model = _triangulated(frames, cameras, Path(folder))
+        else:
+            model = _model(cameras, tracks)
+            _solve(model, ROUNDS[-1])
+        if model is None or len(model.points3D) < LEAST_POINTS:
+            return None
+        poses, found = _poses_and_tracks(model, cameras)
+        given = _model(cameras, found)
+        _solve(given, None)
+        before = _poses_and_tracks(given, cameras)[1].misses(cameras, cameras.cam_from_world)
+    after = found.misses(cameras, poses)
+    errors = float(np.median(before)), float(np.median(after))
+    if not errors[1] < BETTER * errors[0]:
+        return None
+    told = np.bincount(found.view, minlength=len(cameras)) >= LEAST_SEEN
+    if told.mean() < 0.5:
+        return None
+    return _placed(poses, found, cameras, told=told, errors=errors)
+
+
+def tracks_of(scene: Scene, names: Sequence[str], frame: LocalFrame) -> Tracks | None:
+    """The tracks of a project's sparse points in some views; None without any.
+
+    Args:
+        scene: the project.
+        names: of the views, which the tracks number in this order.
+        frame: that positions are given in.
+    """
+    points = scene.points
+    if points is None or not len(points.view_index):
+        return None
+    row = np.full(len(scene.names), -1)
+    row[[scene.names.index(name) for name in names]] = np.arange(len(names))
+    view = row[points.view_index]
+    counts = np.bincount(points.point_index[view >= 0], minlength=len(points.positions))
+    kept = np.flatnonzero(counts > 1)
+    kept = np.sort(kept[np.argsort(-counts[kept], kind="stable")[:MOST_POINTS]])
+    number = np.full(len(points.positions), -1)
+    number[kept] = np.arange(len(kept))
+    use = (view >= 0) & (number[points.point_index] >= 0)
+    if not use.any():
+        return None
+    return Tracks(
+        frame.from_world(points.positions[kept]), number[points.point_index[use]], view[use],
+        points.xy[use],
+    )  # fmt: skip
+
+
+def _placed(
+    poses: Float64, tracks: Tracks, cameras: Cameras, *, told: NDArray[np.bool_],
+    errors: tuple[float, float],
+) -> AdjustedPoses:  # fmt: skip
+    """Poses and tracks in the given world; views that too few points tell move like others."""
+    given = cameras.cam_from_world
+    spread = [float(np.std(_centers(each[told]), axis=0).sum()) for each in (given, poses)]
+    scale = spread[0] / spread[1] if spread[1] > 0 else 1.0
+    poses, positions = poses.copy(), tracks.positions * scale
+    poses[:, :3, 3] *= scale
+    place = align_poses(poses[told], given[told])
+    poses = poses @ place
+    back = np.linalg.inv(place)
+    tracks = Tracks(positions @ back[:3, :3].T + back[:3, 3], tracks.point, tracks.view, tracks.xy)
+    depth = float(np.median(tracks.depths(poses)))
+    changes = motions_between(given, poses)
+    for row in np.flatnonzero(~told):
+        change = mean_near(given[row], given[told], changes[told], depth=depth)
+        poses[row] = moved(given[row], change)
+    return AdjustedPoses(poses.round(DIGITS), tracks, errors)
+
+
+def _centers(poses: Float64) -> Float64:
+    return -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+
+
+def _triangulated(
+    frames: Sequence[Frame], cameras: Cameras, work: Path
+) -> pycolmap.Reconstruction | None:
+    """Points of the pictures' features, and poses adjusted to them; None where hardly any match."""
+    import pycolmap
+
+    images, masks, database = work / "images", work / "masks", work / "database.db"
+    images.mkdir()
+    masks.mkdir()
+    names = [f"{row:06d}.png" for row in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+        cv2.imwrite(str(images / name), frame.rgb[..., ::-1], fast)
+        mask = np.ones(frame.rgb.shape[:2], bool) if frame.mask is None else frame.mask
+        cv2.imwrite(str(masks / f"{name}.png"), mask.astype(np.uint8) * 255, fast)
+    pycolmap.Database.open(database).close()
+    for row, name in enumerate(names):
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "PINHOLE"
+        reader.camera_params = _camera(cameras, row).params_to_string()
+        mode = pycolmap.CameraMode.SINGLE
+        pycolmap.import_images(database, images, mode, image_names=[name], options=reader)
+    reader = pycolmap.ImageReaderOptions()
+    extract(
+        database, images, names, masks=masks, reader=reader, side=SIDE, features=FEATURES,
+        first_octave=0,
+    )  # fmt: skip
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = listed([(names[a], names[b]) for a, b in _pairs(cameras)], work)
+    pycolmap.match_image_pairs(
+        database, pairing_options=pairing, verification_options=verification()
+    )
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        rows = {image.name: image for image in opened.read_all_images()}
+        for row, name in enumerate(names):
+            keypoints = opened.read_keypoints(rows[name].image_id)
+            _add_view(model, cameras, row, xy=keypoints, image=rows[name])
+    options = pycolmap.IncrementalPipelineOptions()
+    options.triangulation.ignore_two_view_tracks = False
+    options.random_seed = options.triangulation.random_seed = SEED
+    for error in ROUNDS:
+        angle = max(2.0, error / 6)
+        options.triangulation.create_max_angle_error = angle
+        options.triangulation.continue_max_angle_error = angle
+        options.mapper.filter_max_reproj_error = error
+        model = pycolmap.triangulate_points(
+            model, database, images, work, clear_points=True, options=options
+        )
+        if len(model.points3D) < LEAST_POINTS:
+            return None
+        _solve(model, error)
+    return model
+
+
+def _pairs(cameras: Cameras) -> list[tuple[int, int]]:
+    """Pairs of views that stand and look alike."""
+    centers = cameras.centers
+    unit = max(float(np.median(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))), 1e-9)
+    pairs = set()
+    for row in range(len(cameras)):
+        others = [other for other in range(len(cameras)) if other != row]
+        for k in nearest_views(cameras[others], cameras[row], NEIGHBOURS, unit=unit):
+            pairs.add((min(row, others[k]), max(row, others[k])))
+    return sorted(pairs)
+
+
+def _camera(cameras: Cameras, row: int) -> pycolmap.Camera:
+    import pycolmap
+
+    K = cameras.K[row]
+    return pycolmap.Camera(
+        model="PINHOLE", width=int(cameras.width[row]), height=int(cameras.height[row]),
+        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera_id=row + 1,
+    )  # fmt: skip
+
+
+def _add_view(
+    model: pycolmap.Reconstruction,
+    cameras: Cameras,
+    row: int,
+    *,
+    xy: NDArray[np.generic],
+    image: pycolmap.Image | None = None,
+) -> None:
+    """A view with its features; its number is that of ``image``, or ``row`` + 1."""
+    import pycolmap
+
+    camera = _camera(cameras, row)
+    number = row + 1
+    if image is not None:
+        number, camera.camera_id = image.image_id, image.camera_id
+    model.add_camera_with_trivial_rig(camera)
+    view = pycolmap.Image(name=f"{row:06d}.png", camera_id=camera.camera_id, image_id=number)
+    view.points2D = pycolmap.Point2DList([pycolmap.Point2D(each[:2].astype(float)) for each in xy])
+    pose = pycolmap.Rigid3d(cameras.cam_from_world[row][:3])
+    model.add_image_with_trivial_frame(view, pose)
+
+
+def _model(cameras: Cameras, tracks: Tracks) -> pycolmap.Reconstruction:
+    """Views at their given poses, and points that at least two of them show."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    order = np.argsort(tracks.view, kind="stable")
+    number = np.empty(len(order), np.int64)
+    for row in range(len(cameras)):
+        mine = order[tracks.view[order] == row]
+        number[mine] = np.arange(len(mine))
+        _add_view(model, cameras, row, xy=tracks.xy[mine])
+    by_point = np.argsort(tracks.point, kind="stable")
+    ends = np.searchsorted(tracks.point[by_point], np.arange(len(tracks.positions) + 1))
+    for point, position in enumerate(tracks.positions):
+        rows = by_point[ends[point] : ends[point + 1]]
+        if len(rows) > 1:
+            track = pycolmap.Track()
+            for k in rows:
+                track.add_element(int(tracks.view[k]) + 1, int(number[k]))
+            model.add_point3D(position, track)
+    return model
+
+
+def _solve(model: pycolmap.Reconstruction, error: float | None) -> None:
+    """Adjust poses and points, then drop points beyond ``error`` px; None: points alone move."""
+    import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    fix_cameras(options)
+    options.refine_principal_point = False
+    options.refine_rig_from_world = error is not None
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    # In any order of threads sums differ in their last digits.
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.max_num_iterations = 30
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    if error is not None:
+        pycolmap.ObservationManager(model).filter_all_points3D(error, 0.0)
+
+
+def _poses_and_tracks(model: pycolmap.Reconstruction, cameras: Cameras) -> tuple[Float64, Tracks]:
+    poses = cameras.cam_from_world.copy()
+    rows = {}
+    for image in model.images.values():
+        row = rows[image.image_id] = int(image.name[:6])
+        poses[row, :3] = image.cam_from_world().matrix()
+    positions, point, view, xy = [], [], [], []
+    for place, number in enumerate(sorted(model.points3D)):
+        found = model.points3D[number]
+        positions.append(found.xyz)
+        for element in found.track.elements:
+            point.append(place)
+            view.append(rows[element.image_id])
+            xy.append(model.images[element.image_id].points2D[element.point2D_idx].xy)
+    return poses, Tracks(
+        np.array(positions).reshape(-1, 3), np.array(point, np.int64), np.array(view, np.int64),
+        np.array(xy, np.float64).reshape(-1, 2),
+    )  # fmt: skip

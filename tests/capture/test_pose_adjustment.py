@@ -1,0 +1,111 @@
+# mypy: no-check-untyped-defs
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gvtools.appearance.camera_corrections import moved
+from gvtools.capture import pose_adjustment
+from gvtools.capture.pose_adjustment import Tracks, adjusted_poses
+from gvtools.procedural.room_sample import write_room
+from gvtools.scenes.project import open_project
+
+VIEWS = 12
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("room") / "room"
+    write_room(folder)
+    scene = open_project(folder)
+    names = scene.names[:VIEWS]
+    return [scene[name].load() for name in names], scene.subset(names).cameras
+
+
+def off(cameras, *, by=0.02):
+    """The cameras with poses as a tracker errs, by shifts and radians."""
+    rng = np.random.default_rng(0)
+    poses = [moved(pose, rng.normal(0, by, 6)) for pose in cameras.cam_from_world]
+    return replace(cameras, cam_from_world=np.stack(poses))
+
+
+def relative_turns(poses, truth):
+    """Degrees by which relative poses of neighbours are off."""
+    apart = [
+        poses[i + 1] @ np.linalg.inv(poses[i]) @ truth[i] @ np.linalg.inv(truth[i + 1])
+        for i in range(len(poses) - 1)
+    ]
+    cosines = [(np.trace(each[:3, :3]) - 1) / 2 for each in apart]
+    return float(np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1)))))
+
+
+def tracks_through(cameras, *, noise=0.3):
+    """Points in a box before the cameras, and where these see them."""
+    rng = np.random.default_rng(1)
+    center = cameras.centers.mean(axis=0) + 3 * cameras.cam_from_world[0, 2, :3]
+    points = center + rng.uniform(-1.5, 1.5, (400, 3))
+    xy, z = cameras.project(points)
+    size = np.stack([cameras.width, cameras.height], axis=1)[:, None]
+    view, point = np.nonzero((z > 0.1) & (xy > 0).all(axis=2) & (xy < size).all(axis=2))
+    return Tracks(points, point, view, xy[view, point] + rng.normal(0, noise, (len(view), 2)))
+
+
+def test_features_correct_a_trackers_poses(room):
+    frames, cameras = room
+    given = off(cameras)
+    found = adjusted_poses(frames, given)
+    assert found is not None
+    before = relative_turns(given.cam_from_world, cameras.cam_from_world)
+    assert relative_turns(found.poses, cameras.cam_from_world) < 0.25 * before
+    assert found.errors[1] < 1 < found.errors[0]
+    scaled = found.scaled(frames, given)
+    baselines = [np.ptp(-np.einsum("vji,vj->vi", p[:, :3, :3], p[:, :3, 3]), axis=0).max()
+                 for p in (scaled, cameras.cam_from_world)]  # fmt: skip
+    assert baselines[0] == pytest.approx(baselines[1], rel=0.03)
+
+
+def test_exact_poses_stay(room):
+    frames, cameras = room
+    assert adjusted_poses(frames, cameras) is None
+    assert adjusted_poses(frames, cameras, tracks=tracks_through(cameras)) is None
+
+
+def test_known_tracks_need_no_picture(room, monkeypatch):
+    frames, cameras = room
+    monkeypatch.setattr(pose_adjustment, "_triangulated", None)
+    tracks, given = tracks_through(cameras), off(cameras)
+    assert tracks.exact(cameras)
+    assert not tracks.exact(given)
+    found = adjusted_poses(frames, given, tracks=tracks)
+    before = relative_turns(given.cam_from_world, cameras.cam_from_world)
+    assert relative_turns(found.poses, cameras.cam_from_world) < 0.25 * before
+
+
+def test_other_cameras_move_only_if_they_err_alike(room):
+    frames, cameras = room
+    turned = np.stack([
+        moved(pose, np.array([0.03, 0, 0, 0, 0.03, 0])) for pose in cameras.cam_from_world
+    ])  # fmt: skip
+    rng = np.random.default_rng(0)
+    alike = np.stack([moved(pose, rng.normal(0, 0.001, 6)) for pose in turned])
+    tracks = tracks_through(cameras)
+    one = replace(cameras, cam_from_world=alike)
+    assert not adjusted_poses(frames, off(cameras), tracks=tracks).refined(off(cameras)).spread
+    found = adjusted_poses(frames, one, tracks=tracks)
+    assert found is None or found.refined(one).spread
+
+
+def test_the_result_is_the_same_every_time(room):
+    frames, cameras = room
+    given = off(cameras)
+    one, two = (adjusted_poses(frames[:6], given[:6]) for _ in range(2))
+    np.testing.assert_array_equal(one.poses, two.poses)
+
+
+def test_pictures_without_features_tell_nothing(room):
+    frames, cameras = room
+    blank = [replace(frame, rgb=np.full_like(frame.rgb, 90)) for frame in frames]
+    assert adjusted_poses(blank, off(cameras)) is None
+    assert adjusted_poses(frames[:1], cameras[:1]) is None
