@@ -73,6 +73,7 @@ class DepthView(NamedTuple):
 
 def main() -> None:
     """Measure what is missing, then write tables and the plot."""
+    o3d.utility.random.seed(0)
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("shared", type=Path)
     parser.add_argument("out", type=Path)
@@ -82,7 +83,10 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     kept = args.out / "geometry.json"
     found = json.loads(kept.read_text()) if kept.exists() else {}
-    for name in args.scenes.split(";"):
+    names = [name.strip() for name in args.scenes.split(";")]
+    if not set(names) <= set(SCENES):
+        parser.error(f"--scenes {args.scenes}; expected names of {'; '.join(SCENES)}")
+    for name in names:
         if name not in found:
             place = args.out / name.replace(",", "").replace(" ", "-")
             found[name] = _measured(name, place, args.shared / "data" / "sevenscenes_reg")

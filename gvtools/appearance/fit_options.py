@@ -47,7 +47,7 @@ class FitOptions(Settings):
     depth: float = Field(0.1, ge=0)
     """Weight of recorded depth in the loss, by relative difference; 0 ignores it."""
     poses: bool = True
-    """Whether a tracker's poses, those of views with recorded depth, are refined: before a run,
+    """Whether poses that pictures contradict, as those of trackers, are refined: before a run,
     also one that fits nothing, and along with the fit."""
     exposure: bool = True
     """Whether each photograph's red, green and blue may be brighter than the others'."""

@@ -20,7 +20,7 @@ CELLS = 24
 # Space is free up to this share of the depth of the nearest surface in a cell and the eight around
 # it; where these have none, up to a smaller share of that of the nearest cells that have one.
 SHARE, UNKNOWN_SHARE = 0.8, 0.5
-# Cells on either side of those nearest ones that count, too.
+# Cells on either side of such a cell whose nearest ones count, too.
 AROUND = 2
 
 

@@ -1,4 +1,4 @@
-"""Whether the poses that RGB-D views tell of themselves are better, and what they say of others."""
+"""Refined poses: whether they are better than the given ones, and how other cameras follow."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gvtools.appearance.pose_graph import agreeing_poses
 
 @dataclass(frozen=True, eq=False)
 class RefinedPoses:
-    """Poses on which RGB-D views agree, beside those that they were given.
+    """Poses on which views agree, beside those that they were given.
 
     Attributes:
         given: (V, 4, 4) camera from world.
@@ -69,9 +69,9 @@ def refined_poses(
         views: all with depth, neighbours along the path beside each other.
         poses: (V, 4, 4) told by features; None finds some by odometry.
     """
-    given = np.stack([view.cam_from_local for view in views])
     if len(views) < 2:
         return None
+    given = np.stack([view.cam_from_local for view in views])
     by_features = poses is not None
     if poses is None:
         poses = agreeing_poses(views)

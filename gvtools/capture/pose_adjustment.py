@@ -31,22 +31,21 @@ if TYPE_CHECKING:
 
 Float64 = NDArray[np.float64]
 
-# More pictures take minutes.
+# Features of more pictures take minutes.
 MOST_VIEWS = 150
 # Features of a picture, the longer side at which they are found [px], and neighbours that each
 # picture is matched with.
 FEATURES, SIDE, NEIGHBOURS = 2048, 640, 8
 # Reprojection errors up to which points stay, round by round [px].
 ROUNDS = (12.0, 8.0, 4.0)
-# A view that sees fewer points moves like its neighbours; with fewer points nothing is told.
+# A view with fewer detections takes its neighbours' correction; a model of fewer points is refused.
 LEAST_SEEN, LEAST_POINTS = 20, 100
-# Tracks that miss by less, in the median, are those of poses that were adjusted to them [px].
+# Known tracks with a smaller median reprojection error: poses were adjusted to them before [px].
 EXACT = 1.0
 # More known points than this tell no more; those of the longest tracks count.
 MOST_POINTS = 20_000
-# Poses are taken where they lower the median error to this share, and are rounded to so many
-# digits, so that they are the same every time.
-BETTER, DIGITS = 0.7, 9
+# Poses are taken where they lower the median error to this share.
+MAX_ERROR_RATIO = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +64,7 @@ class Tracks:
     view: NDArray[np.int64]
     xy: Float64
 
-    def misses(self, cameras: Cameras, poses: Float64) -> Float64:
+    def reprojection_errors(self, cameras: Cameras, poses: Float64) -> Float64:
         """(M,) distances of detections from where cameras at some poses see their points [px]."""
         local = self.depths(poses, whole=True)
         seen = np.einsum("mij,mj->mi", cameras.K[self.view], local)
@@ -82,7 +81,7 @@ class Tracks:
 
     def exact(self, cameras: Cameras) -> bool:
         """Whether poses are the best that features tell: a model was adjusted to them before."""
-        return float(np.median(self.misses(cameras, cameras.cam_from_world))) < EXACT
+        return float(np.median(self.reprojection_errors(cameras, cameras.cam_from_world))) < EXACT
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +112,10 @@ class AdjustedPoses:
             return None
         poses = self.poses.copy()
         poses[:, :3, 3] *= np.median(recorded[both] / z[both])
-        return (poses @ align_poses(poses, given.cam_from_world)).round(DIGITS)
+        return np.asarray(poses @ align_poses(poses, given.cam_from_world))
 
     def refined(self, given: Cameras) -> RefinedPoses:
-        """With whether other cameras err like the views near them."""
+        """As ``RefinedPoses``; targets follow if their neighbours' corrections predict views."""
         before, depth = given.cam_from_world, float(np.median(self.tracks.depths(self.poses)))
         found = RefinedPoses(before, self.poses, depth, False, self.errors, True, True)
         motions = found.motions
@@ -125,9 +124,10 @@ class AdjustedPoses:
             for row, pose in enumerate(before)
         ])  # fmt: skip
         near, away = (
-            float(np.median(self.tracks.misses(given, poses))) for poses in (alike, before)
+            float(np.median(self.tracks.reprojection_errors(given, poses)))
+            for poses in (alike, before)
         )
-        return replace(found, spread=near < BETTER * away)
+        return replace(found, spread=near < MAX_ERROR_RATIO * away)
 
 
 def adjusted_poses(
@@ -136,11 +136,11 @@ def adjusted_poses(
     """Adjust poses to what pictures show; None where the given ones are as good, or nothing tells.
 
     Args:
-        frames: pixels of the views.
+        frames: pixels of the views; may be empty with ``tracks``.
         cameras: their cameras, without skew.
         tracks: known ones, as those of a project's sparse points; None finds features.
     """
-    if not 2 <= len(frames) <= MOST_VIEWS or cameras.K[:, 0, 1].any():
+    if not can_adjust(cameras, tracks):
         return None
     with quiet():
         if tracks is None:
@@ -154,19 +154,27 @@ def adjusted_poses(
         poses, found = _poses_and_tracks(model, cameras)
         given = _model(cameras, found)
         _solve(given, None)
-        before = _poses_and_tracks(given, cameras)[1].misses(cameras, cameras.cam_from_world)
-    after = found.misses(cameras, poses)
+        before = _poses_and_tracks(given, cameras)[1].reprojection_errors(
+            cameras, cameras.cam_from_world
+        )
+    after = found.reprojection_errors(cameras, poses)
     errors = float(np.median(before)), float(np.median(after))
-    if not errors[1] < BETTER * errors[0]:
+    if not errors[1] < MAX_ERROR_RATIO * errors[0]:
         return None
-    told = np.bincount(found.view, minlength=len(cameras)) >= LEAST_SEEN
-    if told.mean() < 0.5:
+    well_observed = np.bincount(found.view, minlength=len(cameras)) >= LEAST_SEEN
+    if well_observed.mean() < 0.5:
         return None
-    return _placed(poses, found, cameras, told=told, errors=errors)
+    return _placed(poses, found, cameras, well_observed=well_observed, errors=errors)
+
+
+def can_adjust(cameras: Cameras, tracks: Tracks | None) -> bool:
+    """Whether there are enough views, not too many to find features in, and none with skew."""
+    enough = len(cameras) >= 2 and (tracks is not None or len(cameras) <= MOST_VIEWS)
+    return enough and not cameras.K[:, 0, 1].any()
 
 
 def tracks_of(scene: Scene, names: Sequence[str], frame: LocalFrame) -> Tracks | None:
-    """The tracks of a project's sparse points in some views; None without any.
+    """The tracks of a project's sparse points in some views; None where these are too few.
 
     Args:
         scene: the project.
@@ -185,7 +193,7 @@ def tracks_of(scene: Scene, names: Sequence[str], frame: LocalFrame) -> Tracks |
     number = np.full(len(points.positions), -1)
     number[kept] = np.arange(len(kept))
     use = (view >= 0) & (number[points.point_index] >= 0)
-    if not use.any():
+    if len(kept) < LEAST_POINTS:
         return None
     return Tracks(
         frame.from_world(points.positions[kept]), number[points.point_index[use]], view[use],
@@ -194,25 +202,27 @@ def tracks_of(scene: Scene, names: Sequence[str], frame: LocalFrame) -> Tracks |
 
 
 def _placed(
-    poses: Float64, tracks: Tracks, cameras: Cameras, *, told: NDArray[np.bool_],
+    poses: Float64, tracks: Tracks, cameras: Cameras, *, well_observed: NDArray[np.bool_],
     errors: tuple[float, float],
 ) -> AdjustedPoses:  # fmt: skip
     """Poses and tracks in the given world; views that too few points tell move like others."""
     given = cameras.cam_from_world
-    spread = [float(np.std(_centers(each[told]), axis=0).sum()) for each in (given, poses)]
-    scale = spread[0] / spread[1] if spread[1] > 0 else 1.0
+    size = [
+        float(np.sqrt(_centers(each[well_observed]).var(axis=0).sum())) for each in (given, poses)
+    ]
+    scale = size[0] / size[1] if min(size) > 0 else 1.0
     poses, positions = poses.copy(), tracks.positions * scale
     poses[:, :3, 3] *= scale
-    place = align_poses(poses[told], given[told])
-    poses = poses @ place
-    back = np.linalg.inv(place)
+    world_from_given = align_poses(poses[well_observed], given[well_observed])
+    poses = poses @ world_from_given
+    back = np.linalg.inv(world_from_given)
     tracks = Tracks(positions @ back[:3, :3].T + back[:3, 3], tracks.point, tracks.view, tracks.xy)
     depth = float(np.median(tracks.depths(poses)))
     changes = motions_between(given, poses)
-    for row in np.flatnonzero(~told):
-        change = mean_near(given[row], given[told], changes[told], depth=depth)
+    for row in np.flatnonzero(~well_observed):
+        change = mean_near(given[row], given[well_observed], changes[well_observed], depth=depth)
         poses[row] = moved(given[row], change)
-    return AdjustedPoses(poses.round(DIGITS), tracks, errors)
+    return AdjustedPoses(poses, tracks, errors)
 
 
 def _centers(poses: Float64) -> Float64:
@@ -241,11 +251,14 @@ def _triangulated(
         reader.camera_params = _camera(cameras, row).params_to_string()
         mode = pycolmap.CameraMode.SINGLE
         pycolmap.import_images(database, images, mode, image_names=[name], options=reader)
-    reader = pycolmap.ImageReaderOptions()
-    extract(
-        database, images, names, masks=masks, reader=reader, side=SIDE, features=FEATURES,
-        first_octave=0,
-    )  # fmt: skip
+    # COLMAP takes pictures of one size at a time.
+    for size in sorted({frame.rgb.shape[:2] for frame in frames}):
+        alike = [name for name, frame in zip(names, frames, strict=True)
+                 if frame.rgb.shape[:2] == size]  # fmt: skip
+        extract(
+            database, images, alike, masks=masks, reader=pycolmap.ImageReaderOptions(),
+            side=SIDE, features=FEATURES, first_octave=0,
+        )  # fmt: skip
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = listed([(names[a], names[b]) for a, b in _pairs(cameras)], work)
     pycolmap.match_image_pairs(
@@ -261,9 +274,6 @@ def _triangulated(
     options.triangulation.ignore_two_view_tracks = False
     options.random_seed = options.triangulation.random_seed = SEED
     for error in ROUNDS:
-        angle = max(2.0, error / 6)
-        options.triangulation.create_max_angle_error = angle
-        options.triangulation.continue_max_angle_error = angle
         options.mapper.filter_max_reproj_error = error
         model = pycolmap.triangulate_points(
             model, database, images, work, clear_points=True, options=options
@@ -358,6 +368,7 @@ def _solve(model: pycolmap.Reconstruction, error: float | None) -> None:
     for number in model.reg_image_ids():
         config.add_image(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     if error is not None:
         pycolmap.ObservationManager(model).filter_all_points3D(error, 0.0)

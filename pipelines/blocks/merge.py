@@ -127,7 +127,7 @@ def _plan(
         named = Cameras(moved.K, moved.cam_from_world, moved.width, moved.height, names)
         cameras = Targets(named, (None,) * len(names), kind)
         if plan.poses is not None:
-            plan = replace(plan, poses=RunPoses(plan.poses.context, moved.cam_from_world))
+            plan = replace(plan, poses=replace(plan.poses, targets=moved.cam_from_world))
     schedule = _schedule(targets, names)
     config = plan.config.replaced(completer=settings.completer, rounds=len(schedule))
     return replace(

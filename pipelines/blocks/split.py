@@ -103,11 +103,9 @@ def _posed(
     max_side: int | None,
 ) -> Scene | None:
     """The project with refined poses; None if the given ones are kept."""
-    if scene.kind == "colmap":
-        return None
     # ``refined`` needs a target; without any, the first view stands in, and its result is not used.
     targets = scene.subset(others or names[:1]).cameras
-    recorded = all(scene[name].has_depth for name in names)
+    recorded = scene.kind != "colmap" and all(scene[name].has_depth for name in names)
     found = poses.refined(reduced(scene, max_side), names, targets, recorded=recorded, say=say)
     if found is None:
         return None

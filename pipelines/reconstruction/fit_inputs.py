@@ -20,7 +20,7 @@ from gvtools.depth.source import DepthMap, is_recorded
 from gvtools.errors import DegenerateError, ShapeError
 from gvtools.scenes.images import resize_nearest
 from gvtools.scenes.reduced import reduced
-from gvtools.scenes.scene import Frame, Scene, View
+from gvtools.scenes.scene import Frame, View
 from gvtools.view_selection import evenly_spread
 from pipelines.reconstruction.prefetch import prefetch
 
@@ -81,10 +81,8 @@ def _estimate(
             return None
     if sweep is None or not sweep.covers(view):
         return None
-    with suppress(DegenerateError):
-        depth = sweep.depth(sweep.scene, sweep.scene[view.name], None).depth
-        return resize_nearest(depth, frame.rgb.shape[1], frame.rgb.shape[0])
-    return None
+    depth = sweep.depth(view)
+    return None if depth is None else resize_nearest(depth, *frame.rgb.shape[1::-1])
 
 
 def first_gaussians(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians:
@@ -150,10 +148,8 @@ class Sweep:
         self.scene = reduced(plan.scene, side)
         stereo = plan.config.stereo
         options = stereo.replaced(max_side=min(stereo.max_side, side))
-        if plan.poses is not None and plan.poses.by_features:
-            options = options.replaced(align=False)
         self._source = PlaneSweepStereo(self.scene, options=options, views=plan.context)
-        self._names, self._kept = frozenset(names), dict[str, DepthMap]()
+        self._names, self._kept = frozenset(names), dict[str, DepthMap | None]()
 
     @classmethod
     def of(cls, plan: Plan, *, begins: bool = True) -> Sweep | None:
@@ -180,11 +176,18 @@ class Sweep:
             return None
         return cls(plan, SMALL_SIDE, list(evenly_spread(plan.context, max(views, FEWEST_SWEPT))))
 
-    def depth(self, scene: Scene, view: View, frame: Frame | None) -> DepthMap:
-        """The depth of a view of ``scene``; see ``DepthSource.depth``."""
+    def depth(self, view: View) -> NDArray[np.float32] | None:
+        """(H, W) z-depth, scene units, of ``scene``'s view; None if no other shows what it does."""
+        found = self.map_of(view)
+        return None if found is None else found.depth
+
+    def map_of(self, view: View) -> DepthMap | None:
+        """The depth with its confidence."""
         if view.name not in self._kept:
-            view = self.scene[view.name]
-            self._kept[view.name] = self._source.depth(self.scene, view, view.load())
+            view, found = self.scene[view.name], None
+            with suppress(DegenerateError):
+                found = self._source.depth(self.scene, view, view.load())
+            self._kept[view.name] = found
         return self._kept[view.name]
 
     def covers(self, view: View) -> bool:

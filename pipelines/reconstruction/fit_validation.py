@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gvtools.errors import DegenerateError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.reconstruction.voxel_edge import grid_frame
@@ -77,14 +76,13 @@ def validate_fit(
         plan.config.voxel * factor, origin=place.origin, axes=place.axes, options=plan.config.memory
     )
     for name in plan.context:
-        if name in predicted:
-            continue
         view = scene[name]
-        frame = view.load()
-        try:
-            found = sweep.depth(scene, view, frame)
-        except DegenerateError:
+        if name in predicted or not sweep.covers(view):
             continue
+        found = sweep.map_of(view)
+        if found is None:
+            continue
+        frame = view.load()
         memory.observe(
             frame.rgb, found.depth, view.camera, round=0, mask=frame.mask,
             confidence=found.confidence, options=plan.config.back_projection,

@@ -1,6 +1,6 @@
 """Before the first round: Gaussians are fitted to the context's photographs.
 
-The fit comes before the memory, because it refines the poses of RGB-D views further, which the
+The fit comes before the memory, because it refines poses that odometry told further, which the
 memory is then built with, and because it gives photographs their depth.
 """
 
@@ -125,7 +125,8 @@ class Fitted:
         fitted = FittedDepth(self.appearance, self.sweep)
         some = any(is_recorded(source, scene[name]) for name in plan.context)
         evidence = scene if some else reduced(scene, SWEPT_SIDE)
-        factor = _size(scene, plan.context) / _size(evidence, plan.context)
+        sizes = (_sizes(each, plan.context) for each in (scene, evidence))
+        factor = float(np.median(np.divide(*sizes)))
         assert plan.config.voxel is not None
         return replace(
             plan,
@@ -390,6 +391,7 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
     return replace(found, poses=poses, spread=cameras.spread)
 
 
-def _size(scene: Scene, names: Sequence[str]) -> float:
-    camera = scene[names[0]].camera
-    return float(max(camera.width[0], camera.height[0]))
+def _sizes(scene: Scene, names: Sequence[str]) -> NDArray[np.int64]:
+    """Longer sides of the pictures."""
+    cameras = scene.subset(names).cameras
+    return np.maximum(cameras.width, cameras.height)

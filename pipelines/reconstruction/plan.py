@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -160,10 +160,13 @@ def make_plan(
         found = poses.refined(scene, context, targets.cameras, recorded=recorded, say=say)
     if found is not None and found.by_features and not recorded:
         # Depth is computed at the poses that the memory is built with.
-        chosen = choose_source(
+        if config.stereo.align is None:
+            config = config.replaced(stereo=config.stereo.replaced(align=False))
+        again = choose_source(
             with_poses(scene, context, found.context), context, config.depth,
-            stereo=config.stereo.replaced(align=False), foundation=config.da3,
+            stereo=config.stereo, foundation=config.da3,
         )  # fmt: skip
+        chosen = replace(again, ignored=chosen.ignored)
     if config.voxel is None:
         posed = scene if found is None else with_poses(scene, context, found.context)
         config = _with_voxel(config, posed, context, source=chosen.source, say=say)

@@ -34,7 +34,7 @@ def refined(
     context: Sequence[str],
     targets: Cameras,
     *,
-    recorded: bool = True,
+    recorded: bool,
     say: Callable[[str], None] | None = None,
 ) -> RunPoses | None:
     """Poses on which the context agrees; None where the given ones stay.
@@ -47,7 +47,7 @@ def refined(
         say: is told what was found.
     """
     from gvtools.appearance.refined_poses import refined_poses
-    from gvtools.capture.pose_adjustment import SIDE, adjusted_poses, tracks_of
+    from gvtools.capture.pose_adjustment import SIDE, adjusted_poses, can_adjust, tracks_of
 
     scene = reduced(scene, SIDE)
     # Lengths stay small there, also in a world whose origin is far away.
@@ -56,9 +56,11 @@ def refined(
     given = scene.subset(context).cameras
     given = posed(given, frame.cam_from_local(given.cam_from_world))
     tracks = tracks_of(scene, context, frame)
-    if not recorded and tracks is not None and tracks.exact(given):
+    exact = tracks is not None and tracks.exact(given)
+    if not recorded and (exact or not can_adjust(given, tracks)):
         return None
-    frames = list(prefetch(lambda view: view.load(), views))
+    needed = views if recorded or tracks is None else []
+    frames = list(prefetch(lambda view: view.load(), needed))
     adjusted = adjusted_poses(frames, given, tracks=tracks)
     if recorded:
         fitted = [

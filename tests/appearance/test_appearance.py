@@ -15,7 +15,6 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import LOGIT
 from gvtools.cameras import Cameras
 from gvtools.depth.fitted_depth import LEAST_CONFIDENCE, OPAQUE, FittedDepth
-from gvtools.depth.source import DepthMap
 from gvtools.guidance import Guidance
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.scenes.scene import Frame
@@ -118,17 +117,16 @@ SHAPE = (int(CAMERA.height[0]), int(CAMERA.width[0]))
 class _Maps:
     """Depth maps of views, by name."""
 
-    name = "maps"
-
     def __init__(self, maps):
         self.maps = maps
 
     def covers(self, view):
         return view.name in self.maps
 
-    def depth(self, scene, view, frame):
-        depth = np.full(SHAPE, self.maps[view.name], np.float32)
-        return DepthMap(depth, np.ones_like(depth), self.name)
+    def depth(self, view):
+        # Half of the size of what is asked, as a sweep in little time.
+        shape = SHAPE if view.name == "one" else (SHAPE[0] // 2, SHAPE[1] // 2)
+        return np.full(shape, self.maps[view.name], np.float32)
 
 
 @pytest.mark.parametrize(
