@@ -141,11 +141,11 @@ class _Maps:
 )
 def test_confidence_is_by_the_depth_maps_that_agree(solid, maps, confidence):
     rgb = np.zeros((*SHAPE, 3), np.uint8)
-    views = [SimpleNamespace(name=name, camera=CAMERA, load=lambda: Frame(rgb, None, None))
+    views: Any = [SimpleNamespace(name=name, camera=CAMERA, load=lambda: Frame(rgb, None, None))
              for name in ("one", "two", "three")]  # fmt: skip
     cameras = Cameras(
         np.repeat(CAMERA.K, 3, axis=0), np.repeat(CAMERA.cam_from_world, 3, axis=0),
-        *(np.repeat(size, 3) for size in (CAMERA.width, CAMERA.height)), ("one", "two", "three"),
+        np.repeat(CAMERA.width, 3), np.repeat(CAMERA.height, 3), ("one", "two", "three"),
     )  # fmt: skip
     scene: Any = SimpleNamespace(
         views=views,

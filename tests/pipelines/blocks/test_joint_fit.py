@@ -153,8 +153,8 @@ def test_poses_and_brightness_stay_where_the_views_across_are_exposed_unlike_oth
     (plan, joined, blocks) = given[0]
     refine = plan.config.refine.replaced(steps=2)
     plan = replace(plan, config=plan.config.replaced(refine=refine))
-    cameras = plan.scene.subset(plan.context).cameras, plan.targets.cameras
-    poses = RunPoses(*(some.cam_from_world for some in cameras))
+    context = plan.scene.subset(plan.context).cameras
+    poses = RunPoses(context.cam_from_world, plan.targets.cameras.cam_from_world)
     exposures = joined.appearance.exposures
     assert exposures is not None
     log_gains = np.zeros_like(exposures.log_gains)

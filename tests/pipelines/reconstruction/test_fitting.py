@@ -249,7 +249,9 @@ def test_a_sweep_is_as_large_as_there_is_time(tmp_path, monkeypatch, seconds, si
     assert sweep is not None
     view = sweep.scene["view_1.png"]
     assert int(view.camera.width[0]) == side
-    assert (sweep.depth(view) > 0).mean() > 0.3
+    depth = sweep.depth(view)
+    assert depth is not None
+    assert (depth > 0).mean() > 0.3
 
 
 def test_recorded_or_named_depth_is_not_replaced(scan, tmp_path):
