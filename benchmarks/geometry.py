@@ -163,7 +163,7 @@ def _truth(run: Run, project: Path) -> dict[str, Float32]:
     """True depth of the context, 0 where none is known."""
     scene, file = open_project(project), project / "truth.npz"
     if file.exists():
-        with np.load(file) as data:
+        with np.load(file, allow_pickle=False) as data:
             depths = data["depth"].astype(np.float32)
         return {view: depths[scene.names.index(view)] for view in run.context}
     recorded = {view: scene[view].load().depth for view in run.context}
@@ -173,7 +173,7 @@ def _truth(run: Run, project: Path) -> dict[str, Float32]:
 def _depth_views(run: Run, truth: dict[str, Float32]) -> list[DepthView]:
     views = []
     for view, path in context_depth_files(round_folder(run.path, 0), run.context).items():
-        with np.load(path) as data:
+        with np.load(path, allow_pickle=False) as data:
             depth, confidence = data["depth"], data["confidence"]
         height, width = depth.shape
         camera = run.scenes[0][view].camera.resized(width, height)
