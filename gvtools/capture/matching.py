@@ -115,6 +115,7 @@ def extract(
     side: int = MAX_SIDE,
     features: int = MAX_FEATURES,
     first_octave: int = -1,
+    one_camera: bool = True,
 ) -> None:
     """Find SIFT features of some pictures.
 
@@ -127,6 +128,7 @@ def extract(
         side: longer side that pictures are reduced to before, pixels.
         features: at most so many of a picture.
         first_octave: -1 doubles pictures before; 0 takes a quarter of the time.
+        one_camera: whether all of them have one camera, and so one size.
     """
     import pycolmap
 
@@ -136,8 +138,9 @@ def extract(
     options.sift.first_octave = first_octave
     if masks is not None:
         reader.mask_path = masks
+    mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.PER_IMAGE
     pycolmap.extract_features(
-        database, images, image_names=list(names), camera_mode=pycolmap.CameraMode.SINGLE,
+        database, images, image_names=list(names), camera_mode=mode,
         reader_options=reader, extraction_options=options, device=pycolmap.Device.auto,
     )  # fmt: skip
 

@@ -22,6 +22,7 @@ from gvtools.cameras import Cameras
 from gvtools.capture.mapping import fix_cameras, quiet
 from gvtools.capture.matching import SEED, extract, listed, verification
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.scenes.colmap_writer import reconstruction
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.similarity import align_poses
 from gvtools.view_selection import nearest_views
@@ -50,7 +51,7 @@ MAX_ERROR_RATIO = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Points and where pictures show them.
+    """Points and where at least two pictures show each.
 
     Attributes:
         positions: (N, 3) in the world of the cameras.
@@ -66,18 +67,17 @@ class Tracks:
 
     def reprojection_errors(self, cameras: Cameras, poses: Float64) -> Float64:
         """(M,) distances of detections from where cameras at some poses see their points [px]."""
-        local = self.depths(poses, whole=True)
+        local = self.local(poses)
         seen = np.einsum("mij,mj->mi", cameras.K[self.view], local)
         ahead = local[:, 2] > 0
         xy = seen[:, :2] / np.where(ahead, local[:, 2], 1)[:, None]
         return np.where(ahead, np.linalg.norm(xy - self.xy, axis=1), np.inf)
 
-    def depths(self, poses: Float64, *, whole: bool = False) -> Float64:
-        """(M,) z-depth of each detection's point, or (M, 3) the ``whole`` point in the camera."""
+    def local(self, poses: Float64) -> Float64:
+        """(M, 3) each detection's point in the frame of its camera at a pose; z is its depth."""
         pose = poses[self.view]
-        local = np.einsum("mij,mj->mi", pose[:, :3, :3], self.positions[self.point])
-        local += pose[:, :3, 3]
-        return local if whole else local[:, 2]
+        turned = np.einsum("mij,mj->mi", pose[:, :3, :3], self.positions[self.point])
+        return np.asarray(turned + pose[:, :3, 3])
 
     def exact(self, cameras: Cameras) -> bool:
         """Whether poses are the best that features tell: a model was adjusted to them before."""
@@ -100,7 +100,7 @@ class AdjustedPoses:
 
     def scaled(self, frames: Sequence[Frame], given: Cameras) -> Float64 | None:
         """(V, 4, 4) the poses at the scale of recorded depth; None where that tells none."""
-        z, recorded = self.tracks.depths(self.poses), np.zeros(len(self.tracks.xy))
+        z, recorded = self.tracks.local(self.poses)[:, 2], np.zeros(len(self.tracks.xy))
         for row, frame in enumerate(frames):
             mine = self.tracks.view == row
             x, y = self.tracks.xy[mine].astype(int).T
@@ -116,7 +116,7 @@ class AdjustedPoses:
 
     def refined(self, given: Cameras) -> RefinedPoses:
         """As ``RefinedPoses``; targets follow if their neighbours' corrections predict views."""
-        before, depth = given.cam_from_world, float(np.median(self.tracks.depths(self.poses)))
+        before, depth = given.cam_from_world, float(np.median(self.tracks.local(self.poses)[:, 2]))
         found = RefinedPoses(before, self.poses, depth, False, self.errors, True, True)
         motions = found.motions
         alike = np.stack([
@@ -217,7 +217,7 @@ def _placed(
     poses = poses @ world_from_given
     back = np.linalg.inv(world_from_given)
     tracks = Tracks(positions @ back[:3, :3].T + back[:3, 3], tracks.point, tracks.view, tracks.xy)
-    depth = float(np.median(tracks.depths(poses)))
+    depth = float(np.median(tracks.local(poses)[:, 2]))
     changes = motions_between(given, poses)
     for row in np.flatnonzero(~well_observed):
         change = mean_near(given[row], given[well_observed], changes[well_observed], depth=depth)
@@ -245,31 +245,33 @@ def _triangulated(
         mask = np.ones(frame.rgb.shape[:2], bool) if frame.mask is None else frame.mask
         cv2.imwrite(str(masks / f"{name}.png"), mask.astype(np.uint8) * 255, fast)
     pycolmap.Database.open(database).close()
-    for row, name in enumerate(names):
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = "PINHOLE"
-        reader.camera_params = _camera(cameras, row).params_to_string()
-        mode = pycolmap.CameraMode.SINGLE
-        pycolmap.import_images(database, images, mode, image_names=[name], options=reader)
-    # COLMAP takes pictures of one size at a time.
-    for size in sorted({frame.rgb.shape[:2] for frame in frames}):
-        alike = [name for name, frame in zip(names, frames, strict=True)
-                 if frame.rgb.shape[:2] == size]  # fmt: skip
-        extract(
-            database, images, alike, masks=masks, reader=pycolmap.ImageReaderOptions(),
-            side=SIDE, features=FEATURES, first_octave=0,
-        )  # fmt: skip
+    # Images get the ids 1 to V in this order; extraction alone would number them as threads end.
+    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
+    mode = pycolmap.CameraMode.PER_IMAGE
+    pycolmap.import_images(database, images, mode, image_names=names, options=reader)
+    extract(
+        database, images, names, masks=masks, reader=reader, side=SIDE, features=FEATURES,
+        first_octave=0, one_camera=False,
+    )  # fmt: skip
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for row, name in enumerate(names):
+            K, camera = cameras.K[row], opened.read_camera(row + 1)
+            camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+            camera.has_prior_focal_length = True
+            opened.update_camera(camera)
+            model.add_camera_with_trivial_rig(camera)
+            keypoints = opened.read_keypoints(row + 1)[:, :2].astype(np.float64)
+            view = pycolmap.Image(
+                name=name, keypoints=keypoints, camera_id=row + 1, image_id=row + 1
+            )
+            pose = pycolmap.Rigid3d(cameras.cam_from_world[row, :3])
+            model.add_image_with_trivial_frame(view, pose)
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = listed([(names[a], names[b]) for a, b in _pairs(cameras)], work)
     pycolmap.match_image_pairs(
         database, pairing_options=pairing, verification_options=verification()
     )
-    model = pycolmap.Reconstruction()
-    with pycolmap.Database.open(database) as opened:
-        rows = {image.name: image for image in opened.read_all_images()}
-        for row, name in enumerate(names):
-            keypoints = opened.read_keypoints(rows[name].image_id)
-            _add_view(model, cameras, row, xy=keypoints, image=rows[name])
     options = pycolmap.IncrementalPipelineOptions()
     options.triangulation.ignore_two_view_tracks = False
     options.random_seed = options.triangulation.random_seed = SEED
@@ -296,59 +298,13 @@ def _pairs(cameras: Cameras) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _camera(cameras: Cameras, row: int) -> pycolmap.Camera:
-    import pycolmap
-
-    K = cameras.K[row]
-    return pycolmap.Camera(
-        model="PINHOLE", width=int(cameras.width[row]), height=int(cameras.height[row]),
-        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera_id=row + 1,
-    )  # fmt: skip
-
-
-def _add_view(
-    model: pycolmap.Reconstruction,
-    cameras: Cameras,
-    row: int,
-    *,
-    xy: NDArray[np.generic],
-    image: pycolmap.Image | None = None,
-) -> None:
-    """A view with its features; its number is that of ``image``, or ``row`` + 1."""
-    import pycolmap
-
-    camera = _camera(cameras, row)
-    number = row + 1
-    if image is not None:
-        number, camera.camera_id = image.image_id, image.camera_id
-    model.add_camera_with_trivial_rig(camera)
-    view = pycolmap.Image(name=f"{row:06d}.png", camera_id=camera.camera_id, image_id=number)
-    view.points2D = pycolmap.Point2DList([pycolmap.Point2D(each[:2].astype(float)) for each in xy])
-    pose = pycolmap.Rigid3d(cameras.cam_from_world[row][:3])
-    model.add_image_with_trivial_frame(view, pose)
-
-
 def _model(cameras: Cameras, tracks: Tracks) -> pycolmap.Reconstruction:
-    """Views at their given poses, and points that at least two of them show."""
-    import pycolmap
-
-    model = pycolmap.Reconstruction()
-    order = np.argsort(tracks.view, kind="stable")
-    number = np.empty(len(order), np.int64)
-    for row in range(len(cameras)):
-        mine = order[tracks.view[order] == row]
-        number[mine] = np.arange(len(mine))
-        _add_view(model, cameras, row, xy=tracks.xy[mine])
-    by_point = np.argsort(tracks.point, kind="stable")
-    ends = np.searchsorted(tracks.point[by_point], np.arange(len(tracks.positions) + 1))
-    for point, position in enumerate(tracks.positions):
-        rows = by_point[ends[point] : ends[point + 1]]
-        if len(rows) > 1:
-            track = pycolmap.Track()
-            for k in rows:
-                track.add_element(int(tracks.view[k]) + 1, int(number[k]))
-            model.add_point3D(position, track)
-    return model
+    """Views at their given poses with the points that they show; image ids are rows + 1."""
+    black = np.zeros(tracks.positions.shape, np.uint8)
+    return reconstruction(
+        cameras, tracks.positions, black, point_index=tracks.point, view_index=tracks.view,
+        xy=tracks.xy,
+    )  # fmt: skip
 
 
 def _solve(model: pycolmap.Reconstruction, error: float | None) -> None:
@@ -375,18 +331,16 @@ def _solve(model: pycolmap.Reconstruction, error: float | None) -> None:
 
 
 def _poses_and_tracks(model: pycolmap.Reconstruction, cameras: Cameras) -> tuple[Float64, Tracks]:
+    """Poses, and tracks of the points; image ids are rows + 1."""
     poses = cameras.cam_from_world.copy()
-    rows = {}
-    for image in model.images.values():
-        row = rows[image.image_id] = int(image.name[:6])
-        poses[row, :3] = image.cam_from_world().matrix()
+    for number, image in model.images.items():
+        poses[number - 1, :3] = image.cam_from_world().matrix()
     positions, point, view, xy = [], [], [], []
-    for place, number in enumerate(sorted(model.points3D)):
-        found = model.points3D[number]
-        positions.append(found.xyz)
-        for element in found.track.elements:
-            point.append(place)
-            view.append(rows[element.image_id])
+    for index, number in enumerate(sorted(model.points3D)):
+        positions.append(model.points3D[number].xyz)
+        for element in model.points3D[number].track.elements:
+            point.append(index)
+            view.append(element.image_id - 1)
             xy.append(model.images[element.image_id].points2D[element.point2D_idx].xy)
     return poses, Tracks(
         np.array(positions).reshape(-1, 3), np.array(point, np.int64), np.array(view, np.int64),

@@ -55,7 +55,7 @@ def write_colmap(
         raise ShapeError("cameras: two views share a name; a model needs unique image names")
     if colors is None:
         colors = np.zeros(points.shape, np.uint8)
-    model = _reconstruction(
+    model = reconstruction(
         cameras, points, colors, point_index=point_index, view_index=view_index, xy=xy
     )
     partial = folder / ".model.part"
@@ -76,7 +76,7 @@ def write_colmap(
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def _reconstruction(
+def reconstruction(
     cameras: Cameras,
     positions: NDArray[np.float64],
     colors: NDArray[np.uint8],
@@ -85,6 +85,11 @@ def _reconstruction(
     view_index: NDArray[np.integer[Any]],
     xy: NDArray[np.float64],
 ) -> pycolmap.Reconstruction:
+    """The model in memory; see ``write_colmap_model``.
+
+    Raises:
+        ShapeError: K with skew.
+    """
     import pycolmap
 
     model = pycolmap.Reconstruction()

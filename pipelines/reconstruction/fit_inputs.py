@@ -140,8 +140,6 @@ class Sweep:
         scene: the project at that size.
     """
 
-    name = "plane-sweep"
-
     def __init__(self, plan: Plan, side: int, names: Sequence[str]) -> None:
         from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 

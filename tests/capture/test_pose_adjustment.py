@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -48,7 +49,10 @@ def tracks_through(cameras, *, noise=0.3):
     points = center + rng.uniform(-1.5, 1.5, (400, 3))
     xy, z = cameras.project(points)
     size = np.stack([cameras.width, cameras.height], axis=1)[:, None]
-    view, point = np.nonzero((z > 0.1) & (xy > 0).all(axis=2) & (xy < size).all(axis=2))
+    seen = (z > 0.1) & (xy > 0).all(axis=2) & (xy < size).all(axis=2)
+    twice = seen.sum(axis=0) > 1
+    seen, xy, points = seen[:, twice], xy[:, twice], points[twice]
+    view, point = np.nonzero(seen)
     return Tracks(points, point, view, xy[view, point] + rng.normal(0, noise, (len(view), 2)))
 
 
@@ -64,6 +68,22 @@ def test_features_correct_a_trackers_poses(room):
     baselines = [np.ptp(-np.einsum("vji,vj->vi", p[:, :3, :3], p[:, :3, 3]), axis=0).max()
                  for p in (scaled, cameras.cam_from_world)]  # fmt: skip
     assert baselines[0] == pytest.approx(baselines[1], rel=0.03)
+
+
+def test_pictures_may_have_several_sizes(room):
+    frames, cameras = room
+    given, K = off(cameras), cameras.K.copy()
+    K[::2, :2] /= 2
+    mixed = [
+        replace(frame, rgb=cv2.resize(frame.rgb, None, fx=0.5, fy=0.5)) if row % 2 == 0 else frame
+        for row, frame in enumerate(frames)
+    ]
+    halves = np.where(np.arange(VIEWS) % 2 == 0, 2, 1)
+    size = {"width": cameras.width // halves, "height": cameras.height // halves}
+    found = adjusted_poses(mixed, replace(given, K=K, **size))
+    assert (np.bincount(found.tracks.view, minlength=VIEWS) >= pose_adjustment.LEAST_SEEN).all()
+    before = relative_turns(given.cam_from_world, cameras.cam_from_world)
+    assert relative_turns(found.poses, cameras.cam_from_world) < 0.25 * before
 
 
 def test_exact_poses_stay(room):
