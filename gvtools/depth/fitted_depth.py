@@ -33,6 +33,8 @@ CONTRADICTED = np.float32(0.25)
 # Just outside of a nearer thing pixels take its depth: where depth is deeper by this share within
 # a window of so many pixels, confidence falls to a part.
 RIM, RIM_PIXELS, AT_RIM = 1.1, 9, np.float32(0.6)
+# Less confident depth is as often wrong as right.
+GUESSED = 0.5
 
 
 class SweptDepth(Protocol):
@@ -70,6 +72,7 @@ class FittedDepth:
         """The depth that the Gaussians show from the view's camera."""
         shown = self.appearance.picture(view.camera)
         known = np.where(shown.alpha > OPAQUE, self.appearance.depth(view.camera), np.float32(0))
+        guessed = None
         if self.swept is None:
             off = np.abs(shown.rgb - frame.rgb / np.float32(255)).mean(axis=2)
             confidence = np.exp(-np.square(off / np.float32(TOLERANCE)))
@@ -77,7 +80,9 @@ class FittedDepth:
             known, confidence = self._confirmed(known, scene, view, swept=self.swept)
             deepest = cv2.dilate(known, np.ones((RIM_PIXELS, RIM_PIXELS), np.uint8))
             confidence = np.where(deepest > RIM * known, AT_RIM * confidence, confidence)
-        return DepthMap(known, np.maximum(confidence, np.float32(LEAST_CONFIDENCE)), self.name)
+            guessed = (known > 0) & (confidence < GUESSED)
+        confidence = np.maximum(confidence, np.float32(LEAST_CONFIDENCE))
+        return DepthMap(known, confidence, self.name, guessed=guessed)
 
     @staticmethod
     def _confirmed(

@@ -29,12 +29,15 @@ class DepthMap:
         confidence: (H, W) float32 in (0, 1].
         source: name of the source.
         contradicted: how many pixels' depth was dropped because other views look through it.
+        guessed: (H, W) pixels whose depth nothing confirms, which the memory takes as generated;
+            None for none; not kept in files.
     """
 
     depth: NDArray[np.float32]
     confidence: NDArray[np.float32]
     source: str
     contradicted: int = 0
+    guessed: NDArray[np.bool_] | None = None
 
 
 class DepthSource(Protocol):

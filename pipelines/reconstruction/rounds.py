@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance.projection_cache import CachedProjection
+from gvtools.cameras import Cameras
 from gvtools.completers.base import (
     Completer,
     Completion,
@@ -19,6 +20,7 @@ from gvtools.completers.base import (
     run_completer,
 )
 from gvtools.completers.scale_alignment import ScaleAlignment
+from gvtools.depth.source import DepthMap
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
@@ -83,6 +85,15 @@ def observe_context(
     total = FuseReport()
     dropped: dict[str, int] = {}
     reports = []
+    guesses: list[tuple[Cameras, NDArray[np.uint8], DepthMap, NDArray[np.bool_]]] = []
+
+    def observe(*images: Any, **how: Any) -> FuseReport:
+        with clock.stage("fuse"):
+            return memory.observe(
+                *images, round=0, options=config.back_projection,
+                pixel_binning=config.savings.pixel_binning, **how,
+            )  # fmt: skip
+
     covered = [view for view in map(scene.__getitem__, names) if source.covers(view)]
     frames = prefetch(_load, covered)
     for name in progress(names, "context views"):
@@ -99,20 +110,30 @@ def observe_context(
                 dropped[reason] = dropped.get(reason, 0) + depth_map.contradicted
                 # Lifting counts them as well, as pixels without depth.
                 dropped["no depth"] = dropped.get("no depth", 0) - depth_map.contradicted
-        with clock.stage("fuse"):
-            report = memory.observe(
-                frame.rgb,
-                depth_map.depth,
-                view.camera,
-                round=0,
-                confidence=depth_map.confidence,
-                mask=frame.mask,
-                options=config.back_projection,
-                pixel_binning=config.savings.pixel_binning,
-            )
+        guessed = depth_map.guessed
+        use = frame.mask
+        if guessed is not None:
+            everywhere = np.ones_like(guessed) if use is None else use
+            guesses.append((view.camera, frame.rgb, depth_map, guessed & everywhere))
+            use = everywhere & ~guessed
+            # These are fused below, not left out.
+            dropped["masked"] = dropped.get("masked", 0) - int((guessed & everywhere).sum())
+        report = observe(
+            frame.rgb, depth_map.depth, view.camera, confidence=depth_map.confidence, mask=use
+        )
         total += report
         for reason, count in report.dropped.items():
             dropped[reason] = dropped.get(reason, 0) + count
+    # Last, so that they stay out of space that any view saw to be free.
+    for camera, rgb, depth_map, where in guesses:
+        total += observe(
+            rgb,
+            depth_map.depth,
+            camera,
+            confidence=depth_map.confidence,
+            mask=where,
+            generated=True,
+        )
     for entry in reports:
         entry["failed"] = source.failed.get(entry["view"])
     if not len(memory) and source.failed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,6 +66,32 @@ def reconstruct(scan, out, *more: object) -> int:
         *more,
     ]
     return main([str(word) for word in words])
+
+
+def test_depth_that_nothing_confirms_is_fused_as_generated(scan, tmp_path, monkeypatch, capsys):
+    exact = Exact.depth
+
+    def half_guessed(self, scene, view, frame):
+        found = exact(self, scene, view, frame)
+        left = np.zeros(found.depth.shape, np.bool_)
+        left[:, :48] = True
+        return replace(found, guessed=left)
+
+    counts = []
+    for name in ("sure", "guessed"):
+        if name == "guessed":
+            monkeypatch.setattr(Exact, "depth", half_guessed)
+        assert reconstruct(scan, tmp_path / name, "--voxel", "0.03", *ALL) == 0
+        report = json.loads((tmp_path / name / "rounds.jsonl").read_text().splitlines()[0])
+        counts.append((report["observed"], report["generated"], report["dropped"]["masked"]))
+    (all_observed, none, masked), (observed, generated, masked_too) = counts
+    assert none == 0 and masked_too == masked
+    # A guess takes no voxel that another view sees for certain.
+    assert 0.4 * all_observed < observed < 0.8 * all_observed
+    assert 0 < generated < all_observed - observed + 500
+    out = tmp_path / "observed.ply"
+    assert main(["export", str(tmp_path / "guessed"), "--format", "ply", "--out", str(out)]) == 0
+    assert "generated" in capsys.readouterr().out
 
 
 def test_computed_depth_is_kept_and_asked_for_once(scan, tmp_path):
