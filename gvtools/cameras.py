@@ -172,12 +172,7 @@ class Cameras:
 
 
 def check_usable(cameras: Cameras) -> None:
-    """Refuse cameras that no picture can be taken with.
-
-    Raises:
-        ShapeError: NaN or infinity in K or the pose, a focal length or an image side that is not
-            positive.
-    """
+    """Refuse cameras that no picture can be taken with."""
     for camera in cameras:
         K, name = camera.K[0], camera.names[0]
         if not (np.isfinite(K).all() and np.isfinite(camera.cam_from_world).all()):
@@ -223,10 +218,6 @@ def rigid_transform(matrix: ArrayLike, *, what: str) -> tuple[Float64, float]:
     Returns:
         The (4, 4) float64 transform with the nearest rotation, and the largest entry of
         ``R Rᵀ − I`` that was removed.
-
-    Raises:
-        ShapeError: not 3x4 or 4x4, not finite, scaled, sheared or mirrored, or a bottom row other
-            than 0 0 0 1.
     """
     matrix = np.asarray(matrix, np.float64)
     if matrix.shape not in ((3, 4), (4, 4)):

@@ -25,9 +25,6 @@ def replaced_when_written(path: Path, *, suffix: str = "", flush: bool = True) -
         suffix: that the temporary name ends with, for writers that tell the format by it.
         flush: False leaves it to the system when the bytes reach the disk, for files that need not
             outlast the process.
-
-    Raises:
-        ProjectError: writing failed; the temporary file is removed and ``path`` is untouched.
     """
     temporary = path.with_name(f".{path.name}.part{suffix}")
     try:
@@ -59,9 +56,6 @@ def folder_replaced_when_written(path: Path) -> Iterator[Path]:
 
     What only the earlier folder holds moves over into the new one. A kill leaves one of both
     complete; ``recover_folder`` finds it.
-
-    Raises:
-        ProjectError: writing failed; ``path`` is as it was.
     """
     new, old = _work(path) / "new" / path.name, _work(path) / "old"
     try:
@@ -140,21 +134,13 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def check_parent(path: Path) -> None:
-    """Before a long computation: whether its result can be written to ``path`` in the end.
-
-    Raises:
-        ProjectError: its folder is absent.
-    """
+    """Before a long computation: whether its result can be written to ``path`` in the end."""
     if not path.parent.is_dir():
         raise ProjectError(f"{path}: no folder {path.parent}; make it first")
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for results, where there is none yet.
-
-    Raises:
-        ProjectError: a file is in the way, or it cannot be made.
-    """
+    """Make a folder for results, where there is none yet."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -183,11 +169,7 @@ class JsonList:
 
 @contextmanager
 def json_list_written(path: Path, head: Mapping[str, Any], name: str) -> Iterator[JsonList]:
-    """Gives a list to append to; on success ``path`` holds ``head`` with it as ``name``.
-
-    Raises:
-        ProjectError: writing failed; ``path`` is as it was.
-    """
+    """Gives a list to append to; on success ``path`` holds ``head`` with it as ``name``."""
     with replaced_when_written(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(json.dumps({**_finite(head), name: []})[: -len("]}")])
         yield JsonList(file)

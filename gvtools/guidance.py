@@ -66,11 +66,7 @@ class Guidance:
 
 
 def concatenate(views: Sequence[Guidance]) -> Guidance:
-    """Several guidances of one picture size as one batch, in their order.
-
-    Raises:
-        ShapeError: none, or pictures of different sizes.
-    """
+    """Several guidances of one picture size as one batch, in their order."""
     sizes = sorted({guidance.valid.shape[1:] for guidance in views})
     if len(sizes) != 1:
         raise ShapeError(f"guidance of {len(sizes)} picture sizes {sizes}; expected one")

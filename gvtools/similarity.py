@@ -82,9 +82,6 @@ def fit_similarity(
         target: (N, 3), row by row the same points.
         with_scale: False fits a rigid motion.
         weights: (N,) >= 0; rows of weight 0 count for nothing.
-
-    Raises:
-        ShapeError: the shapes do not match, or a value is not finite.
     """
     source, target, weight = _checked(source, target, weights)
     row = weight > 0
@@ -271,9 +268,6 @@ def align_depth_scale(
         min_inlier_share: so is a smaller share of inliers,
         max_residual: and a larger median relative deviation.
         inlier_band: largest relative deviation of an inlier.
-
-    Raises:
-        ShapeError: shapes differ.
     """
     ratio, weight = _log_ratios(depth, reference_depth, valid, confidence=confidence)
     support = len(ratio)

@@ -37,10 +37,6 @@ def interpolate(cameras: Cameras, count: int) -> Cameras:
     Args:
         cameras: at least two key cameras, in order.
         count: number of cameras on the path, >= 2.
-
-    Raises:
-        OptionError: fewer than two keys or cameras asked for.
-        DegenerateError: all keys are the same camera.
     """
     from scipy.interpolate import PchipInterpolator
     from scipy.spatial.transform import Rotation, Slerp
@@ -90,11 +86,7 @@ def _steps(centers: Float64, turned: Float64) -> Float64:
 
 
 def focus_point(cameras: Cameras) -> Float64:
-    """(3,) the world point nearest to all optical axes, by least squares.
-
-    Raises:
-        DegenerateError: the axes are parallel or there is one only.
-    """
+    """(3,) the world point nearest to all optical axes, by least squares."""
     world = cameras.world_from_cam
     origin = cameras.centers.mean(axis=0)
     axes, centers = world[:, :3, 2], world[:, :3, 3] - origin
@@ -111,11 +103,7 @@ def focus_point(cameras: Cameras) -> Float64:
 
 
 def mean_up(cameras: Cameras) -> Float64:
-    """(3,) unit, the mean of the cameras' up vectors (−y) in the world frame.
-
-    Raises:
-        DegenerateError: the up vectors cancel out.
-    """
+    """(3,) unit, the mean of the cameras' up vectors (−y) in the world frame."""
     up = -cameras.world_from_cam[:, :3, 1].mean(axis=0)
     norm = float(np.linalg.norm(up))
     if norm < 1e-3:
@@ -133,10 +121,6 @@ def look_at(centers: ArrayLike, target: ArrayLike, *, up: ArrayLike) -> Float64:
 
     Returns:
         (V, 4, 4) float64.
-
-    Raises:
-        OptionError: ``up`` has no direction.
-        DegenerateError: a centre lies on the target, or the view is along ``up``.
     """
     centers, target = np.asarray(centers, np.float64), np.asarray(target, np.float64)
     axis = np.asarray(up, np.float64)
@@ -171,11 +155,6 @@ def orbit(cameras: Cameras, count: int, *, center: ArrayLike | None = None) -> C
         cameras: where the scene was seen from; intrinsics and size are those of the first.
         count: number of cameras, >= 1.
         center: (3,) what to look at; None means ``focus_point``.
-
-    Raises:
-        OptionError: no camera given or asked for.
-        DegenerateError: no focus point or no up vector can be found, or the first camera stands
-            on the axis.
     """
     if len(cameras) < 1 or count < 1:
         raise OptionError(
@@ -207,10 +186,6 @@ def spiral(cameras: Cameras, count: int) -> Cameras:
     Args:
         cameras: a forward-facing capture, at least two; intrinsics and size are the first's.
         count: number of cameras, >= 1; the end meets the start after TURNS revolutions.
-
-    Raises:
-        OptionError: fewer than two cameras, or none asked for.
-        DegenerateError: the cameras' viewing directions or up vectors cancel out.
     """
     if len(cameras) < 2 or count < 1:
         raise OptionError(
@@ -260,10 +235,6 @@ def named_path(
         count: number of cameras.
         depth: one of these cameras and the median depth that it sees, scene units; asked for only
             where the views have no common focus. None where nothing tells it.
-
-    Raises:
-        OptionError: too few cameras given or asked for.
-        DegenerateError: no such path leads through these cameras.
     """
     make = {"interpolate": interpolate, "orbit": orbit, "spiral": spiral}[name]
     try:

@@ -114,9 +114,6 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
     Returns:
         V cameras; the names are the timestamps as written (TUM, EuRoC; a repeated one gets _1, _2,
         ...) or running numbers (KITTI).
-
-    Raises:
-        ProjectError: as of ``read_poses``.
     """
     path = Path(path)
     track = read_poses(path, layout=layout)

@@ -42,9 +42,6 @@ MOST_DIGITS = 400
 def regular(path: Path) -> Path:
     """``path``, where it is a file: not a folder, a pipe or a device, of which reading has no end.
 
-    Raises:
-        OSError: it is absent or something else.
-
     >>> regular(Path("/"))
     Traceback (most recent call last):
         ...
@@ -67,11 +64,7 @@ def is_file(path: Path) -> bool:
 
 
 def read_bytes(path: Path) -> bytes:
-    """What a file holds.
-
-    Raises:
-        OSError: absent, unreadable, or no file.
-    """
+    """What a file holds."""
     return regular(path).read_bytes()
 
 
@@ -81,19 +74,12 @@ def read_text(path: Path, *, errors: str = "strict") -> str:
     Args:
         path: the file.
         errors: as ``bytes.decode`` takes it.
-
-    Raises:
-        OSError: absent, unreadable, or no file.
-        ValueError: no UTF-8.
     """
     return regular(path).read_text(encoding="utf-8", errors=errors)
 
 
 def parse_json(text: str | bytes) -> Any:
     """The value of a JSON text.
-
-    Raises:
-        ValueError: no JSON, nested too deep, or an integer beyond every float.
 
     >>> parse_json("[" * 100_000)
     Traceback (most recent call last):
@@ -114,12 +100,7 @@ def _integer(digits: str) -> int:
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file.
-
-    Raises:
-        OSError: absent, unreadable, or no file.
-        ValueError: no JSON.
-    """
+    """The value in a JSON file."""
     return parse_json(read_text(path))
 
 
@@ -129,10 +110,6 @@ def parse_yaml(text: str, *, most: int = MOST_CHARACTERS) -> Any:
     Args:
         text: of a file.
         most: characters that it may have.
-
-    Raises:
-        ValueError: no YAML, too long, a tag of anything but plain data, aliases of themselves or
-            of too much.
 
     >>> parse_yaml("a: &x [1, two]\nb: *x")
     {'a': [1, 'two'], 'b': [1, 'two']}
@@ -186,9 +163,6 @@ def named_file(folder: Path, name: str | Path, *, where: str, follow_links: bool
         where: the file and the place in it, for the message.
         follow_links: whether links to places outside are followed, as those of a download that is
             kept elsewhere; the name itself still may not.
-
-    Raises:
-        ProjectError: the name leads out of the folder, or is none that a file can have.
     """
     try:
         path = folder / name
@@ -210,13 +184,7 @@ def named_file(folder: Path, name: str | Path, *, where: str, follow_links: bool
 
 @contextmanager
 def archive(source: Path | bytes) -> Iterator[zipfile.ZipFile]:
-    """A ZIP archive, open for reading, whose members together unpack to a sensible size.
-
-    Raises:
-        OSError: absent, unreadable, or no file.
-        ValueError: no archive, damaged, or with more in it than it can hold.
-        KeyError: no member of the name asked for in the block.
-    """
+    """A ZIP archive, open for reading, whose members together unpack to a sensible size."""
     try:
         size = len(source) if isinstance(source, bytes) else regular(source).stat().st_size
         with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source) as opened:
@@ -235,9 +203,6 @@ def unpack_gzip(data: bytes, most: int) -> bytes:
     Args:
         data: one stream.
         most: bytes that it may unpack to.
-
-    Raises:
-        ValueError: damaged, cut, or more than that.
 
     >>> import gzip
     >>> unpack_gzip(gzip.compress(b"abc"), 3)
@@ -274,11 +239,7 @@ class LimitedReader:
         self.stream, self.left = stream, most
 
     def read(self, size: int) -> bytes:
-        """Read on.
-
-        Raises:
-            ValueError: it holds more.
-        """
+        """Read on."""
         found = self.stream.read(size)
         self.left -= len(found)
         if self.left < 0:
@@ -292,11 +253,6 @@ def load_arrays(source: Path | bytes, *names: str) -> dict[str, NDArray[Any]]:
     Args:
         source: the file, or what it holds.
         names: of the arrays; none for all that are there.
-
-    Raises:
-        OSError: absent, unreadable, or no file.
-        ValueError: no archive, damaged, with objects, or an array that claims more than it holds.
-        KeyError: no array of a name.
     """
     with archive(source) as opened:
         held = {item.removesuffix(".npy") for item in opened.namelist()}
@@ -313,12 +269,7 @@ def _member(opened: zipfile.ZipFile, name: str) -> NDArray[Any]:
 
 
 def load_array(path: Path) -> NDArray[Any]:
-    """The array of an ``.npy`` file, without pickle.
-
-    Raises:
-        OSError: absent, unreadable, or no file.
-        ValueError: no array, with objects, or another size than its head says.
-    """
+    """The array of an ``.npy`` file, without pickle."""
     with regular(path).open("rb") as stream:
         return read_array(stream, path.stat().st_size)
 
@@ -327,9 +278,6 @@ def read_array(stream: IO[bytes], size: int) -> NDArray[Any]:
     """The array that a stream of ``size`` bytes holds in NumPy's format.
 
     NumPy itself takes memory for whatever shape the head names before it reads.
-
-    Raises:
-        ValueError: no array, with objects, or another size than its head says.
     """
     import numpy as np
 
@@ -368,10 +316,6 @@ def open_picture(source: Path | bytes) -> Image.Image:
 
     Args:
         source: a file, or what one holds.
-
-    Raises:
-        OSError: absent, unreadable, or no picture.
-        ValueError: it claims more pixels than its bytes can hold.
     """
     from PIL import Image
 

@@ -47,11 +47,7 @@ class Appearance:
 
     @classmethod
     def load(cls, path: Path) -> Appearance:
-        """Read the appearance that a run keeps.
-
-        Raises:
-            MemoryFileError: missing or damaged.
-        """
+        """Read the appearance that a run keeps."""
         loaded = Gaussians.load(path)
         try:
             data = load_arrays(path)

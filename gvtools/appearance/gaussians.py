@@ -113,11 +113,7 @@ class Gaussians:
 
     @classmethod
     def load(cls, path: Path) -> Gaussians:
-        """Read what ``save`` wrote.
-
-        Raises:
-            MemoryFileError: missing, damaged, or of another kind.
-        """
+        """Read what ``save`` wrote."""
         try:
             arrays: dict[str, Any] = load_arrays(path)
             values = arrays["values"]

@@ -55,9 +55,6 @@ def from_depth(
         frame: of the Gaussians.
         seed: of the choice of pixels.
         most: as for ``from_points``.
-
-    Raises:
-        DegenerateError: hardly any pixel has depth.
     """
     count = STARTING_GAUSSIANS if most is None else min(most, STARTING_GAUSSIANS)
     positions, colors = pixels_with_depth(views, seed=seed, count=count)

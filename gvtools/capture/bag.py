@@ -16,9 +16,6 @@ def take_apart(bag: Path, folder: Path) -> float:
 
     Returns:
         Metres per stored unit of depth.
-
-    Raises:
-        ProjectError: the installed Open3D has no such reader, or cannot read the file.
     """
     import open3d as o3d
 

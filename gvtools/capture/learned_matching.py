@@ -43,9 +43,6 @@ def extract(
         masks: folder of masks as COLMAP has them, ``a.jpg.png`` for ``a.jpg``, black where no
             features are to be found; a picture without one is used whole.
         say: told now and then.
-
-    Raises:
-        ProjectError: a picture or mask cannot be read, or they differ in size.
     """
     found = {}
     for number, name in enumerate(names, start=1):
@@ -83,9 +80,6 @@ def write_keypoints(database: Path, features: Mapping[str, Features]) -> None:
     Args:
         database: of COLMAP, with the pictures.
         features: by their names.
-
-    Raises:
-        ShapeError: a picture of the database has another size.
     """
     import pycolmap
 

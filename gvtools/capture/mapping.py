@@ -103,9 +103,6 @@ def find_cameras(
             relative rotations are fixed.
         fisheye: initial parameters of OPENCV_FISHEYE as COLMAP writes them; "" for other lenses.
         say: is called with a line of text at each step.
-
-    Raises:
-        ProjectError: no two pictures overlap, or mapping gives no model.
     """
     import pycolmap
 

@@ -24,10 +24,6 @@ def complete_masks(photographs: Sequence[Photograph], masks: Path, *, out: Path)
 
     Returns:
         What was met: pictures without a mask are used whole.
-
-    Raises:
-        ProjectError: no picture has a mask, or a mask cannot be read or has another size than its
-            picture when that is upright.
     """
     absent = [item.name for item in photographs if not (masks / f"{item.name}.png").is_file()]
     if len(absent) == len(photographs):

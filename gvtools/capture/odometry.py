@@ -94,9 +94,6 @@ def compare(frames: RgbdFrames, source: int, target: int, *, start: Float64) -> 
         source: number of a frame.
         target: number of another frame.
         start: (4, 4) initial ``target_from_source``, metres.
-
-    Raises:
-        ProjectError: a file is unreadable.
     """
     import open3d as o3d
 

@@ -79,11 +79,7 @@ class FaceRig:
 
 
 def lens_of(photographs: Sequence[Photograph], lens: str) -> str:
-    """The kind of lens, one of LENSES but "auto"; recognised from the pictures if ``lens`` is.
-
-    Raises:
-        OptionError: panoramas among other pictures, or pictures that cannot be panoramas.
-    """
+    """The kind of lens, one of LENSES but "auto"; recognised from the pictures if ``lens`` is."""
     if lens == "equirectangular":
         wrong = [item.name for item in photographs if item.size[0] != 2 * item.size[1]]
         if wrong:

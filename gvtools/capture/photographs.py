@@ -75,11 +75,7 @@ class Photograph:
 
 
 def find_photographs(folder: Path) -> tuple[list[Photograph], list[Finding]]:
-    """The readable, different pictures below a folder in natural order, and what was met.
-
-    Raises:
-        ProjectError: fewer than two are there.
-    """
+    """The readable, different pictures below a folder in natural order, and what was met."""
     paths = [
         path
         for path in folder.rglob("*")

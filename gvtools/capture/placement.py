@@ -55,9 +55,6 @@ def place(
         model: is changed.
         locations: latitude and longitude [degrees] and height [m] of pictures by name.
         distance: two pictures and the distance of the places where they were taken, metres.
-
-    Raises:
-        OptionError: the pictures of ``distance`` are not in the model, or were taken at one place.
     """
     import pycolmap
 

@@ -118,10 +118,6 @@ def capture_photographs(
             "auto": recognised from the pictures.
         say: is called with a line of text at each step.
         draw: adds pictures to the project's folder before it gets its name.
-
-    Raises:
-        ProjectError: too few pictures, no overlap between them, no model, or no place to write.
-        OptionError: options that do not fit the source.
     """
     is_video = source.is_file()
     if is_video and masks is not None:
@@ -220,12 +216,7 @@ def _telling(findings: Sequence[Finding]) -> Iterator[None]:
 
 @contextmanager
 def replaced_folder(out: Path) -> Iterator[Path]:
-    """A working folder beside ``out``, renamed to ``out`` at the end and removed after an error.
-
-    Raises:
-        ProjectError: ``out`` holds something, cannot be written, or another capture is at work
-            on it.
-    """
+    """A working folder beside ``out``, renamed to ``out`` at the end and removed after an error."""
     _refuse_filled(out)
     work = out.with_name(f".{out.name}.part")
     with folder_lock(work):

@@ -78,11 +78,7 @@ class RgbdFrames:
         return len(self.scene)
 
     def __getitem__(self, index: int) -> SmallFrame:
-        """A frame.
-
-        Raises:
-            ProjectError: a file is unreadable.
-        """
+        """A frame."""
         if index not in self._frames:
             self._frames[index] = self._load(index)
             if len(self._frames) > CACHED:
@@ -107,11 +103,7 @@ class RgbdFrames:
         return SmallFrame(image, depth)
 
     def features(self, index: int) -> Features:
-        """What a frame is recognised by; kept, so ask for keyframes alone.
-
-        Raises:
-            ProjectError: a file is unreadable.
-        """
+        """What a frame is recognised by; kept, so ask for keyframes alone."""
         if index not in self._features:
             self._features[index] = self._find(index)
         return self._features[index]

@@ -63,9 +63,6 @@ def find_poses(frames: RgbdFrames, *, say: Say = lambda text: None) -> Found:
     Args:
         frames: in order of time.
         say: is called with a line of text at each step.
-
-    Raises:
-        ProjectError: a file is unreadable.
     """
     pairs = _along(frames, say)
     chain = {pair.source: pair for pair in pairs.values() if pair.source - pair.target == 1}

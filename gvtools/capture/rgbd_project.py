@@ -108,10 +108,6 @@ def capture_rgbd(
         options: what the folder does not tell by itself.
         say: told of each step.
         draw: adds pictures to the project's folder before it takes its name.
-
-    Raises:
-        ProjectError: no RGB-D recording, no two frames that agree, or no place to write.
-        OptionError: options that contradict each other.
     """
     with replaced_folder(out) as work:
         folder = source
@@ -283,9 +279,6 @@ def points_from_above(scene: Scene, keyframes: Sequence[str]) -> tuple[Cameras, 
 
     Returns:
         The cameras, and (N, 3) points, metres; up is against the mean of the cameras' y axes.
-
-    Raises:
-        ProjectError: a file is unreadable.
     """
     cameras = scene.cameras
     down = cameras.world_from_cam[:, :3, 1].mean(axis=0)

@@ -61,10 +61,6 @@ def pick_frames(
         folder: is made.
         count: how many frames to take; None takes one a STEP of motion, MOST at most.
         progress: called with the number of frames read, now and then.
-
-    Raises:
-        ProjectError: no video, or one without motion.
-        OptionError: fewer than two frames asked for.
     """
     if count is not None and count < 2:
         raise OptionError(f"--frames {count}; expected 2 or more")

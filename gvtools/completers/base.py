@@ -172,9 +172,6 @@ def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
     Args:
         context: their colours have to be finite; depth that is not finite counts as none.
         guidance: colour, depth and confidence have to be finite where it is valid.
-
-    Raises:
-        ShapeError: they are not, or the guidance's arrays do not fit each other.
     """
     shape = guidance.valid.shape
     if len(shape) != 3 or guidance.rgb.shape != (*shape, 3) or guidance.depth.shape != shape:
@@ -208,12 +205,6 @@ def run_completer(
 
     Where memory does not suffice for all target views, they are completed in halves, and halves of
     these; context and seed stay the same.
-
-    Raises:
-        ShapeError: it returned something else, of another size, or with NaN or infinity; or the
-            views are damaged.
-        OptionError: it changed colours that memory knows, or memory does not suffice for one view,
-            or for the results of all.
     """
     completion = _completed(completer, context, guidance, seed=seed)
     if not isinstance(completion, Completion):
@@ -330,13 +321,7 @@ def available() -> tuple[str, ...]:
 
 
 def create(name: str, /, **options: Any) -> Completer:
-    """The completer called ``name`` with its options, see its ``settings_type``.
-
-    Raises:
-        OptionError: an unknown name or option (the nearest one is named), a required option that
-            is absent, or a value that does not convert or is out of its range; or what was
-            registered is no Completer.
-    """
+    """The completer called ``name`` with its options, see its ``settings_type``."""
     return completer_type(name)(**options)
 
 
@@ -347,11 +332,7 @@ def options_of_all() -> list[Any]:
 
 
 def completer_type(name: str) -> type[Completer]:
-    """The class that is registered as ``name``.
-
-    Raises:
-        OptionError: an unknown name (the nearest one is named), or no Completer.
-    """
+    """The class that is registered as ``name``."""
     if name not in _REGISTRY:
         near = difflib.get_close_matches(name, available(), n=1, cutoff=0.5)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(available())}"

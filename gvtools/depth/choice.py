@@ -57,11 +57,6 @@ def choose_source(
             computed now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights.
         stereo: options of the plane sweep.
         foundation: options of Depth Anything 3; ``da3`` needs its ``weights``.
-
-    Raises:
-        OptionError: unknown choice, or one that the project cannot give.
-        ProjectError: no view has depth, and none can be computed.
-        CheckpointError: a network's weights are needed.
     """
     chosen = _chosen(
         scene, views, choice, stereo=stereo, foundation=foundation or FoundationOptions()

@@ -41,9 +41,6 @@ class ColmapPatchMatch:
     Attributes:
         name: "colmap-patch-match".
         views: names of the given views.
-
-    Raises:
-        ProjectError: a scene without sparse points.
     """
 
     name = "colmap-patch-match"
@@ -62,12 +59,7 @@ class ColmapPatchMatch:
         return view.name in self.views
 
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
-        """The view's geometric depth map, trusted as recorded ones are.
-
-        Raises:
-            ProjectError: PatchMatch failed.
-            DegenerateError: it left no map of the view.
-        """
+        """The view's geometric depth map, trusted as recorded ones are."""
         if self._depth is None:
             with tempfile.TemporaryDirectory() as folder:
                 self._depth = self._run(Path(folder))

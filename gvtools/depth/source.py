@@ -53,12 +53,7 @@ class DepthSource(Protocol):
         ...
 
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
-        """The depth of ``view``, whose pixels are ``frame``.
-
-        Raises:
-            ProjectError: the source does not cover the view.
-            DegenerateError: no depth can be found for it; other views may have some.
-        """
+        """The depth of ``view``, whose pixels are ``frame``."""
         ...
 
 
@@ -85,11 +80,7 @@ class RecordedDepth:
         return view.has_depth
 
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
-        """The depth that was loaded with the picture, but for what other views look through.
-
-        Raises:
-            ProjectError: the view has none.
-        """
+        """The depth that was loaded with the picture, but for what other views look through."""
         if frame.depth is None:
             raise ProjectError(
                 f"{scene.root}: view {view.name} has no depth; leave it out of the context or "

@@ -35,10 +35,6 @@ def by_time(
 
     Returns:
         Rows of the reference and of the estimate, (K,) each, in the order of the shorter one.
-
-    Raises:
-        ShapeError: stamps that are no finite numbers in one row.
-        DegenerateError: no pair.
     """
     first, second = np.asarray(reference, np.float64), np.asarray(estimate, np.float64) + offset
     for name, stamps in (("reference", first), ("estimate", second)):
@@ -69,9 +65,6 @@ def by_name(reference: Sequence[str], estimate: Sequence[str]) -> tuple[Rows, Ro
 
     Returns:
         Rows of the reference and of the estimate, in the reference's order.
-
-    Raises:
-        DegenerateError: no pair, or file names that occur twice.
     """
     for form in (str, lambda name: PurePosixPath(name.replace("\\", "/")).stem.split(".")[0]):
         first, second = [form(name) for name in reference], [form(name) for name in estimate]
@@ -95,9 +88,6 @@ def by_index(reference: int, estimate: int) -> tuple[Rows, Rows]:
     Args:
         reference: number of its poses.
         estimate: likewise.
-
-    Raises:
-        DegenerateError: the numbers differ, or are 0.
     """
     if reference != estimate or not reference:
         raise DegenerateError(

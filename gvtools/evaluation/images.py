@@ -33,9 +33,6 @@ def psnr(image: ArrayLike, truth: ArrayLike, *, mask: ArrayLike | None = None) -
 
     Returns:
         The ratio; infinity when the compared pixels are equal; None when there are none.
-
-    Raises:
-        ShapeError: shapes, types or values that do not fit.
     """
     first, second, where = _pair(image, truth, mask)
     if where is not None:
@@ -64,9 +61,6 @@ def ssim(
 
     Returns:
         The mean over pixels and channels; None when no pixel is compared.
-
-    Raises:
-        ShapeError: shapes, types or values that do not fit, or images below 11 x 11 pixels.
     """
     first, second, where = _pair(image, truth, mask)
     if min(first.shape[:2]) < SIDE:
@@ -89,9 +83,6 @@ def image_figures(
     Returns:
         For each region ``psnr`` and ``ssim``, as those functions give them; the SSIM of an image
         below 11 x 11 pixels is None.
-
-    Raises:
-        ShapeError: shapes, types or values that do not fit.
     """
     first, second, _ = _pair(image, truth, None)
     square = ((first - second) ** 2).mean(axis=-1)
@@ -164,9 +155,6 @@ def relative_depth_error(
 
     Returns:
         The share of the true depth; None where no pixel has both.
-
-    Raises:
-        ShapeError: shapes that differ.
     """
     first, second = np.asarray(depth, np.float64), np.asarray(truth, np.float64)
     if first.shape != second.shape or first.ndim != 2:

@@ -121,11 +121,6 @@ class Lpips:
     Args:
         net: "vgg", as view synthesis usually reports, or "alex".
         folder: where the weights are; None looks into torch's cache (``torch.hub.get_dir()``).
-
-    Raises:
-        OptionError: an unknown network.
-        CheckpointError: the package or the weights are absent, or the file is not the published
-            one; the message says which file to put where.
     """
 
     def __init__(self, net: str = "vgg", *, folder: Path | None = None) -> None:
@@ -153,19 +148,12 @@ class Lpips:
         Returns:
             The package's distance, and its map (H, W) float32: the layers' maps, upsampled. The
             map's mean differs from the distance by what upsampling changes at the border.
-
-        Raises:
-            ShapeError: shapes or types that do not fit.
         """
         return distance(self._model, image, truth)
 
 
 def find_weights(net: str, folder: Path | None = None) -> Path:
-    """The file with the weights of a network below LPIPS.
-
-    Raises:
-        CheckpointError: it is not there.
-    """
+    """The file with the weights of a network below LPIPS."""
     import torch
 
     backbone = BACKBONES[net]
@@ -180,11 +168,7 @@ def find_weights(net: str, folder: Path | None = None) -> Path:
 
 
 def load_model(net: str, file: Path) -> Model:
-    """The network on the weights of ``file``, with the package's last layers.
-
-    Raises:
-        CheckpointError: the package is absent, or the file does not hold the network's weights.
-    """
+    """The network on the weights of ``file``, with the package's last layers."""
     import torch
 
     backbone = BACKBONES[net]

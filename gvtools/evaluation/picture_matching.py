@@ -57,11 +57,6 @@ def match_pictures(
             (img10 before img2); "auto" is "order" then.
         what: the pictures, as error messages call them.
 
-    Raises:
-        OptionError: no picture; two pictures of one view; no name that matches, by "name"; another
-            number of pictures than of views, by order; or, by "auto", only some names match while
-            there are as many pictures as views, so that either rule might be meant.
-
     >>> match_pictures(["r_2.png", "r_10.png"], ["2.jpg", "10.jpg"])
     Matching(rule='name', picture_of=(0, 1), missing=(), left_over=())
     >>> match_pictures(["00001.png", "00000.png"], ["a.jpg", "b.jpg"]).picture_of
@@ -126,9 +121,6 @@ def _by_name(pictures: Sequence[str], views: Sequence[str], what: str) -> list[i
     """For each view the index of the picture with its name; None where there is none.
 
     Names are compared with and without folders; what finds most partners is taken.
-
-    Raises:
-        OptionError: two pictures for one view.
     """
     tried: list[list[list[int]]] = [[[] for _ in views]]
     for view_keys in (_paths(views), _last_parts(views)):

@@ -76,9 +76,6 @@ def protocol_split(
         stride: views from one of the window to the next; None is as wide as the scene allows. In
             a video's many frames that leaves the views little in common; give a number there.
         seed: draws where the window begins. The same seed takes about the same part of any scene.
-
-    Raises:
-        OptionError: numbers below 1, or too few views.
     """
     counts = {"context": context, "targets": targets, "rounds": rounds, "stride": stride}
     for what, number in counts.items():

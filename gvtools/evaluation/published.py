@@ -160,11 +160,7 @@ class Benchmark(SpecRecord):
         return next(iter(self.sources.values()))
 
     def at(self, views: int) -> Benchmark:
-        """The same with one number of context views, and with the rows of that number.
-
-        Raises:
-            OptionError: it is not run with so many.
-        """
+        """The same with one number of context views, and with the rows of that number."""
         if views not in self.views:
             listed = ", ".join(map(str, self.views))
             raise OptionError(f"{self.name} with {views} context views; expected one of {listed}")
@@ -172,11 +168,7 @@ class Benchmark(SpecRecord):
         return self.model_copy(update={"context": views, "views": (views,), "rows": rows})
 
     def split_of(self, views: int) -> SplitRule:
-        """The rule that chooses views where so many are given.
-
-        Raises:
-            OptionError: there is none.
-        """
+        """The rule that chooses views where so many are given."""
         for rule in self.splits:
             if views in rule.views or not rule.views:
                 return rule
@@ -189,11 +181,7 @@ def benchmark_names() -> tuple[str, ...]:
 
 
 def load_benchmark(name: str) -> Benchmark:
-    """A benchmark by its file's name or its printed one, however it is written.
-
-    Raises:
-        OptionError: there is no such benchmark.
-    """
+    """A benchmark by its file's name or its printed one, however it is written."""
     specs, key = _specs(), name_key(name)
     for known, text in specs.items():
         if key == name_key(known):
@@ -209,11 +197,7 @@ def _specs() -> dict[str, str]:
 
 
 def parse_benchmark(text: str) -> Benchmark:
-    """A benchmark from its YAML.
-
-    Raises:
-        OptionError: no YAML, a key that is unknown or absent, or a row without all figures.
-    """
+    """A benchmark from its YAML."""
     try:
         return _benchmark(parse_yaml(text))
     except KeyError as error:

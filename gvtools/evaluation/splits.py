@@ -100,10 +100,6 @@ def split_scene(
         rounds: how many rounds, for "protocol".
         folder: of the scene, for "files".
 
-    Raises:
-        OptionError: the scene has too few views.
-        ProjectError: a split file is absent or damaged.
-
     >>> rule = SplitRule(kind="every", every=8, source="RegNeRF")
     >>> split = split_scene(rule, [f"{i:02d}" for i in range(20)], views=3)
     >>> split.context, split.targets

@@ -57,11 +57,7 @@ Value = str | int | float | Cell | None
 
 @dataclass(frozen=True)
 class Table:
-    """Columns, rows of as many values, a caption, and notes below.
-
-    Raises:
-        ShapeError: a row that is longer or shorter than the columns.
-    """
+    """Columns, rows of as many values, a caption, and notes below."""
 
     columns: tuple[Column, ...]
     rows: tuple[tuple[Value, ...], ...]
@@ -147,11 +143,7 @@ FORMS: dict[str, Callable[[Table], str]] = {"csv": csv_text, "markdown": markdow
 
 
 def render(table: Table, form: str) -> str:
-    """The table in a form of FORMS: csv, markdown or latex.
-
-    Raises:
-        OptionError: another form.
-    """
+    """The table in a form of FORMS: csv, markdown or latex."""
     if form not in FORMS:
         raise OptionError(f"table form {form!r}; expected one of {', '.join(FORMS)}")
     return FORMS[form](table)

@@ -232,9 +232,6 @@ def pose_auc(reference: ArrayLike, estimate: ArrayLike) -> PoseAuc:
     Args:
         reference: (N, 4, 4) world_from_cam.
         estimate: (N, 4, 4), row by row the same cameras.
-
-    Raises:
-        ShapeError: wrong shapes, no rotations, or values that are not finite.
     """
     first, second = _poses(reference, estimate)
     if len(first) < 2:
@@ -259,11 +256,7 @@ def pose_auc(reference: ArrayLike, estimate: ArrayLike) -> PoseAuc:
 
 
 def area_under_recall(errors: ArrayLike, threshold: float) -> float:
-    """Area under the share of errors below x, for x from 0 to ``threshold``, over the threshold.
-
-    Raises:
-        DegenerateError: no errors.
-    """
+    """Area under the share of errors below x, for x from 0 to ``threshold``, over the threshold."""
     if not np.size(errors):
         raise DegenerateError("area under recall: no errors; give at least one")
     edges = np.linspace(0, threshold, AUC_BINS + 1)

@@ -51,9 +51,6 @@ def view_figures(
 
     Returns:
         FIGURES by name, and those of ``others``; None where there is nothing to compare.
-
-    Raises:
-        ShapeError: the pictures differ in size.
     """
     if picture.shape != truth.rgb.shape:
         raise ShapeError(f"the picture is {picture.shape}; its truth is {truth.rgb.shape}")

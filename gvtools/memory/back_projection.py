@@ -71,9 +71,6 @@ def back_project(
             steep; 0, or no ``levels``, keeps every pixel.
         generated: a completer made the depth: it has no measured pixel that mixes foreground and
             background, so depth edges and grazing surfaces are kept, with a small confidence.
-
-    Raises:
-        ShapeError: the images and the camera disagree in size, or the camera is unusable.
     """
     height, width = _checked_size(rgb, depth, confidence, mask=mask, camera=camera)
     options = options or BackProjectionOptions()

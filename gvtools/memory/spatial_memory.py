@@ -275,11 +275,7 @@ class SpatialMemory(Store):
 
 
 def to_uint8(colors: NDArray[Any], name: str) -> NDArray[np.uint8]:
-    """Colours (..., 3) as uint8: those of a photograph as they are, float ones from 0 to 1 scaled.
-
-    Raises:
-        ShapeError: of another type, not finite, or beyond 0 to 1.
-    """
+    """Colours (..., 3) as uint8: a photograph's as they are, float ones from 0 to 1 scaled."""
     if colors.dtype == np.uint8:
         return colors
     found = str(colors.dtype)

@@ -81,11 +81,7 @@ class PagedColumns(Columns):
         self.device, self.count = "cpu", 0
 
     def tensor(self, name: str) -> Any:
-        """Refuse: there are no columns in RAM.
-
-        Raises:
-            OptionError: always; it says what to do instead.
-        """
+        """Refuse: there are no columns in RAM."""
         raise OptionError(
             f"the memory's {self.count:,} observations are in tiles on disk, larger than its "
             "budget; take memory.overview(MOST) for at most so many of them in RAM, or raise "

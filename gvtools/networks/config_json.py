@@ -32,9 +32,6 @@ def check_range(
         gt: lower end, not included.
         le: upper end, included.
         lt: upper end, not included.
-
-    Raises:
-        OptionError: NaN, or out of the range.
     """
     if value is None:
         return
@@ -51,11 +48,7 @@ def check_range(
 
 
 def check_choice(name: str, value: object, known: Collection[object]) -> None:
-    """Refuse a value that is not one of the known ones.
-
-    Raises:
-        OptionError: names the known ones.
-    """
+    """Refuse a value that is not one of the known ones."""
     if value not in known:
         choices = " or ".join(repr(choice) for choice in known)
         raise OptionError(f"{name} = {value!r}; expected {choices}")
@@ -71,11 +64,7 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(kind: type[T], data: Any, *, where: str = "config") -> T:
-    """A configuration of ``kind`` from what ``to_json`` gave; absent keys have their defaults.
-
-    Raises:
-        OptionError: an unknown key (the nearest is named) or a value of the wrong type.
-    """
+    """A configuration of ``kind`` from what ``to_json`` gave; absent keys have their defaults."""
     if not isinstance(data, Mapping):
         raise OptionError(f"{where} = {data!r}; expected an object of fields ({kind.__name__})")
     hints = get_type_hints(kind)

@@ -66,11 +66,7 @@ class TensorFiles:
 
     @classmethod
     def find(cls, place: Path) -> TensorFiles:
-        """Of a safetensors file, or of the one network in a folder.
-
-        Raises:
-            CheckpointError: there is none, or more than one, or it is damaged.
-        """
+        """Of a safetensors file, or of the one network in a folder."""
         if not place.is_dir():
             return cls({name: (place, name) for name in _read_header(place)})
         for pattern in (f"*{INDEX}", "*.safetensors"):
@@ -115,11 +111,7 @@ class TensorFiles:
         return {name: self._entry(name).empty for name in asked if name in self.places}
 
     def read(self, name: str, *, device: str = "cpu") -> Tensor:
-        """One tensor, as stored.
-
-        Raises:
-            CheckpointError: the file is damaged.
-        """
+        """One tensor, as stored."""
         path = self.places[name][0]
         start, empty = self._entry(name)
         content = torch.empty(empty.nbytes, dtype=torch.uint8)
@@ -191,11 +183,7 @@ def _read_index(path: Path) -> dict[str, str]:
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """All tensors of a .safetensors, .pt or .pth file by their stored names.
-
-    Raises:
-        CheckpointError: the file is absent, damaged, or holds more than tensors and plain values.
-    """
+    """All tensors of a .safetensors, .pt or .pth file by their stored names."""
     if path.suffix == ".safetensors":
         files = TensorFiles.find(path)
         return {name: files.read(name) for name in files.places}
@@ -224,9 +212,6 @@ def read_pickled(path: Path, *, legacy: bool = False) -> dict[str, Any]:
         path: the file.
         legacy: also take the form that torch.save wrote before PyTorch 1.6. Like the zip form it is
             read without running code.
-
-    Raises:
-        CheckpointError: the file is absent, damaged, of another kind, or asks for code to be run.
     """
     start = _check_is_whole(path)
     zipped = start.startswith(_ZIP)
@@ -261,11 +246,7 @@ def read_pickled(path: Path, *, legacy: bool = False) -> dict[str, Any]:
 
 
 def _check_is_whole(path: Path) -> bytes:
-    """The first bytes of a file that is more than what git leaves where a large file belongs.
-
-    Raises:
-        CheckpointError: it is absent, empty, or git's placeholder.
-    """
+    """The first bytes of a file that is more than what git leaves where a large file belongs."""
     try:
         with regular(path).open("rb") as file:
             start = file.read(len(_PLACEHOLDER))

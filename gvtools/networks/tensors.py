@@ -108,9 +108,6 @@ def check_fit(stored: Mapping[str, Tensor], expected: Shapes, *, where: object) 
         stored: what is there; may be on the meta device.
         expected: name to shape.
         where: what the message names.
-
-    Raises:
-        CheckpointError: a tensor is missing, unexpected, of another shape, or not of numbers.
     """
     found = fit(stored, expected)
     if not found.ok:
@@ -131,9 +128,6 @@ def load(
         tensors: by the names of its state dict, all of them.
         where: what the message names.
         device: of the module afterwards.
-
-    Raises:
-        CheckpointError: see ``check_fit``.
     """
     check_fit(tensors, shapes(module.state_dict()), where=where)
     module.load_state_dict(
@@ -168,9 +162,6 @@ def share_tied(
         tensors: by name; may be on the meta device.
         tied: groups of names that are one tensor in the publisher's network.
         where: what the message names.
-
-    Raises:
-        CheckpointError: tensors of one group differ.
     """
     for names in tied:
         present = [name for name in names if name in tensors]
@@ -202,10 +193,6 @@ def save_tensors(
         dtype: what floating-point tensors are stored as, one of ``DTYPES``.
         exact: names that keep float32, because rounding them matters.
         about: goes into the file's metadata.
-
-    Raises:
-        CheckpointError: numbers that are not finite, or too large for ``dtype``.
-        OSError: the disk is full, or the file cannot be written.
     """
     from safetensors import SafetensorError
     from safetensors.torch import save_file

@@ -73,9 +73,6 @@ def scene(rng: np.random.Generator, split: str) -> ProceduralScene:
     Args:
         rng: decides everything.
         split: "train" or "held-out".
-
-    Raises:
-        OptionError: no such split.
     """
     build = SceneBuilder(rng, photograph_names(split))
     style = STYLES[split]

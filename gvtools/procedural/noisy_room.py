@@ -62,10 +62,6 @@ def write_noisy_room(
         views: of context and targets together, at least 4.
         width: of the pictures, pixels.
         height: of the pictures, pixels.
-
-    Raises:
-        OptionError: a negative seed, fewer than 4 views, or pictures below 16 x 16 pixels.
-        ProjectError: the folder holds something else or cannot be written.
     """
     check_options(seed, views, width=width, height=height)
     folder = Path(folder)

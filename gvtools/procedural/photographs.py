@@ -41,22 +41,14 @@ LONGEST = 512  # side that larger photographs are reduced to, pixels
 
 
 def check_split(split: str) -> int:
-    """The number of a split.
-
-    Raises:
-        OptionError: no such split.
-    """
+    """The number of a split."""
     if split not in SPLITS:
         raise OptionError(f"split {split!r}; expected one of {', '.join(SPLITS)}")
     return SPLITS.index(split)
 
 
 def photograph_names(split: str) -> tuple[str, ...]:
-    """The photographs of a split that are installed.
-
-    Raises:
-        OptionError: no such split.
-    """
+    """The photographs of a split that are installed."""
     check_split(split)
     learn = find_spec("sklearn") is not None
     return tuple(name for name in PHOTOGRAPHS[split] if learn or not name.startswith("sklearn:"))

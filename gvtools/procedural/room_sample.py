@@ -73,10 +73,6 @@ def write_room(
         views: of context and targets together, at least 4.
         width: of the images, pixels.
         height: of the images, pixels.
-
-    Raises:
-        OptionError: a negative seed, fewer than 4 views, or images below 16 x 16 pixels.
-        ProjectError: the folder holds something else or cannot be written.
     """
     folder = Path(folder)
     check_options(seed, views, width=width, height=height)
@@ -92,11 +88,7 @@ def write_room(
 
 
 def check_options(seed: int, views: int, *, width: int, height: int) -> None:
-    """Refuse what no sample can be drawn with.
-
-    Raises:
-        OptionError: a negative seed, fewer than 4 views, or images below 16 x 16 pixels.
-    """
+    """Refuse what no sample can be drawn with."""
     if seed < 0 or views < 4 or width < 16 or height < 16:
         raise OptionError(
             f"room: seed {seed}, {views} views of {width}x{height}; expected a seed of 0 or more, "

@@ -41,9 +41,6 @@ def read_context_depth(path: Path, size: tuple[int, ...]) -> tuple[DepthMap, str
     Args:
         path: the file.
         size: (H, W) of the view's picture.
-
-    Raises:
-        Exception: one of UNREADABLE, also for depth of another size.
     """
     stored = load_arrays(path, "depth", "confidence", "source", "failed")
     for name in ("depth", "confidence"):
@@ -67,9 +64,6 @@ def write_context_depth(
         depth_map: the depth.
         failed: why it is empty, or an empty text.
         picture: (H, W, 3) that shows it.
-
-    Raises:
-        ProjectError: it cannot be written.
     """
     # The picture first: where the arrays exist, nothing is missing.
     with replaced_when_written(path.with_suffix(".png")) as temporary:

@@ -49,11 +49,7 @@ class RunDirectory:
         self.path = path
 
     def refuse_foreign(self) -> None:
-        """Refuse a path that holds something other than a run.
-
-        Raises:
-            ProjectError: a file, or a folder with files but no run.json.
-        """
+        """Refuse a path that holds something other than a run."""
         if self.path.exists() and not self.path.is_dir():
             raise ProjectError(f"{self.path}: is a file; give another --out")
         if self.path.exists() and not (self.path / RECORD).exists() and self._results():
@@ -71,21 +67,13 @@ class RunDirectory:
         Args:
             identity: what decides the result; kept in run.json and compared on resuming.
             resume: continue after the last complete round.
-
-        Raises:
-            ProjectError: the folder holds something else, another run, a run that is at work, or
-                a run and ``resume`` is off; nothing is touched then.
         """
         self.refuse_foreign()
         with folder_lock(self.path):
             yield self._start(identity, resume=resume)
 
     def check(self, identity: dict[str, Any], *, resume: bool) -> bool:
-        """Whether a run is there that ``open_or_resume`` would continue; touches nothing.
-
-        Raises:
-            ProjectError: as of ``open_or_resume``.
-        """
+        """Whether a run is there that ``open_or_resume`` would continue; touches nothing."""
         self.refuse_foreign()
         record = self.path / RECORD
         if not record.exists():
@@ -193,11 +181,7 @@ class RunDirectory:
         return saved_memory(self.round_path(number))
 
     def last_memory(self, done: int) -> Path:
-        """The newest memory file of a run with ``done`` complete rounds.
-
-        Raises:
-            ProjectError: it is gone.
-        """
+        """The newest memory file of a run with ``done`` complete rounds."""
         for path in (self.round_memory(done - 1), saved_memory(self.path)):
             if path.exists():
                 return path
@@ -230,9 +214,6 @@ class RunDirectory:
         """A folder to fill; it becomes the round when the block ends without an error.
 
         It holds the files that an earlier attempt at this round left (KEPT).
-
-        Raises:
-            ProjectError: the disk is full or the folder cannot be written; earlier rounds stand.
         """
         part = self.unfinished_round(number)
         try:

@@ -12,11 +12,7 @@ from gvtools.errors import ProjectError
 
 @contextmanager
 def folder_lock(path: Path) -> Iterator[None]:
-    """Make the folder if need be; as long as the block lasts, other processes are kept out.
-
-    Raises:
-        ProjectError: it cannot be made, or another process works in it.
-    """
+    """Make the folder if need be; as long as the block lasts, other processes are kept out."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDONLY)

@@ -52,11 +52,7 @@ def context_depth(folder: Path, stem: str) -> Path:
 
 
 def inside(folder: Path, path: Path) -> Path:
-    """``path``, if it lies in ``folder`` once every link and ".." is resolved.
-
-    Raises:
-        ProjectError: it does not.
-    """
+    """``path``, if it lies in ``folder`` once every link and ".." is resolved."""
     if not path.resolve().is_relative_to(folder.resolve()):
         raise ProjectError(f"{path}: lies outside {folder}; only a run's own files are read")
     return path
@@ -73,9 +69,6 @@ def file_stems(names: Sequence[str]) -> dict[str, PurePosixPath]:
 
     An image suffix is left out, unless two views then had the same files; what is then still the
     same for a file system that ignores case gets a number.
-
-    Raises:
-        OptionError: a name that leads out of the folder.
     """
     whole, short = {}, {}
     for name in names:

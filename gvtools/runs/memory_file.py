@@ -16,11 +16,7 @@ if TYPE_CHECKING:
 
 
 def load_appearance(path: Path) -> Appearance | None:
-    """The Gaussians that a run fitted; None for a file, and for a run without them.
-
-    Raises:
-        MemoryFileError: a damaged file.
-    """
+    """The Gaussians that a run fitted; None for a file, and for a run without them."""
     from gvtools.appearance.appearance import Appearance
 
     file = round_folder(path, 0) / APPEARANCE
@@ -34,11 +30,6 @@ def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
         path: a memory file, a folder of tiles, a coloured PLY, or a run's folder; an unfinished run
             gives that of its last complete round.
         up_to: forget the rounds after this one; None keeps all.
-
-    Raises:
-        ProjectError: neither a memory nor a run with one, or the PLY of a run, damaged.
-        MemoryFileError: a damaged file.
-        OptionError: the memory has no such round.
     """
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.memory.tiled_memory import TiledMemory
@@ -65,11 +56,7 @@ def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
 
 
 def memory_path(path: Path) -> Path:
-    """The memory that ``path``, a file, a folder of tiles or a run's folder, stands for.
-
-    Raises:
-        ProjectError: there is none.
-    """
+    """The memory that ``path``, a file, a folder of tiles or a run's folder, stands for."""
     if path.is_file() or (path / INDEX).is_file():
         return path
     if not path.is_dir():

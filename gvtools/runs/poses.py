@@ -48,11 +48,7 @@ class RunPoses:
 
     @classmethod
     def load(cls, path: Path) -> RunPoses | None:
-        """Read what ``save`` wrote; None where the file holds no poses.
-
-        Raises:
-            MemoryFileError: damaged.
-        """
+        """Read what ``save`` wrote; None where the file holds no poses."""
         try:
             data = load_arrays(path)
             if "context_poses" not in data:
@@ -70,11 +66,7 @@ class RunPoses:
 
 
 def _rigid(poses: NDArray[Any], name: str) -> NDArray[np.float64]:
-    """(N, 4, 4) finite poses, as they are.
-
-    Raises:
-        ValueError: something else.
-    """
+    """(N, 4, 4) finite poses, as they are."""
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or poses.dtype != np.float64:
         raise ValueError(f"{name} of shape {poses.shape} and type {poses.dtype}")
     for pose in poses:
@@ -83,11 +75,7 @@ def _rigid(poses: NDArray[Any], name: str) -> NDArray[np.float64]:
 
 
 def refined_poses_of(run: Path) -> RunPoses | None:
-    """The poses that a run's memory was built from; None where these are its project's.
-
-    Raises:
-        MemoryFileError: damaged.
-    """
+    """The poses that a run's memory was built from; None where these are its project's."""
     folder = round_folder(run, 0)
     for path in (folder / APPEARANCE, folder / POSES):
         poses = RunPoses.load(path) if path.exists() else None
@@ -97,11 +85,7 @@ def refined_poses_of(run: Path) -> RunPoses | None:
 
 
 def with_poses(scene: Scene, names: Sequence[str], poses: NDArray[np.float64]) -> Scene:
-    """A scene with other poses (V, 4, 4) of some views.
-
-    Raises:
-        MemoryFileError: there are not as many poses as names.
-    """
+    """A scene with other poses (V, 4, 4) of some views."""
     if len(names) != len(poses):
         raise MemoryFileError(
             f"{len(poses)} refined poses of {len(names)} views; expected one each; start the run "

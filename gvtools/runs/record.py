@@ -92,11 +92,7 @@ class _Report(BaseModel):
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """What the run.json of a run's folder holds.
-
-    Raises:
-        ProjectError: no run, or a record of another version.
-    """
+    """What the run.json of a run's folder holds."""
     file = path / RECORD
     if not file.is_file():
         raise ProjectError(f"{path}: holds no {RECORD}; expected the folder of a run")
@@ -131,11 +127,7 @@ def resolved_settings(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_reports(path: Path) -> tuple[Mapping[str, Any], ...]:
-    """The reports of a run's whole rounds, the context's (round 0) first; perhaps none.
-
-    Raises:
-        ProjectError: one is damaged, or of another version.
-    """
+    """The reports of a run's whole rounds, the context's (round 0) first; perhaps none."""
     reports = tuple(RunDirectory(path).reports())
     for number, report in enumerate(reports):
         try:

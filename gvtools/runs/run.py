@@ -54,11 +54,7 @@ class RunTarget:
         return entry_camera(self.report)
 
     def read(self) -> TargetFiles:
-        """Its picture, depth and support.
-
-        Raises:
-            ProjectError: files are absent, damaged or of another version.
-        """
+        """Its picture, depth and support."""
         return read_target(self.folder, self.report)
 
 
@@ -109,20 +105,12 @@ class Run:
 
     @cached_property
     def memory(self) -> SpatialMemory:
-        """The memory after the last complete round.
-
-        Raises:
-            ProjectError: there is none.
-        """
+        """The memory after the last complete round."""
         return load_memory(self.path)
 
     @cached_property
     def scenes(self) -> tuple[Scene, Scene | None]:
-        """The project, and the scene with the true pictures of the targets, if there is one.
-
-        Raises:
-            GvError: it cannot be read any more.
-        """
+        """The project, and the scene with the true pictures of the targets, if there is one."""
         from gvtools.scenes.data_sets.address import is_address
         from gvtools.scenes.project import open_project
         from gvtools.scenes.reading import open_recorded
@@ -153,11 +141,7 @@ class Run:
         return with_poses(scene, self.context, poses.context), truths
 
     def targets(self) -> Iterator[tuple[RunTarget, TargetFiles, View | None]]:
-        """Each completed target, its files, and the view with its true picture, if any.
-
-        Raises:
-            ProjectError: files are absent or damaged, or the project's camera has changed.
-        """
+        """Each completed target, its files, and the view with its true picture, if any."""
         truths = self.scenes[1]
         for view in self.views:
             files = view.read()
@@ -191,9 +175,6 @@ def load_growing_run(path: Path, *, project: Path | None = None) -> Run:
     Args:
         path: the folder.
         project: where its project lies now; None: where it lay.
-
-    Raises:
-        GvError: no run, no memory, or a damaged file.
     """
     for attempt in range(ATTEMPTS):
         run = load_run(path, project=project)

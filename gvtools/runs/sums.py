@@ -24,9 +24,6 @@ def write_sums(folder: Path, names: Iterable[str] | None = None) -> None:
     Args:
         folder: of a run or of a round.
         names: of the files; None: all but the memory.
-
-    Raises:
-        ProjectError: they cannot be written.
     """
     if names is None:
         there = (path.name for path in folder.iterdir() if path.is_file())
@@ -41,9 +38,6 @@ def check_sums(folder: Path, names: Iterable[str] | None = None) -> None:
     Args:
         folder: of a run or of a round.
         names: of the files; None: all that have a sum.
-
-    Raises:
-        ProjectError: one is damaged or gone, or the sums are; it is named.
     """
     path = folder / SUMS
     if not path.is_file():

@@ -112,10 +112,6 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
     Args:
         folder: the round's, in the run's.
         entry: the target's, of the round's report.
-
-    Raises:
-        ProjectError: files of the round are absent, damaged, of an older version or outside the
-            run's folder.
     """
     try:
         stem, camera = entry["stem"], entry_camera(entry)
@@ -150,12 +146,7 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
 
 
 def read_picture(folder: Path, kind: str, stem: str) -> NDArray[np.uint8]:
-    """The pixels of a target's picture, see ``layout.target_picture``.
-
-    Raises:
-        ProjectError: it lies outside the run's folder.
-        OSError: it is absent or damaged.
-    """
+    """The pixels of a target's picture, see ``layout.target_picture``."""
     with open_picture(inside(folder.parent, target_picture(folder, kind, stem))) as image:
         return np.asarray(image)
 
@@ -179,9 +170,6 @@ def completed_picture(run: Path, number: int, name: str) -> Path | None:
         run: the run's folder.
         number: of the round.
         name: of the target.
-
-    Raises:
-        ProjectError: it lies outside the run's folder.
     """
     folder = round_folder(run, number)
     try:

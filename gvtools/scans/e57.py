@@ -26,13 +26,7 @@ UNIT = 1e-3
 
 
 def open_e57(path: Path) -> ScanFile:
-    """An E57, the headers of its scans read.
-
-    Raises:
-        MemoryFileError: a scan without points or pose that can be read, or more points than the
-            file has room for.
-        ImportError: pye57 is not installed.
-    """
+    """An E57, the headers of its scans read."""
     import pye57
 
     check_e57(path)
@@ -64,11 +58,7 @@ def open_e57(path: Path) -> ScanFile:
 
 
 def _check_fields(path: Path, header: Any) -> int:
-    """The bits that a point's coordinates take.
-
-    Raises:
-        MemoryFileError: no coordinates, or such that take none.
-    """
+    """The bits that a point's coordinates take."""
     axes = _axes(header.point_fields)
     if axes is None:
         raise MemoryFileError(
@@ -106,11 +96,7 @@ def _name(header: Any, index: int) -> str:
 
 
 def _pose(path: Path, header: Any) -> NDArray[np.float64]:
-    """(4, 4) from the scan's frame to the file's.
-
-    Raises:
-        MemoryFileError: it is no rotation and shift.
-    """
+    """(4, 4) from the scan's frame to the file's."""
     pose = np.eye(4)
     if not header.has_pose():
         return pose

@@ -23,11 +23,7 @@ MOST_DEPTH, NODE_BYTES, SPARE_BYTES = 64, 1 << 10, 1 << 27
 
 
 def check_e57(path: Path) -> None:
-    """Refuse what libE57 should not see.
-
-    Raises:
-        MemoryFileError: no E57, truncated, or an XML part that is no plain one.
-    """
+    """Refuse what libE57 should not see."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(HEAD.size)
@@ -63,12 +59,7 @@ def check_e57(path: Path) -> None:
 
 
 def _check_xml(text: bytes, room: int) -> None:
-    """Refuse markup that declares entities, another encoding than UTF-8, or too much.
-
-    Raises:
-        ValueError: see above.
-        ExpatError: no XML.
-    """
+    """Refuse markup that declares entities, another encoding than UTF-8, or too much."""
     if not text.lstrip().startswith(b"<"):
         raise ValueError("no element")
     depth = nodes = 0

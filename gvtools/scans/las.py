@@ -32,10 +32,6 @@ def open_las(path: Path, *, generated: bool = False) -> ScanFile:
     Args:
         path: the file.
         generated: whether points are kept that a completer made.
-
-    Raises:
-        MemoryFileError: no LAS, or one that is shorter than its header says.
-        ImportError: laspy, or lazrs for LAZ, is not installed.
     """
     import laspy
 
@@ -60,11 +56,7 @@ def open_las(path: Path, *, generated: bool = False) -> ScanFile:
 
 
 def _check_records(path: Path) -> None:
-    """Refuse more records before and after the points than the file has room for.
-
-    Raises:
-        MemoryFileError: see above, or no LAS at all.
-    """
+    """Refuse more records before and after the points than the file has room for."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(375)
@@ -109,11 +101,7 @@ def _long_records_fit(path: Path, at: int, count: int, *, size: int) -> bool:
 
 
 def _check_pieces(path: Path, at: int, size: int) -> None:
-    """Refuse a table of compressed pieces that is larger than the file.
-
-    Raises:
-        MemoryFileError: see above.
-    """
+    """Refuse a table of compressed pieces that is larger than the file."""
     with path.open("rb") as file:
         file.seek(at)
         word = file.read(8)

@@ -32,10 +32,6 @@ def check_laz(path: Path, *, at: int, point_bytes: int) -> None:
         path: a LAZ whose records before the points were checked.
         at: byte at which its points begin.
         point_bytes: of a point that is unpacked.
-
-    Raises:
-        MemoryFileError: see above.
-        ImportError: lazrs is not installed.
     """
     import lazrs
 

@@ -22,9 +22,6 @@ PIECE = 1 << 20
 def unpack(packed: NDArray[np.uint8], out: IO[bytes]) -> int:
     r"""Write what ``packed`` holds; returns how many bytes these are.
 
-    Raises:
-        ValueError: a copy of bytes that were not there, or the end within one.
-
     >>> import io
     >>> unpacked = io.BytesIO()
     >>> unpack(np.frombuffer(b"\x01ab\x40\x01", np.uint8), unpacked), unpacked.getvalue()

@@ -44,11 +44,7 @@ class _Header:
 
 
 def open_pcd(path: Path) -> ScanFile:
-    """A PCD, its header read.
-
-    Raises:
-        MemoryFileError: no PCD of points, or one that is shorter than its header says.
-    """
+    """A PCD, its header read."""
     header = _header(path)
     dtype, count = header.dtype, header.count
     width = sum(int(np.prod(dtype[name].shape)) for name in dtype.names or ())
@@ -99,11 +95,7 @@ def _rgb(packed: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.uint8]:
 
 
 def _check_compressed(path: Path, header: _Header) -> None:
-    """Refuse sizes that the points or the file contradict, before anything is unpacked.
-
-    Raises:
-        MemoryFileError: see above.
-    """
+    """Refuse sizes that the points or the file contradict, before anything is unpacked."""
     check_size(path, header.offset + 8, told="compressed points")
     packed, whole = np.fromfile(path, "<u4", 2, offset=header.offset).tolist()
     expected = header.count * header.dtype.itemsize
@@ -121,11 +113,7 @@ def _check_compressed(path: Path, header: _Header) -> None:
 
 
 def _unpacked_rows(path: Path, header: _Header) -> Iterator[Columns]:
-    """Chunks of compressed points, which lie field by field.
-
-    Raises:
-        MemoryFileError: damaged.
-    """
+    """Chunks of compressed points, which lie field by field."""
     from gvtools.scans.lzf import unpack
 
     dtype, count = header.dtype, header.count
@@ -179,11 +167,7 @@ def _header(path: Path) -> _Header:
 
 
 def _checked(given: dict[str, list[str]], offset: int) -> _Header:
-    """The header of its lines, by key.
-
-    Raises:
-        KeyError, ValueError, IndexError, TypeError: lines that do not fit together.
-    """
+    """The header of its lines, by key."""
     names = given["FIELDS"]
     counts = [int(count) for count in given.get("COUNT", ["1"] * len(names))]
     columns: list[tuple[Any, ...]] = []

@@ -78,10 +78,6 @@ class Placement:
 def given_placement(text: str) -> Placement | None:
     """The placement that a text gives, see FORMS; None for "estimate".
 
-    Raises:
-        OptionError: another form, or a matrix that is no similarity.
-        ProjectError: a file without a 3x4 or 4x4 matrix.
-
     >>> round(given_placement("2,0,0,5, 0,2,0,0, 0,0,2,0").scale, 6)
     2.0
     >>> given_placement("1,0,0,5, 0,1,0,0, 0,0,-1,0")

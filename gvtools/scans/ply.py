@@ -32,11 +32,7 @@ class _Header:
 
 
 def open_ply(path: Path) -> ScanFile:
-    """A PLY, its header read.
-
-    Raises:
-        MemoryFileError: no PLY of points, or one that is shorter than its header says.
-    """
+    """A PLY, its header read."""
     header = _header(path)
     names = tuple(name for name, _ in header.columns)
     dtype = np.dtype([(name, header.order + kind) for name, kind in header.columns])

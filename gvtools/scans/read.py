@@ -33,10 +33,6 @@ def open_scan(path: Path, *, generated: bool = False) -> ScanFile:
     Args:
         path: PLY, LAS, LAZ, E57 or PCD, told by its suffix.
         generated: whether points of a LAS that a completer made are kept.
-
-    Raises:
-        OptionError: another suffix, or a package that the format needs is not installed.
-        MemoryFileError: absent, damaged, truncated, or without points.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -67,10 +63,6 @@ def read_scan(path: Path, *, most: int = MOST_POINTS, generated: bool = False) -
         path: see ``open_scan``.
         most: at least 2.
         generated: see ``open_scan``.
-
-    Raises:
-        OptionError: see ``open_scan``.
-        MemoryFileError: see there, or no point has finite coordinates.
     """
     file = open_scan(path, generated=generated)
     reading = _Reading(most)
@@ -89,12 +81,7 @@ def read_scan(path: Path, *, most: int = MOST_POINTS, generated: bool = False) -
 
 @contextmanager
 def _one_line(path: Path) -> Iterator[None]:
-    """What any reader complains of, in one line.
-
-    Raises:
-        OptionError: a package is not installed.
-        MemoryFileError: anything else.
-    """
+    """What any reader complains of, in one line."""
     try:
         yield
     except (GvError, *WRONG):

@@ -79,9 +79,6 @@ def register(
         least: smallest fitness that is accepted, 0 to 1.
         metric: whether the world's unit is the metre: METRIC scales are then tried first.
         seed: of random sampling.
-
-    Raises:
-        DegenerateError: too few points, no surface, or not one placement with enough support.
     """
     for name, surface in (("scan", scan), ("photographs", photographed)):
         if len(surface.positions) < FEWEST:

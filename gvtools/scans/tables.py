@@ -21,11 +21,7 @@ Columns = Mapping[str, NDArray[Any]]
 
 
 def check_size(path: Path, needed: int, *, told: str) -> None:
-    """Refuse a file that is shorter than its header says.
-
-    Raises:
-        MemoryFileError: see above.
-    """
+    """Refuse a file that is shorter than its header says."""
     found = path.stat().st_size
     if found < needed:
         raise MemoryFileError(
@@ -42,11 +38,7 @@ def rows_at_once(dtype: np.dtype[np.void]) -> int:
 def binary_rows(
     path: Path, dtype: np.dtype[np.void], count: int, *, offset: int
 ) -> Iterator[Columns]:
-    """Chunks of ``count`` packed rows from a byte on.
-
-    Raises:
-        MemoryFileError: the file is too short.
-    """
+    """Chunks of ``count`` packed rows from a byte on."""
     told = f"{count} points of {dtype.itemsize} bytes"
     check_size(path, offset + count * dtype.itemsize, told=told)
     step = rows_at_once(dtype)
@@ -57,11 +49,7 @@ def binary_rows(
 
 
 def text_rows(path: Path, names: tuple[str, ...], count: int, *, offset: int) -> Iterator[Columns]:
-    """Chunks of ``count`` lines of numbers from a byte on, as float64.
-
-    Raises:
-        MemoryFileError: too few lines, or one that holds anything else.
-    """
+    """Chunks of ``count`` lines of numbers from a byte on, as float64."""
     told = f"{count} lines of {len(names)} numbers"
     check_size(path, offset + LEAST_TEXT * count * len(names) - 1, told=told)
     with path.open("rb") as file:
@@ -88,11 +76,7 @@ def text_rows(path: Path, names: tuple[str, ...], count: int, *, offset: int) ->
 
 
 def _lines(file: IO[bytes], count: int, most: int) -> Iterator[bytes]:
-    """Lines of a file, none of which is longer than ``most`` bytes.
-
-    Raises:
-        ValueError: one is.
-    """
+    """Lines of a file, none of which is longer than ``most`` bytes."""
     for _ in range(count):
         line = file.readline(most)
         if len(line) == most:

@@ -22,10 +22,6 @@ def open_collection(address: str, root: Path | None = None) -> SceneCollection:
         address: the folder of a project or of shards, "spec:NAME" for all scenes of a data set, or
             "spec:NAME:SCENE" for one.
         root: the folder of the data set's download.
-
-    Raises:
-        OptionError: no such data set, one without a root, or a root without one.
-        ProjectError: nothing there, or what is there cannot be read.
     """
     if not address.startswith(SPEC):
         if root is not None:

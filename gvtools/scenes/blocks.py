@@ -111,11 +111,7 @@ class Block:
 
     @classmethod
     def load(cls, folder: Path) -> Block:
-        """Read what ``save`` wrote.
-
-        Raises:
-            ProjectError: there is none, or it is damaged or of another version.
-        """
+        """Read what ``save`` wrote."""
         path = folder / FILE
         try:
             kept = _File.model_validate(read_json(path))

@@ -40,11 +40,7 @@ class SceneCollection:
         return len(self.names)
 
     def subset(self, names: Sequence[str]) -> SceneCollection:
-        """Some of the scenes, in the order of the collection.
-
-        Raises:
-            ProjectError: no such scene.
-        """
+        """Some of the scenes, in the order of the collection."""
         for name in names:
             if name not in self.names:
                 near = difflib.get_close_matches(name, self.names, n=1)
@@ -76,11 +72,7 @@ class _Opened:
 
 
 def of_scenes(scenes: Sequence[Scene], *, title: str = "") -> SceneCollection:
-    """Scenes that are open already, as a collection; they are named after their folders.
-
-    Raises:
-        ProjectError: there is none, or two of them have the same root.
-    """
+    """Scenes that are open already, as a collection; they are named after their folders."""
     opened = {scene.root.name: scene for scene in scenes}
     if len(opened) != len(scenes):
         opened = {str(scene.root): scene for scene in scenes}

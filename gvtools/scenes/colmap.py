@@ -53,10 +53,6 @@ def read_colmap(
 
     Returns:
         The scene, in the model's frame and scale.
-
-    Raises:
-        ProjectError: no model, a damaged one, no registered image, or no pictures. Unreadable
-            pictures and wrong sizes are error findings, and raise when loaded.
     """
     root = Path(root)
     folder = find_model(root, number=model)

@@ -26,11 +26,7 @@ def depth_map_path(folder: Path, name: str) -> tuple[Path, str] | None:
 
 
 def depth_map_size(path: Path) -> tuple[int, int]:
-    """Width and height of the depth map at ``path``, pixels, checked against the file's size.
-
-    Raises:
-        ProjectError: no depth map, or truncated or oversized.
-    """
+    """Width and height of the depth map at ``path``, pixels, checked against the file's size."""
     return _head(path)[:2]
 
 
@@ -56,23 +52,14 @@ def _head(path: Path) -> tuple[int, int, int]:
 
 
 def read_depth_map(path: Path) -> NDArray[np.float32]:
-    """(H, W) float32 z-depth of the map at ``path``, scene units; 0 = none.
-
-    Raises:
-        ProjectError: no depth map, or its size is not what its head says.
-    """
+    """(H, W) float32 z-depth of the map at ``path``, scene units; 0 = none."""
     width, height, start = _head(path)
     values = np.fromfile(regular(path), "<f4", offset=start).reshape(height, width)
     return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
 
 
 def write_depth_map(path: Path, depth: ArrayLike) -> None:
-    """Write (H, W) z-depth, scene units, 0 = none, in COLMAP's form.
-
-    Raises:
-        ShapeError: not two-dimensional.
-        ProjectError: the file cannot be written.
-    """
+    """Write (H, W) z-depth, scene units, 0 = none, in COLMAP's form."""
     values = np.asarray(depth, "<f4")
     if values.ndim != 2:
         raise ShapeError(f"{path}: depth of shape {values.shape}; expected (H, W)")

@@ -53,9 +53,6 @@ def find_model(root: Path, *, number: int | None = None) -> Path | None:
         root: the workspace.
         number: of the model, where the workspace holds several (``sparse/0``, ``sparse/1``, ...);
             None takes the one with most images, the first of equals.
-
-    Raises:
-        ProjectError: there is no model of that number.
     """
     for place in PLACES:
         numbered = _numbered(root / place)
@@ -84,11 +81,7 @@ def _numbered(folder: Path) -> dict[int, Path]:
 
 
 def model_files(folder: Path) -> ModelFiles:
-    """The files of the model in ``folder``, complete and with counts that they can hold.
-
-    Raises:
-        ProjectError: files are missing, or do not hold the records that they claim to hold.
-    """
+    """The files of the model in ``folder``, complete and with counts that they can hold."""
     suffix = _suffix(folder)
     rigged = [stem for stem in RIGGED if (folder / f"{stem}{suffix}").is_file()]
     if len(rigged) == 1:
@@ -112,11 +105,7 @@ def model_files(folder: Path) -> ModelFiles:
 
 
 def check_cameras(folder: Path, model: pycolmap.Reconstruction) -> None:
-    """Compare the size of cameras.bin with the cameras that a reader got from it.
-
-    Raises:
-        ProjectError: it is shorter or longer.
-    """
+    """Compare the size of cameras.bin with the cameras that a reader got from it."""
     path = folder / "cameras.bin"
     expected = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
     if path.stat().st_size != expected:
@@ -224,11 +213,7 @@ def _count(path: Path) -> int:
 
 
 def text_names(folder: Path) -> dict[int, str]:
-    """The images' whole names in a text model, by id; pycolmap stops at the first blank.
-
-    Raises:
-        ProjectError: no text.
-    """
+    """The images' whole names in a text model, by id; pycolmap stops at the first blank."""
     path = folder / "images.txt"
     try:
         lines = read_text(path).splitlines()

@@ -80,11 +80,6 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
         folder: holds its files.
         faces: cameras that see too much for one pinhole camera become several views, see
             ``faces``; without, each camera is one.
-
-    Raises:
-        ProjectError: damaged, incomplete, without registered image, or with a spherical camera
-            and without faces.
-        ShapeError: a pose with NaN.
     """
     files = model_files(folder)
     findings = []
@@ -198,9 +193,6 @@ def sparse_points(
 
     Returns:
         The points ordered by id (None when the model has none), and what was dropped.
-
-    Raises:
-        ProjectError: detections of points that are not there, or points that are not finite.
     """
     points = model.reconstruction.points3D
     if not len(points):

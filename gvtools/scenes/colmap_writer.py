@@ -46,10 +46,6 @@ def write_colmap(
         point_index: (M,), for each track element its point.
         view_index: (M,), and its view.
         xy: (M, 2), and where it was seen, pixels with the first centre at (0.5, 0.5).
-
-    Raises:
-        ShapeError: K with skew, or a name twice.
-        ProjectError: the folder cannot be written.
     """
     if len(set(cameras.names)) != len(cameras):
         raise ShapeError("cameras: two views share a name; a model needs unique image names")
@@ -85,11 +81,7 @@ def reconstruction(
     view_index: NDArray[np.integer[Any]],
     xy: NDArray[np.float64],
 ) -> pycolmap.Reconstruction:
-    """The model in memory; see ``write_colmap_model``.
-
-    Raises:
-        ShapeError: K with skew.
-    """
+    """The model in memory; see ``write_colmap_model``."""
     import pycolmap
 
     model = pycolmap.Reconstruction()

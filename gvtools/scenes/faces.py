@@ -259,9 +259,6 @@ def perspective_views(
         params: its parameters, in COLMAP's order; pixels, first pixel centre (0.5, 0.5).
         size: width and height of the recorded picture, pixels.
         what: where the camera was read, for the message.
-
-    Raises:
-        ProjectError: an unknown model, impossible parameters, or a panorama that is no full one.
     """
     if model == PANORAMA:
         camera = camera_of(model, params, size, what=what)

@@ -54,11 +54,7 @@ class ImageHeader:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Size and layout of the picture at ``path``.
-
-    Raises:
-        ProjectError: absent, or no picture.
-    """
+    """Size and layout of the picture at ``path``."""
     try:
         with open_picture(path) as image:
             # Other formats are decoded whole when asked for EXIF.
@@ -74,9 +70,6 @@ def read_image(path: Path) -> Frame:
 
     Grey is repeated over the channels, palettes are resolved, 16 bits a channel keep their upper
     eight. EXIF orientation is not applied (see the module's text).
-
-    Raises:
-        ProjectError: absent, truncated, no picture, or neither 8 nor 16 bits a channel.
     """
     try:
         with open_picture(path) as image:
@@ -103,11 +96,7 @@ def _decode(image: Image.Image, path: Path) -> Frame:
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """(H, W) bool mask at ``path``: black is ignored (False), everything else used (True).
-
-    Raises:
-        ProjectError: absent, truncated or no picture.
-    """
+    """(H, W) bool mask at ``path``: black is ignored (False), everything else used (True)."""
     try:
         with open_picture(path) as image:
             pixels = np.asarray(image if image.mode.startswith("I") else image.convert("L"))
@@ -129,9 +118,6 @@ def read_depth(
     Returns:
         (H, W) float32 z-depth, scene units; 0 where the file says 0, a negative number, NaN or
         infinity, or, in 16-bit files, 65535.
-
-    Raises:
-        ProjectError: absent, truncated, 8-bit, coloured, or not two-dimensional.
     """
     raw = _load_array(path) if path.suffix in (".npy", ".npz") else _load_depth_image(path)
     if raw.ndim == 3 and raw.shape[-1] == 1:
@@ -195,11 +181,7 @@ def same_aspect(size: tuple[int, int], expected: tuple[int, int]) -> bool:
 def fit_depth(
     depth: NDArray[np.float32], width: int, height: int, *, path: Path
 ) -> NDArray[np.float32]:
-    """Depth brought to its picture's size: as it is, or by nearest pixel at the same aspect.
-
-    Raises:
-        ProjectError: the aspect differs, so the two do not show the same window.
-    """
+    """Depth brought to its picture's size: as it is, or by nearest pixel at the same aspect."""
     size = (depth.shape[1], depth.shape[0])
     if size == (width, height):
         return depth
@@ -215,11 +197,7 @@ def fit_depth(
 def check_size(
     found: tuple[int, int], expected: tuple[int, int], *, path: Path, orientation: int = 1
 ) -> None:
-    """Refuse a picture or mask whose (width, height) is not its camera's.
-
-    Raises:
-        ProjectError: the sizes differ.
-    """
+    """Refuse a picture or mask whose (width, height) is not its camera's."""
     if found == expected:
         return
     advice = "give the images that the cameras were solved on"

@@ -82,11 +82,7 @@ class Photograph:
         return View(self.name, camera, self.load, self.depth is not None, files)
 
     def load(self) -> Frame:
-        """The pixels in the pinhole camera.
-
-        Raises:
-            ProjectError: a file is unreadable or of another size than the camera says.
-        """
+        """The pixels in the pinhole camera."""
         picture = self.read(self.image)
         check_size(picture.rgb.shape[1::-1], self.lens.source_size, path=self.image)
         masks = [] if picture.mask is None else [self.lens.nearest(picture.mask)]
@@ -125,9 +121,6 @@ def given_folder(folder: Path, held: str) -> Path:
     Args:
         folder: as it was given.
         held: what it should hold, in the plural, for the message.
-
-    Raises:
-        ProjectError: there is no such folder.
     """
     folder = Path(folder)
     if not folder.is_dir():

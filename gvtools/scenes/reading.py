@@ -37,9 +37,6 @@ def open_as(path: Path, reading: Mapping[str, Any]) -> Scene:
         reading: options by the names of READING, JSON-ready; absent and None leave the default.
             ``resolution``, width and height in pixels, is that of a benchmark: see
             ``gvtools.scenes.resized``.
-
-    Raises:
-        GvError: as of ``open_project``; OptionError also for a matrix file that is none.
     """
     folders = {
         name: None if reading.get(name) is None else Path(reading[name])
@@ -62,9 +59,6 @@ def open_recorded(project: str, reading: Mapping[str, Any], *, moved: Path | Non
         reading: of the record.
         moved: where the project lies now, or where the download of its data set does; None: where
             it lay.
-
-    Raises:
-        GvError: as of ``open_as``; the project is gone or cannot be read any more.
     """
     if moved is None:
         return open_as(Path(project), reading)
@@ -74,11 +68,7 @@ def open_recorded(project: str, reading: Mapping[str, Any], *, moved: Path | Non
 
 
 def rgbd_options(reading: Mapping[str, Any]) -> RgbdOptions | None:
-    """The options of RGB-D folders; None where there are none.
-
-    Raises:
-        OptionError: a matrix file that is none.
-    """
+    """The options of RGB-D folders; None where there are none."""
     options = {
         option: reading[name]
         for name, option in READING.items()

@@ -23,9 +23,6 @@ def reduced(scene: Scene, max_side: int | None) -> Scene:
     Args:
         scene: left as it is.
         max_side: pixels; None keeps every size.
-
-    Raises:
-        OptionError: below 64 pixels.
     """
     check_max_side(max_side)
     sizes = np.array([(view.camera.width[0], view.camera.height[0]) for view in scene.views])
@@ -52,11 +49,7 @@ def reduced(scene: Scene, max_side: int | None) -> Scene:
 
 
 def check_max_side(max_side: int | None) -> None:
-    """Refuse a size at which nothing is left.
-
-    Raises:
-        OptionError: below 64 pixels.
-    """
+    """Refuse a size at which nothing is left."""
     if max_side is not None and not max_side >= SMALLEST:
         raise OptionError(f"max_side {max_side}; expected at least {SMALLEST}")
 

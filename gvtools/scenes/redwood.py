@@ -75,11 +75,7 @@ def _record(root: Path, options: RgbdOptions) -> Recording:
 
 
 def intrinsics(root: Path, options: RgbdOptions) -> tuple[Float64, list[Finding]]:
-    """(3, 3) of the colour camera as published, and where they come from.
-
-    Raises:
-        ProjectError: a malformed file.
-    """
+    """(3, 3) of the colour camera as published, and where they come from."""
     cameras = sorted(
         path
         for path in root.glob("*.json")
@@ -98,9 +94,6 @@ def read_log(path: Path) -> tuple[list[int], list[Float64]]:
 
     Returns:
         Each block's first integer and its (4, 4) matrix, as read.
-
-    Raises:
-        ProjectError: unreadable, or not of that form.
     """
     try:
         rows = [line.split() for line in read_text(path).splitlines()]

@@ -41,9 +41,6 @@ def register_depth(
     Returns:
         (height, width) float32 z-depth of the colour camera, 0 where no surface falls on the
         pixel's centre.
-
-    Raises:
-        ShapeError: an array of another shape, or a K of the depth camera that has no inverse.
     """
     z = np.ascontiguousarray(depth, np.float32)
     K_depth, K_color = np.asarray(depth_K, np.float64), np.asarray(color_K, np.float64)

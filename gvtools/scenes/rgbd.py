@@ -57,11 +57,6 @@ class RgbdLayout:
         Args:
             root: the folder.
             options: what the folder does not tell by itself.
-
-        Raises:
-            ProjectError: a file is absent or malformed, or no frame is complete.
-            ShapeError: a pose with NaN, a scale or a mirror.
-            OptionError: a wrong option in the folder's ``rgbd.json``.
         """
         root = Path(root)
         resolved, findings = resolve_options(root, options)
@@ -70,11 +65,7 @@ class RgbdLayout:
 
 
 def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOptions, list[Finding]]:
-    """``options`` over those of the folder's ``rgbd.json``, and a finding when that was read.
-
-    Raises:
-        OptionError: the file is no JSON object, or has an unknown key or a wrong value.
-    """
+    """``options`` over those of the folder's ``rgbd.json``, and a finding when that was read."""
     options = options or RgbdOptions()
     path = root / SIDECAR
     if not path.is_file():
@@ -86,12 +77,7 @@ def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOption
 
 
 def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:
-    """The scene of a recording, in metres, in the poses' own world frame.
-
-    Raises:
-        ProjectError: no frames, or impossible intrinsics.
-        ShapeError: a pose with NaN, a scale or a mirror.
-    """
+    """The scene of a recording, in metres, in the poses' own world frame."""
     root = recording.root
     if not recording.frames:
         reasons = "; ".join(

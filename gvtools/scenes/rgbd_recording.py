@@ -104,9 +104,6 @@ def posed_frames(
     Args:
         files: picture, depth map and pose of each frame; the last two may be absent.
         shapes: that a pose's matrix may have.
-
-    Raises:
-        ProjectError: a pose that is no matrix of these shapes.
     """
     frames, unposed, lost = [], [], []
     for color, depth, pose in files:
@@ -142,11 +139,7 @@ def pinhole(values: Sequence[float]) -> Float64:
 
 
 def open3d_intrinsics(path: Path) -> Float64:
-    """(3, 3) intrinsics of Open3D's JSON form, which lists them column by column.
-
-    Raises:
-        ProjectError: no such JSON.
-    """
+    """(3, 3) intrinsics of Open3D's JSON form, which lists them column by column."""
     try:
         values = read_json(path)["intrinsic_matrix"]
         return np.array(values, np.float64).reshape(3, 3).T
@@ -158,11 +151,7 @@ def open3d_intrinsics(path: Path) -> Float64:
 
 
 def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
-    """A matrix in a text file.
-
-    Raises:
-        ProjectError: absent, no numbers, or of none of ``shapes``.
-    """
+    """A matrix in a text file."""
     expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
     try:
         text = read_text(path).replace(",", " ")

@@ -45,11 +45,7 @@ class SampleContent:
 
 
 def is_written(folder: Path, record: dict[str, Any]) -> bool:
-    """Whether the folder holds exactly the sample that the record describes.
-
-    Raises:
-        ProjectError: it holds something else.
-    """
+    """Whether the folder holds exactly the sample that the record describes."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return False
     try:
@@ -66,11 +62,7 @@ def is_written(folder: Path, record: dict[str, Any]) -> bool:
 
 
 def write_sample(folder: Path, content: SampleContent, *, record: dict[str, Any]) -> None:
-    """Write images, model, depth maps and the record to a folder that is absent or empty.
-
-    Raises:
-        ProjectError: the folder cannot be written.
-    """
+    """Write images, model, depth maps and the record to a folder that is absent or empty."""
     from PIL import Image
 
     with written_whole(folder, record) as partial:
@@ -95,11 +87,7 @@ def write_sample(folder: Path, content: SampleContent, *, record: dict[str, Any]
 
 @contextmanager
 def written_whole(folder: Path, record: dict[str, Any]) -> Iterator[Path]:
-    """A folder to write a sample into, which becomes ``folder`` with its record at the end.
-
-    Raises:
-        ProjectError: the folder cannot be written.
-    """
+    """A folder to write a sample into, which becomes ``folder`` with its record at the end."""
     partial: Path | None = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

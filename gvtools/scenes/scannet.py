@@ -47,11 +47,7 @@ def frame_files(root: Path) -> list[tuple[Path, Path, Path]]:
 
 
 def calibrated(root: Path, options: RgbdOptions, *, frames: Sequence[RgbdFrame]) -> Recording:
-    """The recording of these frames, with the calibration in ``intrinsic``.
-
-    Raises:
-        ProjectError: the colour camera's intrinsics are absent, or a file is malformed.
-    """
+    """The recording of these frames, with the calibration in ``intrinsic``."""
     findings = []
     folder = root / "intrinsic"
     if options.color_K is not None:

@@ -36,9 +36,6 @@ def select(names: Sequence[str], spec: str) -> tuple[str, ...]:
     Args:
         names: a scene's view names, in its order.
         spec: see the module's text.
-
-    Raises:
-        OptionError: an unknown form or name, or a selection of nothing.
     """
     pictures: dict[str, list[int]] = {}
     for i, name in enumerate(names):
@@ -138,9 +135,6 @@ def check_disjoint(context: Sequence[str], targets: Sequence[str]) -> None:
     """Refuse targets that are context as well, since their figures would be of seen pictures.
 
     Views of one picture count as one: its faces may overlap.
-
-    Raises:
-        OptionError: the two overlap.
     """
     seen = {picture_of(name) for name in context}
     both = [name for name in targets if picture_of(name) in seen]

@@ -44,11 +44,7 @@ def frame_files(root: Path) -> list[tuple[Path, Path, Path]]:
 
 
 def intrinsics(root: Path, options: RgbdOptions) -> NDArray[np.float64]:
-    """(3, 3) of the colour camera as published: the folder's file, else the option.
-
-    Raises:
-        ProjectError: neither is there, or the file is malformed.
-    """
+    """(3, 3) of the colour camera as published: the folder's file, else the option."""
     files = [folder / INTRINSICS for folder in (root, root.resolve().parent)]
     path = next((path for path in files if path.is_file()), None)
     if path is None and options.color_K is None:

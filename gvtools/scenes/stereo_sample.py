@@ -57,9 +57,6 @@ def write_motorcycle(folder: Path) -> StereoSample:
 
     Args:
         folder: the workspace; absent, empty, or written by the same call before.
-
-    Raises:
-        ProjectError: the folder holds something else or cannot be written.
     """
     folder = Path(folder)
     sample = StereoSample(folder)

@@ -73,10 +73,6 @@ class FrameKeys(BaseModel):
         Args:
             picture: tells the size where no key does.
             what: where the keys were read, for messages.
-
-        Raises:
-            ProjectError: no focal length, a model that is not perspective, or coefficients that no
-                model holds.
         """
         if self.w is None or self.h is None:
             header = read_header(picture)
@@ -129,9 +125,6 @@ def frame_keys(frame: Mapping[str, Any], shared: Mapping[str, Any], *, what: str
         frame: its own.
         shared: the file's, of which those of the camera stand in for absent ones of the frame.
         what: where they were read, for the message.
-
-    Raises:
-        ProjectError: a key with a wrong value.
     """
     values = {key: shared[key] for key in shared if key not in OF_A_FRAME} | dict(frame)
     if "fl_x" in values or "fl_y" in values:

@@ -56,10 +56,6 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
 
     Returns:
         The scene, in the file's world frame and scale.
-
-    Raises:
-        ProjectError: no such file or folder, malformed, or without frames on disk.
-        ShapeError: a pose with NaN, a scale or a mirror.
     """
     path = Path(path)
     path = path / FILE if path.is_dir() else path
@@ -154,10 +150,6 @@ def read_transforms_cameras(path: Path) -> Cameras:
     Returns:
         One camera a perspective view of a frame, in the order of names that ``read_transforms``
         has.
-
-    Raises:
-        ProjectError: no such file, malformed, or a camera whose picture's size nothing tells.
-        ShapeError: a pose with NaN, a scale or a mirror.
     """
     data = load_frames(path)
     frames = data["frames"]
@@ -190,9 +182,6 @@ def write_transforms(
         cameras: V cameras; K without skew.
         image_paths: V pictures, absolute or relative to the file's folder.
         generated: names of the cameras whose pictures a completer made.
-
-    Raises:
-        ProjectError: the file cannot be written.
     """
     frames = []
     for i, image in enumerate(image_paths):
@@ -230,11 +219,7 @@ def _relative(file: str | Path, folder: Path) -> str:
 
 
 def load_frames(path: Path) -> dict[str, Any]:
-    """The content of a ``transforms.json``, with at least one frame.
-
-    Raises:
-        ProjectError: no such file, or not of that form.
-    """
+    """The content of a ``transforms.json``, with at least one frame."""
     try:
         data = read_json(path)
     except FileNotFoundError:

@@ -86,9 +86,6 @@ def frame_files(root: Path, limit: float) -> tuple[list[tuple[float, Path, Path 
     Args:
         root: the folder with rgb.txt and depth.txt.
         limit: between the times of a picture and its depth map, seconds.
-
-    Raises:
-        ProjectError: a list is unreadable or malformed.
     """
     colors, depths = _read_list(root / "rgb.txt"), _read_list(root / "depth.txt")
     color_times = np.array([time for time, _ in colors])
@@ -120,9 +117,6 @@ def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:
 
     Returns:
         For indices of ``first``, the index of ``second``.
-
-    Raises:
-        ProjectError: nearly all stamps are within the limit of nearly all others.
     """
     order = np.argsort(second, kind="stable")
     low = np.searchsorted(second[order], first - limit, side="left")
@@ -168,11 +162,7 @@ def _read_list(path: Path) -> list[tuple[float, str]]:
 
 
 def intrinsics(root: Path) -> tuple[Float64, tuple[float, ...], str]:
-    """(3, 3) and distortion of the colour camera as published, and where they come from.
-
-    Raises:
-        ProjectError: a malformed file.
-    """
+    """(3, 3) and distortion of the colour camera as published, and where they come from."""
     if (root / "camera-intrinsics.txt").is_file():
         path = root / "camera-intrinsics.txt"
         return load_matrix(path, (3, 3)), (), path.name

@@ -160,9 +160,6 @@ def undistortion(
         params: its parameters, in COLMAP's order; pixels, first pixel centre (0.5, 0.5).
         size: width and height of the recorded picture, pixels.
         what: where the camera was read, for the message.
-
-    Raises:
-        ProjectError: an unknown or spherical model, or impossible parameters.
     """
     import pycolmap
 
@@ -213,9 +210,6 @@ def camera_of(
         params: its parameters, in COLMAP's order.
         size: width and height, pixels.
         what: where the camera was read, for the message.
-
-    Raises:
-        ProjectError: an unknown model, or impossible parameters.
     """
     import pycolmap
 

@@ -25,11 +25,7 @@ LOOKS_LIKE = (
 
 
 def count_unposed(root: Path) -> int:
-    """How many RGB-D frames a folder holds that is no project; 0 where it holds none.
-
-    Raises:
-        ProjectError: a malformed list of frames.
-    """
+    """How many RGB-D frames a folder holds that is no project; 0 where it holds none."""
     kind = _kind(root)
     return 0 if kind is None else len(_files(root, kind, RgbdOptions()))
 
@@ -40,9 +36,6 @@ def read_unposed(root: Path, options: RgbdOptions) -> Recording | None:
     Args:
         root: the folder.
         options: what it does not tell by itself.
-
-    Raises:
-        ProjectError: absent intrinsics, or a malformed file.
     """
     kind = _kind(root)
     if kind is None:

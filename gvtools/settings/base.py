@@ -66,11 +66,7 @@ class Settings(BaseModel):
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     def replaced(self: S, **changes: Any) -> S:
-        """A copy with some fields changed, checked again.
-
-        Raises:
-            OptionError: an unknown field or a value out of range.
-        """
+        """A copy with some fields changed, checked again."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
         return type(self)(**{**values, **changes})
 

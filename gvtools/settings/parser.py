@@ -22,11 +22,7 @@ NONE = ("none", "null", "auto")
 
 
 def with_texts(settings: S, texts: Iterable[str]) -> S:
-    """``settings`` with ``key=value`` texts applied in order.
-
-    Raises:
-        OptionError: a text without ``=``, an unknown key or a wrong value.
-    """
+    """``settings`` with ``key=value`` texts applied in order."""
     pairs = []
     for text in texts:
         key, equals, value = text.partition("=")
@@ -43,9 +39,6 @@ def with_file(settings: S, path: Path, *, presets: Mapping[str, str] | None = No
         settings: to start from.
         path: the file.
         presets: names of presets by field, in place of those that the file may name.
-
-    Raises:
-        OptionError: unreadable, no JSON object, an unknown key or a wrong value.
     """
     try:
         data = read_json(path)
@@ -60,11 +53,7 @@ def with_file(settings: S, path: Path, *, presets: Mapping[str, str] | None = No
 
 
 def with_values(settings: S, values: Iterable[tuple[str, Any]] | Mapping[str, Any]) -> S:
-    """``settings`` with the values of dotted keys, texts or plain data.
-
-    Raises:
-        OptionError: an unknown key or a wrong value.
-    """
+    """``settings`` with the values of dotted keys, texts or plain data."""
     pairs = values.items() if isinstance(values, Mapping) else values
     tree: dict[str, Any] = {}
     for key, value in _expanded(settings, pairs):

@@ -48,9 +48,6 @@ def chosen_context(
         views: of the path.
         count: of context views.
         rule: "every" k-th view; evenly spaced with both "ends"; or the "first" ones.
-
-    Raises:
-        OptionError: no view is left as a target.
     """
     if not 1 <= count < views:
         raise OptionError(f"{count} context views of {views}; expected 1 to {views - 1}")

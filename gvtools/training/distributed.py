@@ -48,11 +48,7 @@ class Processes:
         return self.rank == 0
 
     def share(self, samples: range) -> range:
-        """This process's part of a step's samples; contiguous, equal for all.
-
-        Raises:
-            OptionError: the samples cannot be divided.
-        """
+        """This process's part of a step's samples; contiguous, equal for all."""
         if len(samples) % self.count:
             raise OptionError(
                 f"a batch of {len(samples)} samples over {self.count} processes; expected a "
@@ -121,9 +117,6 @@ def started(device: str = "auto") -> Iterator[Processes]:
 
     Args:
         device: "auto", "cpu" or "cuda".
-
-    Raises:
-        OptionError: CUDA without a CUDA device.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise OptionError("device cuda, and torch sees no CUDA device here; use cpu")

@@ -193,9 +193,6 @@ def split_context(scene: Scene, config: GeoVerseConfig, *, seed: int = 0) -> Spl
         scene: the context alone, with depth.
         config: of the model.
         seed: of the samples.
-
-    Raises:
-        ProjectError: fewer than ``FEWEST_VIEWS`` views have depth, or hardly any see the same.
     """
     usable = [view for view in scene if view.has_depth]
     chosen = list(evenly_spread(usable, MOST))

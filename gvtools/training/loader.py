@@ -33,10 +33,6 @@ def batches(
         data: the data set; has to be picklable when there are workers.
         parts: numbers of each batch's samples, without end.
         workers: processes that make samples; 0 makes them when they are asked for.
-
-    Raises:
-        ShapeError: the numbers of context views of a batch differ.
-        ProjectError: a worker was killed.
     """
     if not workers:
         for part in parts:

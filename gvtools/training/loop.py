@@ -215,9 +215,6 @@ class Trainer:
 
         Args:
             group: so many samples in a row, from a multiple of it, have.
-
-        Raises:
-            OptionError: a part would reach over the end of a group.
         """
         for part in itertools.chain.from_iterable(map(self.parts, range(group))):
             if part[0] // group != part[-1] // group:

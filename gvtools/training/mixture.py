@@ -43,11 +43,7 @@ class Redrawable(Protocol):
     """Samples by index, of which another one can be drawn where one is invalid."""
 
     def sample(self, index: int, attempt: int = 0) -> Sample:
-        """The sample of an index; each attempt gives another one.
-
-        Raises:
-            InvalidSampleError: not to be used; draw the next attempt.
-        """
+        """The sample of an index; each attempt gives another one."""
         ...
 
     def describe(self) -> dict[str, Any]:
@@ -113,12 +109,7 @@ class Mixture:
         return np.minimum(np.searchsorted(ends, numbers, side="right"), last)
 
     def sample(self, index: int) -> Sample:
-        """The sample of an index, 0 or more, with notes of its source and of invalid draws.
-
-        Raises:
-            OptionError: an index below 0.
-            DegenerateError: no source has a valid sample.
-        """
+        """The sample of an index, 0 or more, with notes of its source and of invalid draws."""
         if index < 0:
             raise OptionError(f"sample {index}; expected a number of 0 or more")
         notes: list[str] = []
@@ -184,11 +175,7 @@ class OwnOrEstimated:
         return stratified_at(start, count, stream=stream) < self.own_share
 
     def sample(self, index: int, attempt: int = 0) -> Sample:
-        """The sample of an index, 0 or more; each attempt gives another one.
-
-        Raises:
-            InvalidSampleError: from ``own`` or ``estimated``, whichever was taken.
-        """
+        """The sample of an index, 0 or more; each attempt gives another one."""
         if self.wants_own(index, 1, attempt)[0]:
             try:
                 return _noted(self.own.sample(index, attempt), "own")

@@ -298,9 +298,6 @@ def shipped_or_read(name: str) -> tuple[TrainingSettings, Path]:
 
     Returns:
         The configuration, and the folder of its file.
-
-    Raises:
-        OptionError: no such training or file, an unknown key, or a wrong value.
     """
     if name.endswith(".json"):
         path = Path(name)

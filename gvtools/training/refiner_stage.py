@@ -39,11 +39,7 @@ CUT = 0.6
 
 
 class RefinerStage(Stage):
-    """Loss of the refiner; see the module.
-
-    Raises:
-        OptionError: the model has none, or none of its completions is a correction.
-    """
+    """Loss of the refiner; see the module."""
 
     name = "refiner"
 

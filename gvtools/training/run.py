@@ -102,9 +102,6 @@ class StageRun:
 
         Returns:
             The last record.
-
-        Raises:
-            CheckpointError: there is a state and ``resume`` is not set, or one that does not fit.
         """
         if (self.folder / FILE).exists() and not resume:
             raise CheckpointError(
@@ -260,11 +257,7 @@ class StageRun:
         return model
 
     def _refuse_unfinished(self, before: Sequence[str]) -> None:
-        """A stage that was begun and not finished must not be passed over for one before it.
-
-        Raises:
-            CheckpointError: there is one.
-        """
+        """A stage that was begun and not finished must not be passed over for one before it."""
         for name in reversed(before):
             folder = self.out / name
             if (folder / WEIGHTS).exists():

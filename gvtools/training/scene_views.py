@@ -103,12 +103,7 @@ class SceneViews:
         object.__setattr__(self, "_shares", shares / shares.sum())
 
     def sample(self, index: int, attempt: int = 0) -> Sample:
-        """The sample of a number, 0 or more; of each attempt another one.
-
-        Raises:
-            InvalidSampleError: a file cannot be read, depth is missing, or no window of views that
-                overlap was found.
-        """
+        """The sample of a number, 0 or more; of each attempt another one."""
         clip, truth = self.clips(index, attempt)
         rng = np.random.default_rng([self.seed, RECORDED, index, FAULTS, attempt])
         strength = drawn(rng, self.faults or CorruptionOptions(clean=1.0))
@@ -117,11 +112,7 @@ class SceneViews:
         return make_sample(clip, truth, context, rng=rng, strength=strength, fill=self.fill)
 
     def clips(self, index: int, attempt: int = 0) -> tuple[Clip, Clip]:
-        """The window of a sample: as it is observed, and at the model's size.
-
-        Raises:
-            InvalidSampleError: see ``sample``.
-        """
+        """The window of a sample: as it is observed, and at the model's size."""
         rng = np.random.default_rng([self.seed, RECORDED, index, PATH, attempt])
         number = int(rng.choice(len(self._shares), p=self._shares))
         try:
@@ -177,11 +168,7 @@ class SceneViews:
 
 @lru_cache(KEPT_SCENES)
 def _usable(data: SceneViews, number: int) -> tuple[View, ...]:
-    """The views of a scene that samples are made of.
-
-    Raises:
-        GvError: the scene cannot be read, or has too few of them.
-    """
+    """The views of a scene that samples are made of."""
     name = data.scenes.names[number]
     scene = data.scenes.read(name)
     chosen = [scene[view] for view in select(scene.names, data.select)]

@@ -35,9 +35,6 @@ def recorded_sources(
         draw: makes the samples of scenes.
         share: of all samples, to be divided among them by weight.
         seed: 0 or more.
-
-    Raises:
-        GvError: an address that leads nowhere, or a source without geometry.
     """
     whole = [SceneSource(project=entry) if isinstance(entry, str) else entry for entry in entries]
     opened = [_opened(entry) for entry in whole]

@@ -54,11 +54,7 @@ class StageState:
 
 
 def save_state(state: StageState, folder: Path) -> None:
-    """Write the state; a kill or a full disk leaves the previous one whole.
-
-    Raises:
-        ProjectError: it cannot be written.
-    """
+    """Write the state; a kill or a full disk leaves the previous one whole."""
     content = {**vars(state), "progress": asdict(state.progress)}
     with replaced_when_written(folder / FILE) as part, part.open("wb") as file:
         try:
@@ -79,9 +75,6 @@ def load_state(
         folder: of the stage.
         identity: what must not have changed.
         mapped: leave tensors in the file until they are used; for processes that use a part each.
-
-    Raises:
-        CheckpointError: damaged, or of other settings (the first that differs is named).
     """
     path = folder / FILE
     if not path.exists():

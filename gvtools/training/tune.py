@@ -106,11 +106,7 @@ class Tuning:
 
 
 def check_tunable(weights: Path) -> GeoVerseConfig:
-    """The configuration of weights that can be tuned.
-
-    Raises:
-        CheckpointError: no weights, or untrained ones.
-    """
+    """The configuration of weights that can be tuned."""
     config = config_of(weights)
     if not config.trained:
         raise CheckpointError(
@@ -141,9 +137,6 @@ def tune(
         completer: further options of the completer that predicts the judging views.
         seed: of everything random.
         say: is told how far it is.
-
-    Raises:
-        GvError: weights that cannot be tuned, or too few views with depth.
     """
     begun = time.monotonic()
     config = check_tunable(weights)
@@ -213,11 +206,7 @@ class _Judge:
 
 
 def generated_psnr(completer: Completer, predictions: list[Prediction]) -> float:
-    """PSNR in dB over the generated pixels of all predictions together, at most 100.
-
-    Raises:
-        ProjectError: there are none.
-    """
+    """PSNR in dB over the generated pixels of all predictions together, at most 100."""
     squared, pixels = 0.0, 0
     for number, case in enumerate(predictions):
         holes = ~case.guidance.valid

@@ -151,11 +151,7 @@ def _mean_known(depths: Sequence[Float32]) -> float:
 
 
 def collated(samples: Sequence[Sample]) -> TrainingBatch:
-    """Samples of one size and one number of context views as a batch.
-
-    Raises:
-        ShapeError: they differ; samples of one ``group`` of a data set do not.
-    """
+    """Samples of one size and one number of context views as a batch."""
     kinds = {(tuple(sample.images.shape), sample.context) for sample in samples}
     if len(kinds) != 1:
         raise ShapeError(

@@ -110,11 +110,7 @@ class CompleteOptions(Settings):
 
 
 def parsed_size(text: str) -> tuple[int, int]:
-    """HxW, or N for N x N.
-
-    Raises:
-        OptionError: neither.
-    """
+    """HxW, or N for N x N."""
     parts = text.lower().split("x")
     try:
         height, width = (int(part) for part in (parts * 2 if len(parts) == 1 else parts))

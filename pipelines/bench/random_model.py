@@ -46,11 +46,7 @@ def random_model(
 
 
 def random_video(config: VideoPriorConfig, device: torch.device | str = "cpu") -> VideoPrior:
-    """A video prior of the published network's sizes, truncated behind the last tap.
-
-    Raises:
-        CheckpointError: diffusers is absent, or the configuration is of another network.
-    """
+    """A video prior of the published network's sizes, truncated behind the last tap."""
     # What diffusers takes by default is the published network.
     sizes = {"num_layers": config.taps[-1] + 1, "vace_layers": list(config.taps)}
     dtype = getattr(torch, config.dtype or "bfloat16")

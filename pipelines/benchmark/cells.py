@@ -43,11 +43,7 @@ def identity(cell: Cell) -> dict[str, Any]:
 
 
 def read_cell(cell: Cell) -> dict[str, Any] | None:
-    """What a cell's file holds; None where there is none, or a damaged one.
-
-    Raises:
-        OptionError: it was measured with other settings.
-    """
+    """What a cell's file holds; None where there is none, or a damaged one."""
     try:
         found = read_json(cell.result)
         before = found["identity"]
@@ -79,9 +75,6 @@ def measure_cells(
         console: is told of each.
         measure: measures one and writes its file.
         after: called after each.
-
-    Raises:
-        OptionError: some were measured with other settings; nothing is measured then.
     """
     before = [read_cell(cell) for cell in cells]
     for number, (cell, found) in enumerate(zip(cells, before, strict=True), start=1):

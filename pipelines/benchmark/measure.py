@@ -119,9 +119,6 @@ def measure_cell(cell: Cell) -> dict[str, Any]:
 
     Returns:
         Figures and what they were measured on, JSON-ready.
-
-    Raises:
-        GvError: the scene cannot be read, or the method refuses it.
     """
     from gvtools.evaluation.lpips_distance import Lpips
 

@@ -38,9 +38,6 @@ class Method:
 
         Args:
             seconds: how long Gaussians are fitted, where the method fits any; None leaves it.
-
-        Raises:
-            OptionError: a setting that is none.
         """
         from gvtools.settings import with_values
         from pipelines.reconstruction.settings import RunSettings
@@ -56,9 +53,6 @@ def parse_methods(text: str) -> tuple[Method, ...]:
 
     Each is ``default``, a profile, a completer, ``paper`` (its protocol), ``NAME=FILE.json`` (a
     file of settings) or ``NAME=DIR`` (pictures of another method).
-
-    Raises:
-        OptionError: an unknown name, a name given twice, or a file or folder that is not there.
     """
     methods = tuple(_parsed(part.strip()) for part in text.split(",") if part.strip())
     names = [method.name for method in methods]

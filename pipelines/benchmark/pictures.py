@@ -33,9 +33,6 @@ def object_mask(
     """(H, W) bool, the object in a view; None where the benchmark has no mask of it.
 
     White is the object, as RegNeRF's evaluation reads it; the nearest pixel is taken.
-
-    Raises:
-        ProjectError: the file is no picture.
     """
     from PIL import Image
 

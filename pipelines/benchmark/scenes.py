@@ -14,11 +14,7 @@ if TYPE_CHECKING:
 
 
 def scene_names(benchmark: Benchmark, root: Path) -> tuple[str, ...]:
-    """The benchmark's scenes; where it names none, all that lie below the root.
-
-    Raises:
-        ProjectError: the root is absent, or holds no scene.
-    """
+    """The benchmark's scenes; where it names none, all that lie below the root."""
     if benchmark.scenes:
         if not root.is_dir():
             raise ProjectError(f"{root}: no such folder; expected the scenes of {benchmark.name}")
@@ -52,9 +48,6 @@ def open_benchmark_scene(benchmark: Benchmark, name: str, root: Path) -> Scene:
         benchmark: with one number of context views.
         name: of the scene.
         root: the folder of the data set, or of the projects.
-
-    Raises:
-        GvError: it is not there, or cannot be read.
     """
     from gvtools.scenes.data_sets.layouts import open_data_set
     from gvtools.scenes.project import open_project
@@ -66,11 +59,7 @@ def open_benchmark_scene(benchmark: Benchmark, name: str, root: Path) -> Scene:
 
 
 def _name_there(benchmark: Benchmark, name: str, root: Path) -> str:
-    """A scene's name in the download: in whichever folder it lies, and of the reduced pictures.
-
-    Raises:
-        ProjectError: the pictures that are to be reduced, or their reduced copies, are not there.
-    """
+    """A scene's name in the download: in whichever folder it lies, and of the reduced pictures."""
     from gvtools.scenes.data_sets.layouts import layout_of, scenes_of
     from gvtools.scenes.data_sets.spec import load_spec
 
@@ -94,9 +83,6 @@ def split_of_scene(benchmark: Benchmark, scene: Scene) -> SceneSplit:
     Args:
         benchmark: with one number of context views.
         scene: as recorded.
-
-    Raises:
-        GvError: it has too few views, or its split file is absent.
     """
     from gvtools.evaluation.splits import split_scene
 

@@ -32,11 +32,7 @@ class BlockCompletions(Completer):
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:
-        """The completion of one target; see ``Completer.complete``.
-
-        Raises:
-            ProjectError: its files are damaged, or of another size.
-        """
+        """The completion of one target; see ``Completer.complete``."""
         name = guidance.cameras.names[0]
         target = self.targets[name]
         files = target.read()

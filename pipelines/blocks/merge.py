@@ -70,10 +70,6 @@ def merge(
 
     Returns:
         ``out``.
-
-    Raises:
-        GvError: runs that do not belong together, a project that is gone, or a folder that cannot
-            be written.
     """
     runs = read_runs(paths, blocks=blocks)
     first = runs[0].block

@@ -81,10 +81,6 @@ def read_runs(paths: Sequence[Path], *, blocks: Path | None = None) -> list[Bloc
     Args:
         paths: their folders, in any order.
         blocks: where the split lies now; None: where it lay.
-
-    Raises:
-        ProjectError: a run that is not finished or of no block, or a block without a run.
-        OptionError: runs of different settings, or two of one block.
     """
     known = {} if blocks is None else {path.name: path for path, _ in read_blocks(blocks)}
     found: dict[str, BlockRun] = {}

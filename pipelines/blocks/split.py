@@ -52,9 +52,6 @@ def split(
 
     Returns:
         The blocks in order of their names.
-
-    Raises:
-        GvError: a project that cannot be split so, or a folder that cannot be written.
     """
     if not 0 <= overlap <= 1:
         raise OptionError(f"overlap {overlap:g}; expected 0 to 1")

@@ -49,9 +49,6 @@ def write_blocks(out: Path, scene: Scene, blocks: Sequence[Block], *, layout: st
         scene: the project, in the poses that the blocks are to have.
         blocks: what they hold.
         layout: one of LAYOUTS.
-
-    Raises:
-        GvError: a view that cannot be read, or has skew, or a folder that cannot be written.
     """
     holders = {
         name: [block_folder(out, block.name, layout) for block in blocks if name in _held(block)]
@@ -164,11 +161,7 @@ def read_blocks(folder: Path) -> Iterator[tuple[Path, Block]]:
 
 
 def by_name(found: Mapping[str, Block], *, what: str) -> tuple[Block, ...]:
-    """All blocks of one split, in order of their names.
-
-    Raises:
-        ProjectError: some are missing, or they are of several splits.
-    """
+    """All blocks of one split, in order of their names."""
     first = next(iter(found.values()))
     missing = [name for name in first.names if name not in found]
     if missing:

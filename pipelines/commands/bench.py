@@ -104,11 +104,7 @@ def _add_complete(group: argparse._ArgumentGroup) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Run the benchmark and show or write its rows.
-
-    Raises:
-        OptionError: too few points or repeats, or options of another benchmark.
-    """
+    """Run the benchmark and show or write its rows."""
     given = {name for name in COMPLETE if getattr(args, name) is not None}
     if args.what == "complete":
         if args.points is not None:

@@ -64,12 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Measure what is not measured yet, and write the tables.
-
-    Raises:
-        GvError: an option is wrong, results are there of other settings, or everything failed; the
-            tables with the reasons are out by then.
-    """
+    """Measure what is not measured yet, and write the tables."""
     from gvtools.evaluation.published import load_benchmark
     from gvtools.runs.folder_lock import folder_lock
     from pipelines.benchmark.cells import measure_apart, measure_cells
@@ -92,11 +87,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 
 def _refuse_others(out: Path, name: str) -> None:
-    """Refuse a folder with the tables of another benchmark, which would be overwritten.
-
-    Raises:
-        OptionError: it holds such tables.
-    """
+    """Refuse a folder with the tables of another benchmark, which would be overwritten."""
     from pipelines.benchmark.results import RESULTS
 
     try:
@@ -110,11 +101,7 @@ def _refuse_others(out: Path, name: str) -> None:
 
 
 def _check_some_measured(cells: tuple[Cell, ...], root: Path) -> None:
-    """Refuse a benchmark without any figure, which a script would take for a success.
-
-    Raises:
-        ProjectError: everything failed.
-    """
+    """Refuse a benchmark without any figure, which a script would take for a success."""
     from pipelines.benchmark.cells import MEASURED, read_cell
 
     results = [read_cell(cell) for cell in cells]
@@ -126,11 +113,7 @@ def _check_some_measured(cells: tuple[Cell, ...], root: Path) -> None:
 def planned_cells(
     args: argparse.Namespace, benchmark: Benchmark, console: Console
 ) -> tuple[Cell, ...]:
-    """Every scene, number of views and method, scene by scene.
-
-    Raises:
-        GvError: a name that is none, or a folder without a scene.
-    """
+    """Every scene, number of views and method, scene by scene."""
     from pipelines.benchmark.measure import Cell
     from pipelines.benchmark.methods import parse_methods
     from pipelines.benchmark.scenes import scene_names

@@ -74,11 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Find the cameras and write the project.
-
-    Raises:
-        GvError: nothing that can be used, or no place to write to.
-    """
+    """Find the cameras and write the project."""
     from gvtools.capture.project import capture_photographs
     from gvtools.scenes.project import BAG, VIDEOS, is_recording
     from gvtools.scenes.unposed import count_unposed

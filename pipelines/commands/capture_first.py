@@ -21,10 +21,6 @@ def open_or_capture(args: argparse.Namespace, console: Console) -> tuple[Scene, 
 
     An input without cameras is captured to ``OUT-project`` beside the run's folder where --capture
     or the user's answer says so. A project that was captured from this input before is used again.
-
-    Raises:
-        UnposedError: the input has no cameras, and none are to be found now.
-        GvError: as of ``open_scene`` and ``gvtools capture``.
     """
     try:
         return open_scene(args.project, args), reading_of(args)

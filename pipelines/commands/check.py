@@ -32,12 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Open every file of the project and report.
-
-    Raises:
-        ProjectError: a run could not read it; the report is out by then.
-        GvError: nothing could be opened; the JSON file, if asked for, says so.
-    """
+    """Open every file of the project and report."""
     from gvtools.files import write_json
     from gvtools.scenes.inspection import inspect
 

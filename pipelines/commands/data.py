@@ -98,9 +98,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Do what the action says.
-
-    Raises:
-        GvError: nothing there, an unknown name, or damaged files.
-    """
+    """Do what the action says."""
     args.act(args, console)

@@ -68,11 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Measure, print, write.
-
-    Raises:
-        GvError: a run cannot be read, or an option is wrong.
-    """
+    """Measure, print, write."""
     from gvtools.evaluation.published import benchmark_names
     from gvtools.files import write_json
     from pipelines.evaluation.evaluate import (
@@ -112,11 +108,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 
 def parts_of(text: str) -> tuple[str, ...]:
-    """The parts that a list with commas names.
-
-    Raises:
-        OptionError: an unknown one, or none.
-    """
+    """The parts that a list with commas names."""
     from pipelines.evaluation.run_evaluation import PARTS
 
     parts = tuple(part.strip() for part in text.split(",") if part.strip())

@@ -77,12 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Write the export.
-
-    Raises:
-        GvError: the memory is unreadable, an option is wrong, a package is absent, or the target
-            cannot be written.
-    """
+    """Write the export."""
     from gvtools.runs.memory_file import load_memory
     from pipelines.export.source import Source
 
@@ -116,11 +111,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 
 def _options(args: argparse.Namespace, form: ExportFormat) -> ExportOptions:
-    """What was given, checked.
-
-    Raises:
-        OptionError: an option that the format does not heed, or a number out of range.
-    """
+    """What was given, checked."""
     from pipelines.export.source import ExportOptions
 
     given = {

@@ -60,11 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Draw and write the film.
-
-    Raises:
-        GvError: the memory, the path or an option is wrong, or the file cannot be written.
-    """
+    """Draw and write the film."""
     from gvtools.runs.memory_file import load_memory
     from pipelines.film.path import film_cameras
     from pipelines.film.writer import check_suffix, write_film

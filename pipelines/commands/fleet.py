@@ -45,11 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Run what is not finished, and print one table.
-
-    Raises:
-        GvError: the list or an option is wrong, or a task failed; its record says why.
-    """
+    """Run what is not finished, and print one table."""
     from gvtools.runs.folder_lock import folder_lock
     from pipelines.fleet.drive import run_fleet
     from pipelines.fleet.results import report

@@ -74,11 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Match, measure, print, write.
-
-    Raises:
-        GvError: pictures, run or project cannot be read, or an option is wrong.
-    """
+    """Match, measure, print, write."""
     from gvtools.files import make_folder, write_json
     from pipelines.commands.evaluate import parts_of
     from pipelines.judging.judge import JudgeOptions, judge
@@ -115,11 +111,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 
 def _check_apart(pictures: Sequence[Path], out: Path) -> None:
-    """Refuse results among the pictures, where the next call would take sheets for pictures.
-
-    Raises:
-        OptionError: they are to lie there.
-    """
+    """Refuse results among the pictures, where the next call would take sheets for pictures."""
     from gvtools.runs.layout import RECORD
 
     for path in pictures:

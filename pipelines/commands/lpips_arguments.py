@@ -24,11 +24,7 @@ def add_lpips_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def open_lpips(args: argparse.Namespace) -> tuple[Lpips | None, str | None]:
-    """The network, or None with the reason.
-
-    Raises:
-        CheckpointError: a folder was named, and there is no LPIPS in it.
-    """
+    """The network, or None with the reason."""
     from gvtools.errors import CheckpointError
     from gvtools.evaluation.lpips_distance import Lpips
 

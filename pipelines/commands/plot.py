@@ -42,11 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Draw and write.
-
-    Raises:
-        GvError: nothing there to draw, or a place that cannot be written.
-    """
+    """Draw and write."""
     from gvtools.files import replaced_when_written
 
     ending = args.out.suffix.lower().lstrip(".")
@@ -89,11 +85,7 @@ def _figure(what: str, folder: Path) -> Figure:
 
 
 def read_training(folder: Path) -> dict[str, list[dict[str, object]]]:
-    """The logs of a training's stages by name, or of the one stage whose folder it is.
-
-    Raises:
-        ProjectError: no log there.
-    """
+    """The logs of a training's stages by name, or of the one stage whose folder it is."""
     from gvtools.training.records import STAGES, read_log
 
     logs = {stage: read_log(folder / stage) for stage in STAGES}

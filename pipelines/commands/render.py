@@ -65,11 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Project, write pictures, measure.
-
-    Raises:
-        GvError: the memory, the cameras, the selection or the output folder is wrong.
-    """
+    """Project, write pictures, measure."""
     from gvtools.files import write_json
     from gvtools.runs.layout import file_stems
     from gvtools.runs.memory_file import load_appearance, load_memory
@@ -121,11 +117,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 
 def splat_options(texts: list[str]) -> SplatOptions:
-    """The projection's options, changed by ``splat.KEY=VALUE`` texts.
-
-    Raises:
-        OptionError: another key or a wrong value.
-    """
+    """The projection's options, changed by ``splat.KEY=VALUE`` texts."""
     from gvtools.settings import with_texts
     from pipelines.reconstruction.settings import RunSettings
 

@@ -35,11 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Write the page.
-
-    Raises:
-        GvError: no run, one without a whole round, or a place that cannot be written.
-    """
+    """Write the page."""
     from gvtools.files import write_text
     from pipelines.report.data import collect
     from pipelines.report.write import PAGE

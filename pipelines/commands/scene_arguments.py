@@ -76,21 +76,13 @@ def add_root_argument(parser: argparse._ActionsContainer) -> None:
 
 
 def refuse_root(root: Path | None, paths: Iterable[Path | None]) -> None:
-    """Refuse --root where none of the given paths is a scene of a data set.
-
-    Raises:
-        OptionError: see above.
-    """
+    """Refuse --root where none of the given paths is a scene of a data set."""
     if root is not None and not any(path is not None and is_address(path) for path in paths):
         raise OptionError(f"--root {root}: belongs to {FORM}; expected that, or no --root")
 
 
 def open_scene(path: Path, args: argparse.Namespace) -> Scene:
-    """The project at ``path``, read with the options of ``add_scene_arguments``.
-
-    Raises:
-        GvError: as of ``gvtools.scenes.reading.open_as``.
-    """
+    """The project at ``path``, read with the options of ``add_scene_arguments``."""
     from gvtools.scenes.reading import open_as
 
     return open_as(path, reading_of(args))

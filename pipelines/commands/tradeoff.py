@@ -61,11 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Sweep, and write table, front and the recommended profile.
-
-    Raises:
-        GvError: a project or settings that cannot be run, or a time that is none.
-    """
+    """Sweep, and write table, front and the recommended profile."""
     from gvtools.files import write_json
     from gvtools.runs.folder_lock import folder_lock
     from gvtools.settings import changes
@@ -168,11 +164,7 @@ def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunSettin
 
 
 def parse_seconds(option: str, text: str) -> float:
-    """Of ``60``, ``5m`` or ``2h``.
-
-    Raises:
-        OptionError: another unit, or nothing above 0.
-    """
+    """Of ``60``, ``5m`` or ``2h``."""
     found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", text)
     if not found or found[2].lower() not in UNITS or not float(found[1]) > 0:
         raise OptionError(f"{option} {text!r}; expected seconds (60), 5m or 2h")

@@ -69,11 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Associate, align, measure.
-
-    Raises:
-        GvError: a trajectory cannot be read, nothing belongs together, or an option is wrong.
-    """
+    """Associate, align, measure."""
     from gvtools.evaluation.trajectories import absolute_errors, pose_auc, relative_errors
     from gvtools.files import write_json
     from pipelines.evaluation.pose_figures import pose_figures

@@ -46,22 +46,14 @@ def add_tune_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def refuse_tune_arguments(args: argparse.Namespace) -> None:
-    """Refuse options of ``tune`` beside another training.
-
-    Raises:
-        OptionError: one is given.
-    """
+    """Refuse options of ``tune`` beside another training."""
     for name in ("scene", "root", "context", "depth", "minutes", "steps", "seed"):
         if getattr(args, name) is not None:
             raise OptionError(f"--{name} belongs to 'gvtools train tune'; leave it out")
 
 
 def run_tune(args: argparse.Namespace, console: Console) -> None:
-    """Tune, and write the weights.
-
-    Raises:
-        GvError: no scene or context, weights that cannot be tuned, or options of other trainings.
-    """
+    """Tune, and write the weights."""
     from gvtools.completers.geoverse.completer import SHIPPED
     from gvtools.files import check_parent, write_json
     from gvtools.scenes.project import open_project
@@ -126,9 +118,6 @@ def context_of(scene: Scene, config: RunSettings, folder: Path, *, console: Cons
         config: how a run would read it; its targets are not looked at.
         folder: where computed depth goes.
         console: where progress goes.
-
-    Raises:
-        GvError: as of ``make_plan``.
     """
     from gvtools.settings import with_values
     from pipelines.reconstruction.depth_cache import DepthCache

@@ -60,11 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Show the run.
-
-    Raises:
-        GvError: no run, an option that does not fit, no display.
-    """
+    """Show the run."""
     from pipelines.viewing.rerun import SUFFIX, open_recording
     from pipelines.viewing.serve import read_round, serve
     from pipelines.viewing.source import ViewSource

@@ -74,11 +74,7 @@ def _prompt_options(option: AddOption) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
-    """Do what the action says.
-
-    Raises:
-        GvError: a folder does not fit, a name is unknown, or a file cannot be written.
-    """
+    """Do what the action says."""
     args.act(args, console)
 
 
@@ -216,12 +212,7 @@ def _progress(console: Console) -> Callable[[int, int], None]:
 
 
 def _config(name: str) -> GeoVerseConfig:
-    """A configuration by its name, or from its file.
-
-    Raises:
-        OptionError: neither.
-        CheckpointError: a damaged file.
-    """
+    """A configuration by its name, or from its file."""
     from gvtools.completers.geoverse.config import NAMES, named, read
 
     if name in NAMES:

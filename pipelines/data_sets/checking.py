@@ -47,12 +47,7 @@ class SceneCheck:
 
 
 def check_data_set(args: argparse.Namespace, console: Console) -> None:
-    """Report on each scene as soon as it is read.
-
-    Raises:
-        GvError: no such data set, folder or scene.
-        ProjectError: some scenes cannot be used; the report is out by then.
-    """
+    """Report on each scene as soon as it is read."""
     spec = load_spec(args.name)
     names = chosen_scenes(args.name, args.root, args.scene)
     counted: Counter[str] = Counter()
@@ -84,11 +79,7 @@ def check_data_set(args: argparse.Namespace, console: Console) -> None:
 
 
 def checks(spec: DataSetSpec, root: Path, scenes: Iterable[str]) -> Iterator[SceneCheck]:
-    """Read scenes one after the other; none is kept.
-
-    Raises:
-        OptionError: a package that the data set needs is not installed.
-    """
+    """Read scenes one after the other; none is kept."""
     from gvtools.scenes.inspection import inspect
 
     for scene in scenes:

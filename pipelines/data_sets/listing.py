@@ -14,11 +14,7 @@ COLUMNS = ("data set", "kind", "scenes", "images", "weight", "roles", "layout")
 
 
 def list_data_sets(args: argparse.Namespace, console: Console) -> None:
-    """Print a table of the data sets, or everything about one.
-
-    Raises:
-        OptionError: no such data set.
-    """
+    """Print a table of the data sets, or everything about one."""
     from gvtools.files import write_json
 
     names = spec_names() if args.name is None else (args.name,)

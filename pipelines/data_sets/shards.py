@@ -44,11 +44,7 @@ def verify_options(option: Callable[..., object]) -> None:
 
 
 def shards(args: argparse.Namespace, console: Console) -> None:
-    """Convert scenes to shards, or go on where a conversion stopped.
-
-    Raises:
-        GvError: nothing there, an unknown scene, another conversion in the folder.
-    """
+    """Convert scenes to shards, or go on where a conversion stopped."""
     from gvtools.scenes.addresses import SPEC, open_collection
     from gvtools.scenes.data_sets.spec import name_key, spec_names
     from gvtools.scenes.shards.writer import MEGABYTE, ShardOptions, write_shards
@@ -89,11 +85,7 @@ def _warn(skipped: tuple[Skipped, ...], console: Console) -> None:
 
 
 def verify(args: argparse.Namespace, console: Console) -> None:
-    """Compare shards with their checksums.
-
-    Raises:
-        ProjectError: one of them is damaged; each has a line.
-    """
+    """Compare shards with their checksums."""
     from gvtools.scenes.shards.index import read_index
     from gvtools.scenes.shards.reader import verify as problems_of
 

@@ -140,11 +140,7 @@ class Statistics:
 
 
 def statistics_of_data_set(args: argparse.Namespace, console: Console) -> None:
-    """Print figures of all scenes of a download together.
-
-    Raises:
-        GvError: no such data set, folder or scene, or none that can be read.
-    """
+    """Print figures of all scenes of a download together."""
     spec = load_spec(args.name)
     names = chosen_scenes(args.name, args.root, args.scene)
     total = Statistics()

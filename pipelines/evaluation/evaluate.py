@@ -38,9 +38,6 @@ def load_benchmarks(shown: Sequence[str], data_set: str | None) -> dict[str, Ben
     Args:
         shown: names that the user asked for.
         data_set: name that the user gave.
-
-    Raises:
-        OptionError: a name that is none.
     """
     if data_set is not None:
         load_benchmark(data_set)
@@ -50,11 +47,7 @@ def load_benchmarks(shown: Sequence[str], data_set: str | None) -> dict[str, Ben
 
 
 def load_runs(paths: Sequence[Path], *, project: Path | None) -> list[Run]:
-    """Runs with at least one completed target each.
-
-    Raises:
-        GvError: a run is given twice, has no targets yet, or cannot be read.
-    """
+    """Runs with at least one completed target each."""
     resolved = [path.resolve() for path in paths]
     if len(set(resolved)) < len(resolved):
         raise OptionError("a run is given twice; expected each once")

@@ -45,11 +45,7 @@ class MeasuredTarget:
 
 
 def run_targets(run: Run) -> list[MeasuredTarget]:
-    """The completed targets of a run with the pictures that it made, in the order of its rounds.
-
-    Raises:
-        ProjectError: files are absent or damaged, or the project's camera has changed.
-    """
+    """The completed targets of a run with the pictures that it made, in the order of its rounds."""
     return [
         MeasuredTarget(
             view.round,

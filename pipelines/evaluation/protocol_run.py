@@ -53,9 +53,6 @@ def run_protocol(
 
     Returns:
         The run's folder.
-
-    Raises:
-        GvError: too few views, or wrong settings.
     """
     context, targets, rounds = PROTOCOLS[protocol]
     split = protocol_split(

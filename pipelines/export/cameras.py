@@ -83,10 +83,6 @@ def write_colmap_export(
         folder: the workspace.
         max_points: thin to at most so many.
         run: where the memory came from, for the paths of generated pictures.
-
-    Raises:
-        ProjectError: two observed cameras have one name, a picture lies outside the run, or the
-            folder cannot be written.
     """
     distinct = distinct_cameras(memory, run)
     kept = thinned(memory, max_points)
@@ -127,10 +123,6 @@ def write_transforms_export(
         path: the file, or the folder for it.
         images: folder of the observed views' pictures, absolute or relative to the file.
         run: where the memory came from; pictures of generated views are those of its rounds.
-
-    Raises:
-        ProjectError: two observed cameras have one name, a picture lies outside the run, or the
-            file cannot be written.
     """
     file = transforms_file(path)
     distinct = distinct_cameras(memory, run)
@@ -193,9 +185,6 @@ def distinct_cameras(memory: SpatialMemory, run: Path) -> DistinctCameras:
     Args:
         memory: with at least one view.
         run: where the memory came from, for the paths of generated pictures.
-
-    Raises:
-        ProjectError: no views, or two different observed cameras of one name.
     """
     cameras, made = memory.views.cameras, memory.views.generated
     taken = np.flatnonzero(~memory.views.scanned)

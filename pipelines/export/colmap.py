@@ -14,11 +14,7 @@ foreign = foreign_model
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
-    """Write ``sparse/0`` below a folder; see ``pipelines.export.cameras``.
-
-    Raises:
-        ProjectError: two observed cameras have one name, or the folder cannot be written.
-    """
+    """Write ``sparse/0`` below a folder; see ``pipelines.export.cameras``."""
     limit = MAX_POINTS if options.max_points is None else options.max_points
     written = write_colmap_export(source.memory, path, max_points=limit, run=source.path)
     return (

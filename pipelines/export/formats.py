@@ -47,11 +47,7 @@ class ExportFormat:
     needs: tuple[str, ...] = ()
 
     def load(self) -> Any:
-        """The module that writes it.
-
-        Raises:
-            OptionError: a package that it needs is not installed.
-        """
+        """The module that writes it."""
         absent = [name for name in self.needs if find_spec(name) is None]
         if absent:
             raise OptionError(
@@ -61,11 +57,7 @@ class ExportFormat:
         return import_module(self.module)
 
     def check_path(self, path: Path, source: Path) -> None:
-        """Whether the export may write there.
-
-        Raises:
-            OptionError: another suffix, the input itself, or something that no export wrote.
-        """
+        """Whether the export may write there."""
         if self.suffixes:
             self._check_file(path, source)
             return

@@ -26,12 +26,7 @@ FRAME = "input world frame, scene units, axes as in the input (not turned to y u
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
-    """Write one point a voxel with its colour.
-
-    Raises:
-        OptionError: nothing is left.
-        ProjectError: the file cannot be written.
-    """
+    """Write one point a voxel with its colour."""
     import trimesh
 
     points = source.points(options, most=MAX_POINTS)
@@ -61,9 +56,6 @@ def write_scene(
         path: the file.
         node: its name.
         extras: what the node says beside its origin and frame.
-
-    Raises:
-        ProjectError: the file cannot be written.
     """
     import trimesh
 

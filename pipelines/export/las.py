@@ -22,12 +22,7 @@ TO_16_BITS = 257
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
-    """Write one point a voxel.
-
-    Raises:
-        OptionError: nothing is left.
-        ProjectError: the file cannot be written.
-    """
+    """Write one point a voxel."""
     import laspy
 
     memory = source.memory

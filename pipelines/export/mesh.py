@@ -61,13 +61,7 @@ class Triangles:
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
-    """Write a mesh.
-
-    Raises:
-        OptionError: a texture for a file that has none, without a run, or too small.
-        DegenerateError: no triangle came out.
-        ProjectError: the project cannot be read, or the file be written.
-    """
+    """Write a mesh."""
     memory, size = source.memory, options.texture
     if size is not None:
         _check_texture(source, path)
@@ -112,11 +106,7 @@ def _check_texture(source: Source, path: Path) -> None:
 
 
 def _photographs(source: Source) -> Iterator[tuple[Cameras, NDArray[np.uint8]]]:
-    """Cameras of the observed views in the memory's frame, and their photographs.
-
-    Raises:
-        ProjectError: the project, or a photograph, cannot be read any more.
-    """
+    """Cameras of the observed views in the memory's frame, and their photographs."""
     scene = load_run(source.path).scenes[0]
     for view in source.memory.views.photographed:
         picture = scene[view.camera.names[0]].load().rgb

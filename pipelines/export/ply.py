@@ -9,12 +9,7 @@ from pipelines.export.source import ExportOptions, Source
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
-    """Write every observation, or one a voxel where a number of points is given.
-
-    Raises:
-        OptionError: nothing is left.
-        ProjectError: the file cannot be written.
-    """
+    """Write every observation, or one a voxel where a number of points is given."""
     memory = source.memory
     observed = bool(options.observed)
     points, edge = export_memory_ply(memory, path, max_points=options.max_points, observed=observed)

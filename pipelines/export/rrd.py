@@ -53,11 +53,7 @@ class Shot:
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
-    """Write the recording.
-
-    Raises:
-        GvError: the run is damaged, or the file cannot be written.
-    """
+    """Write the recording."""
     import rerun
 
     memory = source.memory

@@ -30,9 +30,6 @@ def simplified(
     Args:
         mesh: with vertex colours.
         max_triangles: at least 1.
-
-    Raises:
-        DegenerateError: so few that nothing is left.
     """
     import open3d as o3d
 

@@ -75,11 +75,7 @@ class Source:
 
     @cached_property
     def appearance(self) -> Appearance | None:
-        """The Gaussians that the run fitted; None where it has none.
-
-        Raises:
-            MemoryFileError: a damaged file.
-        """
+        """The Gaussians that the run fitted; None where it has none."""
         return load_appearance(self.path)
 
     def points(
@@ -95,9 +91,6 @@ class Source:
             options: ``max_points`` and ``observed`` count.
             most: points at most where the user gave no number.
             among: (N,) the observations that count; None for all.
-
-        Raises:
-            OptionError: nothing is left.
         """
         memory = self.memory
         chosen = np.ones(len(memory), np.bool_) if among is None else among

@@ -27,12 +27,7 @@ from pipelines.export.splats import Splats, splats_of
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
-    """Write the Gaussians.
-
-    Raises:
-        OptionError: fewer are allowed than were fitted, or nothing is left.
-        ProjectError: the file cannot be written.
-    """
+    """Write the Gaussians."""
     splats = splats_of(source, options)
     comments = ["3D Gaussians by gvtools, axes of the input's world frame, scene units"]
     if splats.origin.any():
@@ -67,11 +62,7 @@ def is_splat(names: Collection[str]) -> bool:
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of a file; harmonics above degree 2 and values that are none are left out.
-
-    Raises:
-        MemoryFileError: another kind of PLY, truncated or damaged.
-    """
+    """The Gaussians of a file; harmonics above degree 2 and values that are none are left out."""
     rows = read_ply(path)
     names = rows.dtype.names or ()
     if not is_splat(names):

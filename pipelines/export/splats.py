@@ -97,12 +97,7 @@ class Splats:
 
 
 def splats_of(source: Source, options: ExportOptions) -> Splats:
-    """The Gaussians that show a run or a memory.
-
-    Raises:
-        OptionError: fewer are allowed than were fitted, or nothing is left.
-        MemoryFileError: a damaged fit.
-    """
+    """The Gaussians that show a run or a memory."""
     appearance, memory = source.appearance, source.memory
     if appearance is None:
         values, rounds = of_points(source, options)
@@ -188,9 +183,6 @@ def of_points(
     Returns:
         (N, VALUES) float32 with the world's axes, positions relative to the memory's origin; and
         (N,) int32, the round of each point.
-
-    Raises:
-        OptionError: nothing is left.
     """
     memory = source.memory
     points = source.points(options, among=among)

@@ -54,12 +54,7 @@ LEAST = 1e-4
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
-    """Write the Gaussians.
-
-    Raises:
-        OptionError: fewer are allowed than were fitted, or nothing is left.
-        ProjectError: the file cannot be written.
-    """
+    """Write the Gaussians."""
     splats = splats_of(source, options)
     data, fractional = packed(splats)
     with replaced_when_written(path) as temporary:
@@ -93,12 +88,7 @@ def packed(splats: Splats) -> tuple[bytes, int]:
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of a file, with the axes of a PLY; harmonics above degree 2 are left out.
-
-    Raises:
-        MemoryFileError: unreadable, of another version than 2 and 3, or of another size than its
-            header says.
-    """
+    """The Gaussians of a file, with the axes of a PLY; harmonics above degree 2 are left out."""
     try:
         packed = read_bytes(path)
         data = unpack_gzip(packed, MOST_RATIO * len(packed) + MOST_BYTES)

@@ -62,10 +62,6 @@ def tsdf_mesh(
         memory: with at least one view.
         voxel: edge, scene units.
         observed: leave out generated points and views.
-
-    Raises:
-        OptionError: ``voxel`` is so small that there would be too many.
-        DegenerateError: the mesh has no triangle.
     """
     import open3d as o3d
 
@@ -175,9 +171,6 @@ def poisson_mesh(
         memory: with at least one view.
         voxel: edge of the finest cells, scene units.
         observed: leave out what a completer made.
-
-    Raises:
-        DegenerateError: no triangle came out.
     """
     import open3d as o3d
 

@@ -65,9 +65,6 @@ def textured(mesh: o3d.t.geometry.TriangleMesh, shots: Iterable[Shot], size: int
         mesh: with vertex colours.
         shots: cameras in the mesh's frame, and their photographs (H, W, 3) uint8.
         size: side of the texture, texels.
-
-    Raises:
-        OptionError: more triangles than the texture has room for.
     """
     vertices = mesh.vertex.positions.numpy().astype(np.float64)
     faces = mesh.triangle.indices.numpy()
@@ -95,9 +92,6 @@ def atlas(triangles: NDArray[np.float64], size: int) -> NDArray[np.float64]:
 
     A triangle becomes half a square with its longest edge as the diagonal; the square's side is
     chosen by the length of that edge.
-
-    Raises:
-        OptionError: more triangles than the texture has room for.
     """
     lengths = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
     legs = lengths.max(axis=1) / np.sqrt(2)

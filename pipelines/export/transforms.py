@@ -13,11 +13,7 @@ foreign = foreign_transforms
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
-    """Write the file, or into the folder; see ``pipelines.export.cameras``.
-
-    Raises:
-        ProjectError: two observed cameras have one name, or the file cannot be written.
-    """
+    """Write the file, or into the folder; see ``pipelines.export.cameras``."""
     images = IMAGES if options.images is None else options.images
     written = write_transforms_export(source.memory, path, images=images, run=source.path)
     return f"{written.views} views ({written.generated} generated) in {path}"

@@ -19,12 +19,7 @@ ROOT, CLOUD = "/gvtools", "/gvtools/memory"
 
 
 def write(source: Source, path: Path, options: ExportOptions) -> str:
-    """Write one point a voxel.
-
-    Raises:
-        OptionError: nothing is left.
-        ProjectError: the file cannot be written.
-    """
+    """Write one point a voxel."""
     from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
     memory = source.memory

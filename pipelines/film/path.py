@@ -31,10 +31,6 @@ def film_cameras(memory: SpatialMemory, path: str, *, width: int | None = None) 
             gives intrinsics and size to paths that have none.
         path: one of FORMS.
         width: of the frames, pixels; None keeps the cameras' width.
-
-    Raises:
-        OptionError: another form, no observed views, or a width below 16.
-        DegenerateError: no such path leads through these views.
     """
     captured = [view.camera for view in memory.views.photographed]
     if not captured:

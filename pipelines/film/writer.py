@@ -19,11 +19,7 @@ WEBP_QUALITY = 80
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse a file name that no film can be written to, before anything is drawn.
-
-    Raises:
-        OptionError: another suffix than those of SUFFIXES, or PyAV is absent for an MP4.
-    """
+    """Refuse a file name that no film can be written to, before anything is drawn."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise OptionError(f"--out {path}: expected a name that ends with {', '.join(SUFFIXES)}")
@@ -44,9 +40,6 @@ def write_film(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -
         path: with one of SUFFIXES.
         frames: (H, W, 3) pictures, all of one even size.
         fps: frames a second.
-
-    Raises:
-        ProjectError: the file cannot be written.
     """
     with replaced_when_written(path) as temporary:
         if path.suffix.lower() == ".mp4":

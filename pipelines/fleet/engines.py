@@ -76,11 +76,7 @@ def _result(handle: Future[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _check_reachable(address: str) -> None:
-    """Refuse an address where nothing listens: Ray itself would retry for a quarter of an hour.
-
-    Raises:
-        ProjectError: it takes no connection within ``CONNECT_S``.
-    """
+    """Refuse an address where nothing listens: Ray itself would retry for a quarter of an hour."""
     host, colon, port = address.rpartition(":")
     if not colon or not port.isdecimal() or "/" in host:
         return
@@ -94,12 +90,7 @@ def _check_reachable(address: str) -> None:
 
 
 class Ray:
-    """A Ray cluster; each task asks for its cores, cards and memory.
-
-    Raises:
-        OptionError: Ray is not installed, or a local cluster is too small for a task.
-        ProjectError: no cluster answers at the address.
-    """
+    """A Ray cluster; each task asks for its cores, cards and memory."""
 
     def __init__(self, tasks: Sequence[Task], *, address: str, console: Console) -> None:
         # "auto" may find the address of a cluster that has ended: try 3 times, not 20, 40 s each.

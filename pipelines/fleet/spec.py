@@ -115,12 +115,7 @@ def is_url(text: str) -> bool:
 
 
 def read_list(path: Path) -> FleetSpec:
-    """The list in a YAML file.
-
-    Raises:
-        ProjectError: it cannot be read.
-        OptionError: a key or value is wrong.
-    """
+    """The list in a YAML file."""
     try:
         data: Any = parse_yaml(read_text(path), most=LONGEST)
     except OSError as error:
@@ -141,9 +136,6 @@ def plan(spec: FleetSpec, root: str, *, folder: Path) -> list[Task]:
         spec: the list.
         root: path or URL of the results.
         folder: what relative paths are relative to.
-
-    Raises:
-        OptionError: a command is wrong, a pattern fits nothing, or two scenes have one name.
     """
     commands = {name: _command(name, spec) for name in spec.stages}
     scenes: dict[str, SceneEntry] = {}

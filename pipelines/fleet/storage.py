@@ -24,12 +24,7 @@ def scratch(url: str) -> Path:
 
 
 def fetched(place: str) -> Path:
-    """A local path of a file or folder; a URL is downloaded once and not looked at again.
-
-    Raises:
-        OptionError: no fsspec driver for such URLs is installed.
-        ProjectError: it cannot be read.
-    """
+    """A local path of a file or folder; a URL is downloaded once and not looked at again."""
     if not is_url(place):
         return Path(place)
     local = scratch(place)
@@ -62,11 +57,7 @@ def _fetch(files: Any, remote: str, target: Path) -> None:
 
 
 def stored(folder: Path, place: str) -> None:
-    """Upload a finished folder to its URL; does nothing if ``place`` is a path.
-
-    Raises:
-        ProjectError: it cannot be written.
-    """
+    """Upload a finished folder to its URL; does nothing if ``place`` is a path."""
     if not is_url(place):
         return
     files, remote = _open(place)
@@ -84,11 +75,7 @@ def stored(folder: Path, place: str) -> None:
 
 
 def read_record(place: str) -> dict[str, Any] | None:
-    """A JSON object; None if the file is absent or damaged.
-
-    Raises:
-        ProjectError: the storage does not answer.
-    """
+    """A JSON object; None if the file is absent or damaged."""
     try:
         if is_url(place):
             files, remote = _open(place)
@@ -105,11 +92,7 @@ def read_record(place: str) -> dict[str, Any] | None:
 
 
 def write_record(place: str, data: dict[str, Any]) -> None:
-    """Write a JSON object; a file on disk appears only when complete.
-
-    Raises:
-        ProjectError: it cannot be written.
-    """
+    """Write a JSON object; a file on disk appears only when complete."""
     if not is_url(place):
         write_json(Path(place), data)
         return

@@ -27,9 +27,6 @@ def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = Non
             are those of the views in its memory.
         layout: of a file, see gvtools.trajectory_files.read_poses.
         root: of the download, for spec:NAME:SCENE; not looked at for anything else.
-
-    Raises:
-        GvError: nothing there, or nothing that holds poses.
     """
     from gvtools.scenes.colmap_files import find_model
     from gvtools.scenes.data_sets.address import is_address
@@ -87,10 +84,6 @@ def associate(
             them, else the order.
         max_difference: seconds, of an association by time.
         offset: seconds, added to the estimate's times.
-
-    Raises:
-        OptionError: one of the two has no times or names, or an unknown way.
-        DegenerateError: nothing belongs together.
     """
     from gvtools.evaluation.association import by_index, by_name, by_time
 

@@ -74,9 +74,6 @@ def judge(
 
     Returns:
         What ``judge.json`` holds.
-
-    Raises:
-        GvError: unreadable or ambiguous pictures.
     """
     targets = reference.targets
     measurement = Measurement(

@@ -78,11 +78,7 @@ class Method:
 
 
 def method_names(paths: Sequence[Path], names: Sequence[str]) -> list[str]:
-    """A name for each method: those given, else the folders'.
-
-    Raises:
-        OptionError: there are not as many names as folders, or a name occurs twice.
-    """
+    """A name for each method: those given, else the folders'."""
     if names and len(names) != len(paths):
         raise OptionError(
             f"{len(names)} names (--name) for {len(paths)} folders; give one for each"
@@ -107,9 +103,6 @@ def open_method(path: Path, name: str, targets: Sequence[MeasuredTarget], *, rul
         name: of the method.
         targets: all of them; the picture that each holds is replaced.
         rule: how to match, see ``match_pictures``.
-
-    Raises:
-        GvError: unreadable or ambiguous pictures, or one of another aspect than its target.
     """
     pictures = _run_pictures(path) if (path / RECORD).is_file() else open_pictures(path)
     views = [target.picture.name for target in targets]
@@ -146,11 +139,7 @@ def _posed(frame: Frame, target: PosedPicture) -> PosedPicture:
 
 
 def _sized(frame: Frame, camera: Cameras, *, what: str) -> tuple[Frame, tuple[int, int] | None]:
-    """The picture in its target's size, and the size (width, height) that it had if another.
-
-    Raises:
-        ProjectError: its aspect is not the target's.
-    """
+    """The picture in its target's size, and the size (width, height) that it had if another."""
     import cv2
 
     width, height = int(camera.width[0]), int(camera.height[0])
@@ -177,9 +166,6 @@ def _check_truths(
     """Compare the ground truth that a tool wrote beside its renders with that of the targets.
 
     Nothing is checked where it is missing beside any render.
-
-    Raises:
-        ProjectError: one is clearly more like another target's than like the matched target's.
     """
     kept = [picture.load_truth for picture in pictures.pictures]
     rows = [row for row, target in enumerate(targets) if target.truth is not None]

@@ -45,20 +45,12 @@ class Reference:
 
     @cached_property
     def memory(self) -> SpatialMemory:
-        """What the context alone gave.
-
-        Raises:
-            GvError: there is none, or it is damaged.
-        """
+        """What the context alone gave."""
         return load_memory(self.run.path, up_to=0)
 
     @cached_property
     def targets(self) -> list[MeasuredTarget]:
-        """The targets with the run's own pictures, or the memory's where cameras were given.
-
-        Raises:
-            GvError: files are absent or damaged.
-        """
+        """The targets with the run's own pictures, or the memory's where cameras were given."""
         return run_targets(self.run) if self.cameras is None else self._projected()
 
     def with_surface(self, target: MeasuredTarget) -> MeasuredTarget:
@@ -97,9 +89,6 @@ def open_reference(path: Path, *, cameras: Path | None) -> Reference:
     Args:
         path: its folder.
         cameras: see Reference.
-
-    Raises:
-        ProjectError: no run, or one without targets where no cameras are given.
     """
     run = load_run(path)
     if cameras is None and len(run.rounds) < 2:
@@ -129,10 +118,6 @@ def observe_context(
         cameras: trajectory file with the cameras of the pictures, instead of ``targets``.
         reading: how the user said the project is to be read, JSON-ready.
         console: where progress goes.
-
-    Raises:
-        OptionError: no selection.
-        GvError: the project or the selections are wrong.
     """
     from gvtools.runs.folder import RunDirectory
     from gvtools.settings import with_values

@@ -59,11 +59,7 @@ class SheetPictures:
 
 
 def write_sheets(pictures: SheetPictures, out: Path) -> list[Path]:
-    """Write ``sheet_NNN.png``, some views on each; returns the files.
-
-    Raises:
-        ProjectError: a file cannot be written.
-    """
+    """Write ``sheet_NNN.png``, some views on each; returns the files."""
     from PIL import Image
 
     views, files = pictures.views(), []

@@ -64,11 +64,7 @@ class DepthCache:
         return sum(path.exists() for path in self._file.values())
 
     def depth(self, view: View, frame: Frame) -> DepthMap:
-        """The depth of a context view whose pixels are ``frame``.
-
-        Raises:
-            ProjectError: a kept file is damaged, or cannot be written.
-        """
+        """The depth of a context view whose pixels are ``frame``."""
         path = self._file[view.name]
         if path.exists():
             try:

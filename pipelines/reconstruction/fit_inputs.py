@@ -86,11 +86,7 @@ def _estimate(
 
 
 def first_gaussians(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians:
-    """Gaussians at recorded depth, else at sparse points and, if these are few, estimated depth.
-
-    Raises:
-        GvError: a camera with skew, or too few points and pixels with depth.
-    """
+    """Gaussians at recorded depth, else at sparse points and, if these are few, estimated depth."""
     if any(view.K[0, 1] for view in views):
         raise ShapeError("cameras with skew; expected none; undistort the photographs first")
     seed, most = plan.config.seed, plan.config.refine.most_gaussians

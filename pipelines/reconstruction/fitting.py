@@ -95,11 +95,7 @@ class Fitted:
 
     @classmethod
     def load(cls, path: Path) -> Fitted:
-        """Read what ``save`` wrote.
-
-        Raises:
-            MemoryFileError: missing or damaged.
-        """
+        """Read what ``save`` wrote."""
         appearance = Appearance.load(path)
         data = load_arrays(path)
         spread, steps = data.get("spread", False), data.get("steps", 0)
@@ -171,9 +167,6 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         plan: of the run.
         console: prints progress.
         earlier: fits of this run: the first is continued, or further ones added if it converged.
-
-    Raises:
-        OptionError: an earlier fit has converged, and the time or steps are too few for another.
     """
     began = time.perf_counter()
     plan = _posed(plan, earlier)
@@ -224,11 +217,7 @@ def _warn_of_few_steps(fitted: Fitted, plan: Plan, console: Console) -> None:
 
 
 def _worth_adding(fits: Sequence[Fit], earlier: Fitted) -> Sequence[Fit]:
-    """The new fits that are long enough to be averaged with earlier ones.
-
-    Raises:
-        OptionError: none is long enough.
-    """
+    """The new fits that are long enough to be averaged with earlier ones."""
     least = round(LEAST_SHARE * fits[0].converged_after)
     long = [fit for fit in fits if fit.steps >= least]
     if not long:

@@ -102,9 +102,6 @@ def make_plan(
         say: is told what is computed meanwhile.
         round_0: folder of round 0 of the run that is gone on with: its poses are taken. Refining
             them again may differ in the last digits, by the order in which threads add.
-
-    Raises:
-        GvError: settings that the project cannot serve.
     """
     from gvtools.appearance.fit import validation_rows
     from gvtools.completers.base import create

@@ -89,9 +89,6 @@ def saved(round_0: Path, context: Sequence[str], targets: Cameras) -> RunPoses |
 
     None, too, where they are of another number of views: the run is another one then, and is
     refused for that.
-
-    Raises:
-        MemoryFileError: damaged.
     """
     path = round_0 / POSES
     poses = RunPoses.load(path) if path.exists() else None

@@ -55,9 +55,6 @@ def refine(
 
     Returns:
         The run's folder.
-
-    Raises:
-        GvError: no run, or its project is not as it was; the run is left as it was.
     """
     # A link stays one: what it leads to is replaced.
     place = path.resolve()
@@ -95,11 +92,7 @@ def refine(
 
 
 def _reopened(run: Run, console: Console) -> tuple[Plan, Mapping[str, Any]]:
-    """The plan of a run and its identity.
-
-    Raises:
-        GvError: the project is gone, or is another one now.
-    """
+    """The plan of a run and its identity."""
     record = run.record
     try:
         settings = with_values(RunSettings(), dotted(record["settings"]))
@@ -123,12 +116,7 @@ def _reopened(run: Run, console: Console) -> tuple[Plan, Mapping[str, Any]]:
 
 
 def _project_of(run: Run) -> Scene:
-    """The project of a run.
-
-    Raises:
-        ProjectError: it is gone.
-        GvError: it cannot be read any more.
-    """
+    """The project of a run."""
     project, reading = run.record["project"], run.record["reading"]
     place = Path(reading["root"] if is_address(project) else project)
     if not (run.project or place).exists():

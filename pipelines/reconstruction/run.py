@@ -60,9 +60,6 @@ def reconstruct(
 
     Returns:
         The run's folder.
-
-    Raises:
-        GvError: wrong input or options; nothing of an earlier run is lost.
     """
     compile_kernels(config, console)
     directory = RunDirectory(out)
@@ -108,9 +105,6 @@ def complete_run(
 
     Returns:
         The names of the files that ``draw`` wrote.
-
-    Raises:
-        GvError: see ``reconstruct``.
     """
     if fitted is not None:
         plan = fitted.applied(plan)
@@ -138,9 +132,6 @@ def saved_fit(plan: Plan, directory: RunDirectory) -> Fitted | None:
     """Gaussians that a resumed run's round 0 left; None where there are none.
 
     None are there where none were wanted or could be fitted; ``gvtools refine`` adds them.
-
-    Raises:
-        MemoryFileError: damaged.
     """
     from pipelines.reconstruction.fitting import Fitted
 

@@ -73,11 +73,7 @@ class PlacedScan:
 
 
 def check_scan(options: ScanOptions) -> None:
-    """Refuse a scan that cannot be read or placed before anything is computed.
-
-    Raises:
-        GvError: see ``open_scan`` and ``given_placement``.
-    """
+    """Refuse a scan that cannot be read or placed before anything is computed."""
     from gvtools.scans.placement import given_placement
     from gvtools.scans.read import open_scan
 
@@ -90,11 +86,7 @@ def check_scan(options: ScanOptions) -> None:
 
 
 def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:
-    """The run's scan, placed with the plan's cameras; None where there is none.
-
-    Raises:
-        GvError: it cannot be read, or no placement is supported.
-    """
+    """The run's scan, placed with the plan's cameras; None where there is none."""
     from gvtools.scans.placement import given_placement
     from gvtools.scans.read import read_scan
     from gvtools.scans.registration import register
@@ -119,11 +111,7 @@ def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:
 
 
 def _check_reach(scan: Scan, placement: Placement, plan: Plan) -> None:
-    """Refuse a scan that the memory cannot hold.
-
-    Raises:
-        DegenerateError: all of it lies farther away than the memory's voxels reach.
-    """
+    """Refuse a scan that the memory cannot hold."""
     from gvtools.memory.store.voxel_index import MAX_VOXEL
     from pipelines.reconstruction.voxel_edge import grid_frame
 
@@ -159,11 +147,7 @@ def _surface(scan: Scan) -> Surface:
 
 
 def photographed(plan: Plan) -> Surface:
-    """What the context is known to show: recorded depth, else the project's sparse points.
-
-    Raises:
-        DegenerateError: neither is there.
-    """
+    """What the context is known to show: recorded depth, else the project's sparse points."""
     from gvtools.scans.surface import Surface
 
     scene, positions, seen_from = plan.scene, list[NDArray[Any]](), list[NDArray[Any]]()

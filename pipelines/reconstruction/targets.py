@@ -61,9 +61,6 @@ def resolve_targets(
         spec: one of FORMS.
         allow_overlap: let views be context and target.
         max_side: another project's pictures are reduced to it, pixels.
-
-    Raises:
-        OptionError: an unknown form, an empty selection, or hold-outs that overlap the context.
     """
     context_cameras = scene.subset(context).cameras
     name, _, count = spec.partition(":")
@@ -145,11 +142,7 @@ def _project(path: str, selection: str, scene: Scene, *, max_side: int | None) -
 
 
 def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) -> None:
-    """Refuse another project's views that are the context's: same file, or same place.
-
-    Raises:
-        OptionError: there is such a view.
-    """
+    """Refuse another project's views that are the context's: same file, or same place."""
     given = [scene[name] for name in context]
     files = {view.files[0].resolve() for view in given if view.files}
     context_cameras = scene.subset(context).cameras

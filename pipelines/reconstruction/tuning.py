@@ -24,12 +24,7 @@ TUNING = "tuning"
 
 
 def check_tuning(completer: Completer, context: Sequence[str]) -> None:
-    """Whether a completer can be tuned to so many context views.
-
-    Raises:
-        OptionError: it has no weights, or there are too few views.
-        CheckpointError: its weights are untrained.
-    """
+    """Whether a completer can be tuned to so many context views."""
     from gvtools.training.tune import check_tunable
 
     if completer.weights is None:
@@ -53,9 +48,6 @@ def tuned(plan: Plan, cache: DepthCache, directory: RunDirectory, *, console: Co
         cache: gives the context's depth.
         directory: of the run; the weights are kept in it.
         console: where progress goes.
-
-    Raises:
-        GvError: too few context views have depth.
     """
     from gvtools.training.tune import tune, tuned_before
 

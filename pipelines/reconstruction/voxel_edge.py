@@ -44,9 +44,6 @@ def automatic_voxel(
         source: the run's source of depth.
         percentile: of each view's footprints, 0 to 100.
         say: receives a line before depth is computed.
-
-    Raises:
-        ProjectError: there is no depth, and none can be computed.
     """
     import numpy as np
 

@@ -51,9 +51,6 @@ def measure(
         frame: the picture, and depth where there is some, of the same camera.
         seconds: what the projection took.
         lpips: the network; None leaves LPIPS out.
-
-    Raises:
-        ShapeError: the picture is of another size.
     """
     figures: dict[str, Any] = {"view": name, "coverage": guidance.coverage, "seconds": seconds}
     figures |= dict.fromkeys(FIGURES)

@@ -22,9 +22,6 @@ def write_view(folder: Path, stem: PurePosixPath, guidance: Guidance) -> None:
         folder: made when absent, sub-folders of ``stem`` too.
         stem: what the files' names start with.
         guidance: a batch of one.
-
-    Raises:
-        ProjectError: a file cannot be written.
     """
     confidence = guidance.confidence[0].astype(np.float64)
     grey = np.round(255 * confidence / (1 + confidence)).astype(np.uint8)

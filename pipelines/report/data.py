@@ -58,9 +58,6 @@ def collect(
         sources: the project, where it is open already.
         project: where it lies now, where it is not; None: where it lay.
         most: targets whose pictures are shown.
-
-    Raises:
-        ProjectError: no run, a damaged one, or one without a complete round.
     """
     run = load_run(path, project=project)
     record, reports = run.record, run.rounds

@@ -25,9 +25,6 @@ def draw_run(plan: Plan, directory: RunDirectory) -> tuple[str, ...]:
 
     Returns:
         The names of the files.
-
-    Raises:
-        GvError: the folder cannot be read or written.
     """
     from viz.plots.growth import draw_growth
 
@@ -44,9 +41,6 @@ def write_report(plan: Plan, path: Path) -> None:
     Args:
         plan: of the run.
         path: its folder.
-
-    Raises:
-        GvError: the folder cannot be read or written.
     """
     targets = plan.targets
     truths = dict(zip(targets.cameras.names, targets.truth, strict=True))

@@ -30,9 +30,6 @@ def sweep(
         limit: seconds for all but the start; trials that would not fit are left out and named.
         console: is told of each trial.
         clock: seconds.
-
-    Raises:
-        GvError: the start is refused; other refused trials are named.
     """
     end = clock() + limit
     trials: list[Trial] = []

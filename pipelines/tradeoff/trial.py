@@ -90,11 +90,7 @@ class Trials:
         self._warm = False
 
     def make(self, label: str, settings: Mapping[str, Any]) -> Trial:
-        """Run with these settings.
-
-        Raises:
-            GvError: the run is refused.
-        """
+        """Run with these settings."""
         if not self._warm:
             # Kernels are compiled and files are cached once.
             self._warm = True

@@ -28,12 +28,7 @@ if TYPE_CHECKING:
 
 
 def open_file(path: Path) -> RunView | None:
-    """What a file shows; None where it is no export but, perhaps, a memory or a run.
-
-    Raises:
-        MemoryFileError: damaged, or of another kind than its name says.
-        OptionError: a package that reads it is not installed.
-    """
+    """What a file shows; None where it is no export but, perhaps, a memory or a run."""
     suffix = path.suffix.lower()
     if not path.is_file() or suffix not in OPENERS:
         return None

@@ -20,9 +20,6 @@ def run_gaussians(path: Path, memory: SpatialMemory, most: int) -> ShownGaussian
         path: a run's folder, or a memory file.
         memory: what it holds.
         most: of points at most; fitted Gaussians are always whole.
-
-    Raises:
-        MemoryFileError: a damaged fit.
     """
     source = Source(path, memory)
     fitted = 0 if source.appearance is None else len(source.appearance.gaussians)

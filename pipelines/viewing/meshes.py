@@ -28,12 +28,7 @@ VERTEX_BYTES, SPARE_BYTES = 128, 96 << 20
 
 
 def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
-    """The triangles or the points of a file, in one.
-
-    Raises:
-        MemoryFileError: neither, or a file that claims more than it holds.
-        ImportError: trimesh is not installed.
-    """
+    """The triangles or the points of a file, in one."""
     import trimesh
 
     data = read_bytes(path)
@@ -93,11 +88,7 @@ def _most_pixels(size: int) -> int:
 
 
 def _check_ply(path: Path, data: bytes) -> None:
-    """Refuse more elements than a file has bytes.
-
-    Raises:
-        MemoryFileError: see above.
-    """
+    """Refuse more elements than a file has bytes."""
     for line in data[:HEADER].split(b"end_header")[0].splitlines():
         words = line.split()
         if words[:1] == [b"element"]:
@@ -110,11 +101,7 @@ def _check_ply(path: Path, data: bytes) -> None:
 
 
 def _check_glb(path: Path, data: bytes) -> None:
-    """Refuse arrays that are not in the file, and more copies of meshes than it explains.
-
-    Raises:
-        MemoryFileError: see above.
-    """
+    """Refuse arrays that are not in the file, and more copies of meshes than it explains."""
     try:
         length, kind = struct.unpack_from("<I4s", data, 12)
         if kind != JSON or 20 + length > len(data):

@@ -21,10 +21,6 @@ def open_recording(path: Path, *, host: str, port: int) -> None:
         path: the recording.
         host: address to serve at.
         port: of the web page.
-
-    Raises:
-        ProjectError: no such file.
-        OptionError: rerun is not installed, or ends with an error.
     """
     if not path.is_file():
         raise ProjectError(f"{path}: no such file; expected a recording for rerun")

@@ -35,9 +35,6 @@ def serve(
         mode: colour mode to begin with, see viz.run_view.point_colors.
         live: wait for the first round, and show new ones as they come.
         console: told of the address, of new rounds and of problems.
-
-    Raises:
-        GvError: no run, no such round, or no free port.
     """
     from viz.web.server import is_loopback
     from viz.web.viewer import WebViewer
@@ -69,9 +66,6 @@ def read_round(source: ViewSource, round: int | None) -> tuple[RunView, int]:
     Args:
         source: of the run.
         round: its number; None takes the last.
-
-    Raises:
-        GvError: an empty memory, no such round, or a damaged file.
     """
     shown = source.read()
     if not len(shown.memory):

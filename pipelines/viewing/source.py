@@ -40,11 +40,7 @@ class ViewSource:
         return count_rounds(self.path)
 
     def read(self) -> RunView:
-        """The run as it is now.
-
-        Raises:
-            GvError: no run or memory, a damaged file.
-        """
+        """The run as it is now."""
         if not (self.path / RECORD).is_file():
             shown = open_file(self.path)
             if shown is not None:

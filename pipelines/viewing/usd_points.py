@@ -27,12 +27,7 @@ SPARE_BYTES = 1 << 29
 
 
 def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """(N, 3) positions and colours of all UsdGeom.Points, in the file's frame.
-
-    Raises:
-        MemoryFileError: unreadable, or it names other files, or holds no points.
-        ImportError: usd-core is not installed.
-    """
+    """(N, 3) positions and colours of all UsdGeom.Points, in the file's frame."""
     import pxr  # noqa: F401
 
     size = regular(path).stat().st_size

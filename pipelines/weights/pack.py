@@ -31,10 +31,6 @@ def pack(training: Path, out: Path) -> Path:
 
     Returns:
         The stage's folder that the weights came from.
-
-    Raises:
-        ProjectError: no stage has finished, an earlier one was trained again after the last, or
-            ``out`` is within the training.
     """
     folders = [training / name / WEIGHTS for name in STAGES]
     finished = [folder for folder in folders if folder.is_dir() and config_of(folder).trained]

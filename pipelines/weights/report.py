@@ -88,9 +88,6 @@ def print_needed(config: GeoVerseConfig, console: Console) -> None:
     """The files of a configuration, published ones and one's own.
 
     Sizes are approximate: of our own lists of names and shapes, without headers.
-
-    Raises:
-        CheckpointError: no network comes of the configuration.
     """
     model = empty_model(config, where="the configuration")
     published = {part: expected_of(model, part) for part in parts_of(config)}

@@ -38,9 +38,6 @@ class Open3dViewer:
         round: to begin with; None for the last.
         mode: of viz.run_view.point_colors.MODES.
         say: told, in one line, what is shown whenever that has changed.
-
-    Raises:
-        OptionError: no window can be opened.
     """
 
     def __init__(

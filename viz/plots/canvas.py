@@ -61,11 +61,7 @@ def _take_literally(axes: Axes) -> None:
 
 
 def chosen(panels: Mapping[str, Panel], names: Sequence[str] | None) -> list[Panel]:
-    """The named panels, in the order of the names; all of them without names.
-
-    Raises:
-        OptionError: a name that no panel has, or none at all.
-    """
+    """The named panels, in the order of the names; all of them without names."""
     names = tuple(panels) if names is None else tuple(names)
     unknown = [name for name in names if name not in panels]
     if unknown or not names:
@@ -74,11 +70,7 @@ def chosen(panels: Mapping[str, Panel], names: Sequence[str] | None) -> list[Pan
 
 
 def check_rounds(rounds: Rounds) -> None:
-    """Refuse to draw nothing.
-
-    Raises:
-        OptionError: no rounds.
-    """
+    """Refuse to draw nothing."""
     if not rounds:
         raise OptionError("growth: no rounds; expected the lines of a run's rounds.jsonl")
 

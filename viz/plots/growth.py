@@ -32,9 +32,6 @@ def draw_growth(
 
     Returns:
         A figure with its own Agg canvas; no state of pyplot is touched.
-
-    Raises:
-        OptionError: no rounds, or no such panel.
     """
     check_rounds(rounds)
     known = {
@@ -52,9 +49,6 @@ def growth_text(rounds: Rounds) -> str:
 
     Args:
         rounds: the lines of a run's ``rounds.jsonl``, in order.
-
-    Raises:
-        OptionError: no rounds.
     """
     check_rounds(rounds)
     scanned = any(_scanned(entry) for entry in rounds)

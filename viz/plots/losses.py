@@ -40,9 +40,6 @@ def draw_losses(stages: Mapping[str, Records], *, title: str | None = None) -> F
     Args:
         stages: for each stage the records of its log, each with ``step`` and values by name.
         title: of the training.
-
-    Raises:
-        OptionError: no stage, or one without a loss.
     """
     if not stages:
         raise OptionError("losses: no stage; expected the logs of a training")

@@ -31,9 +31,6 @@ def draw_quality(views: Views, *, title: str | None = None) -> Figure:
         views: of each target ``round`` and, as far as known, ``psnr``, ``psnr_valid`` and
             ``psnr_generated``, dB.
         title: what was reconstructed.
-
-    Raises:
-        OptionError: no target with a PSNR.
     """
     if not is_measured(views):
         raise OptionError("quality: no target has a PSNR; expected figures of one at least")

@@ -28,9 +28,6 @@ def draw_timing(
         rounds: the lines of a run's ``rounds.jsonl``, in order.
         title: what was reconstructed.
         panels: of "stages" and "rounds"; None is both.
-
-    Raises:
-        OptionError: no rounds, or no such panel.
     """
     check_rounds(rounds)
     known = {

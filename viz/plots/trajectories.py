@@ -61,9 +61,6 @@ def draw_trajectories(
         poses: at least one camera.
         title: what was reconstructed.
         panels: of "top" and "side"; None is both.
-
-    Raises:
-        OptionError: no cameras, or no such panel.
     """
     if not len(poses.context) + len(poses.requested):
         raise OptionError("trajectories: no cameras; expected those of a run")

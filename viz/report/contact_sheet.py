@@ -80,9 +80,6 @@ def contact_row(pictures: TargetPictures, *, side: int = SIDE) -> list[Tile]:
     Args:
         pictures: of one target.
         side: of a thumbnail's longer edge, pixels; smaller pictures keep their size.
-
-    Raises:
-        ShapeError: completion and truth differ in size.
     """
     name = pictures.name
     tiles = []
@@ -135,9 +132,6 @@ def error_map(
         picture: (H, W, 3).
         truth: (H, W, 3).
         mask: (H, W), where the truth counts; elsewhere the map is grey. None is everywhere.
-
-    Raises:
-        ShapeError: the pictures differ in size.
     """
     from matplotlib import colormaps
 

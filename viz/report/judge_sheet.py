@@ -54,9 +54,6 @@ def sheet(views: Sequence[JudgedView]) -> NDArray[np.uint8]:
 
     Args:
         views: at least one, all with the same methods.
-
-    Raises:
-        ShapeError: no view, or a picture of another size than its truth.
     """
     from PIL import Image, ImageDraw
 

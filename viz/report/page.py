@@ -9,11 +9,7 @@ from viz.report.html_parts import bulleted, document, paragraph, section, text
 
 
 def report_html(report: RunReport) -> str:
-    """The page.
-
-    Raises:
-        OptionError: no rounds.
-    """
+    """The page."""
     check_rounds(report.rounds)
     parts = {
         "growth": ("Growth", sections.growth(report)),

@@ -76,9 +76,6 @@ def point_colors(
         rows: (P,) which observations; None for all.
         true_depth: the recorded depth (H, W) of a view by its name, or None; for "depth-error".
         counts: the memory's view_counts, for "views"; None: they are counted.
-
-    Raises:
-        OptionError: an unknown mode.
     """
     chosen = np.arange(len(memory)) if rows is None else rows
     if mode == "color":

@@ -22,9 +22,6 @@ def write_screenshot(
         shown: where to look from.
         round: the memory as it was after it.
         mode: of viz.run_view.point_colors.MODES.
-
-    Raises:
-        ProjectError: it cannot be written.
     """
     from PIL import Image
 
@@ -34,11 +31,7 @@ def write_screenshot(
 
 
 def chosen_camera(run: RunView, name: str | None) -> ShownCamera:
-    """The camera of a view, or the first of the context; outside of a cloud without cameras.
-
-    Raises:
-        OptionError: no such view.
-    """
+    """The camera of a view, or the first of the context; outside of a cloud without cameras."""
     if not run.cameras and name is None:
         return ShownCamera("outside", CONTEXT, 0, camera_outside(run))
     if name is None:

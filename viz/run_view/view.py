@@ -151,9 +151,6 @@ class RunView:
         Returns:
             (H, W, 3) uint8 each: for a target "guidance" (holes black), "completion" and "memory
             after", for any camera "truth", the project's picture. What is absent is left out.
-
-        Raises:
-            ProjectError: a picture's file lies outside the run's folder or cannot be read.
         """
         out = {}
         if shown.stem is not None:

@@ -120,22 +120,13 @@ class CameraPath:
             self._draw()
 
     def cameras(self, count: int) -> Cameras:
-        """The path's cameras, world frame.
-
-        Raises:
-            OptionError: fewer than two key frames.
-            DegenerateError: all key frames are one.
-        """
+        """The path's cameras, world frame."""
         if len(self.keys) < 2:
             raise OptionError(f"{len(self.keys)} key frames; expected 2 or more")
         return interpolate(concatenate(self.keys), count)
 
     def save(self, client: viser.ClientHandle) -> Path | None:
-        """Write the path, or send it to a client; returns the file that was written.
-
-        Raises:
-            GvError: see ``cameras``; a name that is none, or a file that is somebody else's.
-        """
+        """Write the path, or send it to a client; returns the file that was written."""
         name = self._name.value
         if not NAME.fullmatch(name):
             raise OptionError("the name; expected letters, digits, - and _, at most 64")
@@ -156,11 +147,7 @@ class CameraPath:
         return path
 
     def preview(self, client: viser.ClientHandle) -> None:
-        """Lead a client along the path at the film's pace; while one runs, stop it.
-
-        Raises:
-            GvError: see ``cameras``.
-        """
+        """Lead a client along the path at the film's pace; while one runs, stop it."""
         with self._lock:
             number = self._previews.get(client.client_id, 0) + 1
             self._previews[client.client_id] = number

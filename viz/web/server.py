@@ -29,9 +29,6 @@ def make_server(host: str, port: int, title: str) -> viser.ViserServer:
         host: address to listen at.
         port: the first one tried; where it is taken, the next free one is used.
         title: of the page.
-
-    Raises:
-        OptionError: viser is not installed, or the address is not one of this machine.
     """
     try:
         import viser

@@ -46,9 +46,6 @@ class WebViewer:
         budget: points drawn at most; a larger run is thinned evenly in space.
         round: to begin with; None for the last.
         mode: colours to begin with, of viz.run_view.point_colors.MODES.
-
-    Raises:
-        OptionError: as of make_server.
     """
 
     def __init__(

@@ -211,11 +211,7 @@ class GeoVerseConfig:
 
 
 def named(name: str) -> GeoVerseConfig:
-    """One of the configurations that ship with the package.
-
-    Raises:
-        OptionError: an unknown name.
-    """
+    """One of the configurations that ship with the package."""
     if name not in NAMES:
         raise OptionError(f"no configuration {name!r}; known: {', '.join(NAMES)}")
     text = resources.files(__package__).joinpath("configs", f"{name}.json").read_text("utf-8")
@@ -223,11 +219,7 @@ def named(name: str) -> GeoVerseConfig:
 
 
 def read(path: Path) -> GeoVerseConfig:
-    """A configuration from its JSON file.
-
-    Raises:
-        CheckpointError: no such file, no JSON, or not a configuration of this model.
-    """
+    """A configuration from its JSON file."""
     try:
         return from_json(GeoVerseConfig, read_json(path))
     except FileNotFoundError:

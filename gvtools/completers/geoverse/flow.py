@@ -28,11 +28,7 @@ MOST_SHIFT = 1e6
 
 
 def shift_time(t: Time, shift: float) -> Time:
-    """Uniform time to shifted time; 0 and 1 stay, ``shift`` 1 changes nothing.
-
-    Raises:
-        OptionError: a shift beyond MOST_SHIFT or below its inverse.
-    """
+    """Uniform time to shifted time; 0 and 1 stay, ``shift`` 1 changes nothing."""
     check_range("time shift", shift, ge=1 / MOST_SHIFT, le=MOST_SHIFT)
     # 1 + (s - 1) t, written so that nothing cancels and t = 1 gives s to the last digit.
     return shift * t / (1 if shift == 1 else (1 - t) + shift * t)
@@ -60,9 +56,6 @@ def time_grid(
         shift: see ``shift_time``.
         start: first and
         end: last time, both after the shift.
-
-    Raises:
-        OptionError: a value out of its range, or more steps than float64 tells apart.
     """
     check_range("steps", steps, ge=1)
     check_range("time grid's start", start, gt=0, le=1)
@@ -102,9 +95,6 @@ def check_bounds(bounds: Sequence[float], *, whole: bool = False) -> tuple[float
     Args:
         bounds: K + 1 times.
         whole: they have to end at 0, where no noise is left.
-
-    Raises:
-        OptionError: not 1 = tau_0 > tau_1 > ... > tau_K >= 0 with K >= 1.
     """
     tau = tuple(float(bound) for bound in bounds)
     wanted = f"expected 1 = tau_0 > tau_1 > ... > tau_K {'=' if whole else '>='} 0"
@@ -173,9 +163,6 @@ def guided(velocity: Velocity, unconditional: Velocity | None, scale: float) -> 
     """Classifier-free guidance: u = unconditional + scale (conditional - unconditional).
 
     ``scale`` 1 returns ``velocity`` itself: the unconditional branch is not evaluated.
-
-    Raises:
-        OptionError: a scale other than 1 without an unconditional branch.
     """
     check_range("cfg_scale", scale, ge=0, lt=math.inf)
     if scale == 1:

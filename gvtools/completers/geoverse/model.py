@@ -197,11 +197,7 @@ class GeoVerse(GeoVerseNetworks):
 
 
 def empty_model(config: GeoVerseConfig, *, where: object) -> GeoVerse:
-    """The model on the meta device: names and shapes, no numbers, no memory.
-
-    Raises:
-        CheckpointError: the numbers in the configuration make no network.
-    """
+    """The model on the meta device: names and shapes, no numbers, no memory."""
     try:
         with torch.device("meta"):
             return GeoVerse(config)

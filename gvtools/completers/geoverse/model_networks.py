@@ -122,9 +122,6 @@ class GeoVerseNetworks(nn.Module):
             video: features computed before, for the same views; taken from the attached prior
                 when None.
             clock: receives the stages' names.
-
-        Raises:
-            CheckpointError: the configuration has a video prior and none is attached.
         """
         config = self.config
         with clock(stages.HINTS):

@@ -55,11 +55,7 @@ class Decoded:
 
     @property
     def geometry(self) -> Geometry:
-        """Of all V views, in the frame of the first view.
-
-        Raises:
-            ShapeError: it was not decoded.
-        """
+        """Of all V views, in the frame of the first view."""
         if self.all_views is None:
             raise ShapeError("the targets' depth alone was decoded, not the geometry of all views")
         return self.all_views

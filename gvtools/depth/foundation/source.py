@@ -52,10 +52,6 @@ class FoundationDepth:
             scene: the project.
             views: names of the views to compute.
             options: see FoundationOptions.
-
-        Raises:
-            CheckpointError: no weights are given, or the folder has none.
-            OptionError: CUDA without a CUDA device.
         """
         self.options = options or FoundationOptions()
         self.views = tuple(dict.fromkeys(views))
@@ -81,11 +77,7 @@ class FoundationDepth:
         return view.name in self.views
 
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
-        """The depth of ``view``, whose pixels are ``frame``.
-
-        Raises:
-            DegenerateError: nothing supports a scale.
-        """
+        """The depth of ``view``, whose pixels are ``frame``."""
         if not self._passes:
             self._compute()
         fitted = self._scales[view.name]

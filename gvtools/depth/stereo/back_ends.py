@@ -12,11 +12,7 @@ from gvtools.errors import OptionError
 
 
 def make_matcher(options: StereoOptions) -> tuple[Matcher, torch.device]:
-    """The back end of the options, and where its tensors live.
-
-    Raises:
-        OptionError: CUDA is asked for and torch sees none.
-    """
+    """The back end of the options, and where its tensors live."""
     if options.backend == "cpu":
         return CpuMatcher(options), torch.device("cpu")
     there = torch.cuda.is_available()

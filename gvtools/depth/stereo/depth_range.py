@@ -90,10 +90,6 @@ def estimate_range(scene: Scene, name: str) -> DepthRange:
     about where the optical axes of the views come closest to each other; and where the axes are
     parallel, that neighbouring views are a twelfth of the depth apart. Both are orders of magnitude
     and get a wide range, to be narrowed by ``range_of_depths``.
-
-    Raises:
-        DegenerateError: one view, or all views at one place as far as their coordinates tell, and
-            no points.
     """
     tracks = seen_points(scene, name)
     camera = scene[name].camera

@@ -72,10 +72,6 @@ class PlaneSweepStereo:
             scene: the project.
             options: see StereoOptions.
             views: names of the views usable as sources; no other picture is read.
-
-        Raises:
-            ProjectError: a name that the scene does not have.
-            OptionError: fewer than two views, or CUDA without a CUDA device.
         """
         self.options = options or StereoOptions()
         self.views = tuple(dict.fromkeys(views))
@@ -96,11 +92,7 @@ class PlaneSweepStereo:
         return view.name in self.views
 
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
-        """The depth of ``view``, whose pixels are ``frame``; 0 where it is not known well.
-
-        Raises:
-            DegenerateError: no other view shows what this one does.
-        """
+        """The depth of ``view``, whose pixels are ``frame``; 0 where it is not known well."""
         raw = self.raw(view, frame)
         options = self.options
         others = [other for other in map(self._confirming, raw.sources) if other is not None]

@@ -75,10 +75,6 @@ def correspond(
         second: the view they are reprojected into; its size may differ.
         occlusion: largest relative depth difference |z / depth - 1| on one surface.
         where: (H, W) bool, the only pixels of first to follow; None means all.
-
-    Raises:
-        OptionError: an occlusion outside 0 to 1.
-        ShapeError: ``where`` is not of first's size.
     """
     if not 0 < occlusion < 1:
         raise OptionError(

@@ -110,9 +110,6 @@ def depth_reprojection(
         first: the view whose pixels are reprojected.
         second: the view they are reprojected into; its size may differ.
         occlusion: largest relative depth difference at which both see one surface.
-
-    Raises:
-        OptionError: an occlusion outside 0 to 1.
     """
     return _compare(first, second, occlusion)[0]
 
@@ -125,9 +122,6 @@ def depth_reprojection_of_views(
     Args:
         pictures: the views, in their order along the path.
         occlusion: as in `depth_reprojection`.
-
-    Raises:
-        OptionError: an occlusion outside 0 to 1.
     """
     found, pixels, relative = [], [], []
     for first, second in pairwise(pictures):

@@ -118,10 +118,6 @@ def feature_consistency(
         second: the view that is carried into it, with depth for the occlusion test.
         network: what makes the features; None is `DenseGradient`, which needs no weights.
         occlusion: largest relative depth difference at which both see one surface.
-
-    Raises:
-        OptionError: an occlusion outside 0 to 1.
-        ShapeError: the network's features are not (C, h, w), not finite, or differ in C.
     """
     network = network or DenseGradient()
     ours, theirs = _features(network, first), _features(network, second)

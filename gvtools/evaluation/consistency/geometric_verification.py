@@ -135,10 +135,6 @@ def verify_geometry(
         workspace: a new or empty folder for the pictures, database and model, which are kept; None
             uses a temporary folder.
         seed: of the random sampling in verification and triangulation, 0 or more.
-
-    Raises:
-        ProjectError: the workspace holds something already.
-        ShapeError: a camera with skew, which COLMAP's PINHOLE does not have.
     """
     for picture in pictures:
         skew = float(picture.camera.K[0, 0, 1])

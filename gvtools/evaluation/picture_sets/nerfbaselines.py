@@ -35,9 +35,6 @@ def predictions(path: Path) -> PictureSet | None:
 
     Args:
         path: the folder, the archive, or the folder of a training with its archives.
-
-    Raises:
-        ProjectError: a damaged archive, or one without pictures.
     """
     if path.name.endswith(".tar.gz"):
         return _archive(path, path)

@@ -35,9 +35,6 @@ def open_pictures(path: Path) -> PictureSet:
 
     Args:
         path: a folder, or a .tar.gz of NerfBaselines.
-
-    Raises:
-        ProjectError: nothing there, or no picture.
     """
     if not path.exists():
         raise ProjectError(f"{path}: no such folder; expected a folder of pictures")

@@ -88,9 +88,6 @@ def read_rgb(source: Path | IO[bytes], *, name: str = "") -> NDArray[np.uint8]:
     Args:
         source: a file, or its bytes.
         name: of messages, for bytes.
-
-    Raises:
-        ProjectError: absent, damaged, or no picture of 8 or 16 bits a channel.
     """
     from gvtools.scenes.images import UNREADABLE, read_header, read_image
 
@@ -111,20 +108,12 @@ def _on_black(image: Image) -> NDArray[np.uint8]:
 
 
 def right_half(canvas: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-    """The right one of two pictures of one size side by side.
-
-    Raises:
-        ProjectError: an odd width, which no two pictures of one size have.
-    """
+    """The right one of two pictures of one size side by side."""
     return _half(canvas, name)[1]
 
 
 def left_half(canvas: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-    """The left one of two pictures of one size side by side.
-
-    Raises:
-        ProjectError: an odd width.
-    """
+    """The left one of two pictures of one size side by side."""
     return _half(canvas, name)[0]
 
 

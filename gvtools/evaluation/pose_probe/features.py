@@ -88,9 +88,6 @@ class SiftMatcher(Settings):
 
         Args:
             rgb: (H, W, 3) uint8.
-
-        Raises:
-            ShapeError: another shape or type.
         """
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
             raise ShapeError(f"SIFT of {rgb.dtype} {rgb.shape}; expected uint8 (H, W, 3)")

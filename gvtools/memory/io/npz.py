@@ -36,11 +36,7 @@ _SEGMENT_ARRAYS = ("start", "length", "view", "box")
 
 
 def save_memory(memory: Store, path: Path) -> None:
-    """Write ``memory`` to ``path``; an older file stays until the new one is whole.
-
-    Raises:
-        ProjectError: the disk is full or the folder cannot be written.
-    """
+    """Write ``memory`` to ``path``; an older file stays until the new one is whole."""
     arrays = _arrays(memory)
     header = {
         **description(memory),
@@ -73,11 +69,7 @@ def description(memory: Store) -> dict[str, Any]:
 
 
 def load_memory(path: Path, kind: type[S]) -> S:
-    """Read a memory of a class; every byte is checked.
-
-    Raises:
-        MemoryFileError: absent, truncated, altered, of another kind or version.
-    """
+    """Read a memory of a class; every byte is checked."""
     header, arrays = _read(path)
     try:
         return _assembled(header, arrays, kind)

@@ -64,11 +64,7 @@ def write_ply(
 
 
 def read_ply(path: Path) -> NDArray[np.void]:
-    """The vertices of a little-endian binary PLY as a structured array.
-
-    Raises:
-        MemoryFileError: no such file, another kind of PLY, or a size other than the header's.
-    """
+    """The vertices of a little-endian binary PLY as a structured array."""
     try:
         with regular(path).open("rb") as file:
             head = file.read(_MAX_HEADER)
@@ -123,11 +119,7 @@ def _parse_header(path: Path, text: str) -> tuple[int, np.dtype[np.void]]:
 
 
 def read_point_cloud(path: Path) -> o3d.t.geometry.PointCloud:
-    """A binary PLY as a point cloud in its own frame, read strictly.
-
-    Raises:
-        MemoryFileError: see ``read_ply``; or without uchar colours.
-    """
+    """A binary PLY as a point cloud in its own frame, read strictly."""
     import open3d as o3d
 
     vertices = read_ply(path)
@@ -161,10 +153,6 @@ def export_memory_ply(
 
     Returns:
         Points written, and the voxel edge they were thinned to (0 when all were kept).
-
-    Raises:
-        OptionError: nothing was observed.
-        ProjectError: the file cannot be written.
     """
     if memory.tiles is not None and max_points is None:
         return _export_tiles(memory, path, observed=observed), 0.0

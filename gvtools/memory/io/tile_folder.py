@@ -37,11 +37,7 @@ def tile_folder(path: Path) -> Path:
 
 
 def save_tiles(memory: Store, tiles: TileSet, folder: Path) -> Path:
-    """Write a memory in tiles.
-
-    Raises:
-        ProjectError: the disk is full or the folder cannot be written; what was there is intact.
-    """
+    """Write a memory in tiles."""
     with tiles.lock, _replaced(folder) as new:
         table = []
         for number, tile in tiles:
@@ -92,9 +88,6 @@ def load_tiles(
         budget: bytes; None takes that it was saved with.
         scratch: where tiles that change are written; if given, tiles are linked into it at once,
             so that the folder may be removed.
-
-    Raises:
-        MemoryFileError: absent, truncated, altered, of another kind or version.
     """
     recover_folder(folder)
     index = ArrayFile(folder / INDEX)
@@ -172,22 +165,14 @@ def _filled(
 
 
 def copy_tiles(source: Path, target: Path) -> None:
-    """Make the tiles in a folder those of another, too, by links where there are any.
-
-    Raises:
-        ProjectError: the disk is full or the folder cannot be written.
-    """
+    """Make the tiles in a folder those of another, too, by links where there are any."""
     with _replaced(target) as new:
         for path in sorted(source.iterdir()):
             link(path, new / path.name)
 
 
 def link(source: Path, target: Path) -> None:
-    """Give a file a second name, or a copy where the file system has no links.
-
-    Raises:
-        OSError: neither is possible.
-    """
+    """Give a file a second name, or a copy where the file system has no links."""
     if target.exists() and target.samefile(source):
         return
     try:
@@ -198,11 +183,7 @@ def link(source: Path, target: Path) -> None:
 
 @contextmanager
 def _replaced(folder: Path) -> Iterator[Path]:
-    """An empty folder that takes the place of ``folder``, which may be absent.
-
-    Raises:
-        ProjectError: see folder_replaced_when_written.
-    """
+    """An empty folder that takes the place of ``folder``, which may be absent."""
     recover_folder(folder)
     if folder.exists():
         with folder_replaced_when_written(folder) as new:

@@ -193,9 +193,6 @@ def project_open3d(
 
     Returns:
         depth (H, W) float32, scene units, 0 where empty, and rgb (H, W, 3) float32.
-
-    Raises:
-        OptionError: the camera has skew, which Open3D would ignore.
     """
     import open3d as o3d
 

@@ -28,11 +28,7 @@ PAIRS = {"cpu": 1 << 20, "cuda": 1 << 24}
 
 
 def torch_device(name: str) -> torch.device:
-    """The device that "auto", "cpu" or "cuda" means here.
-
-    Raises:
-        OptionError: CUDA is asked for and torch sees none.
-    """
+    """The device that "auto", "cpu" or "cuda" means here."""
     there = torch.cuda.is_available()
     if name == "cuda" and not there:
         raise OptionError("splat device 'cuda': torch sees no CUDA device; choose 'auto' or 'cpu'")

@@ -13,9 +13,6 @@ def bytes_of(text: str) -> int:
 
     >>> bytes_of("4GB"), bytes_of("1.5 GiB"), bytes_of("1000000")
     (4000000000, 1610612736, 1000000)
-
-    Raises:
-        ValueError: another form.
     """
     found = _FORM.fullmatch(text.strip())
     if not found:

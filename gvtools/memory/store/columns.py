@@ -64,9 +64,6 @@ class Columns:
 
     Args:
         device: of the tensors, such as "cpu" or "cuda:0".
-
-    Raises:
-        OptionError: Open3D has no such device here.
     """
 
     positions: NDArray[np.float32]
@@ -106,11 +103,7 @@ class Columns:
 
     @property
     def arrays(self) -> ColumnArrays:
-        """Views of the tensors for kernels, which run on the CPU.
-
-        Raises:
-            OptionError: the tensors are on another device.
-        """
+        """Views of the tensors for kernels, which run on the CPU."""
         if self._arrays is None:
             if not self._tensors["positions"].is_cpu:
                 raise OptionError(

@@ -34,11 +34,7 @@ class LocalFrame:
 
     @classmethod
     def at(cls, origin: ArrayLike = (0.0, 0.0, 0.0), axes: ArrayLike | None = None) -> LocalFrame:
-        """The frame of an origin and axes; None for the world's.
-
-        Raises:
-            ShapeError: not three finite numbers, or not a rotation.
-        """
+        """The frame of an origin and axes; None for the world's."""
         point = np.array(origin, np.float64)
         if point.shape != (3,) or not np.isfinite(point).all():
             raise ShapeError(f"memory origin {point.tolist()}; expected three finite numbers")

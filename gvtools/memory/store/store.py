@@ -247,9 +247,6 @@ class Store:
 
         Returns:
             How many observations were removed.
-
-        Raises:
-            OptionError: no view was fused in that round.
         """
         if round not in self.rounds:
             raise OptionError(f"round {round} is not in the memory; it has rounds {self.rounds}")
@@ -325,11 +322,7 @@ class Store:
         return other
 
     def to(self: S, device: str) -> S:
-        """A copy of this memory, independent of it, whose tensors live on a device.
-
-        Raises:
-            OptionError: Open3D has no such device here.
-        """
+        """A copy of this memory, independent of it, whose tensors live on a device."""
         other = self.snapshot()
         other.columns = self.columns.to(device)
         other.segments, other.index = deepcopy(self.segments), deepcopy(self.index)

@@ -354,12 +354,7 @@ class VoxelIndex:
 
 
 def check_grid(voxel: float, origin: NDArray[np.float64]) -> None:
-    """Refuse voxels that the numbers cannot hold.
-
-    Raises:
-        OptionError: an edge outside VOXEL_RANGE, or an origin so far away that float64 positions
-            there are coarser than ORIGIN_STEP of an edge.
-    """
+    """Refuse voxels that the numbers cannot hold."""
     least, most = VOXEL_RANGE
     if not least <= voxel <= most:
         raise OptionError(

@@ -38,9 +38,6 @@ def write_arrays(
         meta: JSON-ready.
         arrays: by name.
         flush: see replaced_when_written.
-
-    Raises:
-        ProjectError: the disk is full or the folder cannot be written.
     """
     table, at = {}, 0
     for name, array in arrays.items():
@@ -66,9 +63,6 @@ class ArrayFile:
     Attributes:
         meta: what was written beside the arrays.
         checksum: CRC-32 of the header.
-
-    Raises:
-        MemoryFileError: absent, truncated, altered, or another kind of file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -118,11 +112,7 @@ class ArrayFile:
         return np.dtype(self._table[name][0]) if name in self._table else None
 
     def array(self, name: str) -> NDArray[Any]:
-        """An array in the file's own pages.
-
-        Raises:
-            MemoryFileError: there is none of that name, or its checksum differs.
-        """
+        """An array in the file's own pages."""
         if name not in self._table:
             raise MemoryFileError(f"{self.path}: holds no array {name}; run again")
         kind, shape, at, crc = self._table[name]
@@ -142,12 +132,7 @@ class ArrayFile:
 
 
 def _check_entry(kind: Any, shape: Any, at: Any) -> None:
-    """Refuse what no array of numbers is.
-
-    Raises:
-        TypeError: see ValueError.
-        ValueError: another type of numbers, or a shape or place that cannot be.
-    """
+    """Refuse what no array of numbers is."""
     # Before NumPy sees it, which takes such texts for Python.
     known = isinstance(kind, str) and KINDS.fullmatch(kind)
     numbers = [at, *shape]

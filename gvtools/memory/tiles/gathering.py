@@ -46,9 +46,6 @@ def gather(
         chosen: (n,) rows of the memory's table.
         length: (n,) of these segments.
         doublings: (n,) of the thinned copy to take each from, 0 = every observation; None is 0.
-
-    Raises:
-        MemoryFileError: a tile's file is damaged.
     """
     with tiles.lock:
         places = tiles.places

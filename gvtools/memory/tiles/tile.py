@@ -79,11 +79,7 @@ class Tile:
         self.agreed = tuple(sorted(self.store.agreements))
 
     def drawn(self) -> Drawn:
-        """All observations, as splatting reads them.
-
-        Raises:
-            MemoryFileError: its file is damaged.
-        """
+        """All observations, as splatting reads them."""
         if self.store is not None:
             arrays = self.store.columns.arrays
             return Drawn(arrays.positions, arrays.colors, arrays.confidence, arrays.spacing)
@@ -93,11 +89,7 @@ class Tile:
         return rows
 
     def thinned(self, doublings: int) -> ThinnedCopy:
-        """The thinned copy whose cubes are 2**doublings voxels wide.
-
-        Raises:
-            MemoryFileError: its file is damaged.
-        """
+        """The thinned copy whose cubes are 2**doublings voxels wide."""
         if self.store is None:
             file, head = self._open(), f"thinned{doublings}_"
             rows = Drawn(*(file.array(f"{head}{name}") for name in Drawn._fields))
@@ -127,11 +119,7 @@ class Tile:
         return read_agreements(self._open())
 
     def write(self, path: Path) -> None:
-        """Write its store to a file, which it is then read from.
-
-        Raises:
-            ProjectError: the disk is full; the store stays as it is.
-        """
+        """Write its store to a file, which it is then read from."""
         store = self.store
         assert store is not None
         columns, segments = store.columns, store.segments
@@ -160,11 +148,7 @@ class Tile:
         self._copies.clear()
 
     def load(self, empty: Store) -> None:
-        """Bring its store into RAM; ``empty``, which knows the views, is filled.
-
-        Raises:
-            MemoryFileError: its file is damaged.
-        """
+        """Bring its store into RAM; ``empty``, which knows the views, is filled."""
         if self.file is not None:
             file = self._open()
             self.mapped = None
@@ -213,21 +197,13 @@ def read_segments(file: ArrayFile) -> Segments:
 
 
 def check(file: ArrayFile, fits: bool) -> None:
-    """Refuse a file whose arrays contradict each other.
-
-    Raises:
-        MemoryFileError: they do.
-    """
+    """Refuse a file whose arrays contradict each other."""
     if not fits:
         raise MemoryFileError(f"{file.path}: the tile's parts do not fit together; run again")
 
 
 def check_shapes(file: ArrayFile) -> None:
-    """Whether the columns have as many rows as the file says.
-
-    Raises:
-        MemoryFileError: they have not.
-    """
+    """Whether the columns have as many rows as the file says."""
     count = file.meta.get("count")
     for name in COLUMNS:
         kind, width = LAYOUT[name]
@@ -236,11 +212,7 @@ def check_shapes(file: ArrayFile) -> None:
 
 
 def check_segments(file: ArrayFile, segments: Segments, views: int) -> None:
-    """Whether segments cover the observations, one behind the other.
-
-    Raises:
-        MemoryFileError: they do not.
-    """
+    """Whether segments cover the observations, one behind the other."""
     n = segments.count
     start, length, view = (
         segments.start[:n],
@@ -256,11 +228,7 @@ def check_segments(file: ArrayFile, segments: Segments, views: int) -> None:
 
 
 def _check(file: ArrayFile, views: int) -> None:
-    """Whether the values of a tile's file fit together.
-
-    Raises:
-        MemoryFileError: they do not.
-    """
+    """Whether the values of a tile's file fit together."""
     view, level, row = (file.array(name) for name in ("view", "level", "agreement_row"))
     count = len(view)
     check(file, not count or bool(0 <= view.min() <= view.max() < views))

@@ -100,11 +100,7 @@ class TileSet:
 
     @property
     def folder(self) -> Path:
-        """The working folder, made when first needed and deleted with the memory.
-
-        Raises:
-            ProjectError: it cannot be made.
-        """
+        """The working folder, made when first needed and deleted with the memory."""
         if self._folder is None:
             try:
                 ours = self.scratch if self.scratch and not self.scratch.exists() else None
@@ -132,11 +128,7 @@ class TileSet:
         return number
 
     def load(self, number: int) -> Store:
-        """A tile's store, read into RAM if it is not there.
-
-        Raises:
-            MemoryFileError: its file is damaged.
-        """
+        """A tile's store, read into RAM if it is not there."""
         tile = self[number]
         if tile.store is None:
             tile.load(self.empty())
@@ -155,9 +147,6 @@ class TileSet:
 
         Args:
             keep: number of a tile that stays in RAM.
-
-        Raises:
-            ProjectError: the disk is full; no tile is lost.
         """
         limit = CACHE * self.budget - self.reserved - self.places.nbytes
         for number in list(self._recent):

@@ -109,11 +109,7 @@ class Backbone(Recomputing):
         self.ray_embed = _ray_embedder(width) if config.rays else None
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Patches (rows, columns) of an image of this size.
-
-        Raises:
-            ShapeError: a side is no multiple of the patch.
-        """
+        """Patches (rows, columns) of an image of this size."""
         patch = self.config.patch
         if height % patch or width % patch or height <= 0 or width <= 0:
             raise ShapeError(

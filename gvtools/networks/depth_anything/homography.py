@@ -32,9 +32,6 @@ def draw_samples(count: int, *, seed: int) -> Tensor:
     """(ITERATIONS, SAMPLE) places among the candidates of ``count`` rays.
 
     The same as Depth Anything 3 draws on a CPU after ``torch.manual_seed(seed)``.
-
-    Raises:
-        DegenerateError: fewer rays than one sample has.
     """
     if count < SAMPLE:
         raise DegenerateError(f"{count} rays; a homography is sampled from at least {SAMPLE}")
@@ -95,10 +92,6 @@ def ransac(
 
     Returns:
         (3, 3), up to scale, determinant above 0.
-
-    Raises:
-        ShapeError: samples beyond the candidates.
-        DegenerateError: no sample has inliers that determine a homography.
     """
     pool = min(candidates(len(source)), len(source))
     if samples.ndim != 2 or int(samples.min()) < 0 or int(samples.max()) >= pool:
@@ -130,9 +123,6 @@ def factor(H: Tensor, *, upper: bool) -> tuple[Tensor, Tensor]:
         upper: K⁻¹ is upper triangular, as intrinsics are. Else H is R times a *lower* triangular
             L, as published, whose diagonal gives 1 / focal lengths and whose last row the
             principal point, which holds for a principal point of 0 alone.
-
-    Raises:
-        DegenerateError: H has no inverse.
     """
     # A lower triangular factor is the upper one of the columns in reverse order.
     order = [0, 1, 2] if upper else [2, 1, 0]

@@ -55,10 +55,6 @@ def camera_centres(ray: Tensor, confidence: Tensor | None = None) -> Tensor:
 
     Returns:
         (..., 3), the rays' units and dtype.
-
-    Raises:
-        ShapeError: shapes that do not match.
-        DegenerateError: a view whose confidences are not finite, negative or all 0.
     """
     _check(ray, confidence)
     origin = ray[..., 3:]
@@ -94,10 +90,6 @@ def poses_least_squares(
         subsample: step between cells.
         cell_offset: where in a cell its ray passes: 0 is published, 0.5 gives K in this project's
             convention (the first pixel's centre at 0.5). Poses are the same.
-
-    Raises:
-        ShapeError: shapes that do not match.
-        DegenerateError: rays of a view that do not span three directions, or bad confidences.
     """
     _check(ray, confidence, views=True)
     if subsample < 1:
@@ -149,10 +141,6 @@ def poses_ransac(
         seed: of the samples.
         samples: (iterations, 8), places among the most confident rays, instead of the seed's.
         factorisation: "ql" as published, "qr" as it should be: see the module.
-
-    Raises:
-        ShapeError: shapes that do not match, or samples beyond the candidates.
-        DegenerateError: a view without enough rays that agree.
     """
     _check(ray, confidence, views=True)
     if factorisation not in ("ql", "qr"):

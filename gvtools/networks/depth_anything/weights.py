@@ -79,11 +79,7 @@ def tied_norms(start: str) -> tuple[tuple[str, ...], ...]:
 
 
 def find_weights(folder: Path | str) -> Path:
-    """The file that holds Depth Anything 3's weights.
-
-    Raises:
-        CheckpointError: the folder or the file is absent.
-    """
+    """The file that holds Depth Anything 3's weights."""
     folder = Path(folder)
     if folder.is_file():
         return folder
@@ -110,9 +106,6 @@ def load_depth_anything(
         folder: with ``model.safetensors`` of DA3-SMALL, -BASE or -LARGE, or a GeoVerse folder.
         device: of the weights.
         dtype: of the autocast that it is run in, see ``DepthAnything3.hold_in``.
-
-    Raises:
-        CheckpointError: nothing there, or a tensor that does not fit.
     """
     path = find_weights(folder)
     if path.name == GEOVERSE_FILE:

@@ -96,9 +96,6 @@ def read_trajectory(path: Path, *, version: str) -> tuple[Float64, Float64]:
     Args:
         path: ``aria_trajectory.csv``, whose columns 1 and 3 to 9 are read.
         version: of the data set.
-
-    Raises:
-        ProjectError: absent, empty or not of that form.
     """
     try:
         with regular(path).open(newline="", encoding="utf-8") as file:

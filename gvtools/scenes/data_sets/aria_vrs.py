@@ -93,12 +93,7 @@ class AriaCamera:
 
 
 def rgb_camera(path: Path) -> AriaCamera:
-    """The colour camera of a recording.
-
-    Raises:
-        ProjectError: no readable recording, or a calibration of another model.
-        OptionError: projectaria_tools is not installed.
-    """
+    """The colour camera of a recording."""
     calibration = _provider(path).get_device_calibration()
     camera = None if calibration is None else calibration.get_camera_calib(RGB_LABEL)
     if camera is None:
@@ -128,12 +123,7 @@ def rgb_times(path: Path) -> list[int]:
 
 
 def read_rgb(path: Path, *, index: int, camera: AriaCamera) -> Frame:
-    """A picture of the colour camera as a pinhole sees it.
-
-    Raises:
-        ProjectError: absent or damaged.
-        OptionError: projectaria_tools is not installed.
-    """
+    """A picture of the colour camera as a pinhole sees it."""
     stream = _tools().stream_id.StreamId(RGB_STREAM)
     data, _ = _provider(path).get_image_data_by_index(stream, index)
     return camera.picture(_array(data, path))
@@ -146,10 +136,6 @@ def read_rgb_depth(path: Path, *, time: int, camera: AriaCamera) -> Depth:
         path: ``depth_images.vrs``, whose streams name the recorded streams that they belong to.
         time: nanoseconds of the device's clock.
         camera: of the recording.
-
-    Raises:
-        ProjectError: absent or damaged.
-        OptionError: projectaria_tools is not installed.
     """
     tools, provider = _tools(), _provider(path)
     for stream in provider.get_all_streams():

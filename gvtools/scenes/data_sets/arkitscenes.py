@@ -127,11 +127,7 @@ def _nearest_stamp(time: float, lenses: dict[int, LensParameters]) -> int:
 
 
 def read_trajectory(path: Path) -> tuple[Float64, Float64]:
-    """A ``.traj`` file: (N,) seconds in increasing order and (N, 4, 4) cam_from_world.
-
-    Raises:
-        ProjectError: absent, empty or not of that form.
-    """
+    """A ``.traj`` file: (N,) seconds in increasing order and (N, 4, 4) cam_from_world."""
     from scipy.spatial.transform import Rotation
 
     try:

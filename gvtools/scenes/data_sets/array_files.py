@@ -19,12 +19,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def hdf5_file(path: Path) -> Iterator[h5py.File]:
-    """The HDF5 file at ``path``, open for reading.
-
-    Raises:
-        ProjectError: absent, damaged, without what is asked of it in the block, or h5py is not
-            installed.
-    """
+    """The HDF5 file at ``path``, open for reading."""
     try:
         import h5py
     except ImportError:
@@ -44,9 +39,6 @@ def read_dataset(path: Path, found: Any) -> NDArray[Any]:
     Args:
         path: the file.
         found: of h5py.
-
-    Raises:
-        ValueError: no data set, or one that claims more than its file can hold.
     """
     size = path.stat().st_size
     if not hasattr(found, "nbytes"):
@@ -62,9 +54,6 @@ def hdf5_array(path: Path, key: str) -> NDArray[Any]:
     Args:
         path: the file.
         key: the array's name in it.
-
-    Raises:
-        ProjectError: as of ``hdf5_file``, or no such array.
     """
     with hdf5_file(path) as file:
         if key not in file:
@@ -78,9 +67,6 @@ def exr_channel(path: Path, channels: tuple[str, ...]) -> NDArray[np.float32]:
     Args:
         path: the file.
         channels: names in order of preference; the first that is there is read.
-
-    Raises:
-        ProjectError: absent, damaged, without these channels, or OpenEXR is not installed.
     """
     try:
         import OpenEXR

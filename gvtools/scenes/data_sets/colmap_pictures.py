@@ -17,11 +17,7 @@ from gvtools.scenes.transforms_frame import LensParameters
 
 
 def model_in(folder: Path) -> ColmapModel:
-    """The COLMAP model of a folder.
-
-    Raises:
-        ProjectError: none there, or a damaged one.
-    """
+    """The COLMAP model of a folder."""
     found = find_model(folder)
     if found is None:
         raise ProjectError(
@@ -64,9 +60,6 @@ def colmap_scene(
         model: a loaded model.
         pictures: frames named as the model names its images; not every one has to be there.
         metric: whether the model's unit is the metre.
-
-    Raises:
-        ProjectError: no frame is left.
     """
     scene = posed_scene(
         root, pictures, poses="cam_from_world", metric=metric, findings=model.findings

@@ -58,9 +58,6 @@ def number_table(path: Path, columns: int, *, header: bool = False) -> Float64:
         path: the file.
         columns: that each row has.
         header: whether the first line holds names.
-
-    Raises:
-        ProjectError: not of that form.
     """
     try:
         lines = read_text(path).splitlines()[int(header) :]

@@ -103,9 +103,6 @@ def read_raw_depth(path: Path, *, size: tuple[int, int], lens: Undistortion | No
 
     Returns:
         (H, W) float32 z-depth, metres, 0 where the file says infinity.
-
-    Raises:
-        ProjectError: absent, or of another size.
     """
     width, height = size
     try:

@@ -30,11 +30,7 @@ KEY = re.compile(r"(image|depth|pose|K)_([0-9]+)")
 
 
 def hdf5_picture(path: Path, *, key: str) -> Frame:
-    """The picture that an HDF5 file holds as the bytes of a JPEG or PNG.
-
-    Raises:
-        ProjectError: absent, damaged, or no picture.
-    """
+    """The picture that an HDF5 file holds as the bytes of a JPEG or PNG."""
     data = np.asarray(hdf5_array(path, key), np.uint8).tobytes()
     try:
         with open_picture(data) as image:
@@ -44,11 +40,7 @@ def hdf5_picture(path: Path, *, key: str) -> Frame:
 
 
 def hdf5_depth(path: Path, *, key: str) -> NDArray[np.float32]:
-    """(H, W) float32 z-depth that an HDF5 file holds, 0 where it is not finite and positive.
-
-    Raises:
-        ProjectError: absent, damaged, or not two-dimensional.
-    """
+    """(H, W) float32 z-depth that an HDF5 file holds, 0 where it is not finite and positive."""
     depth = np.squeeze(hdf5_array(path, key)).astype(np.float32)
     if depth.ndim != 2:
         raise ProjectError(f"{path}, {key}: shape {depth.shape}; expected (height, width)")

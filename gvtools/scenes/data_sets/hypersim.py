@@ -152,9 +152,6 @@ def turned_pinhole(cam_from_uv: Float64, size: tuple[int, int]) -> TurnedPinhole
         cam_from_uv: (3, 3), from (u, v, 1) to a ray; x right, y up, z backward. u and v are from
             -1 to 1 across the picture.
         size: width and height of the picture, pixels.
-
-    Raises:
-        ProjectError: the projection is mirrored, or has no inverse.
     """
     width, height = size
     finite = np.isfinite(cam_from_uv).all() and min(size) >= 1
@@ -173,12 +170,7 @@ def turned_pinhole(cam_from_uv: Float64, size: tuple[int, int]) -> TurnedPinhole
 
 
 def read_distance(path: Path, *, camera: TurnedPinhole) -> Depth:
-    """``depth_meters`` as (h, w) float32 depth along the pinhole's z, metres; 0 for none.
-
-    Raises:
-        ProjectError: absent or damaged.
-        OptionError: h5py is not installed.
-    """
+    """``depth_meters`` as (h, w) float32 depth along the pinhole's z, metres; 0 for none."""
     distance = camera.straight(np.nan_to_num(_hdf5(path).astype(np.float32)), nearest=True)
     fx, fy, cx, cy = camera.lens.values
     height, width = distance.shape
@@ -194,10 +186,6 @@ def read_color(path: Path) -> Frame:
 
     The 90th percentile of the pixels' brightness becomes 0.8 of white. Pixels that show no object
     do not count, where the scene's ``render_entity_id`` is there.
-
-    Raises:
-        ProjectError: absent or damaged.
-        OptionError: h5py is not installed.
     """
     color = np.nan_to_num(_hdf5(path).astype(np.float32), posinf=0.0, neginf=0.0)
     shown = color @ np.array([0.3, 0.59, 0.11], np.float32)

@@ -71,12 +71,7 @@ def layout_of(spec: DataSetSpec) -> Layout:
 
 
 def scenes_of(name: str, root: Path) -> tuple[str, ...]:
-    """The scenes of a data set that a folder holds.
-
-    Raises:
-        OptionError: no such data set.
-        ProjectError: the folder is absent or holds no scene of it.
-    """
+    """The scenes of a data set that a folder holds."""
     spec = load_spec(name)
     layout = layout_of(spec)
     if not Path(root).is_dir():
@@ -94,10 +89,6 @@ def open_data_set(name: str, scene: str, root: Path) -> Scene:
         name: of the data set, see ``spec.load_spec``.
         scene: as ``scenes_of`` names it, or a variant; "" for the only one of the folder.
         root: the folder of the download.
-
-    Raises:
-        OptionError: no such data set.
-        ProjectError: no such scene there, or nothing of it can be read.
     """
     spec = load_spec(name)
     known = scenes_of(name, root)
@@ -118,10 +109,6 @@ def open_address(address: Path | str, root: Path | None) -> Scene:
     Args:
         address: ``spec:NAME:SCENE``; ":SCENE" may be left out where the folder holds only one.
         root: the folder of the data set's download.
-
-    Raises:
-        OptionError: no such data set, or no root.
-        ProjectError: no such scene in the folder, or nothing of it can be read.
     """
     name, _, scene = str(address).removeprefix(SPEC).partition(":")
     if not name:
@@ -136,12 +123,7 @@ def open_address(address: Path | str, root: Path | None) -> Scene:
 
 
 def chosen_scenes(name: str, root: Path, scenes: Sequence[str] = ()) -> tuple[str, ...]:
-    """The scenes of a download that a user names, without repeats; all of them if none is named.
-
-    Raises:
-        OptionError: no such data set.
-        ProjectError: the folder is absent or lacks one of them.
-    """
+    """The scenes of a download that a user names, without repeats; all of them if none is named."""
     spec = load_spec(name)
     known = scenes_of(name, root)
     for scene in scenes:
@@ -158,11 +140,7 @@ def _check_is_there(spec: DataSetSpec, scene: str, root: Path, *, known: Sequenc
 
 
 def read_scene(spec: DataSetSpec, scene: str, root: Path) -> Scene:
-    """A scene by its name, without listing the others first, as ``open_data_set`` does.
-
-    Raises:
-        ProjectError: nothing of it can be read.
-    """
+    """A scene by its name, without listing the others first, as ``open_data_set`` does."""
     opened = layout_of(spec).read(root, scene, spec)
     origin = Origin(f"{SPEC}{name_key(spec.name)}:{scene}", root.resolve())
     return replace(opened, origin=origin)

@@ -37,11 +37,7 @@ MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def exr_depth(path: Path, *, channels: tuple[str, ...] = ("Y", "R")) -> NDArray[np.float32]:
-    """(H, W) float32 depth of an OpenEXR file, 0 where it says infinity, NaN or nothing positive.
-
-    Raises:
-        ProjectError: absent, damaged, without these channels, or OpenEXR is not installed.
-    """
+    """(H, W) float32 depth of an OpenEXR file, 0 where it says infinity, NaN or 0 and less."""
     depth = exr_channel(path, channels)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 

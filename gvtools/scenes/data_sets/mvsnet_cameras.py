@@ -36,11 +36,7 @@ class MvsCamera:
 
 
 def read_camera(path: Path) -> MvsCamera:
-    """A camera file.
-
-    Raises:
-        ProjectError: absent or not of that form.
-    """
+    """A camera file."""
     try:
         words = read_text(path).split()
         at = words.index("extrinsic") + 1

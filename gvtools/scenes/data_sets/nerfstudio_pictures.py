@@ -22,9 +22,6 @@ def nerfstudio_pictures(
         file: the ``transforms.json``.
         picture_of: where the picture of a frame's ``file_path`` should be.
         keys: which lists of frames are read.
-
-    Raises:
-        ProjectError: no such file, not of that form, or a wrong value in a frame.
     """
     data = load_frames(file)
     pictures = []

@@ -35,11 +35,7 @@ NEAREST, FARTHEST = 0.0015, 65500 / 65535
 
 
 def buffer_depth(path: Path) -> NDArray[np.float32]:
-    """(H, W) float32 z-depth of OmniWorld's 16-bit depth buffers, 0 where they hold none.
-
-    Raises:
-        ProjectError: absent, damaged, or not 16-bit grey.
-    """
+    """(H, W) float32 z-depth of OmniWorld's 16-bit depth buffers, 0 where they hold none."""
     try:
         with open_picture(path) as image:
             mode, raw = image.mode, np.asarray(image)

@@ -17,9 +17,6 @@ def read_pfm_depth(path: Path, *, unit: float = 1.0) -> Depth:
     Args:
         path: the file.
         unit: scene units in a stored unit.
-
-    Raises:
-        ProjectError: absent, truncated, coloured or no PFM.
     """
     try:
         with regular(path).open("rb") as file:

@@ -34,11 +34,7 @@ def variants_of(root: Path, scenes: Iterable[str], *, inside: str = "") -> tuple
 
 
 def chosen_folder(root: Path, scene: str, *, inside: str = "") -> tuple[Path, Path]:
-    """A scene's folder, and the pictures that its name chooses: of a variant, else the largest.
-
-    Raises:
-        ProjectError: no pictures.
-    """
+    """A scene's folder, and the pictures that its name chooses: of a variant, else the largest."""
     named = root / scene
     if inside and named.parent.joinpath(inside, named.name).is_dir() and _factor(named.name):
         return named.parent, named.parent / inside / named.name

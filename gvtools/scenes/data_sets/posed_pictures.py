@@ -96,9 +96,6 @@ def pinhole_lens(K: Sequence[float] | Float64, size: tuple[int, int]) -> LensPar
 def scaled_lens(lens: LensParameters, size: tuple[int, int]) -> LensParameters:
     """The camera of the same picture resampled to ``size`` (width and height, pixels).
 
-    Raises:
-        ProjectError: of an impossible camera.
-
     >>> scaled_lens(pinhole_lens([500, 500, 320, 240], (640, 480)), (320, 240)).values
     (250.0, 250.0, 160.0, 120.0)
     """
@@ -191,9 +188,6 @@ def posed_scene(
         metric: whether the units of poses and depth are metres.
         findings: what the reader met.
         home: the folder that no file of a frame may lie outside of; None: ``root``.
-
-    Raises:
-        ProjectError: no frame is left, or one names a file outside of the data set.
     """
     sieve = _Sieve(len(pictures))
     for picture in pictures:

@@ -73,11 +73,7 @@ class SensFile:
 
     @staticmethod
     def open(path: Path) -> SensFile:
-        """The head and the index of a file, which may end early.
-
-        Raises:
-            ProjectError: absent, no such file, or of a compression that is not read.
-        """
+        """The head and the index of a file, which may end early."""
         try:
             with regular(path).open("rb") as file:
                 (version,) = _unpack(file, "<I")
@@ -132,11 +128,7 @@ def _index(file: BinaryIO, count: int, end: int) -> list[SensFrame]:
 
 
 def read_color(path: Path, *, frame: SensFrame) -> Frame:
-    """The picture of a frame.
-
-    Raises:
-        ProjectError: absent or damaged.
-    """
+    """The picture of a frame."""
     try:
         with regular(path).open("rb") as file:
             file.seek(frame.offset)
@@ -147,11 +139,7 @@ def read_color(path: Path, *, frame: SensFrame) -> Frame:
 
 
 def read_sens_depth(path: Path, *, frame: SensFrame, sens: SensFile) -> Depth:
-    """(h, w) float32 z-depth of the depth camera, metres, 0 for none.
-
-    Raises:
-        ProjectError: absent or damaged.
-    """
+    """(h, w) float32 z-depth of the depth camera, metres, 0 for none."""
     width, height = sens.depth_size
     try:
         with regular(path).open("rb") as file:

@@ -173,9 +173,6 @@ def load_spec(name: str) -> DataSetSpec:
 
     >>> load_spec("7-Scenes").depth.unit_m
     0.001
-
-    Raises:
-        OptionError: there is no such data set.
     """
     texts, key = _texts(), name_key(name)
     if key not in texts:
@@ -186,11 +183,7 @@ def load_spec(name: str) -> DataSetSpec:
 
 
 def parse_spec(text: str, *, where: str = "spec") -> DataSetSpec:
-    """A data set from its YAML.
-
-    Raises:
-        OptionError: a key that is unknown or absent, or a value of another type.
-    """
+    """A data set from its YAML."""
     try:
         return DataSetSpec.model_validate(parse_yaml(text))
     except ValidationError as error:

@@ -46,9 +46,6 @@ def spring_depth(path: Path, *, focal: float, sky: Path | None) -> NDArray[np.fl
         path: the map.
         focal: horizontal focal length, pixels of the frame.
         sky: the map of the sky, of (2 H, 2 W) or (H, W); None where there is none.
-
-    Raises:
-        ProjectError: absent, damaged, of an odd size, or h5py is not installed.
     """
     disparity = hdf5_array(path, "disparity").astype(np.float64)
     if disparity.ndim != 2 or disparity.shape[0] % 2 or disparity.shape[1] % 2:

@@ -109,11 +109,7 @@ def _official(folder: Path, log: Path) -> tuple[list[PosedPicture], list[Finding
 
 
 def _numbered(files: list[Path], home: Path, numbers: list[int]) -> list[Path]:
-    """Pictures by the numbers in their names, from the official 000001 on, where some are absent.
-
-    Raises:
-        ProjectError: names that are no such numbers.
-    """
+    """Pictures by the numbers in their names, from the official 000001 on, where some are gone."""
     known = {int(path.stem): path for path in files if path.stem.isdecimal()}
     if len(known) < len(files) or 0 in known or max(known, default=0) > len(numbers):
         raise ProjectError(

@@ -44,9 +44,6 @@ def ned_poses(path: Path) -> NDArray[np.float64]:
 
     Args:
         path: rows ``tx ty tz qx qy qz qw``; where it is absent there are no poses.
-
-    Raises:
-        ProjectError: not of that form.
     """
     from scipy.spatial.transform import Rotation
 
@@ -94,9 +91,6 @@ def read_trajectory(
         lens: of all pictures.
         depth_suffix: of depth maps, such as ".npy".
         read_depth: how one is read.
-
-    Raises:
-        ProjectError: a malformed pose file, or nothing that can be read.
     """
     trajectory, _, camera = scene.rpartition("/")
     folder = root / trajectory

@@ -27,11 +27,7 @@ CAMERAS = tuple(f"{side}cam_{direction}" for side in "lr" for direction in DIREC
 
 
 def packed_depth(path: Path) -> NDArray[np.float32]:
-    """(H, W) float32 z-depth, metres, 0 = none, of a PNG whose channels are a float's bytes.
-
-    Raises:
-        ProjectError: absent, damaged, or no picture of four 8-bit channels.
-    """
+    """(H, W) float32 z-depth, metres, 0 = none, of a PNG whose channels are a float's bytes."""
     try:
         with open_picture(path) as image:
             mode, pixels = image.mode, np.asarray(image)

@@ -33,12 +33,7 @@ class VideoHeader:
 
 
 def video_header(path: Path) -> VideoHeader:
-    """Size and length of a video; nothing is decoded.
-
-    Raises:
-        ProjectError: absent, or no video.
-        OptionError: PyAV is not installed.
-    """
+    """Size and length of a video; nothing is decoded."""
     with _opened(path) as container:
         stream = container.streams.video[0]
         seconds = np.inf
@@ -58,10 +53,6 @@ def frame_seconds(path: Path, *, edits: bool = True) -> NDArray[np.float64]:
     Args:
         path: the video.
         edits: whether frames that the file's edit list hides are left out.
-
-    Raises:
-        ProjectError: absent, or no video.
-        OptionError: PyAV is not installed.
     """
     try:
         with _opened(path, edits=edits) as container:
@@ -84,10 +75,6 @@ def read_frame(path: Path, *, seconds: float, edits: bool = True) -> Frame:
         path: the video.
         seconds: from its beginning.
         edits: whether frames that the file's edit list hides are left out.
-
-    Raises:
-        ProjectError: absent, damaged, or it ends before.
-        OptionError: PyAV is not installed.
     """
     best, best_off = None, np.inf
     try:

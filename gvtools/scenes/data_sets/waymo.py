@@ -94,10 +94,6 @@ def read_picture(path: Path, *, group: int, row: int) -> Frame:
         path: the file.
         group: its row group.
         row: within the group.
-
-    Raises:
-        ProjectError: absent or damaged.
-        OptionError: pyarrow is not installed.
     """
     try:
         with _parquet().ParquetFile(regular(path)) as file:

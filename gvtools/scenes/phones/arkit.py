@@ -82,9 +82,6 @@ def read_lidar(path: Path, *, confidence: Path | None) -> Depth:
     Args:
         path: 16-bit PNG or ``.npy``.
         confidence: 8-bit picture; None: all depth is used.
-
-    Raises:
-        ProjectError: one of them is absent, damaged or something else.
     """
     depth = read_depth(path, unit=MILLIMETRES)
     return readings(depth, None if confidence is None else read_mask(confidence))
@@ -126,9 +123,6 @@ def phone_scene(
         pictures: poses are world_from_cam for OpenCV's axes.
         upright: whether y of the world points up, as gravity has it.
         findings: what the reader met.
-
-    Raises:
-        ProjectError: no frame is left.
     """
     scene = posed_scene(
         root, pictures, poses="world_from_cam", metric=True, findings=tuple(findings)

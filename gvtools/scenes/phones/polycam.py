@@ -94,11 +94,7 @@ def _of_size(image: Path, lens: LensParameters | None) -> bool:
 
 
 def read_undistorted(path: Path) -> Frame:
-    """An undistorted picture, its black border masked.
-
-    Raises:
-        ProjectError: absent, damaged or no picture.
-    """
+    """An undistorted picture, its black border masked."""
     picture = read_image(path)
     return Frame(picture.rgb, mask=~_border(picture.rgb))
 

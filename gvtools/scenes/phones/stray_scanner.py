@@ -81,11 +81,7 @@ def _read(root: Path) -> Scene:
 
 
 def read_odometry(path: Path) -> list[dict[str, float]]:
-    """The rows of ``odometry.csv`` by the names of its header; what is no number is left out.
-
-    Raises:
-        ProjectError: absent, empty, or without frame numbers.
-    """
+    """The rows of ``odometry.csv`` by the names of its header; what is no number is left out."""
     try:
         with regular(path).open(encoding="utf-8-sig", newline="") as file:
             lines = list(csv.DictReader(file, skipinitialspace=True))

@@ -173,11 +173,7 @@ def is_shards(folder: Path) -> bool:
 
 
 def read_index(folder: Path) -> ShardsIndex:
-    """The index of a folder of shards.
-
-    Raises:
-        ProjectError: absent, damaged, or of another version.
-    """
+    """The index of a folder of shards."""
     path = folder / INDEX
     if not path.is_file():
         raise ProjectError(
@@ -200,9 +196,6 @@ def read_shard_index(path: Path, checksum: str) -> ShardRecord:
         path: of the file.
         checksum: as ``index.json`` lists it; part of the cache's key, so that a shard that was
             converted anew is read again.
-
-    Raises:
-        ProjectError: absent, damaged, or of another checksum.
     """
     record = read_record(path, ShardRecord)
     if sha256_of(path) != checksum:
@@ -214,11 +207,7 @@ def read_shard_index(path: Path, checksum: str) -> ShardRecord:
 
 
 def read_record(path: Path, kind: type[R]) -> R:
-    """A record from its JSON file.
-
-    Raises:
-        ProjectError: absent or damaged.
-    """
+    """A record from its JSON file."""
     try:
         return kind.model_validate_json(read_bytes(path))
     except (OSError, ValidationError) as error:

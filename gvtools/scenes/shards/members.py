@@ -84,9 +84,6 @@ def decoded(members: Mapping[str, bytes], *, depth_unit: float | None, where: st
         members: by the end of their names.
         depth_unit: scene units of a stored one, where depth is a picture.
         where: for messages.
-
-    Raises:
-        ProjectError: a file that cannot be decoded.
     """
     try:
         picture = next(members[name] for name in PICTURES if name in members)

@@ -35,11 +35,7 @@ AGAIN = "copy it again, or run gvtools data shards again"
 
 
 def open_shards(folder: Path) -> SceneCollection:
-    """The scenes of a folder of shards.
-
-    Raises:
-        ProjectError: the folder holds no complete shards.
-    """
+    """The scenes of a folder of shards."""
     index = read_index(folder)
     names = tuple(scene.name for scene in index.scenes)
     counts = tuple(scene.with_depth for scene in index.scenes)
@@ -61,11 +57,7 @@ class ShardScenes:
         self._numbers = {scene.name: number for number, scene in enumerate(index.scenes)}
 
     def __call__(self, name: str) -> Scene:
-        """The scene of a name.
-
-        Raises:
-            ProjectError: no such scene, or a shard of it is absent, cut off or damaged.
-        """
+        """The scene of a name."""
         if name not in self._numbers:
             raise ProjectError(
                 f"{self.folder}: no scene {name!r}; first of {len(self._numbers)}: "
@@ -101,9 +93,6 @@ def verify(folder: Path, *, progress: Callable[[str], None] = lambda text: None)
 
     Returns:
         What is wrong, one line for each damaged or missing shard; empty if nothing is.
-
-    Raises:
-        ProjectError: the folder holds no complete shards.
     """
     problems = []
     for listed in read_index(folder).shards:

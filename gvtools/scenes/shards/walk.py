@@ -109,9 +109,6 @@ def write_shard(walk: Walk, tar: Path, *, limit: float) -> ShardRecord | None:
         walk: goes on by the views of the shard.
         tar: its file; the index is written beside it, after it.
         limit: bytes; the view that reaches it is the last.
-
-    Raises:
-        ProjectError: a file cannot be written.
     """
     first = walk.position
     step = walk.next()

@@ -81,11 +81,6 @@ def write_shards(
         out: the folder of the shards.
         options: see ShardOptions.
         progress: is called after each shard.
-
-    Raises:
-        ProjectError: the folder holds something else, nothing of the scenes can be read, or a file
-            cannot be written.
-        OptionError: another conversion lies there, or a wrong option.
     """
     options = options or ShardOptions()
     make_folder(out)
@@ -121,12 +116,7 @@ def write_shards(
 
 
 def _settle_description(collection: SceneCollection, out: Path, options: ShardOptions) -> None:
-    """Write what is converted, or compare it with what was.
-
-    Raises:
-        OptionError: another conversion lies there.
-        ProjectError: something else does.
-    """
+    """Write what is converted, or compare it with what was."""
     description = {
         "title": collection.title,
         "data_set": collection.data_set,

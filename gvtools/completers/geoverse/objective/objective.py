@@ -134,9 +134,6 @@ def objective(
         context: number of context views, which come first.
         weights: None is ``LossWeights()``.
         context_weight: see ``flow_matching_loss``.
-
-    Raises:
-        OptionError: nothing was predicted, or a prediction has no reference.
     """
     weights = weights or LossWeights()
     parts, counts = _parts(prediction, reference, context, context_weight=context_weight)

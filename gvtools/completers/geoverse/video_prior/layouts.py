@@ -74,9 +74,6 @@ def view_layout(name: str, views: int) -> ViewLayout:
             eight views); after the first, four views share a latent. "repeat4": one clip, the
             first view once and every other one four times, so each has its latent.
         views: how many.
-
-    Raises:
-        OptionError: an unknown name.
     """
     if name not in _LAYOUTS:
         raise OptionError(f"video layout {name!r}; expected one of {', '.join(LAYOUTS)}")

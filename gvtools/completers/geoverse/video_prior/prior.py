@@ -70,9 +70,6 @@ class VideoPrior:
         vae: diffusers' AutoencoderKLWan.
         prompt: (tokens, channels) embedding of the empty prompt; None with ``prompt="zeros"``.
         config: see there.
-
-    Raises:
-        CheckpointError: the three and the configuration do not fit each other.
     """
 
     def __init__(
@@ -128,9 +125,6 @@ class VideoPrior:
             offload: the weights stay in the CPU's memory and go to a CUDA device for the time of a
                 pass's one forward: "always", "never", or, "auto", where less than
                 ``ROOM`` would be free beside them.
-
-        Raises:
-            CheckpointError: diffusers, a file or a tensor is absent or does not fit.
         """
         config = config or VideoPriorConfig()
         prompt = read_empty_prompt(Path(folder)) if config.prompt == "empty" else None

@@ -47,9 +47,6 @@ def write_empty_prompt(text_encoder: Path | str, out: Path | str) -> None:
         text_encoder: folder of the UMT5 encoder in transformers' form (``text_encoder`` of a Wan
             folder of diffusers); 11.4 GB in bfloat16 for the published one.
         out: the truncated folder that it belongs into.
-
-    Raises:
-        CheckpointError: transformers or the text encoder is absent.
     """
     from safetensors.torch import save_file
 
@@ -95,11 +92,6 @@ def truncate(
         dtype: of the result, except for what diffusers keeps in float32.
         vae: folder of the VAE in diffusers' form; None looks beside the transformer.
         progress: called with bytes done and in all.
-
-    Raises:
-        CheckpointError: the source lacks something, or is of another kind.
-        OptionError: numbers of blocks that the source does not have.
-        ProjectError: ``out`` is there already, or cannot be written, or the disk is too full.
     """
     from safetensors import SafetensorError
 
@@ -184,12 +176,7 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _network(folder: Path, blocks: int) -> tuple[TensorFiles, dict[str, Any]]:
-    """A transformer's tensors by diffusers' names, and its config cut to its first blocks.
-
-    Raises:
-        CheckpointError: not a Wan VACE transformer.
-        OptionError: numbers of blocks that it does not have.
-    """
+    """A transformer's tensors by diffusers' names, and its config cut to its first blocks."""
     files = TensorFiles.find(folder)
     files = files.renamed(by_diffusers_name(files.places))
     beside = folder if folder.is_dir() else folder.parent
@@ -232,9 +219,6 @@ def _config_of_tensors(files: TensorFiles, *, stated: Mapping[str, Any]) -> dict
         stated: Wan's own config.json where there is one; of it ``num_heads``, ``eps`` and
             ``vace_layers`` are taken, which no shape shows. Without it they are what all
             published Wan VACE networks have: heads of 128, 1e-6, evenly spread.
-
-    Raises:
-        CheckpointError: these are not the tensors of a Wan VACE transformer.
     """
     sides = {
         "ffn_dim": ("blocks.0.ffn.net.0.proj.weight", 0),

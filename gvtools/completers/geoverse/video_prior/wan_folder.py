@@ -37,9 +37,6 @@ def expected_tensors(config: Mapping[str, Any], *, component: str = "transformer
     Args:
         config: of the truncated folder's ``transformer/config.json`` or ``vae/config.json``.
         component: "transformer" or "vae".
-
-    Raises:
-        CheckpointError: diffusers is absent, or makes no network of the config.
     """
     return shapes(empty_network(component, config).state_dict())
 
@@ -55,9 +52,6 @@ def load_network(
         dtype: None keeps what is stored. Otherwise what diffusers keeps in float32 is float32 and
             the rest is this.
         device: where to; "meta" checks names, shapes and types by headers alone.
-
-    Raises:
-        CheckpointError: diffusers, the folder, or a tensor is absent or does not fit.
     """
     place = Path(folder) / component
     network: Any = empty_network(component, read_config(place))
@@ -77,11 +71,7 @@ def load_network(
 
 
 def read_empty_prompt(folder: Path) -> Tensor:
-    """What Wan's text encoder gives for the empty prompt, (tokens, channels) as stored.
-
-    Raises:
-        CheckpointError: it is absent; the message says how it is made.
-    """
+    """What Wan's text encoder gives for the empty prompt, (tokens, channels) as stored."""
     path = Path(folder) / EMPTY_PROMPT
     if not path.is_file():
         raise CheckpointError(
@@ -108,11 +98,7 @@ def dtype_of(name: str, dtype: torch.dtype) -> torch.dtype:
 
 
 def network_class(component: str) -> Any:
-    """The class of "transformer" or "vae".
-
-    Raises:
-        CheckpointError: diffusers is absent, too old, or does not work.
-    """
+    """The class of "transformer" or "vae"."""
     name = COMPONENTS[component]
     with _broken_torchvision_hidden() as hidden:
         try:
@@ -137,9 +123,6 @@ def empty_network(component: str, config: Mapping[str, Any]) -> nn.Module:
     Args:
         component: "transformer" or "vae".
         config: as in the component's config.json.
-
-    Raises:
-        CheckpointError: diffusers is absent, or makes no network of the config.
     """
     kind = network_class(component)
     try:
@@ -154,11 +137,7 @@ def empty_network(component: str, config: Mapping[str, Any]) -> nn.Module:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """A component's config.json.
-
-    Raises:
-        CheckpointError: absent, or not a JSON object.
-    """
+    """A component's config.json."""
     path = folder / "config.json"
     try:
         config = read_json(path)

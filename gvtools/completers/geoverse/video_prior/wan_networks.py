@@ -25,9 +25,6 @@ class WanNetworks:
             zeros.
         prompt_rows: what it is padded to with zeros, which take part in attention, as in Wan's
             training.
-
-    Raises:
-        CheckpointError: the three do not fit each other.
     """
 
     def __init__(

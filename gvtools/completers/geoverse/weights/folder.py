@@ -90,9 +90,6 @@ def config_of(folder: Path) -> GeoVerseConfig:
     """The folder's own configuration.
 
     Published files without one are ``base`` where the video prior is beside them, else ``gld``.
-
-    Raises:
-        CheckpointError: there is no such folder, nothing of use in it, or a damaged config.json.
     """
     check_is_folder(folder)
     if (folder / CONFIG_FILE).is_file():
@@ -182,9 +179,6 @@ def check_folder(folder: Path | str, config: GeoVerseConfig | None = None) -> li
     Args:
         folder: of weights.
         config: instead of the folder's own.
-
-    Raises:
-        CheckpointError: there is no such folder, or its configuration is damaged.
     """
     folder = Path(folder)
     check_is_folder(folder)
@@ -216,9 +210,6 @@ def check_headers(folder: Path | str) -> GeoVerseConfig:
 
     Returns:
         Its configuration.
-
-    Raises:
-        CheckpointError: a file is absent or damaged, or names, shapes and types do not fit.
     """
     folder = Path(folder)
     config = config_of(folder)
@@ -269,9 +260,6 @@ def from_pretrained(
         dtype: of the autocast that the model is run in, see ``GeoVerse.hold_in``.
         video: load the video prior, where the configuration has one; see ``needs_video``.
         offload: whether its weights leave the device between passes, see ``VideoPrior``.
-
-    Raises:
-        CheckpointError: a file or a tensor is missing, unexpected, of another shape or not finite.
     """
     folder = Path(folder)
     check_is_folder(folder)
@@ -328,10 +316,6 @@ def save_pretrained(
 
     Returns:
         The weights' file.
-
-    Raises:
-        CheckpointError: numbers that are not finite, or too large for ``dtype``.
-        ProjectError: a file cannot be written.
     """
     folder = Path(folder)
     path, config_path = folder / WHOLE_FILE, folder / CONFIG_FILE

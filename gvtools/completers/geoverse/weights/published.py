@@ -197,9 +197,6 @@ def read_part(
         path: the file.
         part: what it is.
         numbers: False reads the headers of a safetensors file alone.
-
-    Raises:
-        CheckpointError: see ``read_tensors``; or two stored tensors claim one name.
     """
     content: dict[str, Any] = {}
     if path.suffix == ".safetensors":
