@@ -20,7 +20,7 @@ from gvtools.procedural.furnished_room import furnished_room
 from gvtools.procedural.geometry import BALL, BOX, TUBE
 from gvtools.procedural.photographs import photograph_names
 from gvtools.procedural.room_sample import photographed
-from gvtools.scenes.sample_workspace import SampleContent, write_sample
+from gvtools.procedural.sample_workspace import SampleContent, write_sample
 from gvtools.trajectories import look_at
 
 Float64 = NDArray[np.float64]

@@ -7,6 +7,7 @@ thousandfold; an archive or an array may claim terabytes in a kilobyte; a name m
 
 from __future__ import annotations
 
+import codecs
 import io
 import json
 import os
@@ -69,13 +70,14 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_text(path: Path, *, errors: str = "strict") -> str:
-    """What a text file holds, in UTF-8.
+    """A text file, in UTF-8 or, with a byte order mark, UTF-16; no mark, lines end by a line feed.
 
-    Args:
-        path: the file.
-        errors: as ``bytes.decode`` takes it.
+    ``errors`` is as ``bytes.decode`` takes it.
     """
-    return regular(path).read_text(encoding="utf-8", errors=errors)
+    data = read_bytes(path)
+    marked = data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    text = data.decode("utf-16" if marked else "utf-8-sig", errors)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def parse_json(text: str | bytes) -> Any:

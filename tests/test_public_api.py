@@ -37,7 +37,7 @@ DOCTESTED = (
     "gvtools.scans.fuse",
     "gvtools.scans.placement",
     "gvtools.scans.surface",
-    "gvtools.scenes.blocks",
+    "pipelines.blocks.block",
     "gvtools.scenes.data_sets.address",
     "gvtools.scenes.data_sets.drawn",
     "gvtools.scenes.data_sets.mvsnet_cameras",

@@ -187,3 +187,11 @@ def test_an_error_is_one_printable_line():
 def test_names_with_thousands_of_digits_are_sorted():
     names = ["img10", "img2", "img" + "9" * 5000, "img" + "8" * 5000]
     assert sorted(names, key=natural_key)[:2] == ["img2", "img10"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le-marked"])
+def test_text_of_windows_programs_reads_as_any_other(tmp_path, encoding):
+    text = "1.5 rgb/ä.png\r\n2.5 rgb/b.png\r3\n"
+    data = b"\xff\xfe" + text.encode("utf-16-le") if "marked" in encoding else text.encode(encoding)
+    (tmp_path / "list.txt").write_bytes(data)
+    assert read_text(tmp_path / "list.txt") == "1.5 rgb/ä.png\n2.5 rgb/b.png\n3\n"

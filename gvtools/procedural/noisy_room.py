@@ -21,8 +21,8 @@ from gvtools.procedural.geometry import BOX
 from gvtools.procedural.ray_cast import cast
 from gvtools.procedural.render import developed, radiance
 from gvtools.procedural.room_sample import RoomSample, check_options, room_views
+from gvtools.procedural.sample_workspace import is_written, written_whole
 from gvtools.procedural.shading import Look
-from gvtools.scenes.sample_workspace import is_written, written_whole
 from gvtools.scenes.sevenscenes import INTRINSICS
 from gvtools.similarity import align_poses
 

@@ -19,7 +19,7 @@ from gvtools.kernels import KernelSet
 from gvtools.procedural.builder import ProceduralScene
 from gvtools.procedural.furnished_room import furnished_room
 from gvtools.procedural.render import develop, developed, radiance
-from gvtools.scenes.sample_workspace import SampleContent, is_written, write_sample
+from gvtools.procedural.sample_workspace import SampleContent, is_written, write_sample
 from gvtools.trajectories import look_at
 
 Float32 = NDArray[np.float32]

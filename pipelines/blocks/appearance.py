@@ -15,7 +15,7 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.appearance.turning import turned
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.scenes.blocks import Block
+from pipelines.blocks.block import Block
 
 Float64 = NDArray[np.float64]
 

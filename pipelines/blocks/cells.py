@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
-from gvtools.scenes.blocks import Cell
+from pipelines.blocks.block import Cell
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene

@@ -15,9 +15,9 @@ import numpy as np
 
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.scenes.blocks import Block
 from gvtools.view_selection import evenly_spread
 from pipelines.blocks.appearance import brighter
+from pipelines.blocks.block import Block
 from pipelines.reconstruction.fitting import Fitted, fit_appearance
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import numpy as np
 from gvtools.errors import OptionError, ProjectError
 from gvtools.runs.poses import refined_poses_of
 from gvtools.runs.run import Run, RunTarget, load_run
-from gvtools.scenes.blocks import FILE, Block
+from pipelines.blocks.block import FILE, Block
 from pipelines.blocks.write import by_name, read_blocks
 
 # What may differ from block to block.

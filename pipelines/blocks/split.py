@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from gvtools.capture.project import replaced_folder
 from gvtools.errors import OptionError
 from gvtools.runs.poses import with_poses
-from gvtools.scenes.blocks import Block
 from gvtools.scenes.reduced import reduced
 from gvtools.scenes.selection import select
 from gvtools.view_selection import nearest_views
+from pipelines.blocks.block import Block
 from pipelines.blocks.cells import NEAREST, VIEWS_PER_BLOCK, cut_cells, helpers_of, seen_points
 from pipelines.blocks.write import PROJECTS, write_blocks
 from pipelines.reconstruction import poses

@@ -104,7 +104,7 @@ def _write(name: str, folder: Path, seed: int) -> tuple[tuple[str, ...], tuple[s
 
         noisy = write_noisy_room(folder, seed=seed)
         return noisy.context, noisy.targets
-    from gvtools.scenes.stereo_sample import write_motorcycle
+    from gvtools.procedural.stereo_sample import write_motorcycle
 
     pair = write_motorcycle(folder)
     return pair.context, pair.targets

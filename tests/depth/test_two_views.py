@@ -11,9 +11,9 @@ from walls import camera_at, photograph
 
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+from gvtools.procedural.stereo_sample import write_motorcycle
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
-from gvtools.scenes.stereo_sample import write_motorcycle
 
 pytest_plugins = ("wall_fixtures",)
 

@@ -14,9 +14,9 @@ from tiny_scan import write_colmap_scan, write_scan
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.run import load_run
-from gvtools.scenes.blocks import Block
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_values
+from pipelines.blocks.block import Block
 from pipelines.blocks.cells import cut_cells
 from pipelines.blocks.merge import merge
 from pipelines.blocks.split import split

@@ -13,8 +13,8 @@ from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.appearance.turning import turned
 from gvtools.cameras import Cameras
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.scenes.blocks import Block, Cell
 from pipelines.blocks.appearance import BlockAppearance, joined
+from pipelines.blocks.block import Block, Cell
 
 NAMES = ("a", "b", "c")
 

@@ -13,10 +13,10 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.poses import RunPoses
 from gvtools.runs.run import load_run
-from gvtools.scenes.blocks import Block
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_values
 from pipelines.blocks import merge as merging
+from pipelines.blocks.block import Block
 from pipelines.blocks.joint_fit import fitted_across, rows_across
 from pipelines.blocks.merge import merge
 from pipelines.blocks.split import split

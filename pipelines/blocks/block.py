@@ -1,4 +1,4 @@
-"""What a block of a split project is: ``block.json`` in its folder.
+"""Blocks of a split project and their cells: ``block.json`` in a block's folder.
 
 A block owns the views whose cameras stand in its cell, and holds others as helpers: they belong to
 another block, but see what this one's views see. Cells are boxes, closed below and open above, that
@@ -56,31 +56,19 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One block of a split project.
+    """One block of a split project."""
 
-    Attributes:
-        name: of the block, the name of its folder.
-        names: of all blocks of the split.
-        project: what opens the whole project.
-        reading: how it is read, JSON-ready.
-        cell: the block's part of space.
-        owners: context views in the cell, in order of their names.
-        helpers: context views of other cells.
-        targets: held-out views in the cell.
-        poses: (4, 4) cam_from_world of each owner and target, exactly as the blocks have them.
-        refined: whether these poses are other ones than the project's.
-    """
-
-    name: str
-    names: tuple[str, ...]
-    project: str
-    reading: Mapping[str, Any]
+    name: str  # also of its folder
+    names: tuple[str, ...]  # of all blocks of the split
+    project: str  # what opens the whole project
+    reading: Mapping[str, Any]  # how that is read, JSON-ready
     cell: Cell
-    owners: tuple[str, ...]
-    helpers: tuple[str, ...]
-    targets: tuple[str, ...]
+    owners: tuple[str, ...]  # context views in the cell, in order of their names
+    helpers: tuple[str, ...]  # context views of other cells
+    targets: tuple[str, ...]  # held-out views in the cell
+    # (4, 4) cam_from_world of each owner and target, exactly as the blocks have them.
     poses: Mapping[str, Float64]
-    refined: bool
+    refined: bool  # whether these poses are other ones than the project's
 
     @property
     def context(self) -> tuple[str, ...]:

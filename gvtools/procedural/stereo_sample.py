@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.scenes.sample_workspace import SampleContent, is_written, write_sample
+from gvtools.procedural.sample_workspace import SampleContent, is_written, write_sample
 
 Float64 = NDArray[np.float64]
 
@@ -34,19 +34,12 @@ POINTS = 1500
 
 @dataclass(frozen=True)
 class StereoSample:
-    """A written stereo pair.
-
-    Attributes:
-        folder: the COLMAP workspace; its unit is the metre, its world the left camera's frame.
-        context: the left view, which has measured depth.
-        targets: the right view, to be predicted; its own image is the truth.
-        depth_truth: the left view alone: no depth was measured for the right one.
-    """
+    """A written stereo pair: a COLMAP workspace in metres, its world the left camera's frame."""
 
     folder: Path
     context: tuple[str, ...] = (LEFT,)
-    targets: tuple[str, ...] = (RIGHT,)
-    depth_truth: tuple[str, ...] = (LEFT,)
+    targets: tuple[str, ...] = (RIGHT,)  # to be predicted; its own image is the truth
+    depth_truth: tuple[str, ...] = (LEFT,)  # measured for this view alone
 
 
 def write_motorcycle(folder: Path) -> StereoSample:
@@ -54,9 +47,6 @@ def write_motorcycle(folder: Path) -> StereoSample:
 
     Pixels without measured disparity have depth 0. Sparse points lie on the measured surface, each
     with a track of both views.
-
-    Args:
-        folder: the workspace; absent, empty, or written by the same call before.
     """
     folder = Path(folder)
     sample = StereoSample(folder)

@@ -9,14 +9,14 @@ import skimage.data
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from gvtools.scenes.colmap import read_colmap
-from gvtools.scenes.scene import Scene
-from gvtools.scenes.stereo_sample import (
+from gvtools.procedural.stereo_sample import (
     StereoSample,
     depth_from_disparity,
     motorcycle_cameras,
     write_motorcycle,
 )
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.scene import Scene
 
 
 @pytest.fixture(scope="module")

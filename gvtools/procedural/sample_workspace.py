@@ -25,22 +25,15 @@ RECORD = "sample.json"
 
 @dataclass(frozen=True, eq=False)
 class SampleContent:
-    """What a sample consists of.
-
-    Attributes:
-        cameras: V cameras, named like the images.
-        images: V arrays (H, W, 3) uint8.
-        depths: V arrays (H, W) float32 z-depth, scene units, 0 = none; None: no depth map.
-        points: (N, 3) float64 sparse points, world frame, scene units.
-        colors: (N, 3) uint8.
-        tracks: point index (M,), view index (M,) and position (M, 2) in pixels.
-    """
+    """What a sample consists of: V views, named as their cameras are."""
 
     cameras: Cameras
-    images: Sequence[NDArray[np.uint8]]
+    images: Sequence[NDArray[np.uint8]]  # (H, W, 3) each
+    # (H, W) z-depth each, scene units, 0 = none; None: no depth map.
     depths: Sequence[NDArray[np.float32] | None]
-    points: NDArray[np.float64]
-    colors: NDArray[np.uint8]
+    points: NDArray[np.float64]  # (N, 3) sparse points, world frame, scene units
+    colors: NDArray[np.uint8]  # (N, 3)
+    # Point index (M,), view index (M,) and position (M, 2) in pixels.
     tracks: tuple[NDArray[Any], NDArray[Any], NDArray[Any]] = field(repr=False)
 
 
