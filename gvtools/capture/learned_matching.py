@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from gvtools.errors import ShapeError
-from gvtools.evaluation.pose_probe.features import FeatureMatcher, Features
+from gvtools.features import FeatureMatcher, Features
 from gvtools.scenes.images import check_size, read_image, read_mask
 
 # The longer side that pictures are reduced to, pixels: that of the pictures LightGlue's authors

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -22,14 +21,13 @@ import numpy as np
 
 from gvtools.capture.matching import SEED, flat_pairs, match_pictures, only_turned, verified
 from gvtools.errors import ProjectError
+from gvtools.features import quiet_colmap
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     import pycolmap
 
     from gvtools.capture.panoramas import FaceRig
-    from gvtools.evaluation.pose_probe.features import FeatureMatcher
+    from gvtools.features import FeatureMatcher
 
 # If a smaller share of the verified matches became points of the global model, incremental mapping
 # is tried, too.
@@ -106,7 +104,7 @@ def find_cameras(
     """
     import pycolmap
 
-    with quiet():
+    with quiet_colmap(errors=False):
         pycolmap.set_random_seed(SEED)
         say(f"finding features in {sum(map(len, cameras))} pictures")
         database, matching = match_pictures(
@@ -317,16 +315,3 @@ def _adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOp
         config.add_image(number)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep COLMAP's log off the terminal; what fails is raised or reported by the caller."""
-    import pycolmap
-
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before

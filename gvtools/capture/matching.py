@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pycolmap
 
     from gvtools.capture.panoramas import FaceRig
-    from gvtools.evaluation.pose_probe.features import FeatureMatcher
+    from gvtools.features import FeatureMatcher
 
 # Up to this many pictures, every pair is matched; fewer with LightGlue, which takes a second a pair
 # on a processor.

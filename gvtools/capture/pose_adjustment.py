@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from gvtools.appearance.camera_corrections import mean_near, motions_between, moved
 from gvtools.appearance.refined_poses import RefinedPoses
 from gvtools.cameras import Cameras
-from gvtools.capture.mapping import fix_cameras, quiet
+from gvtools.capture.mapping import fix_cameras
 from gvtools.capture.matching import SEED, extract, listed, verification
+from gvtools.features import quiet_colmap
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.scenes.colmap_writer import reconstruction
 from gvtools.scenes.scene import Frame, Scene
@@ -142,7 +143,7 @@ def adjusted_poses(
     """
     if not can_adjust(cameras, tracks):
         return None
-    with quiet():
+    with quiet_colmap(errors=False):
         if tracks is None:
             with tempfile.TemporaryDirectory() as folder:
                 model = _triangulated(frames, cameras, Path(folder))

@@ -34,7 +34,7 @@ from gvtools.scenes.photographs import named
 from gvtools.scenes.scene import Finding
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
+    from gvtools.features import LightGlueMatcher
 
 REPORT = "capture.json"
 IMAGES, MODEL = "images", "sparse/0"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.features import root_sift
 from gvtools.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -128,7 +129,7 @@ class RgbdFrames:
         z = depth[line.clip(0, depth.shape[0] - 1), column.clip(0, depth.shape[1] - 1)]
         rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(self.feature_K).T
         points = rays * np.where(z > 0, z, np.nan)[:, None]
-        rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+        rooted = root_sift(np.asarray(descriptors, np.float32))
         return Features(pixels, rooted, points, thumbnail)
 
 

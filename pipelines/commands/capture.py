@@ -13,7 +13,7 @@ from pipelines.commands.scene_arguments import add_rgbd_arguments, rgbd_reading_
 if TYPE_CHECKING:
     from gvtools.capture.project import CaptureReport
     from gvtools.capture.rgbd_project import RgbdCaptureReport
-    from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
+    from gvtools.features import LightGlueMatcher
     from pipelines.console import Console
 
 SUMMARY = "find the cameras of photographs, a video or an RGB-D recording; write a project"
@@ -123,7 +123,7 @@ def _learned(args: argparse.Namespace) -> LightGlueMatcher | None:
     import torch
 
     from gvtools.capture.learned_matching import MAX_FEATURES
-    from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
+    from gvtools.features import LightGlueMatcher
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
     return LightGlueMatcher(

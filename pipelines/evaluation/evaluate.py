@@ -149,7 +149,7 @@ def write_evaluation(
 def _matcher(name: str) -> Any:
     if name == "sift":
         return None
-    from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
+    from gvtools.features import LightGlueMatcher
 
     return LightGlueMatcher()
 

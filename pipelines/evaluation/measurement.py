@@ -19,9 +19,9 @@ from pipelines.evaluation.probed_poses import probed_figures
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
-    from gvtools.evaluation.pose_probe.features import FeatureMatcher
     from gvtools.evaluation.pose_probe.probe import PoseProbe
     from gvtools.evaluation.posed_picture import PosedPicture
+    from gvtools.features import FeatureMatcher
     from pipelines.console import Console
     from pipelines.evaluation.measured_target import MeasuredTarget
 

@@ -12,7 +12,7 @@ from pipelines.evaluation.measurement import PARTS, Measurement
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
-    from gvtools.evaluation.pose_probe.features import FeatureMatcher
+    from gvtools.features import FeatureMatcher
     from gvtools.runs.run import Run
     from pipelines.console import Console
 

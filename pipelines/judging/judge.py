@@ -177,6 +177,6 @@ def _write(figures: dict[str, Any], sheets: SheetPictures, out: Path, *, console
 def _matcher(name: str) -> Any:
     if name == "sift":
         return None
-    from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
+    from gvtools.features import LightGlueMatcher
 
     return LightGlueMatcher()

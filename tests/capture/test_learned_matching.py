@@ -15,8 +15,7 @@ from random_features import write_disk
 from gvtools.capture import learned_matching
 from gvtools.capture.mapping import find_cameras
 from gvtools.errors import CheckpointError, OptionError
-from gvtools.evaluation.pose_probe.features import Features, SiftMatcher
-from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
+from gvtools.features import Features, LightGlueMatcher, SiftMatcher
 from gvtools.procedural.room_sample import write_room
 from gvtools.scenes.project import open_project
 

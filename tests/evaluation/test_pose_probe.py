@@ -159,7 +159,7 @@ def test_far_from_the_origin(context: list[PosedPicture], take: Take) -> None:
 
 
 def test_lightglue_locates_without_an_offset(context: list[PosedPicture], take: Take) -> None:
-    from gvtools.evaluation.pose_probe.lightglue import LightGlueMatcher
+    from gvtools.features import LightGlueMatcher
 
     try:
         matcher = LightGlueMatcher()
@@ -177,16 +177,16 @@ def test_lightglue_reads_weights_of_a_folder_and_refuses_others(
 ) -> None:
     import torch
 
-    from gvtools.evaluation.pose_probe import lightglue
+    from gvtools import features
 
     pytest.importorskip("kornia.feature.aliked", reason="kornia without ALIKED")
 
     torch.manual_seed(0)
-    files = lightglue.FILES["aliked"]
-    random = lightglue.networks("aliked", 64)
+    files = features.FILES["aliked"]
+    random = features.networks("aliked", 64)
     for network, name in zip(random, files, strict=True):
         torch.save(network.state_dict(), tmp_path / name)
-    matcher = lightglue.LightGlueMatcher(max_features=64, weights=tmp_path)
+    matcher = features.LightGlueMatcher(max_features=64, weights=tmp_path)
     for network, stored in zip((matcher._extractor, matcher._matcher), random, strict=True):
         for name, tensor in stored.state_dict().items():
             assert torch.equal(network.state_dict()[name], tensor), name
@@ -198,11 +198,11 @@ def test_lightglue_reads_weights_of_a_folder_and_refuses_others(
     weights = random[1].state_dict()
     torch.save(weights | {"input_proj.weight": torch.zeros(2, 2)}, tmp_path / files[1])
     with pytest.raises(CheckpointError, match=r"input_proj\.weight.*another network"):
-        lightglue.LightGlueMatcher(weights=tmp_path)
+        features.LightGlueMatcher(weights=tmp_path)
     del weights["input_proj.weight"]
     torch.save(weights, tmp_path / files[1])
     with pytest.raises(CheckpointError, match=r"no input_proj\.weight"):
-        lightglue.LightGlueMatcher(weights=tmp_path)
+        features.LightGlueMatcher(weights=tmp_path)
     (tmp_path / files[1]).unlink()
     with pytest.raises(CheckpointError, match="download it"):
-        lightglue.LightGlueMatcher(weights=tmp_path)
+        features.LightGlueMatcher(weights=tmp_path)

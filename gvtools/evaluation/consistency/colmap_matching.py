@@ -5,8 +5,7 @@ One thread on the CPU with fixed seeds: equal pictures give equal results.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,19 +52,6 @@ class Matched:
 
     keypoints: tuple[Float64, ...]
     pairs: tuple[VerifiedMatches, ...] = ()
-
-
-@contextmanager
-def quiet_colmap() -> Iterator[None]:
-    """COLMAP's progress reports kept off stderr; its warnings stay."""
-    import pycolmap
-
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(level, int(pycolmap.logging.WARNING))
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 def match_pictures(pictures: Sequence[PosedPicture], folder: Path, *, seed: int) -> Matched:

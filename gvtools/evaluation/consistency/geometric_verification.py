@@ -38,10 +38,10 @@ from gvtools.evaluation.consistency.colmap_matching import (
     Matched,
     match_pictures,
     observed_points,
-    quiet_colmap,
     triangulate,
 )
 from gvtools.evaluation.posed_picture import PosedPicture
+from gvtools.features import quiet_colmap
 
 if TYPE_CHECKING:
     import pycolmap

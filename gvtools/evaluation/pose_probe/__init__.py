@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from gvtools.evaluation.pose_probe.features import FeatureMatcher, Features, SiftMatcher
 from gvtools.evaluation.pose_probe.located import Located, PoseSummary, summarise
 from gvtools.evaluation.pose_probe.probe import PoseProbe, PoseProbeOptions
 
 __all__ = [
-    "FeatureMatcher",
-    "Features",
     "Located",
     "PoseProbe",
     "PoseProbeOptions",
     "PoseSummary",
-    "SiftMatcher",
     "summarise",
 ]

@@ -22,15 +22,15 @@ from gvtools.evaluation.pose_probe.absolute_pose import (
     center_distance,
     rival_pose,
 )
-from gvtools.evaluation.pose_probe.features import (
+from gvtools.evaluation.pose_probe.lifting import lift_keypoints
+from gvtools.evaluation.pose_probe.located import LOCATED, Located
+from gvtools.evaluation.posed_picture import PosedPicture
+from gvtools.features import (
     FeatureMatcher,
     Features,
     SiftMatcher,
     mutual_nearest,
 )
-from gvtools.evaluation.pose_probe.lifting import lift_keypoints
-from gvtools.evaluation.pose_probe.located import LOCATED, Located
-from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.settings import Settings
 
 # Cells along the longer side of a picture, in which the spread of the inliers is counted.

