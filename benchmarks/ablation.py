@@ -43,9 +43,7 @@ UNUSED = {
 
 def _with_swept_depth(fitted: Fitted, plan: Plan) -> Plan:
     """The plan with a fit's poses alone, so that photographs keep the plane sweep's depth."""
-    from pipelines.reconstruction.poses import applied
-
-    return plan if fitted.poses is None else applied(fitted.poses, plan)
+    return plan if fitted.poses is None else plan.at(fitted.poses)
 
 
 def _as_completed(projected: Any, guidance: Any, rgb: Any) -> Any:
@@ -65,7 +63,7 @@ PARTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "fading of opacities": ({}, {"gvtools.appearance.fit.FADING": 0.0}),
     "depth of the Gaussians (a plane sweep instead)": (
         {},
-        {"pipelines.reconstruction.fitting.Fitted.applied": _with_swept_depth},
+        {"pipelines.reconstruction.fitting.Fitted.apply": _with_swept_depth},
     ),
     "pose refinement": ({"refine.poses": False}, {}),
     "depth in the loss": ({"refine.depth": 0.0}, {}),
@@ -75,7 +73,7 @@ PARTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "completions of little confidence": ({"fusion.min_confidence": 0.35}, {}),
     "Gaussians' colours in holes": (
         {},
-        {"gvtools.appearance.projection_cache.CachedProjection.colored": _as_completed},
+        {"pipelines.reconstruction.rounds.CachedProjection.colored": _as_completed},
     ),
 }
 

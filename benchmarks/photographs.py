@@ -30,7 +30,7 @@ from gvtools.memory.store.points import PointSet
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
 from gvtools.scenes.selection import select
-from pipelines.reconstruction.plan import automatic_voxel
+from pipelines.reconstruction.voxel import automatic_voxel
 
 FOOTPRINTS = (2, 4, 6, 8, 12, 16, 24, 32)  # pixels across
 VARIANTS = {

@@ -17,7 +17,6 @@ import numpy as np
 
 from benchmarks.experiments.options import ExperimentOptions
 from benchmarks.experiments.rows import INPAINT, geoverse
-from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.completers.base import Completer, ContextView
 from gvtools.errors import DegenerateError
 from gvtools.evaluation.images import psnr
@@ -27,7 +26,7 @@ from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.tables import Column, Table
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.training.hints import Clip
-from pipelines.reconstruction.rounds import Clock, complete_targets
+from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
 
 READS = ("weights", "scenes", "size", "seed")
@@ -123,7 +122,7 @@ def _follow(
         rows = list(range(CONTEXT + number * PER_ROUND, CONTEXT + (number + 1) * PER_ROUND))
         cameras = truth.cameras[rows]
         if arm.memory:
-            results, _ = complete_targets(
+            results = complete_targets(
                 [CachedProjection(memory, camera, options=config.splat) for camera in cameras],
                 number + 1,
                 memory=memory,
@@ -131,7 +130,6 @@ def _follow(
                 context=context,
                 config=config,
                 clock=Clock(),
-                progress=lambda items, _: items,
             )
             made = [result.completion.rgb[0] for result in results]
         else:

@@ -171,8 +171,7 @@ def _of_run(task: _Task) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 def _reconstruct(task: _Task) -> float:
     """Run the method; returns the seconds from the opened scene to the finished run."""
     from gvtools.settings import with_values
-    from pipelines.reconstruction.compile_kernels import compile_kernels
-    from pipelines.reconstruction.run import reconstruct
+    from pipelines.reconstruction.run import compile_kernels, reconstruct
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.report.write import draw_run
 

@@ -34,12 +34,10 @@ from pipelines.blocks.appearance import BlockAppearance, joined
 from pipelines.blocks.completions import BlockCompletions
 from pipelines.blocks.joint_fit import fitted_across
 from pipelines.blocks.runs import BlockRun, read_runs
-from pipelines.reconstruction.compile_kernels import compile_kernels
-from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
-from pipelines.reconstruction.run import Draw, complete_run, saved_fit, say_results
-from pipelines.reconstruction.scan import placed_scan
+from pipelines.reconstruction.plan import Plan, Targets, describe, run_identity
+from pipelines.reconstruction.prepare import make_plan, placed_scan
+from pipelines.reconstruction.run import Draw, compile_kernels, complete_run, saved_fit, say_results
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.reconstruction.targets import Targets
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
@@ -197,7 +195,7 @@ def _take_depth(plan: Plan, runs: Sequence[BlockRun], directory: RunDirectory) -
 def _fitted(plan: Plan, runs: Sequence[BlockRun], console: Console) -> Fitted | None:
     """The blocks' Gaussians, joined and fitted across faces; None where a block has none."""
     from pipelines.reconstruction.fitting import Fitted
-    from pipelines.reconstruction.voxel_edge import grid_frame
+    from pipelines.reconstruction.voxel import grid_frame
 
     files = [round_folder(item.run.path, 0) / APPEARANCE for item in runs]
     without = [

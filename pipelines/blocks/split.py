@@ -15,7 +15,7 @@ from gvtools.view_selection import nearest_views
 from pipelines.blocks.block import Block
 from pipelines.blocks.cells import NEAREST, VIEWS_PER_BLOCK, cut_cells, helpers_of, seen_points
 from pipelines.blocks.write import PROJECTS, write_blocks
-from pipelines.reconstruction import poses
+from pipelines.reconstruction.prepare import refined_poses_of
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
@@ -103,7 +103,7 @@ def _posed(
     # ``refined`` needs a target; without any, the first view stands in, and its result is not used.
     targets = scene.subset(others or names[:1]).cameras
     recorded = scene.kind != "colmap" and all(scene[name].has_depth for name in names)
-    found = poses.refined(reduced(scene, max_side), names, targets, recorded=recorded, say=say)
+    found = refined_poses_of(reduced(scene, max_side), names, targets, recorded=recorded, say=say)
     if found is None:
         return None
     moved = with_poses(scene, names, found.context)

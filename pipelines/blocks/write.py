@@ -22,6 +22,7 @@ import numpy as np
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.files import link_or_copy, write_text
+from gvtools.prefetch import prefetch
 from gvtools.runs.layout import file_stems
 from gvtools.runs.target_files import write_png
 from gvtools.scenes.colmap import CHUNK_BOX
@@ -29,7 +30,6 @@ from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import read_image
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.blocks.block import Block, Cell
-from pipelines.reconstruction.prefetch import prefetch
 
 PROJECTS, CHUNKS = "projects", "chunks"
 LAYOUTS = (PROJECTS, CHUNKS)

@@ -44,8 +44,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     sample = out.with_name(f"{out.name}-sample")
     from gvtools.procedural.room_sample import KERNELS
     from gvtools.scenes.project import open_project
-    from pipelines.reconstruction.compile_kernels import compile_kernels
-    from pipelines.reconstruction.run import reconstruct
+    from pipelines.reconstruction.run import compile_kernels, reconstruct
     from pipelines.report.write import draw_run
 
     compile_kernels(config, console, more=(KERNELS,) if args.sample != "motorcycle" else ())

@@ -102,7 +102,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             )
         memory = shown
     console.line(writer.write(Source(args.memory, memory, args.round), args.out, options))
-    made = float(memory.generated.mean())
+    made = memory.generated_count / len(memory)
     if made and "observed" in form.options and not options.observed:
         console.line(
             f"{made:.0%} of the observations are generated: a completer's, or depth that only "

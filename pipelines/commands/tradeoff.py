@@ -124,7 +124,7 @@ def _within(config: RunSettings, budget: float | None) -> RunSettings:
 def _planned(args: argparse.Namespace, config: RunSettings, console: Console) -> tuple[Scene, Plan]:
     """The scene, and the plan of the run that the sweep starts from."""
     from pipelines.commands.scene_arguments import open_scene
-    from pipelines.reconstruction.plan import make_plan
+    from pipelines.reconstruction.prepare import make_plan
 
     if config.rounds is not None:
         raise OptionError(

@@ -119,10 +119,9 @@ def context_of(scene: Scene, config: RunSettings, folder: Path, *, console: Cons
         folder: where computed depth goes.
         console: where progress goes.
     """
+    from gvtools.runs.depth_cache import DepthCache
     from gvtools.settings import with_values
-    from pipelines.reconstruction.depth_cache import DepthCache
-    from pipelines.reconstruction.plan import make_plan
-    from pipelines.reconstruction.tuning import with_depth
+    from pipelines.reconstruction.prepare import make_plan, with_depth
 
     # The context stands for the targets, and an edge that nothing is fused with is not sought.
     reading = {"completer": "none", "voxel": 1.0, "allow_overlap": True, "tune.minutes": 0.0}

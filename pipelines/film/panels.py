@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance, applied
-from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.cameras import Cameras
 from gvtools.completers.base import create, run_completer
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.memory_file import load_appearance, load_memory
+from pipelines.reconstruction.rounds import CachedProjection
 from viz.run_view.render import picture_of
 
 Picture = NDArray[np.uint8]
@@ -112,10 +112,11 @@ class FilmRenderer:
             CachedProjection(memory, self.cameras[int(row)], appearance=self.appearance)
             for row in rows
         ]
-        complete_targets(
+        for _ in complete_targets(
             targets, memory.rounds[-1] + 1, memory=memory, completer=self._inpaint, context=(),
-            config=RunSettings(), clock=Clock(), progress=lambda items, _: items,
-        )  # fmt: skip
+            config=RunSettings(), clock=Clock(),
+        ):  # fmt: skip
+            pass
         return memory
 
     @cached_property

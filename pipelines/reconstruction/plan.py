@@ -1,41 +1,92 @@
-"""A run before its first round: its context, targets, schedule, depth source and identity."""
+"""Plan of a run before its first round: what is given, what is asked, and all that was derived."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.completers.base import Completer
+from gvtools.errors import OptionError
 from gvtools.runs.identity import array_digest, fingerprint
+from gvtools.runs.poses import RunPoses, posed, with_poses
+from gvtools.scenes.data_sets.address import is_address
+from gvtools.scenes.reduced import reduced
+from gvtools.scenes.scene import Scene, View
+from gvtools.scenes.selection import check_disjoint, select
 from gvtools.settings import changes
+from gvtools.trajectories import PATHS, named_path
 from gvtools.view_selection import evenly_spread
 from pipelines.console import Console
-from pipelines.reconstruction.voxel_edge import automatic_voxel
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from gvtools.completers.base import Completer
     from gvtools.depth.source import DepthSource
-    from gvtools.runs.poses import RunPoses
-    from gvtools.scenes.scene import Scene
-    from pipelines.reconstruction.scan import PlacedScan
+    from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
+    from gvtools.scans.placement import Placement
+    from gvtools.scans.points import Scan
     from pipelines.reconstruction.settings import RunSettings
-    from pipelines.reconstruction.targets import Targets
 
-
+# Two pictures are one shot when their centres are this near (a share of the context's extent) and
+# their rotations differ by no more than this many degrees, whatever their sizes and lenses.
+SAME_PLACE, SAME_DIRECTION = 1e-4, 0.05
 # Processor seconds: of a view's plane sweep whole and as a fit needs it, of a view with recorded
 # depth, of a megapixel that is lifted, of a target; and what a run takes whatever it does [s].
 SWEPT, SWEPT_SMALL, RECORDED, LIFTED, COMPLETED, START = 2.2, 0.7, 0.5, 1.0, 2.0, 4.0
-# A fit whose length is not given takes at most so long if no photographs can be left out to tell
-# whether it gains [s].
-UNVALIDATED_SECONDS = 30.0
-# From this share of sparse points that the context's views alone would not give, the run says so:
-# fox without every eighth view 0.01, one in eight alone 0.82.
-TOLD_FROM = 0.1
+# What --targets takes.
+FORMS = (
+    "a selection of the project's views, interpolate:N, orbit:N, spiral:N, a trajectory file "
+    "(TUM or KITTI), or another project as PATH, spec:NAME:SCENE or either with @SELECTION"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """The cameras to complete, in order.
+
+    Attributes:
+        cameras: V cameras.
+        truth: per camera the view that shows the truth, None where there is none.
+        kind: "hold-out", the path's name, "trajectory" or "project".
+        files: what was read beside the project.
+        project: what opens the other project that ``truth`` is of; None when it is the run's own.
+    """
+
+    cameras: Cameras
+    truth: tuple[View | None, ...]
+    kind: str
+    files: tuple[Path, ...] = ()
+    project: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedScan:
+    """A scan and where it lies."""
+
+    scan: Scan
+    placement: Placement
+
+    def fuse_into(self, memory: SpatialMemory) -> tuple[FuseReport, dict[str, Any]]:
+        """Fuse it into round 0; returns what became of it, and its entry in the round's report."""
+        from gvtools.scans.fuse import fuse_scan
+
+        report = fuse_scan(memory, self.scan, self.placement)
+        scan = self.scan
+        return report, {
+            "file": scan.name,
+            "points": scan.count,
+            "fused": report.points,
+            "stations": len(scan.stations),
+            "colored_by": scan.colored_by,
+            "dropped": dict(Counter(scan.dropped) + Counter(report.dropped)),
+            "placement": self.placement.to_json(),
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,202 +130,141 @@ class Plan:
         """What the run's settings leave open, by dotted key: voxel edge, rounds, device, ..."""
         return changes(self.settings, self.config)
 
+    def at(self, poses: RunPoses) -> Plan:
+        """The plan with other poses of its context and targets."""
+        targets = replace(self.targets, cameras=posed(self.targets.cameras, poses.targets))
+        scene = with_poses(self.scene, self.context, poses.context)
+        return replace(self, scene=scene, targets=targets)
+
     @property
     def posed(self) -> Plan:
         """The plan with refined poses."""
-        from pipelines.reconstruction.poses import applied
-
-        return self if self.poses is None else applied(self.poses, self)
+        return self if self.poses is None else self.at(self.poses)
 
 
-def make_plan(
-    scene: Scene,
-    settings: RunSettings,
-    *,
-    say: Callable[[str], None] | None = None,
-    round_0: Path | None = None,
-) -> Plan:
-    """Resolve selections, depth source, poses, voxel edge and schedule.
-
-    Args:
-        scene: the project.
-        settings: as the user gave them.
-        say: is told what is computed meanwhile.
-        round_0: folder of round 0 of the run that is gone on with: its poses are taken. Refining
-            them again may differ in the last digits, by the order in which threads add.
-    """
-    from gvtools.appearance.fit import validation_rows
-    from gvtools.completers.base import create
-    from gvtools.depth.choice import choose_source
-    from gvtools.depth.source import RecordedDepth
-    from gvtools.errors import OptionError, ProjectError
-    from gvtools.runs.poses import with_poses
-    from gvtools.scenes.reduced import reduced
-    from gvtools.scenes.selection import select
-    from pipelines.reconstruction import poses
-    from pipelines.reconstruction.scan import check_scan
-    from pipelines.reconstruction.targets import resolve_targets
-    from pipelines.reconstruction.tuning import check_tuning
-
-    errors = [finding.message for finding in scene.findings if finding.level == "error"]
-    if errors:
-        raise ProjectError(
-            f"{scene.root}: {errors[0]}"
-            + (f" (and {len(errors) - 1} more; see 'gvtools check')" if len(errors) > 1 else "")
-        )
-    check_scan(settings.scan)
-    config = _on_device(settings)
-    if config.protocol == "paper" and config.completer != "geoverse":
-        raise OptionError(
-            f"protocol paper with completer {config.completer!r}; expected geoverse; leave one out"
-        )
-    scene = reduced(scene, config.max_side)
-    completer = config.effort.applied(create(config.completer, **config.completer_options))
-    # By name: a project may list its views in any order, and merging depends on theirs.
-    context = tuple(sorted(select(scene.names, config.context)))
-    if config.tune.wanted:
-        check_tuning(completer, context)
-    targets = resolve_targets(
-        scene,
-        context,
-        config.targets,
-        allow_overlap=config.allow_overlap,
-        max_side=config.max_side,
-    )
-    scene = _allowed_points(scene, context, config.points, say=say)
-    chosen = choose_source(
-        scene, context, config.depth, stereo=config.stereo, foundation=config.da3
-    )
-    recorded = (
-        scene.kind != "colmap"
-        and isinstance(chosen.source, RecordedDepth)
-        and all(scene[name].has_depth for name in context)
-    )
-    found = None
-    if round_0 is not None:
-        found = poses.saved(round_0, context, targets.cameras)
-    elif config.refine.poses:
-        found = poses.refined(scene, context, targets.cameras, recorded=recorded, say=say)
-    if found is not None and found.by_features and not recorded:
-        # Depth is computed at the poses that the memory is built with.
-        if config.stereo.align is None:
-            config = config.replaced(stereo=config.stereo.replaced(align=False))
-        again = choose_source(
-            with_poses(scene, context, found.context), context, config.depth,
-            stereo=config.stereo, foundation=config.da3,
-        )  # fmt: skip
-        chosen = replace(again, ignored=chosen.ignored)
-    if config.voxel is None:
-        posed = scene if found is None else with_poses(scene, context, found.context)
-        config = _with_voxel(config, posed, context, source=chosen.source, say=say)
-    if (config.refine.seconds, config.refine.steps) == (None, None) and not validation_rows(
-        len(context)
-    ):
-        config = config.replaced(refine=config.refine.replaced(seconds=UNVALIDATED_SECONDS))
-    schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
-    config = config.replaced(rounds=len(schedule))
-    weights = [*getattr(chosen.source, "files", ()), *completer.files]
-    return Plan(
-        scene,
-        settings,
-        config,
-        context,
-        targets,
-        schedule,
-        chosen.source,
-        chosen.reason,
-        completer,
-        chosen.ignored,
-        tuple(weights),
-        poses=found,
-    )
-
-
-def _allowed_points(
-    scene: Scene, context: tuple[str, ...], which: str, *, say: Callable[[str], None] | None
-) -> Scene:
-    """The scene with the sparse points that the settings allow; tells what others give away."""
-    from gvtools.scenes.resized import seen_by
-
-    alone = seen_by(scene, context)
-    if scene.points is None or alone.points is None or len(context) == len(scene.names):
-        return scene
-    count, told = len(scene.points.positions), len(alone.points.positions)
-    if which == "context":
-        return alone
-    if say is not None and told < (1 - TOLD_FROM) * count:
-        say(
-            f"{count - told:,} of {count:,} sparse points were detected with the help of views "
-            "outside the context: results on held-out views profit from them; leave them out by "
-            "--set points=context"
-        )
-    return scene
-
-
-def _with_voxel(
-    config: RunSettings,
+def resolve_targets(
     scene: Scene,
     context: tuple[str, ...],
+    spec: str,
     *,
-    source: DepthSource,
-    say: Callable[[str], None] | None,
-) -> RunSettings:
-    """The settings with the automatic voxel edge."""
-    from gvtools.depth.source import is_recorded
-    from pipelines.reconstruction.voxel_probe import at_scale, sufficient_scale
+    allow_overlap: bool = False,
+    max_side: int | None = None,
+) -> Targets:
+    """The target cameras that ``spec`` means.
 
-    fusion = config.fusion
-    edge = automatic_voxel(scene, context, source, percentile=fusion.voxel_percentile, say=say)
-    # Not rounded: it has to follow the world's scale.
-    config = at_scale(config.replaced(voxel=edge), fusion.voxel_scale)
-    if fusion.max_psnr_drop_db is None:
-        return config
-    recorded = [name for name in context if is_recorded(source, scene[name])]
-    loss = fusion.max_psnr_drop_db
-    return at_scale(config, sufficient_scale(scene, recorded, config=config, loss=loss, say=say))
-
-
-def _on_device(config: RunSettings) -> RunSettings:
-    """The device of the projection: "cuda" takes the torch back end there, "cpu" no other.
-
-    "auto" is CUDA where the torch back end was chosen, may choose, and finds such a device.
+    Args:
+        scene: the project, already of the size that the run works in.
+        context: names of the given views.
+        spec: one of FORMS.
+        allow_overlap: let views be context and target.
+        max_side: another project's pictures are reduced to it, pixels.
     """
-    from gvtools.appearance.splat.gsplat_splatter import gsplat_installed
-    from gvtools.errors import OptionError
-    from gvtools.settings import with_values
+    context_cameras = scene.subset(context).cameras
+    name, _, count = spec.partition(":")
+    if name in PATHS and spec not in scene.names:
+        if not count.isdecimal() or int(count) < 1:
+            raise OptionError(f"targets {spec!r}; expected {name}:N with N >= 1")
+        return _path(scene, context, name, count=int(count))
+    path, at, selection = spec.partition("@")
+    if path and (is_address(path) or _exists(path)) and spec not in scene.names:
+        if is_address(path) or Path(path).is_dir() or Path(path).suffix == ".json":
+            targets = _project(path, selection if at else "all", scene, max_side=max_side)
+            if not allow_overlap:
+                _check_pictures(scene, context, targets)
+            return targets
+        return _file(Path(path), context_cameras)
+    try:
+        # By name, as the context: what one target adds, the next ones are completed on.
+        chosen = tuple(sorted(select(scene.names, spec)))
+    except OptionError as error:
+        raise OptionError(f"targets {spec!r}: {error}; or give {FORMS}") from None
+    if not allow_overlap:
+        check_disjoint(context, chosen)
+    views = tuple(scene[name] for name in chosen)
+    return Targets(scene.subset(chosen).cameras, views, "hold-out")
 
-    splat, device = config.splat, str(config.device)
-    if device == "cuda" and splat.backend in ("nearest", "open3d"):
+
+def _exists(text: str) -> bool:
+    try:
+        return Path(text).exists()
+    except OSError:
+        return False  # A long list of names is longer than any file's.
+
+
+def _path(scene: Scene, context: tuple[str, ...], name: str, *, count: int) -> Targets:
+    def depth() -> tuple[Cameras, float] | None:
+        view = scene[context[len(context) // 2]]
+        seen = view.load().depth if view.has_depth else None
+        if seen is None or not (seen > 0).any():
+            return None
+        return view.camera, float(np.median(seen[seen > 0]))
+
+    cameras = named_path(name, scene.subset(context).cameras, count=count, depth=depth)
+    named = Cameras(
+        cameras.K,
+        cameras.cam_from_world,
+        cameras.width,
+        cameras.height,
+        tuple(f"{name}_{i:04d}" for i in range(count)),
+    )
+    return Targets(named, (None,) * count, name)
+
+
+def _file(path: Path, context_cameras: Cameras) -> Targets:
+    from gvtools.trajectory_files import read_trajectory
+
+    cameras = read_trajectory(path, context_cameras[0])
+    return Targets(cameras, (None,) * len(cameras), "trajectory", (path,))
+
+
+def _project(path: str, selection: str, scene: Scene, *, max_side: int | None) -> Targets:
+    """Views of another project; one of a data set lies in the same download as the run's own."""
+    from gvtools.scenes.project import open_project
+
+    if not is_address(path):
+        other, address = open_project(path), str(Path(path).resolve())
+    elif scene.origin is None:
         raise OptionError(
-            f"device cuda with splat.backend {splat.backend}, which computes on the CPU; expected "
-            "torch; leave one of them out"
+            f"targets {path}: the run's project is none of a data set, so that no --root says "
+            "where this one lies; give the folder of the scene instead"
         )
-    if device == "auto":
-        device = splat.device if splat.backend == "torch" else "cpu"
-        if device == "auto":
-            device = "cuda" if _cuda() else "cpu"
-        return with_values(config, {"device": device, "splat.device": device})
-    if device == "cpu":
-        return with_values(config, {"splat.device": "cpu"})
-    if not _cuda():
-        import torch
+    else:
+        other = open_project(path, root=scene.origin.root)
+        address = other.address
+    other = reduced(other, max_side)
+    chosen = tuple(sorted(select(other.names, selection)))
+    views = tuple(other[name] for name in chosen)
+    files = tuple(file for view in views for file in view.files)
+    return Targets(other.subset(chosen).cameras, views, "project", files, address)
 
+
+def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) -> None:
+    """Refuse another project's views that are the context's: same file, or same place."""
+    given = [scene[name] for name in context]
+    files = {view.files[0].resolve() for view in given if view.files}
+    context_cameras = scene.subset(context).cameras
+    near = SAME_PLACE * max(float(np.ptp(context_cameras.centers, axis=0).max()), 1e-9)
+    both = []
+    for view in targets.truth:
+        if view is None:
+            continue
+        same = bool(view.files) and view.files[0].resolve() in files
+        if same or _at_one_place(view.camera, context_cameras, near).any():
+            both.append(view.name)
+    if both:
         raise OptionError(
-            f"device cuda: torch {torch.__version__} finds no CUDA device; expected one; use "
-            "--device cpu, or install a CUDA build of torch"
+            f"targets of another project overlap with the context in {len(both)} pictures (first "
+            f"{both[0]!r}: same file, or same place and direction); expected none; change one, or "
+            "pass --allow-overlap"
         )
-    if config.refine.wanted and not gsplat_installed():
-        raise OptionError(
-            "device cuda: gsplat, which fits Gaussians there, is not installed; expected it; pip "
-            "install gvtools[cuda], or use --refine 0 or --device cpu"
-        )
-    return with_values(config, {"splat.backend": "torch", "splat.device": "cuda"})
 
 
-def _cuda() -> bool:
-    import torch
-
-    return torch.cuda.is_available()
+def _at_one_place(camera: Cameras, context_cameras: Cameras, near: float) -> NDArray[np.bool_]:
+    """Which of the context cameras stand where ``camera`` does and look where it looks."""
+    apart = np.linalg.norm(context_cameras.centers - camera.centers[0], axis=1)
+    rotations = context_cameras.cam_from_world[:, :3, :3] @ camera.cam_from_world[0, :3, :3].T
+    cosine = (np.trace(rotations, axis1=1, axis2=2) - 1) / 2
+    return (apart <= near) & (cosine >= np.cos(np.radians(SAME_DIRECTION)))
 
 
 def make_schedule(
@@ -399,3 +389,13 @@ def describe(plan: Plan, console: Console) -> None:
     for finding in plan.scene.findings:
         if finding.level == "warning":
             console.warn(finding.message)
+
+
+def scan_line(entry: Mapping[str, Any]) -> str:
+    """What a report says of a run's scan, for the user."""
+    placed = entry["placement"]
+    text = (
+        f"{entry['file']}: {entry['fused']:,} of {entry['points']:,} points scanned from "
+        f"{entry['stations']} station(s), placement {placed['how']}, scale {placed['scale']:.6g}"
+    )
+    return text if placed["fitness"] is None else f"{text}, fitness {placed['fitness']:.2f}"

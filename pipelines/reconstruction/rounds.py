@@ -1,36 +1,218 @@
-"""One round: lift the context, or project, complete, align and fuse the round's targets."""
+"""Rounds of a run: fuse the context, then project, complete, align and fuse targets."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.projection_cache import CachedProjection
+from gvtools.appearance.appearance import Appearance, Picture, applied
 from gvtools.cameras import Cameras
-from gvtools.completers.base import (
-    Completer,
-    Completion,
-    ContextView,
-    run_completer,
-)
+from gvtools.completers.base import Completer, Completion, ContextView, run_completer
 from gvtools.completers.scale_alignment import ScaleAlignment
+from gvtools.depth.from_memory import MEMORY, depth_from_memory
+from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, concatenate
+from gvtools.kernels import parallel_kernels_may_overlap
+from gvtools.memory.projection import Observed, observed_of, project_again
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
-from gvtools.scenes.scene import Frame, Scene, View
+from gvtools.memory.splat.api import ONE_PIXEL, SplatOptions
+from gvtools.prefetch import prefetch
+from gvtools.runs.context_depth import (
+    disagreeing,
+)
+from gvtools.runs.depth_cache import DepthCache, depth_report
+from gvtools.runs.layout import target_stems
+from gvtools.runs.target_files import camera_entry, write_after, write_target
+from gvtools.scenes.scene import Frame, View
 from gvtools.similarity import align_depth_scale
-from pipelines.reconstruction.depth_cache import DepthCache, depth_report
-from pipelines.reconstruction.prefetch import prefetch
+from pipelines.console import Console
+from pipelines.reconstruction.plan import Plan, scan_line
 from pipelines.reconstruction.settings import RunSettings
 
+
+class CachedProjection:
+    """One camera, and the memory as it is projected into it, now and after every change.
+
+    Generated observations only fill what observed ones leave open, and never change these. So what
+    the observed ones show is kept, and a projection after a completion was fused splats the
+    generated ones alone. The result is that of ``SpatialMemory.project`` to the bit.
+
+    Args:
+        memory: is looked at whenever a guidance is asked for.
+        camera: a batch of one.
+        options: of the projection.
+        reuse: False splats everything each time that the memory has changed.
+        appearance: gives colours of what was observed; None leaves them the memory's.
+    """
+
+    def __init__(
+        self,
+        memory: SpatialMemory,
+        camera: Cameras,
+        *,
+        options: SplatOptions | None = None,
+        reuse: bool = True,
+        appearance: Appearance | None = None,
+    ) -> None:
+        self.memory, self.camera = memory, camera
+        self.options = options or SplatOptions()
+        self.reuse = reuse and self.options.backend not in ONE_PIXEL
+        self._at = (-1, -1)
+        self._observed: Observed | None = None
+        self._guidance: Guidance | None = None
+        self.appearance = appearance
+        self._picture: Picture | None = None
+
+    def prefetch(self, snapshot: SpatialMemory) -> None:
+        """Project what observed views show ahead of ``guidance``, where that is reused.
+
+        Args:
+            snapshot: of the memory; so this may run beside fusions of generated content.
+        """
+        if self.reuse and self.options.backend == "cpu":
+            self._observed = observed_of(snapshot, self.camera, options=self.options)
+            self._at = (-1, snapshot.observed_changes)
+
+    def guidance(self) -> Guidance:
+        """The projection of the memory as it is now, a batch of one; the last one if unchanged."""
+        memory = self.memory
+        at = (memory.changes, memory.observed_changes)
+        if self._guidance is None or at != self._at:
+            if not self.reuse:
+                self._guidance = memory.project(self.camera, options=self.options)
+            else:
+                observed = self._observed if at[1] == self._at[1] else None
+                self._guidance, self._observed = project_again(
+                    memory, self.camera, observed, options=self.options
+                )
+            if self.appearance is not None:
+                if self._picture is None:
+                    self._picture = self.appearance.picture(self.camera)
+                self._guidance = applied(self._picture, self._guidance, blend=self.appearance.blend)
+            self._at = at
+        return self._guidance
+
+    def colored(self, guidance: Guidance, rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A completion's colours (1, H, W, 3), with the Gaussians' where these show a surface.
+
+        Some photograph did see most of it, though not well enough to tell its depth. It remains
+        generated: nothing observed supports it. Its depth remains the completer's.
+
+        Args:
+            guidance: that was completed; the Gaussians' colours come where it is not valid.
+            rgb: of the completion, 0 to 1.
+        """
+        if self._picture is None:
+            return rgb
+        where = ~guidance.valid[0] & self._picture.solid
+        return np.where(where[..., None], self._picture.rgb, rgb[0])[None]
+
+
+def warn_of_depth(reports: Sequence[Mapping[str, Any]], console: Console) -> None:
+    """Say of how many views there is no depth, or depth of another scale.
+
+    Args:
+        reports: see depth_report, with ``failed``.
+        console: where to.
+    """
+    failed = [report for report in reports if report["failed"]]
+    if failed:
+        console.warn(
+            f"{len(failed)} of {len(reports)} views have no depth and give no points, first: "
+            f"{failed[0]['failed']}"
+        )
+    odd = disagreeing(reports)
+    if odd:
+        first = odd[0]["scale"]
+        console.warn(
+            f"the depth of {len(odd)} of {len(reports)} views disagrees with the sparse points, "
+            f"first {odd[0]['view']}: {first['status']}, scale {first['scale']:.3g}; look at its "
+            "unit and at the poses"
+        )
+
+
+class RoundTargets:
+    """The targets of each round as they follow the memory.
+
+    While the targets of a round are completed, what observed views show of the next round's is
+    projected in another thread, where projections are reused at all: completions do not change it.
+
+    Args:
+        plan: of the run.
+        memory: that the rounds add to.
+        appearance: shows what was observed; None leaves it to the memory.
+    """
+
+    def __init__(
+        self, plan: Plan, memory: SpatialMemory, appearance: Appearance | None = None
+    ) -> None:
+        self.plan, self.memory, self.appearance = plan, memory, appearance
+        self._pool = ThreadPoolExecutor(1)
+        self._next: tuple[int, list[CachedProjection], list[Future[None]]] | None = None
+
+    def __enter__(self) -> RoundTargets:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def of(self, number: int) -> list[CachedProjection]:
+        """The targets of round ``number``, from 1, in order."""
+        if self._next is None or self._next[0] != number:
+            return self._projections(number)
+        _, targets, looks = self._next
+        self._next = None
+        for look in looks:
+            look.result()
+        return targets
+
+    def prefetch_round(self, number: int) -> None:
+        """Begin to project what observed views show of round ``number``, if there is one."""
+        if number > len(self.plan.schedule) or not parallel_kernels_may_overlap():
+            return
+        if self.plan.config.fusion.generated_as_observed:
+            # A snapshot holds while generated points alone are fused.
+            return
+        targets = self._projections(number)
+        snapshot = self.memory.snapshot()
+        # One by one, so that a run that is stopped need not wait for all.
+        looks = [self._pool.submit(target.prefetch, snapshot) for target in targets]
+        self._next = (number, targets, looks)
+
+    def _projections(self, number: int) -> list[CachedProjection]:
+        config = self.plan.config
+        return [
+            CachedProjection(
+                self.memory,
+                camera,
+                options=config.splat,
+                reuse=config.savings.reuse,
+                appearance=self.appearance,
+            )
+            for camera in self.plan.targets.cameras[list(self.plan.schedule[number - 1])]
+        ]
+
+
 STAGES = ("depth", "fuse", "project", "complete", "align")
+# Targets whose files are written at once.
+WRITERS = 2
 
 
 @dataclass
@@ -51,40 +233,47 @@ class Clock:
 
 @dataclass(frozen=True, eq=False)
 class TargetResult:
-    """One completed target.
+    """One completed target."""
 
-    Attributes:
-        guidance: what the completer was given, a batch of one; a completer that takes one target
-            at a time is given what earlier targets of the round added, too.
-        completion: what the completer made of it, a batch of one.
-        fused: which pixels went to fusion.
-        report: figures of the view for the round's report.
-    """
-
+    # What the completer was given, a batch of one: one that takes a target at a time is given what
+    # earlier targets of the round added, too.
     guidance: Guidance
+    # A batch of one.
     completion: Completion
+    # (H, W) bool, the pixels that went to fusion.
     fused: NDArray[np.bool_]
-    report: dict[str, Any]
+    fusion: FuseReport
+    # Figures of the view for the round's report.
+    figures: dict[str, Any]
 
 
-def observe_context(
-    scene: Scene,
-    names: Sequence[str],
-    *,
-    source: DepthCache,
-    memory: SpatialMemory,
-    config: RunSettings,
-    clock: Clock,
-    progress: Any,
-) -> tuple[FuseReport, dict[str, int], list[dict[str, Any]]]:
-    """Round 0: lift the context views and fuse them.
+def fuse_context(
+    plan: Plan, memory: SpatialMemory, folder: Path, *, console: Console
+) -> dict[str, Any]:
+    """Round 0: fuse the scan, then the context views with recorded, projected or computed depth.
 
-    Returns:
-        The sum of what was fused, the pixels dropped by reason, and a report of each view's depth.
+    Depth that nothing confirms comes last, as generated: it stays out of space that any view saw to
+    be free. Computed depth is kept in ``folder``. Returns the round's report.
     """
-    total = FuseReport()
-    dropped: dict[str, int] = {}
-    reports = []
+    clock, begun, voxels = Clock(), time.perf_counter(), memory.voxels
+    scene, config = plan.evidence or plan.scene, plan.config
+    cache = DepthCache(
+        scene, plan.context, plan.source,
+        folder=folder, unfinished=True, fallback=_depth_from_memory(plan, memory),
+    )  # fmt: skip
+    if cache.kept:
+        console.line(
+            f"taking over the depth of {cache.kept} of {len(plan.context)} context views, "
+            "which an interrupted attempt at this run had computed"
+        )
+    total, scan = FuseReport(), None
+    if plan.scan is not None:
+        with clock.stage("fuse"):
+            scanned, scan = plan.scan.fuse_into(memory)
+        total = replace(scanned, dropped={})
+        console.line(scan_line(scan))
+    dropped: Counter[str] = Counter()
+    reports: list[dict[str, Any]] = []
     guesses: list[tuple[Cameras, NDArray[np.uint8], DepthMap, NDArray[np.bool_]]] = []
 
     def observe(*images: Any, **how: Any) -> FuseReport:
@@ -94,165 +283,235 @@ def observe_context(
                 pixel_binning=config.savings.pixel_binning, **how,
             )  # fmt: skip
 
-    covered = [view for view in map(scene.__getitem__, names) if source.covers(view)]
-    frames = prefetch(_load, covered)
-    for name in progress(names, "context views"):
+    covered = [view for view in map(scene.__getitem__, plan.context) if cache.covers(view)]
+    frames = prefetch(lambda view: view.load(), covered)
+    for name in console.track(plan.context, "context views"):
         view = scene[name]
-        if not source.covers(view):
-            dropped["views without depth"] = dropped.get("views without depth", 0) + 1
+        if not cache.covers(view):
+            dropped["views without depth"] += 1
             continue
         with clock.stage("depth"):
             frame = next(frames)
-            depth_map = source.depth(view, frame)
+            depth_map = cache.depth(view, frame)
             reports.append(depth_report(scene, name, depth_map))
-            if depth_map.contradicted:
-                reason = "depth that other views look through"
-                dropped[reason] = dropped.get(reason, 0) + depth_map.contradicted
-                # Lifting counts them as well, as pixels without depth.
-                dropped["no depth"] = dropped.get("no depth", 0) - depth_map.contradicted
-        guessed = depth_map.guessed
-        use = frame.mask
+        if depth_map.contradicted:
+            dropped["depth that other views look through"] += depth_map.contradicted
+            # Lifting counts them as well, as pixels without depth.
+            dropped["no depth"] -= depth_map.contradicted
+        use, guessed = frame.mask, depth_map.guessed
         if guessed is not None:
             everywhere = np.ones_like(guessed) if use is None else use
             guesses.append((view.camera, frame.rgb, depth_map, guessed & everywhere))
             use = everywhere & ~guessed
             # These are fused below, not left out.
-            dropped["masked"] = dropped.get("masked", 0) - int((guessed & everywhere).sum())
-        report = observe(
+            dropped["masked"] -= int((guessed & everywhere).sum())
+        fused = observe(
             frame.rgb, depth_map.depth, view.camera, confidence=depth_map.confidence, mask=use
         )
-        total += report
-        for reason, count in report.dropped.items():
-            dropped[reason] = dropped.get(reason, 0) + count
-    # Last, so that they stay out of space that any view saw to be free.
+        total += fused
+        for reason, count in fused.dropped.items():
+            dropped[reason] += count
     for camera, rgb, depth_map, where in guesses:
         total += observe(
-            rgb,
-            depth_map.depth,
-            camera,
-            confidence=depth_map.confidence,
-            mask=where,
-            generated=True,
-        )
+            rgb, depth_map.depth, camera,
+            confidence=depth_map.confidence, mask=where, generated=True,
+        )  # fmt: skip
     for entry in reports:
-        entry["failed"] = source.failed.get(entry["view"])
-    if not len(memory) and source.failed:
-        raise ProjectError(next(iter(source.failed.values())))
-    if not len(memory) and total.out_of_reach:
-        raise ProjectError(
-            f"{scene.root}: all {total.out_of_reach} points of the context lie beyond the "
+        entry["failed"] = cache.failed.get(entry["view"])
+    if not len(memory):
+        raise ProjectError(_nothing_fused(plan, memory, cache, beyond=total.out_of_reach))
+    warn_of_depth(reports, console)
+    projected = sum(report["source"] == MEMORY for report in reports)
+    if projected:
+        console.line(
+            f"{projected} of {len(reports)} context views took their depth from the memory, which "
+            "matches their photographs"
+        )
+    report = _round_report(0, memory, total, clock=clock, begun=begun, voxels=voxels)
+    return report | {"dropped": dict(dropped), "depth": reports, "scan": scan}
+
+
+def _depth_from_memory(
+    plan: Plan, memory: SpatialMemory
+) -> Callable[[View, Frame], DepthMap | None]:
+    """The memory's depth of a view where it matches ``savings.depth_from_memory`` of its pixels."""
+    least = plan.config.savings.depth_from_memory
+
+    def projected(view: View, frame: Frame) -> DepthMap | None:
+        if least is None or plan.evidence is not None:
+            return None
+        found = depth_from_memory(
+            memory, view.camera, frame.rgb, least=least, options=plan.config.splat
+        )
+        # Reject projected depth that contradicts the sparse points: errors would accumulate.
+        fit = found and scale_to_points(plan.scene, view.name, found.depth)
+        return None if fit and disagrees(fit) else found
+
+    return projected
+
+
+def _nothing_fused(plan: Plan, memory: SpatialMemory, cache: DepthCache, *, beyond: int) -> str:
+    if cache.failed:
+        return next(iter(cache.failed.values()))
+    if beyond:
+        return (
+            f"{plan.scene.root}: all {beyond} points of the context lie beyond the "
             f"{memory.reach:.3g} scene units that voxels of {memory.voxel:g} reach from the "
             "cameras; expected a greater voxel edge; leave --voxel out, or look at the depth's unit"
         )
-    if not len(memory):
-        raise ProjectError(
-            f"{scene.root}: the context's depth gave no point; look at 'gvtools check' and at the "
-            "depth's unit"
-        )
-    return total, dropped, reports
+    return (
+        f"{plan.scene.root}: the context's depth gave no point; look at 'gvtools check' and at the "
+        "depth's unit"
+    )
 
 
-def _load(view: View) -> Frame:
-    return view.load()
-
-
-def load_context(scene: Scene, names: Sequence[str], source: DepthCache) -> list[ContextView]:
+def load_context(plan: Plan, cache: DepthCache) -> list[ContextView]:
     """The context as completers see it."""
-    out = []
-    views = [scene[name] for name in names]
-    for name, view, frame in zip(names, views, prefetch(_load, views), strict=True):
-        depth = source.depth(view, frame) if source.covers(view) else None
-        out.append(
-            ContextView(
-                name,
-                view.camera,
-                (frame.rgb / np.float32(255)).astype(np.float32),
-                depth.depth if depth else None,
-                depth.confidence if depth else None,
-            )
-        )
+    scene = plan.evidence or plan.scene
+    views, out = [scene[name] for name in plan.context], []
+    for view, frame in zip(views, prefetch(lambda view: view.load(), views), strict=True):
+        depth = cache.depth(view, frame) if cache.covers(view) else None
+        rgb = (frame.rgb / np.float32(255)).astype(np.float32)
+        known = (depth.depth, depth.confidence) if depth else (None, None)
+        out.append(ContextView(view.name, view.camera, rgb, *known))
     return out
 
 
+def complete_round(
+    plan: Plan, round_targets: RoundTargets, number: int, *, context: Sequence[ContextView],
+    folder: Path, console: Console,
+) -> dict[str, Any]:  # fmt: skip
+    """Round ``number``, from 1: complete and fuse its targets, and write their files.
+
+    Files are compressed and written in the background while the next targets are completed. Returns
+    the round's report.
+    """
+    memory, rows = round_targets.memory, plan.schedule[number - 1]
+    clock, begun, voxels, total = Clock(), time.perf_counter(), memory.voxels, FuseReport()
+    all_stems = target_stems(plan.targets.cameras.names)
+    stems, views = [all_stems[row] for row in rows], []
+    with clock.stage("project"):
+        targets = round_targets.of(number)
+        before = [target.guidance().coverage for target in targets]
+    round_targets.prefetch_round(number + 1)
+    results = complete_targets(
+        targets, number, memory=memory, completer=plan.completer, context=context,
+        config=plan.config, clock=clock,
+    )  # fmt: skip
+    with ThreadPoolExecutor(WRITERS) as pool:
+        writing: list[Future[None]] = []
+        for at, result in zip(
+            console.track(range(len(targets)), f"round {number}"), results, strict=True
+        ):
+            total += result.fusion
+            camera = camera_entry(targets[at].camera)
+            views.append({**result.figures, "stem": stems[at], "camera": camera,
+                          "coverage": before[at]})  # fmt: skip
+            writing.append(pool.submit(
+                write_target, folder, stems[at], guidance=result.guidance,
+                completion=result.completion, fused=result.fused,
+            ))  # fmt: skip
+        with clock.stage("project"):
+            after = [target.guidance() for target in targets]
+        for view, guidance in zip(views, after, strict=True):
+            view["coverage_after"] = guidance.coverage
+            writing.append(pool.submit(write_after, folder, view["stem"], guidance))
+        for written in writing:
+            written.result()
+    refused = [view for view in views if not view["scale"]["accepted"]]
+    if refused:
+        console.warn(
+            f"round {number}: {len(refused)} of {len(views)} completions give no points, first "
+            f"{refused[0]['name']}: {refused[0]['scale']['description']}"
+        )
+    report = _round_report(number, memory, total, clock=clock, begun=begun, voxels=voxels)
+    return report | {
+        "coverage_before": float(np.mean(before)),
+        "coverage_after": float(np.mean([guidance.coverage for guidance in after])),
+        "views": views,
+    }
+
+
+def _round_report(
+    number: int, memory: SpatialMemory, total: FuseReport, *, clock: Clock, begun: float,
+    voxels: int,
+) -> dict[str, Any]:  # fmt: skip
+    """A round's report, JSON-ready.
+
+    ``points``, ``observed`` (by cameras), ``scanned`` and ``generated`` count observations in the
+    memory after the round; ``scan`` tells of the scan that it starts from; ``added``, ``merged``
+    and ``rejected`` are those of FuseReport; ``coverage_*`` are mean shares of target pixels (0 to
+    1) that the memory projects to, None in round 0; ``bytes`` is its size.
+    """
+    generated, scanned = memory.generated_count, memory.scanned_count
+    return {
+        "round": number,
+        "points": len(memory),
+        "voxels": memory.voxels,
+        "voxels_added": memory.voxels - voxels,
+        "observed": len(memory) - generated - scanned,
+        "scanned": scanned,
+        "generated": generated,
+        "added": total.added,
+        "merged": total.merged,
+        "rejected": total.rejected,
+        "fuse": asdict(total),
+        "dropped": {},
+        "depth": [],
+        "scan": None,
+        "coverage_before": None,
+        "coverage_after": None,
+        "seconds": {**clock.seconds, "total": time.perf_counter() - begun},
+        "bytes": memory.nbytes,
+        "views": [],
+    }
+
+
 def complete_targets(
-    targets: Sequence[CachedProjection],
-    number: int,
-    *,
-    memory: SpatialMemory,
-    completer: Completer,
-    context: Sequence[ContextView],
-    config: RunSettings,
-    clock: Clock,
-    progress: Any,
-    done: Callable[[int, TargetResult], object] = lambda row, result: None,
-) -> tuple[list[TargetResult], FuseReport]:
-    """Rounds 1, 2, ...: complete, align and fuse the round's targets.
+    targets: Sequence[CachedProjection], number: int, *, memory: SpatialMemory,
+    completer: Completer, context: Sequence[ContextView], config: RunSettings, clock: Clock,
+) -> Iterator[TargetResult]:  # fmt: skip
+    """Complete, align and fuse targets, in order.
 
     A completer that takes several targets in a call (``batches_targets``) gets all of one size
     together; for any other, each view is completed on what the views before it added, so that they
     agree with each other.
 
     Args:
-        targets: projections of ``memory`` into the round's cameras; each updates when it changes.
-        number: number of the round, from 1.
+        targets: projections of ``memory``; each updates when it changes.
+        number: of the round, from 1.
         memory: generated points are fused into it.
         completer: see ``Completer``.
         context: the observed views that the completer may use.
         config: settings of the run.
         clock: receives the stages' times.
-        progress: ``progress(items, label)`` iterates over ``items`` and shows a progress bar.
-        done: called as ``done(row, result)`` after each target was completed and fused.
-
-    Returns:
-        One result per target, in the order given, and the sum of what was fused.
     """
-    seed = config.seed + number
-    results: list[TargetResult] = []
-    total = FuseReport()
-
-    def fuse_and_record(
-        target: CachedProjection, guidance: Guidance, completion: Completion
-    ) -> None:
-        nonlocal total
-        if not completion.whole:
-            completion = replace(completion, rgb=target.colored(guidance, completion.rgb))
-        result, report = _align_and_fuse(
-            guidance, completion, number, memory=memory, config=config, clock=clock
-        )
-        done(len(results), result)
-        results.append(result)
-        total += report
-
+    seed, together = config.seed + number, None
     if completer.batches_targets:
         with clock.stage("project"):
             guidances = [target.guidance() for target in targets]
         with clock.stage("complete"):
-            completions = _completed_together(completer, context, guidances, seed=seed)
-        together = list(zip(targets, guidances, completions, strict=True))
-        for target, guidance, completion in progress(together, f"round {number}"):
-            fuse_and_record(target, guidance, completion)
-        return results, total
-    for target in progress(list(targets), f"round {number}"):
-        with clock.stage("project"):
-            guidance = target.guidance()
-        with clock.stage("complete"):
-            completion = run_completer(completer, context, guidance, seed=seed)
-        fuse_and_record(target, guidance, completion)
-    return results, total
+            together = _completed_together(completer, context, guidances, seed=seed)
+    for row, target in enumerate(targets):
+        if together is not None:
+            guidance, completion = guidances[row], together[row]
+        else:
+            with clock.stage("project"):
+                guidance = target.guidance()
+            with clock.stage("complete"):
+                completion = run_completer(completer, context, guidance, seed=seed)
+        if not completion.whole:
+            completion = replace(completion, rgb=target.colored(guidance, completion.rgb))
+        yield _align_and_fuse(
+            guidance, completion, number, memory=memory, config=config, clock=clock
+        )
 
 
 def _completed_together(
-    completer: Completer,
-    context: Sequence[ContextView],
-    guidances: Sequence[Guidance],
-    *,
+    completer: Completer, context: Sequence[ContextView], guidances: Sequence[Guidance], *,
     seed: int,
-) -> list[Completion]:
-    """Complete the targets in one call per image size.
-
-    Returns:
-        One Completion (V = 1) per target, in the order of ``guidances``.
-    """
+) -> list[Completion]:  # fmt: skip
+    """One completion (V = 1) per target, of one call per image size."""
     completions: dict[int, Completion] = {}
     sizes: dict[tuple[int, ...], list[int]] = {}
     for index, guidance in enumerate(guidances):
@@ -286,7 +545,7 @@ def _align_and_fuse(
     memory: SpatialMemory,
     config: RunSettings,
     clock: Clock,
-) -> tuple[TargetResult, FuseReport]:
+) -> TargetResult:
     valid, depth = guidance.valid[0], completion.depth[0]
     confidence = completion.confidence[0]
     with clock.stage("align"):
@@ -326,7 +585,7 @@ def _align_and_fuse(
         "scale": alignment.to_json(),
         "fuse": asdict(report),
     }
-    return TargetResult(guidance, completion, fused, figures), report
+    return TargetResult(guidance, completion, fused, report, figures)
 
 
 def _scale_alignment(

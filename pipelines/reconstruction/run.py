@@ -1,37 +1,179 @@
-"""A run: plan, rounds of fuse, project and complete, and what is left of them in a folder."""
+"""Runs: prepare, fit, fuse and complete round by round, and what is left of them in a folder."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from gvtools.files import write_json
-from gvtools.runs.folder import RunDirectory
+import numpy as np
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.evaluation.view_figures import FIGURES, view_figures
+from gvtools.files import folder_replaced_when_written, only_in, recover_folder, write_json
+from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.tiled_memory import TiledMemory
+from gvtools.prefetch import prefetch
+from gvtools.runs.depth_cache import DepthCache
+from gvtools.runs.folder import RunDirectory, changed_keys
+from gvtools.runs.folder_lock import folder_lock
 from gvtools.runs.layout import (
     APPEARANCE,
     MEMORY,
+    METRICS,
     POINTS,
     POSES,
     REPORT,
     TILES_AT_WORK,
+    round_folder,
     saved_memory,
 )
+from gvtools.runs.run import Run, load_run
+from gvtools.runs.target_files import TargetFiles, read_target
+from gvtools.scenes.data_sets.address import is_address
+from gvtools.scenes.reading import open_recorded
+from gvtools.settings import dotted, with_values
+from gvtools.untrusted import read_json
 from pipelines.console import Console
-from pipelines.reconstruction.compile_kernels import compile_kernels
-from pipelines.reconstruction.plan import Plan, describe, make_plan, run_identity
-from pipelines.reconstruction.scan import placed_scan
+from pipelines.reconstruction.fitting import Fitted, fit_appearance
+from pipelines.reconstruction.plan import Plan, describe, run_identity
+from pipelines.reconstruction.prepare import make_plan, placed_scan, tuned
+from pipelines.reconstruction.rounds import RoundTargets, complete_round, fuse_context, load_context
+from pipelines.reconstruction.settings import RunSettings
+from pipelines.reconstruction.voxel import grid_frame
 
 if TYPE_CHECKING:
     from gvtools.completers.base import ContextView
-    from gvtools.memory.spatial_memory import SpatialMemory
-    from gvtools.scenes.scene import Scene
-    from pipelines.reconstruction.fitting import Fitted
-    from pipelines.reconstruction.settings import RunSettings
+    from gvtools.kernels import KernelSet
+    from gvtools.scenes.scene import Frame, Scene, View
 
+
+# Figures of the table that closes a run.
+TABLE = ("psnr", "psnr_valid", "psnr_generated", "ssim", "depth_rel_valid", "depth_rel_generated")
+NO_LPIPS = "lpips is null here: gvtools evaluate measures it, where its weights are"
+# In run.json: what each call was given, the first one first.
+REFINED = "refined"
 # Draws what a finished run shows, given its plan and its folder; returns the names of the files.
 Draw = Callable[[Plan, RunDirectory], Sequence[str]]
+
+
+def compile_kernels(
+    config: RunSettings, console: Console, *, more: Sequence[KernelSet] = ()
+) -> None:
+    """Compile what numba's cache does not hold, side by side, so that no round is charged with it.
+
+    Args:
+        config: of the run; its completer and the back end of projection tell which kernels.
+        console: is told what is compiled and how long it took.
+        more: kernels that are needed besides.
+    """
+    from gvtools.completers.base import completer_type
+    from gvtools.depth import view_check
+    from gvtools.kernels import compile_side_by_side
+    from gvtools.memory import compile_kernels as memory
+
+    completer = completer_type(config.completer)
+    sets = [memory.KERNELS, view_check.KERNELS, *completer.kernels, *more]
+    if completer.costly and config.effort.inpaint_below > 0:
+        sets += completer_type("inpaint").kernels
+    if config.refine.wanted:
+        from gvtools.appearance.compile_kernels import kernel_sets
+
+        sets += kernel_sets()
+    missing = [kernels for kernels in sets if not kernels.cached]
+    began = perf_counter()
+    if missing:
+        names = ", ".join(kernels.name for kernels in missing)
+        console.line(f"compiling kernels ({names}), once per installation")
+        compile_side_by_side(missing)
+    memory.compile_kernels(config.splat.backend)
+    if missing:
+        console.line(f"kernels compiled in {perf_counter() - began:.0f} s")
+
+
+def measure_run(
+    plan: Plan, memory: SpatialMemory, directory: RunDirectory, *, console: Console
+) -> dict[str, Any]:
+    """Means over the targets that have a truth, and the figures of each view.
+
+    All figures are of the completed picture: ``_valid`` on the pixels that observations support,
+    ``_generated`` on all others that it fills, by a completer's hand in this round or an earlier
+    one. ``coverage`` is the share that memory supports before the round, ``coverage_after`` after
+    it.
+    """
+    views = _figures_of_targets(plan, directory)
+    notes = [NO_LPIPS]
+    if not any("psnr" in view for view in views):
+        notes.append("no target has a true picture, so there are no image figures")
+    summary: dict[str, Any] = {name: mean_of(views, name) for name in FIGURES}
+    summary |= {
+        "coverage": mean_of(views, "coverage"),
+        "coverage_after": mean_of(views, "coverage_after"),
+        "targets": len(views),
+        "observations": len(memory),
+        "voxels": memory.voxels,
+        "views": views,
+        "notes": notes,
+    }
+    if views:
+        _print(views, summary, console)
+    return summary
+
+
+def _print(views: list[dict[str, Any]], summary: dict[str, Any], console: Console) -> None:
+    columns = ["target", "round", "coverage", "after", *TABLE]
+    keys = ["name", "round", "coverage", "coverage_after", *TABLE]
+    body = [[view.get(key) for key in keys] for view in views]
+    mean = ["mean", None, *(summary[key] for key in keys[2:])]
+    console.table(columns, [*body, mean])
+
+
+def _figures_of_targets(plan: Plan, directory: RunDirectory) -> list[dict[str, Any]]:
+    """Name, round, coverage and, where there is a true picture, figures of each target."""
+    views: list[dict[str, Any]] = []
+    reports = directory.reports()
+    # Reports stand in the order of the rows, one entry a target.
+    shown = [
+        (number, entry, plan.targets.truth[row])
+        for number, rows in enumerate(plan.schedule, start=1)
+        for row, entry in zip(
+            rows, reports[number]["views"] if number < len(reports) else [], strict=False
+        )
+    ]
+
+    def read(item: tuple[int, dict[str, Any], View | None]) -> tuple[TargetFiles, Frame] | None:
+        number, entry, truth = item
+        if truth is None:
+            return None
+        return read_target(directory.round_path(number), entry), truth.load()
+
+    for (number, entry, _), files in zip(shown, prefetch(read, shown), strict=True):
+        figures = {
+            "name": entry["name"],
+            "round": number,
+            "coverage": entry["coverage"],
+            "coverage_after": entry["coverage_after"],
+        }
+        if files is not None:
+            target, truth = files
+            figures |= view_figures(
+                target.picture,
+                truth,
+                observed=target.observed,
+                generated=target.generated,
+                depth=target.depth,
+            )
+        views.append(figures)
+    return views
+
+
+def mean_of(views: list[dict[str, Any]], name: str) -> float | None:
+    """The mean over the views that have the figure."""
+    values = [view[name] for view in views if view.get(name) is not None]
+    return float(np.mean(values)) if values else None
 
 
 def reconstruct(
@@ -78,7 +220,10 @@ def reconstruct(
         # Before the folder is made: a scan that is refused leaves none.
         plan = replace(plan, scan=placed_scan(plan, console))
     with directory.open_or_resume(identity, resume=resume) as done:
-        fitted = _fitted(plan, directory, done, console=console)
+        if done:
+            fitted = saved_fit(plan, directory)
+        else:
+            fitted = fit_appearance(plan, console) if plan.config.refine.wanted else None
         drawn = complete_run(plan, directory, done, fitted=fitted, console=console, draw=draw)
         say_results(directory, drawn, console)
     return out
@@ -107,25 +252,49 @@ def complete_run(
         The names of the files that ``draw`` wrote.
     """
     if fitted is not None:
-        plan = fitted.applied(plan)
+        plan = fitted.apply(plan)
     memory = (
         _last_memory(plan, directory, done, console=console)
         if done
         else _empty_memory(plan, directory.path / TILES_AT_WORK)
     )
-    _run_rounds(plan, memory, directory, done=done, fitted=fitted, console=console)
-    drawn = _finish(plan, memory, directory, console=console, draw=draw)
+    context: list[ContextView] | None = None
+    with RoundTargets(plan, memory, None if fitted is None else fitted.appearance) as targets:
+        for number in range(done, len(plan.schedule) + 1):
+            if number and context is None:
+                cache = DepthCache(
+                    plan.evidence or plan.scene, plan.context, plan.source,
+                    folder=directory.round_path(0),
+                )  # fmt: skip
+                context = load_context(plan, cache)
+                if plan.config.tune.wanted:
+                    plan = tuned(plan, cache, directory, console=console)
+            with directory.writing_round(number) as folder:
+                if number:
+                    report = complete_round(
+                        plan, targets, number, context=context or [], folder=folder,
+                        console=console,
+                    )  # fmt: skip
+                else:
+                    report = fuse_context(plan, memory, folder, console=console)
+                memory.save(folder / MEMORY)
+                if plan.poses is not None and number == 0:
+                    plan.poses.save(folder / POSES)
+                if fitted is not None and number == 0:
+                    fitted = fitted.with_best_blend(plan, memory)
+                    fitted.save(folder / APPEARANCE)
+                    targets.appearance = fitted.appearance
+                    report["colours"] = str(fitted.validation or fitted.appearance.blend)
+                    if fitted.validation is None:
+                        console.line(f"colours: {report['colours']}")
+                write_json(folder / REPORT, report)
+            console.line(_round_line(report))
+    export_memory_ply(memory, directory.path / POINTS)
+    metrics = measure_run(plan, memory, directory, console=console)
+    directory.finish(len(plan.schedule), metrics)
+    drawn = draw(plan, directory) if draw else ()
     memory.close()
     return drawn
-
-
-def _fitted(plan: Plan, directory: RunDirectory, done: int, *, console: Console) -> Fitted | None:
-    """Gaussians fitted now or by the attempt that is resumed; None where there are none."""
-    from pipelines.reconstruction.fitting import fit_appearance
-
-    if done:
-        return saved_fit(plan, directory)
-    return fit_appearance(plan, console) if plan.config.refine.wanted else None
 
 
 def saved_fit(plan: Plan, directory: RunDirectory) -> Fitted | None:
@@ -133,17 +302,11 @@ def saved_fit(plan: Plan, directory: RunDirectory) -> Fitted | None:
 
     None are there where none were wanted or could be fitted; ``gvtools refine`` adds them.
     """
-    from pipelines.reconstruction.fitting import Fitted
-
     saved = directory.round_path(0) / APPEARANCE
     return Fitted.load(saved).on(plan.config.device) if saved.exists() else None
 
 
 def _empty_memory(plan: Plan, scratch: Path) -> SpatialMemory:
-    from gvtools.memory.spatial_memory import SpatialMemory
-    from gvtools.memory.tiled_memory import TiledMemory
-    from pipelines.reconstruction.voxel_edge import grid_frame
-
     assert plan.config.voxel is not None
     frame = grid_frame(plan.scene, plan.context)
     options = plan.config.memory
@@ -157,9 +320,6 @@ def _last_memory(
     plan: Plan, directory: RunDirectory, done: int, *, console: Console
 ) -> SpatialMemory:
     """The memory after the last of ``done`` complete rounds."""
-    from gvtools.memory.spatial_memory import SpatialMemory
-    from gvtools.memory.tiled_memory import TiledMemory
-
     console.line(f"resuming after round {done - 1}")
     saved, budget = directory.last_memory(done), plan.config.memory.budget
     memory: SpatialMemory
@@ -174,49 +334,6 @@ def _last_memory(
     return memory
 
 
-def _run_rounds(
-    plan: Plan,
-    memory: SpatialMemory,
-    directory: RunDirectory,
-    *,
-    done: int,
-    fitted: Fitted | None,
-    console: Console,
-) -> None:
-    """The rounds from number ``done`` on."""
-    from pipelines.reconstruction.depth_cache import DepthCache
-    from pipelines.reconstruction.round_targets import RoundTargets
-    from pipelines.reconstruction.rounds import load_context
-    from pipelines.reconstruction.run_round import run_round
-    from pipelines.reconstruction.tuning import tuned
-
-    context: list[ContextView] | None = None
-    with RoundTargets(plan, memory, None if fitted is None else fitted.appearance) as targets:
-        for number in range(done, len(plan.schedule) + 1):
-            if number and context is None:
-                scene = plan.evidence or plan.scene
-                cache = DepthCache(scene, plan.context, plan.source, folder=directory.round_path(0))
-                context = load_context(scene, plan.context, cache)
-                if plan.config.tune.wanted:
-                    plan = tuned(plan, cache, directory, console=console)
-            with directory.writing_round(number) as folder:
-                report = run_round(
-                    plan, targets, number, context=context or [], folder=folder, console=console
-                )
-                memory.save(folder / MEMORY)
-                if plan.poses is not None and number == 0:
-                    plan.poses.save(folder / POSES)
-                if fitted is not None and number == 0:
-                    fitted = fitted.with_best_blend(plan, memory)
-                    fitted.save(folder / APPEARANCE)
-                    targets.appearance = fitted.appearance
-                    report["colours"] = str(fitted.validation or fitted.appearance.blend)
-                    if fitted.validation is None:
-                        console.line(f"colours: {report['colours']}")
-                write_json(folder / REPORT, report)
-            console.line(_round_line(report))
-
-
 def _round_line(report: dict[str, Any]) -> str:
     text = (
         f"round {report['round']}: {report['points']:,} observations in {report['voxels']:,} "
@@ -226,24 +343,6 @@ def _round_line(report: dict[str, Any]) -> str:
     if report["coverage_before"] is not None:
         text += f", coverage {report['coverage_before']:.1%} -> {report['coverage_after']:.1%}"
     return f"{text}, {report['seconds']['total']:.1f} s"
-
-
-def _finish(
-    plan: Plan,
-    memory: SpatialMemory,
-    directory: RunDirectory,
-    *,
-    console: Console,
-    draw: Draw | None,
-) -> Sequence[str]:
-    """The run's end products, all derived from the last round's memory; see ``complete_run``."""
-    from gvtools.memory.io.ply import export_memory_ply
-    from pipelines.reconstruction.measure import measure_run
-
-    export_memory_ply(memory, directory.path / POINTS)
-    metrics = measure_run(plan, memory, directory, console=console)
-    directory.finish(len(plan.schedule), metrics)
-    return draw(plan, directory) if draw else ()
 
 
 def say_results(directory: RunDirectory, drawn: Sequence[str], console: Console) -> None:
@@ -260,3 +359,115 @@ def say_results(directory: RunDirectory, drawn: Sequence[str], console: Console)
         [saved_memory(directory.path).name, "memory.ply", *drawn, "metrics.json", "round_*/"]
     )
     console.line(f"results in {directory.path}: {files}")
+
+
+def refine(
+    path: Path,
+    *,
+    seconds: float | None = None,
+    steps: int | None = None,
+    project: Path | None = None,
+    console: Console,
+    draw: Draw | None = None,
+) -> Path:
+    """Fit a run's Gaussians further, and make all of its rounds again with them.
+
+    The new run is written beside the earlier one, which it replaces when it is complete.
+
+    Args:
+        path: the run's folder; the run need not be finished.
+        seconds: how long to fit; None counts steps.
+        steps: how many steps, where no time is given.
+        project: where the run's project lies now; None: where it lay.
+        console: where progress and figures go.
+        draw: see ``reconstruct``.
+
+    Returns:
+        The run's folder.
+    """
+    # A link stays one: what it leads to is replaced.
+    place = path.resolve()
+    recover_folder(place)
+    run = load_run(path, project=project)
+    plan, identity = _reopened(run, console)
+    asked = {"seconds": seconds} if steps is None else {"steps": steps}
+    options = plan.config.refine.replaced(**{"seconds": None, "steps": None, **asked})
+    plan = replace(plan, config=plan.config.replaced(refine=options))
+    compile_kernels(plan.config, console)
+    describe(plan, console)
+    earlier = _earlier(run, console)
+    with folder_lock(place), folder_replaced_when_written(place) as folder:
+        plan = plan.posed
+        plan = replace(plan, scan=placed_scan(plan, console))
+        fitted = fit_appearance(plan, console, earlier=earlier)
+        if fitted is None:
+            raise ProjectError(
+                f"{path}: no Gaussians can be fitted to its context that show more than the "
+                "memory; expected photographs with sparse points or recorded depth, and time for "
+                "a fit; the run is as it was"
+            )
+        directory = RunDirectory(folder)
+        history = [*run.record.get(REFINED, []), asked]
+        with directory.open_or_resume({**identity, REFINED: history}, resume=False):
+            drawn = complete_run(plan, directory, fitted=fitted, console=console, draw=draw)
+        before, after = _figures(path), _figures(folder)
+        others = only_in(path, folder)
+    say_results(RunDirectory(path), drawn, console)
+    if before.get("psnr") and after.get("psnr"):
+        console.line(f"refined: PSNR {before['psnr']:.2f} -> {after['psnr']:.2f} dB")
+    if others:
+        console.warn(f"{', '.join(others)} in {path}: kept, of the run before it was refined")
+    return path
+
+
+def _reopened(run: Run, console: Console) -> tuple[Plan, Mapping[str, Any]]:
+    """The plan of a run and its identity."""
+    record = run.record
+    try:
+        settings = with_values(RunSettings(), dotted(record["settings"]))
+    except OptionError as error:
+        raise ProjectError(
+            f"{run.path}: settings of another version ({error}); run reconstruct again"
+        ) from None
+    begun = round_folder(run.path, 0) if run.rounds else None
+    scene = _project_of(run)
+    plan = make_plan(scene, settings, say=console.line, round_0=begun)
+    identity = run_identity(plan, record["reading"])
+    changed = changed_keys(identity, record)
+    if run.project is not None and "project" in changed:
+        changed.remove("project")
+    if changed:
+        raise ProjectError(
+            f"{run.path}: its project {scene.root} is not as it was when the run was made "
+            f"({', '.join(changed)} differ); expected it unchanged; run reconstruct again"
+        )
+    return plan, identity
+
+
+def _project_of(run: Run) -> Scene:
+    """The project of a run."""
+    project, reading = run.record["project"], run.record["reading"]
+    place = Path(reading["root"] if is_address(project) else project)
+    if not (run.project or place).exists():
+        raise ProjectError(
+            f"{run.path}: its project {run.project or place} is gone; say by --project where it is"
+        )
+    return open_recorded(project, reading, moved=run.project)
+
+
+def _earlier(run: Run, console: Console) -> Fitted | None:
+    """The fit of a run; None where it was made without, or stopped before it was saved."""
+    saved = round_folder(run.path, 0) / APPEARANCE
+    if run.rounds and saved.exists():
+        return Fitted.load(saved)
+    console.line(f"{run.path}: holds no fitted Gaussians; the fit begins anew")
+    return None
+
+
+def _figures(path: Path) -> Mapping[str, Any]:
+    """The means of a run's metrics.json; none where the run is not finished."""
+    try:
+        figures = read_json(path / METRICS)
+    except (OSError, ValueError):
+        return {}
+    return figures if isinstance(figures, dict) else {}

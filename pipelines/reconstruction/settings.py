@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -17,7 +18,26 @@ from gvtools.memory.splat.api import SplatOptions
 from gvtools.scenes.reduced import SMALLEST
 from gvtools.settings import Settings
 from gvtools.training.tune_options import TuneOptions
-from pipelines.reconstruction.scan import ScanOptions
+
+
+class ScanOptions(Settings):
+    """An existing scan that memory starts from."""
+
+    section = "scan"
+
+    file: str | None = None
+    """A PLY, LAS, LAZ, E57 or PCD; none starts from the photographs alone."""
+    placement: str = "estimate"
+    """The similarity from the scan's frame to the photographs' world: estimate, identity, a text
+    file with a 3x4 or 4x4 matrix, or its numbers row by row with commas between."""
+    min_fitness: float = Field(0.5, gt=0, le=1)
+    """An estimated placement is refused if smaller shares of both the photographs' points and the
+    scan's points have a point of the other beside them."""
+
+    def files(self) -> tuple[Path, ...]:
+        """What decides a run's result, for its fingerprint."""
+        named = (self.file, self.placement)
+        return tuple(Path(name) for name in named if name is not None and Path(name).is_file())
 
 
 class FusionOptions(Settings):

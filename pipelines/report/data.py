@@ -11,7 +11,7 @@ from gvtools.errors import GvError, ProjectError
 from gvtools.runs.context_depth import off_scale
 from gvtools.runs.run import Run, load_run
 from gvtools.settings import dotted
-from pipelines.reconstruction.scan import scan_line
+from pipelines.reconstruction.plan import scan_line
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.report.measures import read_measures, report_poses
 from pipelines.report.sheets import contact_sheets

@@ -66,17 +66,17 @@ def test_the_splatter_is_that_of_the_device(monkeypatch):
 
 
 def test_without_gsplat_cuda_is_refused_unless_nothing_is_fitted(monkeypatch):
-    from pipelines.reconstruction import plan
+    from pipelines.reconstruction import prepare
     from pipelines.reconstruction.settings import RunSettings
 
-    monkeypatch.setattr(plan, "_cuda", lambda: True)
+    monkeypatch.setattr(prepare, "_cuda", lambda: True)
     monkeypatch.setattr(gsplat_splatter, "gsplat_installed", lambda: False)
     config = with_values(RunSettings(), {"device": "cuda"})
     with pytest.raises(OptionError, match=r"gsplat.*gvtools\[cuda\].*--refine 0"):
-        plan._on_device(config)
-    assert plan._on_device(with_values(config, {"refine.seconds": 0})).splat.device == "cuda"
+        prepare._on_device(config)
+    assert prepare._on_device(with_values(config, {"refine.seconds": 0})).splat.device == "cuda"
     monkeypatch.setattr(gsplat_splatter, "gsplat_installed", lambda: True)
-    assert plan._on_device(config).device == "cuda"
+    assert prepare._on_device(config).device == "cuda"
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])

@@ -12,7 +12,6 @@ from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture
-from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
@@ -21,6 +20,7 @@ from gvtools.memory.projection import _Projection
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.cpu import CpuSplatter
+from pipelines.reconstruction.rounds import CachedProjection
 
 SIZE = (48, 64)
 

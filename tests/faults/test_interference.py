@@ -14,10 +14,10 @@ from run_files import results
 
 from gvtools.capture.project import replaced_folder
 from gvtools.errors import ProjectError
+from gvtools.prefetch import prefetch
 from gvtools.runs.folder_lock import folder_lock
 from gvtools.scenes.colmap_writer import CAMERAS
 from pipelines.cli import main
-from pipelines.reconstruction.prefetch import prefetch
 
 RUN = (*PLAIN, "--quiet")
 

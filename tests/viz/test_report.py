@@ -18,7 +18,7 @@ from figures import unpainted_figures
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
-from pipelines.reconstruction.plan import make_plan
+from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.report.data import collect
 from pipelines.report.sheets import chosen_targets

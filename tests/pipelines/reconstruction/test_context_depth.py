@@ -15,9 +15,9 @@ from gvtools.depth import choice
 from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError
 from gvtools.runs.context_depth import off_scale
+from gvtools.runs.depth_cache import colored
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.cli import main
-from pipelines.reconstruction.depth_cache import colored
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

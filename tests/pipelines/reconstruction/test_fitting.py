@@ -31,11 +31,17 @@ from gvtools.runs.poses import RunPoses
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.console import Console
-from pipelines.reconstruction import fit_inputs, fitting
-from pipelines.reconstruction.fit_inputs import Sweep, first_gaussians, fit_views
-from pipelines.reconstruction.fit_validation import validate_fit
-from pipelines.reconstruction.fitting import Fitted, fit_appearance
-from pipelines.reconstruction.plan import Plan, make_plan
+from pipelines.reconstruction import fitting
+from pipelines.reconstruction.fitting import (
+    Fitted,
+    Sweep,
+    first_gaussians,
+    fit_appearance,
+    fit_views,
+    validate_fit,
+)
+from pipelines.reconstruction.plan import Plan
+from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.run import _empty_memory, reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
@@ -101,7 +107,7 @@ def test_a_run_keeps_its_gaussians_beside_round_0(whole, scan):
 def test_targets_show_the_gaussians_where_the_memory_observed(whole, scan):
     fitted, plan = Fitted.load(whole / FITTED), planned(scan)
     memory = memory_of_round_0(whole)
-    camera = fitted.applied(plan).targets.cameras[[0]]
+    camera = fitted.apply(plan).targets.cameras[[0]]
     guidance = project(memory, camera, options=plan.config.splat)
     shown = applied(fitted.appearance.picture(camera), guidance, blend=fitted.appearance.blend)
     off = np.abs(shown.rgb[0] * 255 - guidance_of(whole, 1))[guidance.valid[0]]
@@ -136,7 +142,7 @@ def test_a_run_that_nothing_can_be_fitted_to_goes_on_without_and_resumes(
     def nowhere(*args, **kwargs):
         raise DegenerateError("no surface is known")
 
-    monkeypatch.setattr(fit_inputs, "from_depth", nowhere)
+    monkeypatch.setattr(fitting, "from_depth", nowhere)
     out = run(scan, tmp_path / "run")
     assert "no Gaussians are fitted: no surface is known" in capsys.readouterr().err
     assert not (out / FITTED).exists()
@@ -216,11 +222,11 @@ def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeyp
         begun.append(positions)
         return from_points(positions, colors, **kwargs)
 
-    monkeypatch.setattr(fit_inputs, "from_points", watched)
+    monkeypatch.setattr(fitting, "from_points", watched)
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=15)
     plan = planned(scan, "refine.steps=1", "refine.most_gaussians=20000")
     fit_appearance(plan, Console(quiet=True))
-    monkeypatch.setattr(fit_inputs, "FEW_POINTS", 150)
+    monkeypatch.setattr(fitting, "FEW_POINTS", 150)
     fit_appearance(plan, Console(quiet=True))
     few, enough = begun
     assert len(enough) == 150
@@ -235,16 +241,16 @@ def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeyp
 
 @pytest.mark.parametrize(("seconds", "side"), [("none", 96), ("40", 96), ("15", 64), ("5", None)])
 def test_a_sweep_is_as_large_as_there_is_time(tmp_path, monkeypatch, seconds, side):
-    monkeypatch.setattr(fit_inputs, "SWEPT_SIDE", 96)
-    monkeypatch.setattr(fit_inputs, "SMALL_SIDE", 64)
-    monkeypatch.setattr(fit_inputs, "get_num_threads", lambda: 2)
-    monkeypatch.setattr(fit_inputs, "FEW_POINTS", 15)
+    monkeypatch.setattr(fitting, "SWEPT_SIDE", 96)
+    monkeypatch.setattr(fitting, "SMALL_SIDE", 64)
+    monkeypatch.setattr(fitting, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(fitting, "FEW_POINTS", 15)
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=20)
     sweep = Sweep.of(planned(scan, f"refine.seconds={seconds}"))
     if side is None:
         assert sweep is None
         # A start needs points.
-        monkeypatch.setattr(fit_inputs, "FEW_POINTS", 10**6)
+        monkeypatch.setattr(fitting, "FEW_POINTS", 10**6)
         sweep, side = Sweep.of(planned(scan, f"refine.seconds={seconds}")), 64
     assert sweep is not None
     view = sweep.scene["view_1.png"]
@@ -259,8 +265,8 @@ def test_recorded_or_named_depth_is_not_replaced(scan, tmp_path):
     bare = write_colmap_scan(tmp_path / "scan", views=10)
     appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1)
     plan = planned(bare, "depth=plane-sweep")
-    assert Fitted(appearance).applied(plan).source is plan.source
-    assert Fitted(appearance).applied(planned(bare)).source.name == "fitted"
+    assert Fitted(appearance).apply(plan).source is plan.source
+    assert Fitted(appearance).apply(planned(bare)).source.name == "fitted"
 
 
 def test_nothing_is_fitted_to_views_that_tell_no_depth(tmp_path, monkeypatch):
@@ -277,7 +283,7 @@ def test_refined_poses_move_context_and_targets(scan):
     context[:, 0, 3] += 0.01
     targets[:, 1, 3] -= 0.02
     appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1)
-    moved = Fitted(appearance, RunPoses(context, targets)).applied(plan)
+    moved = Fitted(appearance, RunPoses(context, targets)).apply(plan)
     np.testing.assert_array_equal(moved.scene.subset(plan.context).cameras.cam_from_world, context)
     np.testing.assert_array_equal(moved.targets.cameras.cam_from_world, targets)
     others = [name for name in plan.scene.names if name not in plan.context]
@@ -285,7 +291,7 @@ def test_refined_poses_move_context_and_targets(scan):
         moved.scene.subset(others).cameras.cam_from_world,
         plan.scene.subset(others).cameras.cam_from_world,
     )
-    kept = Fitted(appearance).applied(plan)
+    kept = Fitted(appearance).apply(plan)
     np.testing.assert_array_equal(
         kept.scene.subset(plan.context).cameras.cam_from_world,
         plan.scene.subset(plan.context).cameras.cam_from_world,
@@ -297,7 +303,7 @@ def test_photographs_with_fitted_depth_enter_the_memory_smaller(tmp_path, monkey
     monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
     plan = planned(write_colmap_scan(tmp_path / "scan", views=10))
     appearance = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1)
-    changed = Fitted(appearance).applied(plan)
+    changed = Fitted(appearance).apply(plan)
     assert changed.evidence is not None and plan.config.voxel is not None
     camera = changed.evidence["view_0.png"].camera
     assert (int(camera.width[0]), int(camera.height[0])) == (64, 48)
@@ -368,7 +374,7 @@ def test_a_run_with_validation_photographs_keeps_the_blend_that_they_chose(tmp_p
     plan = planned(scan, *settings)
     fitted = fit_appearance(plan, Console(quiet=True))
     assert fitted is not None and list(fitted.predicted) == [plan.context[4]]
-    chosen = fitted.with_best_blend(fitted.applied(plan), memory_of_round_0(out))
+    chosen = fitted.with_best_blend(fitted.apply(plan), memory_of_round_0(out))
     assert chosen.appearance.blend != Blend()
     assert Fitted.load(out / FITTED).appearance.blend == chosen.appearance.blend
 

@@ -19,7 +19,7 @@ from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.cli import main
 from pipelines.console import Console
-from pipelines.reconstruction import run_round
+from pipelines.reconstruction import run as runs
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
@@ -80,7 +80,7 @@ def test_a_run_goes_on_after_a_kill_with_any_budget(
     scan, tiled, in_ram, tmp_path, monkeypatch, budget
 ):
     monkeypatch.setattr(tile_set, "SMALLEST", 1)
-    out, real = tmp_path / "run", run_round.run_round
+    out, real = tmp_path / "run", runs.complete_round
 
     def until_round_2(plan, targets, number, **options):
         if number == 2:
@@ -88,7 +88,7 @@ def test_a_run_goes_on_after_a_kill_with_any_budget(
         return real(plan, targets, number, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(run_round, "run_round", until_round_2)
+        patch.setattr(runs, "complete_round", until_round_2)
         with pytest.raises(Killed):
             run(scan, out, TINY)
     assert (out / "round_001" / "memory.tiles").is_dir()

@@ -18,7 +18,7 @@ from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.console import Console
-from pipelines.reconstruction import poses
+from pipelines.reconstruction import prepare
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
@@ -88,7 +88,7 @@ def test_a_resumed_run_takes_the_poses_that_it_began_with(scan, whole, tmp_path,
     def refined_again(*args, **kwargs):
         raise AssertionError("refined again")
 
-    monkeypatch.setattr(poses, "refined", refined_again)
+    monkeypatch.setattr(prepare, "refined_poses_of", refined_again)
     run(scan, tmp_path / "run", resume=True)
     assert results(tmp_path / "run") == results(whole)
     (tmp_path / "run" / POSES).write_bytes((whole / POSES).read_bytes()[:-300])

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from pipelines.reconstruction.prefetch import prefetch
+from gvtools.prefetch import prefetch
 
 
 def test_items_come_in_order_with_the_next_one_begun():

@@ -23,10 +23,9 @@ from gvtools.settings import with_texts
 from pipelines.cli import main
 from pipelines.console import Console
 from pipelines.reconstruction import fitting
-from pipelines.reconstruction import refine as module
+from pipelines.reconstruction import run as module
 from pipelines.reconstruction.fitting import Fitted
-from pipelines.reconstruction.refine import refine
-from pipelines.reconstruction.run import reconstruct
+from pipelines.reconstruction.run import reconstruct, refine
 from pipelines.reconstruction.settings import RunSettings
 
 pytestmark = pytest.mark.usefixtures("unpainted")

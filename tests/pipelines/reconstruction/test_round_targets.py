@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from memory_scenes import camera, random_memory
 
-from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.cameras import concatenate
 from gvtools.kernels import parallel_kernels_may_overlap
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.reconstruction.plan import Plan
-from pipelines.reconstruction.round_targets import RoundTargets
+from pipelines.reconstruction.rounds import CachedProjection, RoundTargets
 from pipelines.reconstruction.settings import RunSettings
 
 

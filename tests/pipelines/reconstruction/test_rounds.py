@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gvtools.appearance.projection_cache import CachedProjection
 from gvtools.cameras import Cameras
 from gvtools.completers.base import (
     Completer,
@@ -14,9 +13,9 @@ from gvtools.completers.base import (
 from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, concatenate
-from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.settings import with_texts
-from pipelines.reconstruction.rounds import Clock, complete_targets
+from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
 
 
@@ -76,17 +75,18 @@ def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras],
     for target in followed:
         target.guidance()
     memory.project = counted  # type: ignore[method-assign]
-    results, total = complete_targets(
-        followed,
-        1,
-        memory=memory,
-        completer=completer,
-        context=(),
-        config=with_texts(RunSettings(), settings),
-        clock=Clock(),
-        progress=lambda items, _: items,
+    results = list(
+        complete_targets(
+            followed,
+            1,
+            memory=memory,
+            completer=completer,
+            context=(),
+            config=with_texts(RunSettings(), settings),
+            clock=Clock(),
+        )
     )
-    return results, total, calls
+    return results, sum((result.fusion for result in results), FuseReport()), calls
 
 
 def test_targets_of_different_sizes_are_completed_together_by_size(memory):

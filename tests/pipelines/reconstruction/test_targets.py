@@ -8,9 +8,9 @@ from trajectory_writers import write_tum
 from gvtools.errors import OptionError
 from gvtools.runs.layout import target_stems
 from gvtools.scenes.project import open_project
-from pipelines.reconstruction.plan import make_plan, make_schedule
+from pipelines.reconstruction.plan import make_schedule, resolve_targets
+from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.reconstruction.targets import resolve_targets
 
 
 @pytest.fixture(scope="module")

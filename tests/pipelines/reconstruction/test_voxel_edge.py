@@ -16,7 +16,7 @@ from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.scenes.sevenscenes import read_sevenscenes
 from pipelines.cli import main
-from pipelines.reconstruction.voxel_edge import automatic_voxel
+from pipelines.reconstruction.voxel import automatic_voxel
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

@@ -13,9 +13,9 @@ from gvtools.errors import OptionError
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
 from gvtools.settings import with_texts
-from pipelines.reconstruction.plan import make_plan
+from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.reconstruction.voxel_probe import NEIGHBOURS, SCALES, sufficient_scale
+from pipelines.reconstruction.voxel import NEIGHBOURS, SCALES, sufficient_scale
 
 FOOTPRINT = WALL / FOCAL
 AT_FOOTPRINT = RunSettings(voxel=FOOTPRINT)

@@ -1,8 +1,8 @@
-"""Depth of the context: recorded, read from round 0, or computed and kept there."""
+"""Depth of a run's context: recorded, kept by round 0, or computed and kept there."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,10 @@ from gvtools.errors import DegenerateError, ProjectError
 from gvtools.runs.context_depth import (
     UNREADABLE,
     context_depth_files,
-    disagreeing,
     read_context_depth,
     write_context_depth,
 )
 from gvtools.scenes.scene import Frame, Scene, View
-from pipelines.console import Console
 
 
 class DepthCache:
@@ -116,29 +114,6 @@ def depth_report(scene: Scene, name: str, depth_map: DepthMap) -> dict[str, Any]
             "disagrees": disagrees(fit),
         }
     return report
-
-
-def warn_of_depth(reports: Sequence[Mapping[str, Any]], console: Console) -> None:
-    """Say of how many views there is no depth, or depth of another scale.
-
-    Args:
-        reports: see depth_report, with ``failed``.
-        console: where to.
-    """
-    failed = [report for report in reports if report["failed"]]
-    if failed:
-        console.warn(
-            f"{len(failed)} of {len(reports)} views have no depth and give no points, first: "
-            f"{failed[0]['failed']}"
-        )
-    odd = disagreeing(reports)
-    if odd:
-        first = odd[0]["scale"]
-        console.warn(
-            f"the depth of {len(odd)} of {len(reports)} views disagrees with the sparse points, "
-            f"first {odd[0]['view']}: {first['status']}, scale {first['scale']:.3g}; look at its "
-            "unit and at the poses"
-        )
 
 
 def colored(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
