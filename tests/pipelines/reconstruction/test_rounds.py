@@ -113,7 +113,7 @@ def test_a_later_target_sees_what_an_earlier_one_added(memory):
 def test_depth_of_another_unit_is_aligned_with_the_memory(memory, factor):
     completer = Recorder(batches_targets=True, factor=factor)
     ((result,), total, _) = complete(memory, completer, [camera("t0", (24, 32), x=0.3)])
-    scale = result.report["scale"]
+    scale = result.figures["scale"]
     assert scale["status"] == ScaleStatus.MEMORY_DEPTH and scale["accepted"]
     assert scale["scale"] == pytest.approx(1 / factor, rel=1e-5)
     assert scale["overlap_px"] == result.guidance.valid.sum()
@@ -128,8 +128,8 @@ def test_a_scale_that_the_completer_refuses_gives_no_points(memory):
     completer.status = ScaleStatus.CONTRADICTED
     ((result,), total, _) = complete(memory, completer, [camera("t0", (24, 32), x=0.3)])
     assert not total.added and not result.fused.any()
-    assert not result.report["scale"]["accepted"]
-    assert result.report["scale"]["description"].startswith("refused: known depth contradicts")
+    assert not result.figures["scale"]["accepted"]
+    assert result.figures["scale"]["description"].startswith("refused: known depth contradicts")
 
 
 @pytest.mark.parametrize("pixels", ["holes", "all"])
