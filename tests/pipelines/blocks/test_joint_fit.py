@@ -128,7 +128,7 @@ def test_a_resumed_merge_has_the_same_bytes_and_fits_no_second_time(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(run, "_finish", stop)
+        patch.setattr(run, "measure_run", stop)
         with pytest.raises(KeyboardInterrupt):
             merge(runs, out, console=QUIET)
     assert len(RunDirectory(out).reports()) == 2
