@@ -39,8 +39,8 @@ wheel: environment
 	ls -l dist/*.whl
 
 environment:
-	@PYTHON="$(PYTHON)" bash tools/environment.sh
-	@bash tools/system_libraries.sh $(BIN)/python
+	@PYTHON="$(PYTHON)" bash packaging/environment.sh
+	@bash packaging/system_libraries.sh $(BIN)/python
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

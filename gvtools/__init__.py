@@ -91,6 +91,12 @@ def __getattr__(name: str) -> Any:
     if name not in _SOURCES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, attribute = _SOURCES[name].split(":")
+    if not module.startswith("gvtools."):
+        from gvtools.packages import hidden
+
+        problem = hidden()
+        if problem is not None:
+            raise ImportError(problem)
     value = globals()[name] = getattr(import_module(module), attribute)
     return value
 

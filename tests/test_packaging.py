@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import configparser
+import os
 import re
+import subprocess
+import sys
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -31,7 +34,7 @@ def setup() -> configparser.ConfigParser:
 def steps(request):
     """Instructions of a Dockerfile in order, as (instruction, value)."""
     parse = pytest.importorskip("dockerfile_parse", reason="dockerfile-parse is not installed")
-    file = ROOT / "containers" / f"{request.param}.Dockerfile"
+    file = ROOT / "packaging" / f"{request.param}.Dockerfile"
     parser = parse.DockerfileParser(path=str(file), fileobj=None)
     return [(each["instruction"], each["value"]) for each in parser.structure]
 
@@ -92,7 +95,7 @@ def test_torch_comes_from_its_own_index_and_nothing_else_does(steps):
 
 def test_the_conda_recipe_asks_for_what_the_package_does():
     rattler = pytest.importorskip("rattler_build", reason="py-rattler-build is not installed")
-    (variant,) = rattler.Stage0Recipe.from_file(ROOT / "conda" / "recipe.yaml").render()
+    (variant,) = rattler.Stage0Recipe.from_file(ROOT / "packaging" / "recipe.yaml").render()
     recipe = variant.recipe.to_dict()
     assert recipe["package"] == {"name": "gvtools", "version": gvtools.__version__}
     expected = {f"python {setup()['options']['python_requires']}"}
@@ -102,3 +105,27 @@ def test_the_conda_recipe_asks_for_what_the_package_does():
     assert set(recipe["requirements"]["run"]) == expected
     scripts = setup()["options.entry_points"]["console_scripts"].split("\n")[1:]
     assert recipe["build"]["python"]["entry_points"] == scripts
+
+
+@pytest.mark.parametrize(("name", "content"), [("viz", ""), ("pipelines", "raise SystemExit"),
+                                               ("data_specs", None)])  # fmt: skip
+def test_a_foreign_package_first_on_the_path_is_one_line(name, content, tmp_path):
+    if content is None:
+        (tmp_path / f"{name}.py").write_text("")
+    else:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(content)
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    done = subprocess.run(
+        [sys.executable, "-m", "gvtools", "--version"], cwd=tmp_path, text=True,
+        env={**os.environ, "PYTHONPATH": path}, capture_output=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert str(tmp_path / name) in line and "PYTHONPATH" in line
+    script = "import gvtools; gvtools.SpatialMemory; gvtools.reconstruct"
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, text=True,
+        env={**os.environ, "PYTHONPATH": path}, capture_output=True,
+    )  # fmt: skip
+    assert done.returncode == 1 and f"ImportError: package {name!r} is found at" in done.stderr

@@ -1,6 +1,6 @@
 # gvtools on the CPU. From the repository's root:
 #
-#   docker build -f containers/cpu.Dockerfile -t gvtools .
+#   docker build -f packaging/cpu.Dockerfile -t gvtools .
 #   docker run --rm -v "$PWD:/data" --user "$(id -u):$(id -g)" gvtools demo --out /data/demo
 ARG BASE=python:3.12-slim-bookworm
 

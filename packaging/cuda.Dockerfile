@@ -1,7 +1,7 @@
 # gvtools on an NVIDIA card, with the CUDA toolkit that gsplat compiles its kernels with. From the
 # repository's root:
 #
-#   docker build -f containers/cuda.Dockerfile -t gvtools:cuda .
+#   docker build -f packaging/cuda.Dockerfile -t gvtools:cuda .
 #   docker run --rm --gpus all -v "$PWD:/data" --user "$(id -u):$(id -g)" gvtools:cuda \
 #     demo --device cuda --out /data/demo
 ARG BASE=nvidia/cuda:13.0.2-devel-ubuntu24.04
