@@ -1,4 +1,4 @@
-"""The structure of the code: no circles of imports, a size for each room, words that open modules."""
+"""The structure of the code: imports without circles, short ways, sizes of rooms."""
 
 from __future__ import annotations
 
