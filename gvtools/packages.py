@@ -20,7 +20,7 @@ def hidden() -> str | None:
     home = Path(__file__).resolve().parent.parent
     for name in NAMES:
         spec = importlib.util.find_spec(name)
-        places = [] if spec is None else list(spec.submodule_search_locations or [spec.origin])
+        places = [] if spec is None else [*(spec.submodule_search_locations or ()), spec.origin]
         found = [Path(place).resolve() for place in places if place]
         if home / name not in found[:1]:
             where = found[0] if found else "nowhere"
