@@ -1,4 +1,6 @@
-"""From a depth image to points: what is lifted, what is dropped, and how far it is trusted."""
+"""Back-projection of depth images to points, with confidence and pixel binning."""
+
+# mypy: no-check-untyped-defs
 
 from __future__ import annotations
 
@@ -11,16 +13,20 @@ from pydantic import Field
 from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
 from gvtools.kernels import compiled
-from gvtools.memory.pixel_binning import bin_pixels
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.points import PointSet
-from gvtools.memory.store.voxel_levels import VoxelLevels
+from gvtools.memory.store.voxel_levels import VoxelLevels, level_of
 from gvtools.settings import Settings
 
 # Side of a cell of the free-space grid, pixels.
 FREE_CELL = 4
 # Cosine that generated pixels at depth edges and on grazing surfaces are weighted by.
 LEAST_COSINE = 0.05
+# Side of a block of pixels that may become one point.
+SIDE = 2
+# A block may be so many times wider along its surface than across the line of sight: slanted
+# surfaces keep their points, and nothing is averaged across a step. Noise widens blocks, too.
+SLANTED = 4.0
 
 
 class BackProjectionOptions(Settings):
@@ -52,27 +58,37 @@ def back_project(
     pixel_binning: float = 0.0,
     generated: bool = False,
 ) -> PointSet:
-    """Lift the pixels of one view to points.
+    """Lift the pixels of one view, a batch of one, to points.
 
-    Confidence is the source's, times the cosine between ray and surface (oblique surfaces are
-    measured badly); depth edges are dropped. The spacing is the pixel's footprint, z / f.
+    Confidence is the source's (None: 1), times the cosine between ray and surface (oblique surfaces
+    are measured badly); depth edges are dropped. The spacing is the pixel's footprint, z / f.
 
     Args:
         rgb: (H, W, 3) uint8.
-        depth: (H, W) float32 z-depth, scene units; 0, NaN and inf mean none.
-        camera: a batch of one, of the same image size.
-        frame: of the memory that the points are for (``memory.frame``); None for the world's.
-        confidence: (H, W) float32 of the source, > 0; None means 1.
-        mask: (H, W) bool, True = use.
+        depth: (H, W) z-depth, scene units; 0, NaN and inf mean none.
+        camera: of the same image size.
+        frame: ``memory.frame``; None for the world's.
+        confidence: (H, W) float32 > 0.
+        mask: (H, W), True = use.
         options: see BackProjectionOptions.
-        levels: the voxels that the points are for (``memory.levels``); for ``pixel_binning``.
+        levels: ``memory.levels``, for ``pixel_binning``.
         pixel_binning: merge 2 x 2 pixels into one point, their mean, if together they are at most
             this many voxel edges wide (of the voxel that they fall into) and the surface is not
             steep; 0, or no ``levels``, keeps every pixel.
         generated: a completer made the depth: it has no measured pixel that mixes foreground and
             background, so depth edges and grazing surfaces are kept, with a small confidence.
     """
-    height, width = _checked_size(rgb, depth, confidence, mask=mask, camera=camera)
+    check_usable(camera)
+    height, width = int(camera.height[0]), int(camera.width[0])
+    images: dict[str, NDArray[Any] | None] = {
+        "rgb": rgb, "depth": depth, "confidence": confidence, "mask": mask,
+    }  # fmt: skip
+    for name, array in images.items():
+        shape = (height, width, 3) if name == "rgb" else (height, width)
+        if array is not None and array.shape != shape:
+            raise ShapeError(
+                f"{camera.names[0]}: {name} has shape {array.shape}; its camera needs {shape}"
+            )
     options = options or BackProjectionOptions()
     far = np.inf if options.depth_max is None else options.depth_max
     frame = frame or LocalFrame.at()
@@ -89,43 +105,17 @@ def back_project(
         options.edge, far, options.grazing, LEAST_COSINE if generated else 0.0,
         positions, colors, weight, spacing, pixels,
     )  # fmt: skip
+    columns: list[NDArray[Any]] = [array[:count] for array in (positions, colors, weight, spacing)]
     if levels and pixel_binning > 0:
-        count = bin_pixels(
-            pixels[:count], (height, width), pixel_binning * levels.edge,
-            per_spacing=levels.per_spacing, positions=positions[:count], colors=colors[:count],
-            weight=weight[:count], spacing=spacing[:count],
+        count = _bin(
+            pixels[:count], np.full((height + SIDE - 1, width + SIDE - 1), -1, np.int32), width,
+            pixel_binning * levels.edge, levels.per_spacing, *(a.copy() for a in columns), *columns,
         )  # fmt: skip
     return PointSet(
         positions[:count].copy(), colors[:count].copy(), weight[:count].copy(),
         spacing[:count].copy(), camera, frame, _free_depth(z, trust, use, np.float32(far)),
         {"no depth": invalid, "depth edge": edges, "masked": masked},
     )  # fmt: skip
-
-
-def _checked_size(
-    rgb: NDArray[np.uint8],
-    depth: NDArray[np.float32],
-    confidence: NDArray[np.float32] | None,
-    *,
-    mask: NDArray[np.bool_] | None,
-    camera: Cameras,
-) -> tuple[int, int]:
-    """Height and width of the camera, which all images must have."""
-    check_usable(camera)
-    size = (int(camera.height[0]), int(camera.width[0]))
-    images: dict[str, NDArray[Any] | None] = {
-        "rgb": rgb,
-        "depth": depth,
-        "confidence": confidence,
-        "mask": mask,
-    }
-    for name, array in images.items():
-        shape = (*size, 3) if name == "rgb" else size
-        if array is not None and array.shape != shape:
-            raise ShapeError(
-                f"{camera.names[0]}: {name} has shape {array.shape}; its camera needs {shape}"
-            )
-    return size
 
 
 @compiled(inline="always")
@@ -138,11 +128,10 @@ def _lift(rgb, depth, trust, mask, K, local_from_cam, edge, depth_max, grazing, 
           positions, colors, weight, spacing, pixels):  # fmt: skip
     """Back-project all usable pixels; pixel (row, col) has its centre at (col + 0.5, row + 0.5).
 
-    In: depth (H, W); trust and mask (H, W), or empty where unused; K (3, 3); local_from_cam (4, 4).
-    Edges and grazing surfaces are dropped where ``least_cosine`` is 0, else they have this cosine.
-    Out, H*W rows filled from row 0: positions, colors, weight, spacing, pixels (row * W + col).
-    Returns the numbers of points, of pixels without usable depth or confidence, of edges and
-    grazing surfaces, and of masked pixels.
+    ``trust`` and ``mask`` are (H, W), or empty where unused. Edges and grazing surfaces are dropped
+    where ``least_cosine`` is 0, else they have this cosine. Out, filled from row 0: positions,
+    colors, weight, spacing, pixels (row * W + col). Returns the numbers of points, of pixels
+    without usable depth or confidence, of edges and grazing surfaces, and of masked pixels.
     """
     height, width = depth.shape
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -266,3 +255,69 @@ def _free_depth(depth, trust, mask, depth_max):
                         nearest = min(z, depth_max)
             out[i, j] = nearest
     return out
+
+
+@compiled()
+def _bin(
+    pixels, point, width, largest, per_spacing, old_positions, old_colors, old_weight, old_spacing,
+    positions, colors, weight, spacing,
+):  # fmt: skip
+    """Each block of 2 x 2 lifted pixels becomes one point where it is small enough.
+
+    Its width is that of its pixels across the line of sight; along the surface it may be SLANTED
+    times as wide. ``largest`` is the width where voxels are the finest; it doubles with them.
+    Returns how many points are left, at the arrays' beginning, in the order of their blocks.
+    """
+    for i in range(len(pixels)):
+        point[pixels[i] // width, pixels[i] % width] = i
+    n = 0
+    for row in range(0, point.shape[0] - 1, SIDE):
+        for col in range(0, point.shape[1] - 1, SIDE):
+            a, b = point[row, col], point[row, col + 1]
+            c, d = point[row + 1, col], point[row + 1, col + 1]
+            if a >= 0 and b >= 0 and c >= 0 and d >= 0:
+                widest = max(
+                    _apart(old_positions, a, b),
+                    _apart(old_positions, c, d),
+                    _apart(old_positions, a, c),
+                    _apart(old_positions, b, d),
+                )
+                apart = _mean(old_spacing[a], old_spacing[b], old_spacing[c], old_spacing[d])
+                most = largest * (1 << level_of(apart, per_spacing))
+                if SIDE * apart <= most and SIDE * widest <= SLANTED * most:
+                    for k in range(3):
+                        positions[n, k] = _mean(
+                            old_positions[a, k], old_positions[b, k],
+                            old_positions[c, k], old_positions[d, k],
+                        )  # fmt: skip
+                        color = _mean(
+                            old_colors[a, k], old_colors[b, k], old_colors[c, k], old_colors[d, k]
+                        )
+                        colors[n, k] = np.uint8(color + 0.5)
+                    weight[n] = _mean(old_weight[a], old_weight[b], old_weight[c], old_weight[d])
+                    spacing[n] = apart
+                    n += 1
+                    continue
+            for i in (a, b, c, d):
+                if i >= 0:
+                    for k in range(3):
+                        positions[n, k] = old_positions[i, k]
+                        colors[n, k] = old_colors[i, k]
+                    weight[n], spacing[n] = old_weight[i], old_spacing[i]
+                    n += 1
+    return n
+
+
+@compiled()
+def _apart(positions, p, q):
+    """The distance of two points by their rows."""
+    total = 0.0
+    for k in range(3):
+        total += (np.float64(positions[p, k]) - np.float64(positions[q, k])) ** 2
+    return np.sqrt(total)
+
+
+@compiled()
+def _mean(a, b, c, d):
+    """In float64, where the sum of the greatest float32 has room."""
+    return (np.float64(a) + np.float64(b) + np.float64(c) + np.float64(d)) / 4

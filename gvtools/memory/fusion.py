@@ -193,7 +193,7 @@ def fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> Fused:
         positions, colors, confidence, spacing, levels, locals_, touched, starts, order
     )
     round_ = int(views.round[view])
-    source = kernels.Source(
+    source = kernels.FusedView(
         view, round_, bool(views.generated[view]), views.centers[view], views.centers,
         views.scanned,
     )  # fmt: skip

@@ -32,10 +32,7 @@ REPORT_SIZE = 6
 
 
 class Batch(NamedTuple):
-    """N points of one view, grouped by block.
-
-    ``order`` lists the points block by block: those of ``touched[g]`` from ``starts[g]`` on.
-    """
+    """N points of one view; ``order`` lists those of block ``touched[g]`` from ``starts[g]`` on."""
 
     positions: NDArray[np.float32]
     colors: NDArray[np.uint8]
@@ -48,11 +45,8 @@ class Batch(NamedTuple):
     order: NDArray[np.int64]
 
 
-class Source(NamedTuple):
-    """The view that is fused: its row, round, kind and centre.
-
-    Of all views, itself included, ``centers`` and whether they are ``scanned``.
-    """
+class FusedView(NamedTuple):
+    """The view that is fused, and of all views ``centers`` and whether they are ``scanned``."""
 
     row: int
     round: int
@@ -63,10 +57,7 @@ class Source(NamedTuple):
 
 
 class FusionRules(NamedTuple):
-    """MemoryOptions as the kernel takes them; ``inverse_edge`` is of level 0.
-
-    ``top`` is the highest level that the memory holds with the points.
-    """
+    """MemoryOptions for the kernel; ``inverse_edge`` is of level 0, ``top`` the highest level."""
 
     cosine_same: float
     min_detail_ratio: float
@@ -84,10 +75,7 @@ class SegmentTable(NamedTuple):
 
 
 class FusionOutput(NamedTuple):
-    """New segments, agreements with observations of earlier rounds, and the report's counts.
-
-    ``group`` is the row of ``Batch.touched`` that a segment's block has.
-    """
+    """New segments (``group``: rows of ``touched``), agreements with earlier rounds, and counts."""
 
     group: NDArray[np.int32]
     start: NDArray[np.int64]
@@ -102,8 +90,7 @@ class FusionOutput(NamedTuple):
 def _most_similar(head, p, spacing, source, columns):
     """The chain's observation seen from the most similar direction: (record, cosine, length).
 
-    Generated content never stands in for observed content: observed points pass it by. A scan's
-    and a camera's observations stand apart, too.
+    Observed points pass generated content by. A scan's and a camera's observations stand apart.
     """
     center, generated = source.center, source.generated
     scanned = source.scanned[source.row]
@@ -147,18 +134,9 @@ def fuse_blocks(batch, index, columns, count, source, rules, old, out):
     """Fuse one view's points, grouped by block; returns (observations, segments, agreements).
 
     New observations are appended block by block, so each (block, view) is one contiguous segment
-    with a tight bounding box (``out.box``: min xyz, max xyz, largest spacing). Observations of
-    earlier rounds are never changed: what agrees with one is logged as (row, confidence).
-
-    Args:
-        batch: the points.
-        index: the voxel index.
-        columns: observations, ``count`` of them so far.
-        count: see columns.
-        source: the view.
-        rules: see FusionRules.
-        old: the segments so far; ``out.report[FIRST_SEGMENT]`` is the first that has changed.
-        out: is written.
+    with a tight bounding box (``out.box``). Observations of earlier rounds are never changed: what
+    agrees with one is logged as (row, confidence). ``columns`` hold ``count`` observations so far;
+    of the segments of before (``old``), ``out.report[FIRST_SEGMENT]`` is the first that changes.
     """
     starts, order, locals_ = batch.starts, batch.order, batch.locals
     positions, colors, confidence = batch.positions, batch.colors, batch.confidence
@@ -361,9 +339,7 @@ def _observed_there(head, p, level, rules, index, columns):
 def _merge(m, p, sums, weight, own, width, view, inverse_edge, columns, weight_cap):
     """Confidence-weighted running mean; the integer view goes to the more confident side.
 
-    ``p`` (3,) and ``sums`` (6,) / ``weight`` are the view's mean position and colour in the voxel;
-    its confidence is ``own`` and its spacing ``width``. What is merged into is of the same round,
-    so no later round has added to its confidence.
+    What is merged into is of the same round: no later round has added to its confidence.
     """
     old = np.float64(columns.confidence[m])
     share = own / (old + own)
