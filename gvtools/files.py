@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -179,6 +180,12 @@ def json_list_written(path: Path, head: Mapping[str, Any], name: str) -> Iterato
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """One JSON object; NaN and infinity become null."""
     write_text(path, json.dumps(_finite(data), indent=1) + "\n")
+
+
+def digest(content: object) -> str:
+    """16 hex digits of SHA-256 over a text, or over plain data as JSON."""
+    text = content if isinstance(content, str) else json.dumps(content, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _finite(value: Any) -> Any:

@@ -53,6 +53,16 @@ class Console:
         yield from track(items, description=label, transient=True)
 
 
+class Silent(Console):
+    """Prints nothing, warnings included."""
+
+    def __init__(self) -> None:
+        super().__init__(quiet=True)
+
+    def warn(self, text: str) -> None:
+        """Nothing."""
+
+
 def _cell(value: object) -> str:
     if value is None:
         return "-"

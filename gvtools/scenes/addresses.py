@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from gvtools.errors import OptionError
-from gvtools.scenes.collection import SceneCollection, digest_of, of_scenes
+from gvtools.files import digest
+from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.data_sets.address import SPEC
 from gvtools.scenes.scene import Scene
 
@@ -42,7 +43,7 @@ def open_collection(address: str, root: Path | None = None) -> SceneCollection:
         return replace(of_scenes([opened], title=f"{spec.name} {scene}".strip()), data_set=key)
     names = scenes_of(name, root)
     read = partial(_read, key, root=Path(root))
-    return SceneCollection(spec.name, names, read, None, digest_of(list(names)), key)
+    return SceneCollection(spec.name, names, read, None, digest(list(names)), key)
 
 
 def _read(data_set: str, scene: str, *, root: Path) -> Scene:

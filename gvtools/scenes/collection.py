@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from gvtools.errors import ProjectError
+from gvtools.files import digest
 from gvtools.scenes.scene import Scene
 
 
@@ -52,7 +51,7 @@ class SceneCollection:
         counts = None if self.counts is None else tuple(self.counts[row] for row in rows)
         chosen = tuple(self.names[row] for row in rows)
         return replace(
-            self, names=chosen, counts=counts, digest=digest_of([self.digest, list(chosen)])
+            self, names=chosen, counts=counts, digest=digest([self.digest, list(chosen)])
         )
 
     @property
@@ -80,11 +79,5 @@ def of_scenes(scenes: Sequence[Scene], *, title: str = "") -> SceneCollection:
         raise ProjectError("two scenes have the same folder; give each of them once")
     title = title or next(iter(opened), "scenes")
     counts = tuple(sum(view.has_depth for view in scene) for scene in scenes)
-    digest = digest_of([[name, list(scene.names)] for name, scene in opened.items()])
-    return SceneCollection(title, tuple(opened), _Opened(opened), counts, digest)
-
-
-def digest_of(content: object) -> str:
-    """16 hex digits of SHA-256 over plain data."""
-    text = json.dumps(content, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    content = digest([[name, list(scene.names)] for name, scene in opened.items()])
+    return SceneCollection(title, tuple(opened), _Opened(opened), counts, content)

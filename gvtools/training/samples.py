@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.scenes.collection import digest_of
+from gvtools.files import digest
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.context_choice import ContextChoice
 from gvtools.training.dataset import ProceduralViews
@@ -59,7 +59,7 @@ class TrainingSamples:
         return {
             source.name: {
                 "share": float(share),
-                "digest": digest_of(source.samples.describe()),
+                "digest": digest(source.samples.describe()),
             }
             for source, share in zip(self._train.sources, self._train.shares, strict=True)
         }

@@ -11,8 +11,8 @@ from gvtools.errors import OptionError, ProjectError
 
 if TYPE_CHECKING:
     from pipelines.console import Console
-    from pipelines.fleet.engines import Engine
     from pipelines.fleet.spec import Task
+    from pipelines.scoring.sweep import Pool
 
 SUMMARY = "run commands over many scenes: on Ray, under Slurm, or on this machine"
 EXAMPLES = (
@@ -47,15 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run what is not finished, and print one table."""
     from gvtools.runs.folder_lock import folder_lock
-    from pipelines.fleet.drive import run_fleet
-    from pipelines.fleet.results import report
-    from pipelines.fleet.slurm import write_slurm
-    from pipelines.fleet.spec import is_url, plan, read_list
+    from pipelines.fleet.run import jobs_of, report, run_fleet, write_slurm
+    from pipelines.fleet.spec import is_url, read_list, tasks_of
 
     if args.address is not None and args.engine != "ray":
         raise OptionError(f"--address: belongs to --engine ray, not {args.engine}")
     root = args.out.rstrip("/") if is_url(args.out) else str(Path(args.out).absolute())
-    tasks = plan(read_list(args.scenes), root, folder=args.scenes.absolute().parent)
+    tasks = tasks_of(read_list(args.scenes), root, folder=args.scenes.absolute().parent)
     if args.engine == "slurm" and not args.collect:
         if is_url(root):
             raise OptionError(f"--out {root}: expected a shared folder, which job scripts lie in")
@@ -66,8 +64,12 @@ def run(args: argparse.Namespace, console: Console) -> None:
     # A second driver would begin the same commands; of a URL, the user has to take care.
     alone = nullcontext() if args.collect or is_url(root) else folder_lock(Path(root))
     with alone:
-        if not args.collect:
-            run_fleet(tasks, lambda left: _engine(left, args, console), console=console)
+        jobs = [] if args.collect else jobs_of(tasks)
+        left = [job.work for job in jobs if job.record is None]
+        if left:
+            run_fleet(jobs, _pool(left, args, console), console=console)
+        elif jobs:
+            console.line(f"all {len(tasks)} tasks were finished before")
         failed = report(tasks, root, console)
     if failed:
         first = failed[0]
@@ -77,9 +79,9 @@ def run(args: argparse.Namespace, console: Console) -> None:
         )
 
 
-def _engine(left: list[Task], args: argparse.Namespace, console: Console) -> Engine:
-    from pipelines.fleet.engines import Processes, Ray
+def _pool(left: list[Task], args: argparse.Namespace, console: Console) -> Pool:
+    from pipelines.fleet.run import Ray, this_machine
 
     if args.engine == "processes":
-        return Processes(left)
+        return this_machine(left)
     return Ray(left, address=args.address or "local", console=console)

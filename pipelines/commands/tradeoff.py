@@ -68,10 +68,13 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from pipelines.commands.scene_arguments import reading_of
     from pipelines.reconstruction.plan import run_identity
     from pipelines.reconstruction.settings import RunSettings
-    from pipelines.tradeoff.planned import planned_trials
-    from pipelines.tradeoff.results import write_results
-    from pipelines.tradeoff.sweep import sweep
-    from pipelines.tradeoff.trial import Trials, applied
+    from pipelines.scoring.tradeoff import (
+        Trials,
+        changed,
+        planned_trials,
+        run_trials,
+        write_results,
+    )
 
     if args.out.exists() and not args.out.is_dir():
         raise OptionError(f"--out {args.out}: is a file; give a folder")
@@ -95,7 +98,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         folder = args.out / "trials"
         folder.mkdir(exist_ok=True)
         runs = Trials(scene, config, folder=folder, identity=identity)
-        trials = sweep(planned, runs, limit=limit, console=console)
+        trials = run_trials(planned, runs, limit=limit, console=console)
         chosen = write_results(
             trials,
             args.out,
@@ -108,8 +111,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
             file.unlink(missing_ok=True)
             return
         # Everything but which views are given and which are completed.
-        changed = changes(RunSettings(), applied(config, chosen.settings))
-        write_json(file, {k: changed[k] for k in changed if k not in ("context", "targets")})
+        profile = changes(RunSettings(), changed(config, chosen.settings))
+        write_json(file, {k: profile[k] for k in profile if k not in ("context", "targets")})
         console.line(f"gvtools reconstruct ... --config {file}; more results in {args.out}")
 
 

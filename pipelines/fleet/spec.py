@@ -1,16 +1,4 @@
-"""The list of scenes and stages that ``gvtools fleet`` reads, a YAML file.
-
-stages:
-  reconstruct:
-    command: reconstruct {project} --out {out} --refine 0
-    cpus: 2
-    memory_gb: 4
-  evaluate:
-    command: evaluate {reconstruct} --out {out}
-scenes:
-  - scans/*
-  - {project: "s3://bucket/kitchen", labels: {rack: a}}
-"""
+"""The list of scenes and stages that ``gvtools fleet`` reads (YAML), and its tasks."""
 
 from __future__ import annotations
 
@@ -35,7 +23,7 @@ WORDS = ("project", "name", "out")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
-class Stage(Settings):
+class StageCommand(Settings):
     """A command that is run for every scene."""
 
     section = "stages"
@@ -72,7 +60,7 @@ class FleetSpec(Settings):
 
     section = "fleet"
 
-    stages: dict[str, Stage] = Field(min_length=1)
+    stages: dict[str, StageCommand] = Field(min_length=1)
     """In the order in which they run."""
     scenes: tuple[SceneEntry, ...] = Field(min_length=1)
     """What they run on."""
@@ -80,33 +68,33 @@ class FleetSpec(Settings):
 
 @dataclass(frozen=True)
 class Task:
-    """One stage of one scene, as any machine can run it.
-
-    Attributes:
-        scene: the scene's name.
-        stage: the stage's name.
-        project: path or URL of the input.
-        command: arguments of ``gvtools``, with words in braces.
-        before: names of earlier stages, which have to be done.
-        root: path or URL of the fleet's results.
-        cpus: cores, and threads.
-        gpus: GPUs, or a fraction of one.
-        memory_gb: RAM, GB.
-        retries: how often it may be restarted.
-        labels: of preferred nodes.
-    """
+    """One stage of one scene, as any machine can run it."""
 
     scene: str
     stage: str
-    project: str
-    command: tuple[str, ...]
-    before: tuple[str, ...]
-    root: str
-    cpus: int
+    project: str  # path or URL of the input
+    command: tuple[str, ...]  # arguments of gvtools, with words in braces
+    before: tuple[str, ...]  # earlier stages, which have to be done
+    root: str  # path or URL of the fleet's results
+    cpus: int  # also the number of threads
     gpus: float
     memory_gb: float
     retries: int
-    labels: dict[str, str]
+    labels: dict[str, str]  # of preferred nodes
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> Task:
+        """A task from its fields as JSON has them."""
+        return Task(**data | {"command": tuple(data["command"]), "before": tuple(data["before"])})
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What decides its result."""
+        return {"project": self.project, "command": [*self.command]}
+
+    def record(self, stage: str | None = None) -> str:
+        """Where its record lies, or that of another stage of its scene."""
+        return f"{self.root}/{self.scene}/{stage or self.stage}.json"
 
 
 def is_url(text: str) -> bool:
@@ -115,7 +103,7 @@ def is_url(text: str) -> bool:
 
 
 def read_list(path: Path) -> FleetSpec:
-    """The list in a YAML file."""
+    """The list of a file."""
     try:
         data: Any = parse_yaml(read_text(path), most=LONGEST)
     except OSError as error:
@@ -129,14 +117,8 @@ def read_list(path: Path) -> FleetSpec:
     return FleetSpec(**{**data, "scenes": entries})
 
 
-def plan(spec: FleetSpec, root: str, *, folder: Path) -> list[Task]:
-    """Every stage of every scene, stage by stage.
-
-    Args:
-        spec: the list.
-        root: path or URL of the results.
-        folder: what relative paths are relative to.
-    """
+def tasks_of(spec: FleetSpec, root: str, *, folder: Path) -> list[Task]:
+    """Every stage of every scene, stage by stage; relative paths count from ``folder``."""
     commands = {name: _command(name, spec) for name in spec.stages}
     scenes: dict[str, SceneEntry] = {}
     for entry in spec.scenes:
@@ -162,7 +144,7 @@ def plan(spec: FleetSpec, root: str, *, folder: Path) -> list[Task]:
             before=tuple(names[: names.index(stage)]),
             root=root,
             labels=entry.labels,
-            **{key: getattr(spec.stages[stage], key) for key in Stage.model_fields
+            **{key: getattr(spec.stages[stage], key) for key in StageCommand.model_fields
                if key != "command"},
         )
         for stage in names

@@ -1,6 +1,7 @@
-"""One stage of one scene on the machine that it fell to: an ordinary command, its log kept.
+"""One stage of one scene on the machine that it fell to: an ordinary command, with its log.
 
 The stage's record, FOLDER/SCENE/STAGE.json, is written last; a stage is finished when it says so.
+Folders lie on shared storage, by path or by fsspec URL.
 """
 
 from __future__ import annotations
@@ -8,21 +9,21 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from gvtools.errors import GvError
-from gvtools.files import remove, write_text
+from gvtools.errors import GvError, OptionError, ProjectError
+from gvtools.files import digest, remove, write_json
 from pipelines.fleet.spec import Task, is_url
-from pipelines.fleet.storage import fetched, read_record, scratch, stored, write_record
+from pipelines.scoring.sweep import DONE, FAILED, Record, difference
 
-DONE, FAILED = "done", "failed"
 # Commands that go on where an earlier attempt stopped, when told so.
 RESUMABLE = ("reconstruct", "train", "merge")
 # Commands whose folder appears at once, and that refuse one which is there.
@@ -31,36 +32,22 @@ THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_
 _BUSY = "another process is at work there"
 
 
-def record_of(task: Task, stage: str | None = None) -> str:
-    """Where the record of a task lies, or that of another stage of its scene."""
-    return f"{task.root}/{task.scene}/{stage or task.stage}.json"
-
-
-def finished(task: Task) -> dict[str, Any] | None:
+def finished_record(task: Task) -> Record | None:
     """The record of a stage that was finished by the same command on the same input."""
-    record = read_record(record_of(task))
-    same = record is not None and record.get("command") == [*task.command]
-    same = same and record is not None and record.get("project") == task.project
-    return record if same and record and record.get("status") == DONE else None
+    record = read_record(task.record())
+    if record is None or record.get("status") != DONE or difference(record, task.identity):
+        return None
+    return record
 
 
-def run_task(data: dict[str, Any], attempt: int = 1) -> dict[str, Any]:
-    """Run a task and write its record.
-
-    Args:
-        data: the fields of the task.
-        attempt: 1 at first.
-
-    Returns:
-        The record: status, reason, whether trying again may help, seconds, node.
-    """
-    task = Task(**{**data, "command": tuple(data["command"]), "before": tuple(data["before"])})
+def run_task(task: Task, attempt: int = 1) -> Record:
+    """Run a task, and write and return its record."""
     began = monotonic()
     try:
         status, reason, again = _attempt(task)
     except GvError as error:
         status, reason, again = FAILED, str(error), isinstance(error.__cause__, OSError)
-    record = {
+    record: Record = {
         "scene": task.scene,
         "stage": task.stage,
         "status": status,
@@ -69,24 +56,25 @@ def run_task(data: dict[str, Any], attempt: int = 1) -> dict[str, Any]:
         "attempts": attempt,
         "seconds": monotonic() - began,
         "node": platform.node(),
-        "project": task.project,
-        "command": [*task.command],
+        **task.identity,
     }
     if status == DONE:
         record["figures"] = _figures(_folder(task, task.stage))
-    write_record(record_of(task), record)
+    write_record(task.record(), record)
     return record
 
 
 def _attempt(task: Task) -> tuple[str, str, bool]:
-    missing = [stage for stage in task.before if not _is_done(task, stage)]
-    if missing:
-        return FAILED, f"stage {missing[0]} is not done", False
-    folders = {stage: str(_input(task, stage)) for stage in task.before}
-    words = {"project": str(fetched(task.project)), "name": task.scene,
-             "out": str(_folder(task, task.stage)), **folders}  # fmt: skip
-    arguments = [_filled(word, words) for word in task.command]
-    out = Path(words["out"])
+    """Status, reason, and whether trying again may help."""
+    for stage in task.before:
+        if (read_record(task.record(stage)) or {}).get("status") != DONE:
+            return FAILED, f"stage {stage} is not done", False
+    out = _folder(task, task.stage)
+    words = {stage: str(_input(task, stage)) for stage in task.before}
+    words |= {"project": str(fetch(task.project)), "name": task.scene, "out": str(out)}
+    arguments = [*task.command]
+    for name, value in words.items():
+        arguments = [word.replace(f"{{{name}}}", value) for word in arguments]
     out.parent.mkdir(parents=True, exist_ok=True)
     log = out.with_name(f"{task.stage}.log")
     if task.command[0] in RESUMABLE and out.exists():
@@ -101,14 +89,14 @@ def _attempt(task: Task) -> tuple[str, str, bool]:
             stdout=file,
             stderr=subprocess.STDOUT,
             env={**os.environ, **dict.fromkeys(THREADS, str(task.cpus))},
-            preexec_fn=_dying_with(os.getpid()),
+            preexec_fn=_ending_with(os.getpid()),
         ).returncode
-    last = (log.read_text(encoding="utf-8", errors="replace").splitlines() or [""])[-1]
+    text = log.read_text(encoding="utf-8", errors="replace")
+    last = (text.splitlines() or [""])[-1]
     if is_url(task.root):
-        write_record(f"{task.root}/{task.scene}/{task.stage}.log.json", {"log": log.read_text(
-            encoding="utf-8", errors="replace")})  # fmt: skip
+        write_record(f"{task.root}/{task.scene}/{task.stage}.log.json", {"log": text})
     if code == 0:
-        stored(out, f"{task.root}/{task.scene}/{task.stage}")
+        upload(out, f"{task.root}/{task.scene}/{task.stage}")
         return DONE, "", False
     if code < 0:
         return FAILED, f"ended by {signal.Signals(-code).name}", True
@@ -116,8 +104,8 @@ def _attempt(task: Task) -> tuple[str, str, bool]:
     return FAILED, last or f"exit status {code}", code != 2 or _BUSY in last
 
 
-def _dying_with(worker: int) -> Callable[[], None] | None:
-    """What a command's process does first: it must not outlive its worker.
+def _ending_with(worker: int) -> Callable[[], None] | None:
+    """What a command's process does first, so that it ends with its worker.
 
     The next attempt needs the folder.
     """
@@ -137,54 +125,135 @@ def _dying_with(worker: int) -> Callable[[], None] | None:
     return die_with_worker
 
 
-def _filled(word: str, words: dict[str, str]) -> str:
-    for name, value in words.items():
-        word = word.replace(f"{{{name}}}", value)
-    return word
-
-
 def _folder(task: Task, stage: str) -> Path:
-    base = scratch(f"{task.root}/{task.scene}") if is_url(task.root) else None
-    return (base or Path(task.root) / task.scene) / stage
+    place = f"{task.root}/{task.scene}"
+    return (cache_folder(place) if is_url(task.root) else Path(place)) / stage
 
 
 def _input(task: Task, stage: str) -> Path:
-    return fetched(f"{task.root}/{task.scene}/{stage}") if is_url(task.root) else _folder(
-        task, stage)  # fmt: skip
-
-
-def _is_done(task: Task, stage: str) -> bool:
-    record = read_record(record_of(task, stage))
-    return record is not None and record.get("status") == DONE
+    return fetch(f"{task.root}/{task.scene}/{stage}")
 
 
 def _figures(folder: Path) -> dict[str, float]:
     """Numbers that a command left as JSON: metrics.json, evaluation.json, results.json."""
-    found: dict[str, float] = {}
+    figures: dict[str, float] = {}
     for name in ("metrics.json", "evaluation.json", "results.json"):
         for key, value in (read_record(str(folder / name)) or {}).items():
             if isinstance(value, (int, float)) and not isinstance(value, bool):
-                found.setdefault(key, value)
-    return found
+                figures.setdefault(key, value)
+    return figures
 
 
-def write_tasks(path: Path, tasks: list[Task]) -> None:
-    """The list of tasks as ``python -m pipelines.fleet.task`` reads it."""
-    write_text(path, json.dumps([asdict(task) for task in tasks], indent=1) + "\n")
+def cache_folder(url: str) -> Path:
+    """Where the local copy of a URL lies, under GVTOOLS_FLEET_CACHE; it may not exist yet."""
+    default = Path(tempfile.gettempdir()) / "gvtools-fleet"
+    base = Path(os.environ.get("GVTOOLS_FLEET_CACHE", default))
+    return base / digest(url) / url.rstrip("/").rpartition("/")[2]
+
+
+def fetch(place: str) -> Path:
+    """A local path of a file or folder; a URL is downloaded once and not looked at again."""
+    if not is_url(place):
+        return Path(place)
+    local = cache_folder(place)
+    if not local.exists():
+        files, remote = _open(place)
+        part: Path | None = None
+        try:
+            local.parent.mkdir(parents=True, exist_ok=True)
+            # A folder of its own: several tasks on this machine may download the same URL.
+            part = Path(tempfile.mkdtemp(prefix=".part-", dir=local.parent))
+            _download(files, remote, part / local.name)
+            os.rename(part / local.name, local)
+        except (OSError, ValueError) as error:
+            if not local.exists():
+                raise ProjectError(f"{place}: cannot be fetched ({error})") from error
+        finally:
+            if part is not None:
+                shutil.rmtree(part, ignore_errors=True)
+    return local
+
+
+def _download(files: Any, remote: str, target: Path) -> None:
+    if files.isfile(remote):
+        files.get_file(remote, str(target))
+        return
+    names = [name for name in files.find(remote) if not name.endswith("/")]
+    if not names:
+        raise FileNotFoundError(f"nothing at {remote}")
+    for name in names:
+        relative = name[len(remote) :].lstrip("/")
+        if not name.startswith(remote) or ".." in Path(relative).parts or not relative:
+            raise ProjectError(f"{name}: lies outside {remote}")
+        (target / relative).parent.mkdir(parents=True, exist_ok=True)
+        files.get_file(name, str(target / relative))
+
+
+def upload(folder: Path, place: str) -> None:
+    """Copy a finished folder to its URL; does nothing if ``place`` is a path."""
+    if not is_url(place):
+        return
+    files, remote = _open(place)
+    try:
+        if files.exists(remote):
+            # Left by an upload that was interrupted.
+            files.rm(remote, recursive=True)
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                name = path.relative_to(folder).as_posix()
+                files.pipe_file(f"{remote}/{name}", path.read_bytes())
+    except OSError as error:
+        raise ProjectError(f"{place}: cannot be written ({error})") from error
+
+
+def read_record(place: str) -> Record | None:
+    """A JSON object; None if the file is absent or damaged."""
+    try:
+        if is_url(place):
+            files, remote = _open(place)
+            files.invalidate_cache()
+            text = files.cat_file(remote)
+        else:
+            text = Path(place).read_bytes()
+        record = json.loads(text)
+    except (FileNotFoundError, ValueError):
+        return None
+    except OSError as error:
+        raise ProjectError(f"{place}: cannot be read ({error})") from error
+    return record if isinstance(record, dict) else None
+
+
+def write_record(place: str, record: Record) -> None:
+    """Write a JSON object; a file on disk appears only when complete."""
+    if not is_url(place):
+        write_json(Path(place), record)
+        return
+    files, remote = _open(place)
+    try:
+        files.pipe_file(remote, json.dumps(record, indent=1).encode())
+    except OSError as error:
+        raise ProjectError(f"{place}: cannot be written ({error})") from error
+
+
+def _open(place: str) -> tuple[Any, str]:
+    try:
+        import fsspec
+
+        files, remote = fsspec.url_to_fs(place)
+    except (ImportError, ValueError) as error:
+        raise OptionError(
+            f"{place}: {error}; pip install 'gvtools[cluster]' reads s3:// URLs"
+        ) from None
+    return files, str(remote).rstrip("/")
 
 
 def main(argv: list[str]) -> int:
-    """Run the task of a list that a Slurm array gives by number, with its retries.
-
-    Args:
-        argv: path of the list, number.
-    """
-    data = json.loads(Path(argv[0]).read_text(encoding="utf-8"))[int(argv[1])]
-    task = Task(**{**data, "command": tuple(data["command"]), "before": tuple(data["before"])})
-    if finished(task):
+    """Run the task of a list (path, number) that a Slurm array names, with its retries."""
+    task = Task.from_json(json.loads(Path(argv[0]).read_text(encoding="utf-8"))[int(argv[1])])
+    if finished_record(task):
         return 0
     for attempt in range(1, task.retries + 2):
-        record = run_task(data, attempt)
+        record = run_task(task, attempt)
         print(f"{task.scene} {task.stage}: {record['status']} {record['reason']}".rstrip())
         if record["status"] == DONE or not record["again"]:
             break

@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -20,13 +19,17 @@ from gvtools.errors import OptionError
 from gvtools.runs.folder_lock import folder_lock
 from pipelines.cli import main
 from pipelines.console import Console
-from pipelines.fleet.drive import run_fleet
-from pipelines.fleet.engines import Processes, lost
-from pipelines.fleet.results import collect, result_table
-from pipelines.fleet.slurm import write_slurm
-from pipelines.fleet.spec import FleetSpec, plan, read_list
-from pipelines.fleet.storage import fetched, read_record, stored
-from pipelines.fleet.task import _dying_with, record_of, run_task
+from pipelines.fleet.run import (
+    collect,
+    jobs_of,
+    result_table,
+    run_fleet,
+    this_machine,
+    write_slurm,
+)
+from pipelines.fleet.spec import FleetSpec, Task, read_list, tasks_of
+from pipelines.fleet.task import _ending_with, fetch, read_record, run_task, upload
+from pipelines.scoring.sweep import lost_worker
 
 ROOT = Path(__file__).resolve().parents[3]
 # Quick, since it imports neither torch nor numba, and needs no scene.
@@ -49,12 +52,14 @@ def scenes(tmp_path):
     return path
 
 
-def tasks_of(path: Path, out: Path) -> list:
-    return plan(read_list(path), str(out), folder=path.parent)
+def planned(path: Path, out: Path) -> list[Task]:
+    return tasks_of(read_list(path), str(out), folder=path.parent)
 
 
 class Script:
-    """An engine that answers from a script: (scene, stage) -> the attempts' records."""
+    """A pool that answers from a script: (scene, stage) -> the attempts' records."""
+
+    slots = float("inf")
 
     def __init__(self, answers: dict) -> None:
         self.answers = answers
@@ -75,7 +80,7 @@ class Script:
 
 
 def test_a_pattern_gives_the_folders_that_fit_stage_by_stage(scenes, tmp_path):
-    tasks = tasks_of(scenes, tmp_path / "out")
+    tasks = planned(scenes, tmp_path / "out")
     assert [(t.stage, t.scene) for t in tasks] == [
         (stage, scene) for stage in ("first", "second") for scene in "abc"
     ]
@@ -99,24 +104,24 @@ def test_a_pattern_gives_the_folders_that_fit_stage_by_stage(scenes, tmp_path):
 def test_a_wrong_list_is_refused_in_one_line(scenes, tmp_path, change, message):
     scenes.write_text(scenes.read_text().replace(*change))
     with pytest.raises(OptionError) as error:
-        tasks_of(scenes, tmp_path / "out")
+        planned(scenes, tmp_path / "out")
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_lost_workers_are_replaced_and_a_failure_skips_what_follows(scenes, tmp_path):
-    tasks = tasks_of(scenes, tmp_path / "out")
+    tasks = planned(scenes, tmp_path / "out")
     wrong = {"status": "failed", "reason": "no cameras", "again": False}
-    engine = Script({("a", "first"): [lost("node lost")], ("b", "first"): [wrong],
-                     ("c", "second"): [lost("killed")] * 9})  # fmt: skip
-    run_fleet(tasks, lambda _: engine, console=Console(quiet=True))
-    assert ("a", "first", 2) in engine.begun and ("a", "second", 1) in engine.begun
-    assert ("b", "first", 2) not in engine.begun and ("b", "second", 1) not in engine.begun
-    assert [n for scene, stage, n in engine.begun if (scene, stage) == ("c", "second")] == [1, 2, 3]
+    pool = Script({("a", "first"): [lost_worker("node lost")], ("b", "first"): [wrong],
+                     ("c", "second"): [lost_worker("killed")] * 9})  # fmt: skip
+    run_fleet(jobs_of(tasks), pool, console=Console(quiet=True))
+    assert ("a", "first", 2) in pool.begun and ("a", "second", 1) in pool.begun
+    assert ("b", "first", 2) not in pool.begun and ("b", "second", 1) not in pool.begun
+    assert [n for scene, stage, n in pool.begun if (scene, stage) == ("c", "second")] == [1, 2, 3]
     records = {(r["scene"], r["stage"]): r for r in collect(tasks)}
     assert records["b", "first"]["reason"] == "no cameras"
     assert records["b", "second"]["reason"] == "stage first failed"
     assert records["c", "second"]["attempts"] == 3
-    # The script's engine leaves no records of what it says is done: they are missing, and said so.
+    # The script leaves no records of what it says is done: they are missing, and said so.
     assert records["a", "second"]["status"] == "not run"
     assert len(result_table(collect(tasks)).rows) == 6
 
@@ -143,16 +148,16 @@ def test_a_list_runs_once_and_its_failures_are_told(scenes, tmp_path, capsys):
 def test_a_command_that_was_killed_may_be_tried_again_and_a_wrong_input_not(
     scenes, tmp_path, monkeypatch
 ):
-    task = tasks_of(scenes, tmp_path / "out")[0]
+    task = planned(scenes, tmp_path / "out")[0]
 
     class Ended:
         returncode = -signal.SIGKILL
 
     monkeypatch.setattr("pipelines.fleet.task.subprocess.run", lambda *_, **__: Ended)
-    record = run_task(asdict(task))
+    record = run_task(task)
     assert (record["reason"], record["again"]) == ("ended by SIGKILL", True)
     Ended.returncode = 2
-    assert run_task(asdict(task))["again"] is False
+    assert run_task(task)["again"] is False
 
 
 def test_a_capture_that_ended_before_its_record_is_made_again(tmp_path, monkeypatch):
@@ -161,7 +166,7 @@ def test_a_capture_that_ended_before_its_record_is_made_again(tmp_path, monkeypa
     spec = FleetSpec(
         stages={"take": {"command": "capture {project} --out {out}"}}, scenes=[{"project": "a"}]
     )
-    (task,) = plan(spec, str(tmp_path / "o"), folder=tmp_path)
+    (task,) = tasks_of(spec, str(tmp_path / "o"), folder=tmp_path)
     out = tmp_path / "o" / "a" / "take"
     seen = []
 
@@ -171,15 +176,15 @@ def test_a_capture_that_ended_before_its_record_is_made_again(tmp_path, monkeypa
         return subprocess.CompletedProcess([], 0)
 
     monkeypatch.setattr("pipelines.fleet.task.subprocess.run", ran)
-    assert run_task(asdict(task))["status"] == "done"
-    Path(record_of(task)).unlink()
-    assert run_task(asdict(task))["status"] == "done"
+    assert run_task(task)["status"] == "done"
+    Path(task.record()).unlink()
+    assert run_task(task)["status"] == "done"
     assert seen == [False, False]
     # What no attempt of the fleet has made is never removed.
-    Path(record_of(task)).unlink()
+    Path(task.record()).unlink()
     (tmp_path / "o" / "a" / "take.log").unlink()
     with pytest.raises(FileExistsError):
-        run_task(asdict(task))
+        run_task(task)
     assert seen[2:] == [True]
 
 
@@ -188,7 +193,7 @@ def test_a_merge_goes_on_where_an_attempt_stopped(tmp_path, monkeypatch):
     spec = FleetSpec(
         stages={"join": {"command": "merge {project} --out {out}"}}, scenes=[{"project": "a"}]
     )
-    (task,) = plan(spec, str(tmp_path / "o"), folder=tmp_path)
+    (task,) = tasks_of(spec, str(tmp_path / "o"), folder=tmp_path)
     words: list[list[str]] = []
 
     def failing(command, **_):
@@ -196,15 +201,15 @@ def test_a_merge_goes_on_where_an_attempt_stopped(tmp_path, monkeypatch):
         return subprocess.CompletedProcess([], 1)
 
     monkeypatch.setattr("pipelines.fleet.task.subprocess.run", failing)
-    run_task(asdict(task))
+    run_task(task)
     (tmp_path / "o" / "a" / "join").mkdir()
-    run_task(asdict(task))
+    run_task(task)
     assert ["--resume" in command for command in words] == [False, True]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux")
 def test_a_command_begun_by_a_worker_that_has_died_ends_at_once():
-    die = _dying_with(os.getpid() + 1)
+    die = _ending_with(os.getpid() + 1)
     assert die is not None
     process = os.fork()
     if not process:
@@ -234,11 +239,11 @@ def test_a_command_ends_with_a_driver_that_is_killed(tmp_path):
 WORKER = """
 import os, subprocess, sys
 from concurrent.futures import ThreadPoolExecutor
-from pipelines.fleet.task import _dying_with
+from pipelines.fleet.task import _ending_with
 
 command = [sys.executable, "-c", "import os, time; print(os.getpid(), flush=True); time.sleep(60)"]
 pool = ThreadPoolExecutor(1)
-pool.submit(subprocess.run, command, preexec_fn=_dying_with(os.getpid())).result()
+pool.submit(subprocess.run, command, preexec_fn=_ending_with(os.getpid())).result()
 """
 
 
@@ -280,7 +285,7 @@ def test_slurm_asks_for_what_a_stage_needs(tmp_path):
     (tmp_path / "a").mkdir()
     stage = {"command": "check {project}", "cpus": 3, "gpus": 0.5, "memory_gb": 1.5}
     spec = FleetSpec(stages={"look": stage}, scenes=[{"project": "a"}])
-    write_slurm(plan(spec, str(tmp_path / "o"), folder=tmp_path), tmp_path / "o")
+    write_slurm(tasks_of(spec, str(tmp_path / "o"), folder=tmp_path), tmp_path / "o")
     script = (tmp_path / "o" / "stage-look.sh").read_text()
     for option in ("--cpus-per-task=3", "--gres=gpu:1", "--mem=1500M", "--array=0-0"):
         assert f"#SBATCH {option}\n" in script
@@ -310,8 +315,8 @@ def test_folders_go_to_s3_and_come_back(tmp_path, monkeypatch):
         spec = FleetSpec(
             stages={"x": {"command": QUICK}}, scenes=[{"project": "s3://bucket/scene"}]
         )
-        tasks = plan(spec, "s3://bucket/fleet", folder=tmp_path)
-        run_fleet(tasks, Processes, console=Console(quiet=True))
+        tasks = tasks_of(spec, "s3://bucket/fleet", folder=tmp_path)
+        run_fleet(jobs_of(tasks), this_machine(tasks), console=Console(quiet=True))
         [record] = collect(tasks)
         assert (record["scene"], record["status"]) == ("scene", "done")
     finally:
@@ -324,8 +329,8 @@ def _round_trip(url: str, tmp_path: Path) -> None:
     contents = {"images/1.bin": bytes(range(256)), "cameras.txt": b"x\n"}
     for name, data in contents.items():
         (folder / name).write_bytes(data)
-    stored(folder, url)
-    found = fetched(url)
+    upload(folder, url)
+    found = fetch(url)
     assert {p.relative_to(found).as_posix(): p.read_bytes() for p in found.rglob("*")
             if p.is_file()} == contents  # fmt: skip
 

@@ -15,8 +15,7 @@ from gvtools.settings import changes, with_texts, with_values
 from pipelines.cli import build_parser, main
 from pipelines.commands.tradeoff import asked_for
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.tradeoff.sweep import EQUAL
-from pipelines.tradeoff.trial import applied
+from pipelines.scoring.tradeoff import EQUAL, changed
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -96,7 +95,7 @@ def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
         assert asked_for(args, name) == wanted, name
         # As a trial reaches it, from the start with the edge that it has.
         found = start.replaced(voxel=start.voxel or 0.02)
-        tried = applied(found, changes(found, wanted))
+        tried = changed(found, changes(found, wanted))
         assert tried.replaced(profile=name) == wanted
 
 

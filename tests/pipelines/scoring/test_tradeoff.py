@@ -16,9 +16,15 @@ from pipelines.commands.tradeoff import parse_seconds
 from pipelines.console import Console
 from pipelines.reconstruction.plan import Plan
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.tradeoff.planned import START, planned_trials
-from pipelines.tradeoff.sweep import pareto_front, recommended, sweep
-from pipelines.tradeoff.trial import Trial, applied
+from pipelines.scoring.tradeoff import (
+    START,
+    Trial,
+    changed,
+    pareto_front,
+    planned_trials,
+    recommended,
+    run_trials,
+)
 
 PLANNED = {
     START: {},
@@ -37,7 +43,7 @@ class Runs:
         self.now = 0.0
         self.refuse, self.earlier = refuse, earlier
 
-    def kept(self, label, settings):
+    def stored(self, label, settings):
         return next((trial for trial in self.earlier if trial.settings == settings), None)
 
     def make(self, label, settings):
@@ -54,7 +60,7 @@ class Runs:
 
 def swept(runs: Any = None, *, limit: float = 1e6) -> list[Trial]:
     runs = runs or Runs()
-    return sweep(PLANNED, runs, limit=limit, console=Console(), clock=lambda: runs.now)
+    return run_trials(PLANNED, runs, limit=limit, console=Console(), clock=lambda: runs.now)
 
 
 def test_every_planned_trial_is_made_once():
@@ -87,7 +93,7 @@ def test_a_long_fit_needs_its_time(capsys):
         "edge 4": {"edge": 4},
     }
     runs: Any = Runs()
-    made = sweep(planned, runs, limit=600, console=Console(), clock=lambda: runs.now)
+    made = run_trials(planned, runs, limit=600, console=Console(), clock=lambda: runs.now)
     assert [trial.label for trial in made] == [START, "edge 4"]
     assert "profile long" in capsys.readouterr().err
 
@@ -154,7 +160,7 @@ def test_every_trial_but_the_start_changes_something_that_a_run_takes(completer,
     assert ("savings.depth_from_memory 0.8" in planned) == (source != "recorded")
     assert ("fusion.min_confidence 0.35" in planned) == (completer != "none")
     for label, settings in planned.items():
-        assert (applied(config, settings) != config) == (label != START), label
+        assert (changed(config, settings) != config) == (label != START), label
 
 
 def test_the_starts_own_values_are_no_trials():
@@ -177,7 +183,7 @@ def test_only_what_has_weights_is_tuned_in_a_trial():
     tuned = with_values(core, {"tune.minutes": 2.0})
     planned = planned_of("recorded", tuned)
     assert "tune.minutes 0" in planned
-    assert not applied(tuned, planned["completer inpaint"]).tune.wanted
+    assert not changed(tuned, planned["completer inpaint"]).tune.wanted
     # With a number of steps, minutes are not looked at.
     stepped = planned_of("recorded", with_values(core, {"tune.steps": 5}))
     assert not any("tune" in name for name in stepped)
@@ -190,6 +196,6 @@ def test_a_tuning_needs_its_time(capsys):
         "edge 4": {"edge": 4},
     }
     runs: Any = Runs()
-    made = sweep(planned, runs, limit=200, console=Console(), clock=lambda: runs.now)
+    made = run_trials(planned, runs, limit=200, console=Console(), clock=lambda: runs.now)
     assert [trial.label for trial in made] == [START, "edge 4"]
     assert "tune.minutes 4" in capsys.readouterr().err

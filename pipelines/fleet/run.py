@@ -1,0 +1,324 @@
+"""A fleet run: its tasks swept on Ray or on this machine, or written for Slurm; its tables."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shlex
+import socket
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.evaluation.tables import Column, Table, csv_text, markdown
+from gvtools.files import make_folder, write_json, write_text
+from pipelines.console import Console
+from pipelines.fleet.spec import Task, is_url
+from pipelines.fleet.task import finished_record, read_record, run_task, write_record
+from pipelines.scoring.sweep import (
+    DONE,
+    FAILED,
+    WAIT_S,
+    Job,
+    Pool,
+    Record,
+    Threads,
+    Watch,
+    difference,
+    lost_worker,
+    sweep,
+)
+
+# Time-out for connecting to a cluster [s].
+CONNECT_S = 10.0
+NOT_RUN = "not run"
+TASKS, SUBMIT = "tasks.json", "submit.sh"
+_STATES = ("done", "running", "waiting", "failed", "again")
+
+
+def jobs_of(tasks: Sequence[Task]) -> list[Job[Task]]:
+    """The tasks as jobs of a sweep: the stages of a scene one after another."""
+    return [Job(task, finished_record(task), task.scene, task.retries) for task in tasks]
+
+
+def run_fleet(jobs: Sequence[Job[Task]], pool: Pool, *, console: Console) -> None:
+    """Run the tasks that are not finished; at the end every task has a record."""
+    with Progress(jobs, console) as progress:
+        sweep(jobs, pool, progress)
+
+
+class Progress(Watch[Task]):
+    """Counts by stage: one table on a terminal, a line for each event elsewhere."""
+
+    def __init__(self, jobs: Sequence[Job[Task]], console: Console) -> None:
+        self._console, self._total = console, len(jobs)
+        self._counts: dict[str, Counter[str]] = {job.work.stage: Counter() for job in jobs}
+        for job in jobs:
+            self._counts[job.work.stage]["waiting" if job.record is None else "done"] += 1
+        self._live: Any = None
+        before = sum(job.record is not None for job in jobs)
+        console.line(f"{self._total} tasks" + (f", {before} finished before" if before else ""))
+
+    def __enter__(self) -> Progress:
+        if self._console.interactive:
+            from rich.live import Live
+
+            self._live = Live(self._table(), auto_refresh=False, transient=True)
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def begin(self, job: Job[Task]) -> bool:
+        """See Watch."""
+        self._counts[job.work.stage].update(running=1, waiting=-1)
+        return True
+
+    def again(self, job: Job[Task], record: Record, attempt: int) -> None:
+        """See Watch."""
+        task = job.work
+        self._counts[task.stage].update(running=-1, waiting=1, again=1)
+        self._console.warn(
+            f"{task.scene} {task.stage}: attempt {attempt} failed: {record['reason']}"
+        )
+
+    def end(self, job: Job[Task], record: Record, attempts: int) -> None:
+        """See Watch."""
+        task, done = job.work, record["status"] == DONE
+        self._counts[task.stage].update({"running": -1, "done" if done else "failed": 1})
+        if not done:
+            self._give_up(task, record, attempts)
+        elif self._live is None:
+            self._console.line(f"{self._head(task)}: {record['seconds']:.1f} s on {record['node']}")
+
+    def skip(self, job: Job[Task], failed: Job[Task]) -> None:
+        """See Watch."""
+        self._counts[job.work.stage].update(waiting=-1, failed=1)
+        reason = f"stage {failed.work.stage} failed"
+        self._give_up(job.work, {"status": FAILED, "reason": reason}, 0)
+
+    def tick(self) -> None:
+        """See Watch."""
+        if self._live is not None:
+            self._live.update(self._table(), refresh=True)
+
+    def _give_up(self, task: Task, record: Record, attempts: int) -> None:
+        head = {"scene": task.scene, "stage": task.stage, "attempts": attempts, **task.identity}
+        write_record(task.record(), {**head, **record})
+        self._console.warn(f"{self._head(task)}: failed: {record['reason']}")
+
+    def _head(self, task: Task) -> str:
+        over = sum(count["done"] + count["failed"] for count in self._counts.values())
+        return f"[{over}/{self._total}] {task.scene} {task.stage}"
+
+    def _table(self) -> Any:
+        from rich.table import Table
+
+        table = Table("stage", *_STATES)
+        for stage, counts in self._counts.items():
+            table.add_row(stage, *(str(counts[state]) for state in _STATES))
+        return table
+
+
+def this_machine(tasks: Sequence[Task]) -> Threads:
+    """As many at a time as there are cores for the task with the most; one with any GPU."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    gpus = any(task.gpus for task in tasks)
+    return Threads(run_task, 1 if gpus else max(1, (cores or 1) // max(t.cpus for t in tasks)))
+
+
+class Ray:
+    """A Ray cluster, which queues the tasks; each asks for its cores, cards and memory."""
+
+    slots = float("inf")
+
+    def __init__(self, tasks: Sequence[Task], *, address: str, console: Console) -> None:
+        # "auto" may find the address of a cluster that has ended: try 3 times, not 20, 40 s each.
+        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "3")
+        try:
+            import ray
+        except ImportError:
+            raise OptionError(
+                "--engine ray: Ray is not installed; pip install 'gvtools[cluster]', or give "
+                "--engine processes or slurm"
+            ) from None
+        _check_reachable(address)
+        try:
+            context = ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise _no_cluster(address, str(error).splitlines()[0]) from None
+        self._ray = ray
+        self._remote = ray.remote(run_task)
+        if context.dashboard_url:
+            console.line(f"Ray's dashboard: http://{context.dashboard_url}")
+        else:
+            console.line("Ray's dashboard is not installed; pip install 'ray[default]' brings it")
+        self._check(tasks, address, console)
+
+    def _check(self, tasks: Sequence[Task], address: str, console: Console) -> None:
+        """Warn of tasks that are too large for every node: they would wait for ever."""
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        for task in {task.stage: task for task in tasks}.values():
+            asked = {"CPU": task.cpus, "GPU": task.gpus, "memory": task.memory_gb * 1e9}
+            if any(all(node.get(k, 0) >= v for k, v in asked.items()) for node in nodes):
+                continue
+            text = (
+                f"stage {task.stage}: no machine has {task.cpus} cores, {task.gpus:g} cards and "
+                f"{task.memory_gb:g} GB"
+            )
+            if address == "local":
+                self.close()
+                raise OptionError(f"{text}; ask for less")
+            console.warn(f"{text}; it waits until one joins")
+
+    def submit(self, work: Task, attempt: int) -> Any:
+        """Begin a task on a machine with its labels, or, where none of those is free, on any."""
+        options: dict[str, Any] = {
+            "num_cpus": work.cpus,
+            "num_gpus": work.gpus,
+            "max_retries": 0,
+            "name": f"{work.scene} {work.stage}",
+        }
+        if work.memory_gb:
+            options["memory"] = int(work.memory_gb * 1e9)
+        if work.labels:
+            options["label_selector"] = dict(work.labels)
+            options["fallback_strategy"] = [{"label_selector": {}}]
+        return self._remote.options(**options).remote(work, attempt)
+
+    def finished(self, handles: Sequence[Any]) -> list[tuple[Any, Record]]:
+        """Those that ended, also by the loss of their worker or machine."""
+        ended, _ = self._ray.wait(list(handles), num_returns=1, timeout=WAIT_S)
+        return [(handle, self._record(handle)) for handle in ended]
+
+    def _record(self, handle: Any) -> Record:
+        try:
+            return dict(self._ray.get(handle))
+        except self._ray.exceptions.RayError as error:
+            first = (str(error).strip().splitlines() or [""])[0]
+            return lost_worker(f"worker lost ({type(error).__name__}: {first})")
+
+    def close(self) -> None:
+        """Leave the cluster; what still runs is ended."""
+        self._ray.shutdown()
+
+
+def _check_reachable(address: str) -> None:
+    """Refuse an address where nothing listens: Ray itself would retry for a quarter of an hour."""
+    host, colon, port = address.rpartition(":")
+    if not colon or not port.isdecimal() or "/" in host:
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise _no_cluster(address, str(error)) from None
+
+
+def _no_cluster(address: str, reason: str) -> ProjectError:
+    return ProjectError(
+        f"--address {address}: no Ray cluster ({reason}); begin one with 'ray start --head', or "
+        "give --address local"
+    )
+
+
+def write_slurm(tasks: Sequence[Task], folder: Path) -> Path:
+    """Write the list of tasks, a job script for each stage, and the script to start; returns that.
+
+    Task N of a stage's array is scene N; it begins when scene N has passed the stage before.
+    """
+    make_folder(folder / "slurm-logs")
+    write_text(folder / TASKS, json.dumps([asdict(task) for task in tasks], indent=1) + "\n")
+    stages: dict[str, list[int]] = {}
+    for number, task in enumerate(tasks):
+        stages.setdefault(task.stage, []).append(number)
+    lines = ["#!/bin/bash", "# Submits the stages; extra options of sbatch may follow.", "set -e"]
+    wait = ""
+    for name, numbers in stages.items():
+        script = folder / f"stage-{name}.sh"
+        write_text(script, _array_job(tasks[numbers[0]], numbers, folder))
+        lines.append(f'job=$(sbatch --parsable {wait}"$@" {shlex.quote(str(script))})')
+        lines.append(f'echo "{name}: job $job"')
+        wait = '--dependency=aftercorr:"${job%%;*}" --kill-on-invalid-dep=yes '
+    write_text(folder / SUBMIT, "\n".join(lines) + "\n")
+    return folder / SUBMIT
+
+
+def _array_job(task: Task, numbers: Sequence[int], folder: Path) -> str:
+    asked = [
+        f"--job-name=gvtools-{task.stage}",
+        f"--array=0-{len(numbers) - 1}",
+        f"--cpus-per-task={task.cpus}",
+        "--requeue",
+        f"--output={folder}/slurm-logs/{task.stage}-%A_%a.log",
+    ]
+    if task.memory_gb:
+        asked.append(f"--mem={-(-task.memory_gb * 1000 // 1):.0f}M")
+    if task.gpus:
+        asked.append(f"--gres=gpu:{-(-task.gpus // 1):.0f}")
+    run = (
+        f"{shlex.quote(sys.executable)} -m pipelines.fleet.task {shlex.quote(str(folder / TASKS))}"
+    )
+    heads = "\n".join(f"#SBATCH {option}" for option in asked)
+    return (
+        f"#!/bin/bash\n{heads}\n\n"
+        f"# Tasks {numbers[0]} to {numbers[-1]} of the list are this stage's.\n"
+        f"exec {run} $(({numbers[0]} + SLURM_ARRAY_TASK_ID))\n"
+    )
+
+
+def collect(tasks: Sequence[Task]) -> list[Record]:
+    """A record of every task; one without any has the status "not run"."""
+    records = []
+    for task in tasks:
+        head = {"scene": task.scene, "stage": task.stage, "status": NOT_RUN,
+                "reason": "left no record"}  # fmt: skip
+        record = read_record(task.record())
+        if record is not None and difference(record, {"command": [*task.command]}):
+            record, head["reason"] = None, "was run with another command"
+        records.append({**head, **(record or {})})
+    return sorted(records, key=lambda record: record["scene"])
+
+
+def result_table(records: Sequence[Record]) -> Table:
+    """A row for each stage of each scene; a column for each figure that any has."""
+    figures = sorted({name for record in records for name in record.get("figures", {})})
+    heads = ("scene", "stage", "status", "attempts", "seconds", "node", *figures, "reason")
+    rows = [
+        (
+            *(record.get(name) for name in heads[:6]),
+            *(record.get("figures", {}).get(name) for name in figures),
+            record.get("reason") or None,
+        )
+        for record in records
+    ]
+    return Table(tuple(Column(head) for head in heads), tuple(rows), caption="Fleet")
+
+
+def report(tasks: Sequence[Task], root: str, console: Console) -> list[Record]:
+    """Write results.json (and .csv, .md where the root is a path), print; returns what failed."""
+    records = collect(tasks)
+    table = result_table(records)
+    if is_url(root):
+        write_record(f"{root}/results.json", {"tasks": records})
+    else:
+        write_json(Path(root) / "results.json", {"tasks": records})
+        write_text(Path(root) / "results.csv", csv_text(table))
+        write_text(Path(root) / "results.md", markdown(table))
+    heads = ("scene", "stage", "status", "attempts", "seconds", "node", "reason")
+    console.table(heads, [[record.get(name) or None for name in heads] for record in records])
+    failed = [record for record in records if record["status"] != DONE]
+    console.line(f"{len(records) - len(failed)} of {len(records)} tasks done; results in {root}")
+    return failed

@@ -1,0 +1,1 @@
+"""Scores of pictures and runs: evaluation, judgement, benchmarks and trade-offs."""

@@ -1,0 +1,176 @@
+"""The resumable sweep: jobs that leave a record each, run in turn, side by side or on a cluster.
+
+What decides a job's result is its identity. A job with a record of the same identity is done.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Generic, Protocol, TypeVar
+
+Work = TypeVar("Work")
+Record = dict[str, Any]
+
+# Statuses of a record. One that failed has a ``reason``, and ``again`` where another attempt helps.
+DONE, FAILED = "done", "failed"
+# Longest wait for a job to end before progress is shown again, seconds.
+WAIT_S = 1.0
+
+
+def difference(record: Mapping[str, Any], identity: Mapping[str, Any]) -> str | None:
+    """The first part of an identity that a record has otherwise; None where all are equal."""
+    return next((key for key, value in identity.items() if record.get(key) != value), None)
+
+
+def lost_worker(reason: str) -> Record:
+    """The record of a job whose worker could not write one; it may be run again."""
+    return {"status": FAILED, "reason": reason, "again": True}
+
+
+@dataclass(frozen=True, eq=False)
+class Job(Generic[Work]):
+    """Work, and what is known of it."""
+
+    work: Work
+    record: Record | None = None  # of an earlier sweep; None has to run
+    chain: str | None = None  # jobs of one chain run in their order, and none after a failure
+    retries: int = 0  # attempts after the first
+
+
+class Pool(Protocol):
+    """Where jobs run."""
+
+    slots: float
+    """Jobs at a time."""
+
+    def submit(self, work: Any, attempt: int) -> Any:
+        """Begin a job; returns a handle."""
+
+    def finished(self, handles: Sequence[Any]) -> list[tuple[Any, Record]]:
+        """Handles of jobs that ended, with their records; waits for one at most ``WAIT_S``."""
+
+    def close(self) -> None:
+        """Release the workers."""
+
+
+class InTurn:
+    """One job at a time, in this thread."""
+
+    slots = 1.0
+
+    def __init__(self, run: Callable[[Any], Record]) -> None:
+        self._run = run
+
+    def submit(self, work: Any, attempt: int) -> Callable[[], Record]:
+        """The job, which runs when its end is asked for."""
+        return partial(self._run, work)
+
+    def finished(
+        self, handles: Sequence[Callable[[], Record]]
+    ) -> list[tuple[Callable[[], Record], Record]]:
+        """Run the job."""
+        return [(handle, handle()) for handle in handles]
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class Threads:
+    """Several jobs at a time, each waited for by a thread; ``run`` takes a job and its attempt."""
+
+    def __init__(self, run: Callable[[Any, int], Record], slots: int) -> None:
+        self._run, self.slots = run, float(slots)
+        self._pool = ThreadPoolExecutor(slots)
+
+    def submit(self, work: Any, attempt: int) -> Future[Record]:
+        """Begin a job."""
+        return self._pool.submit(self._run, work, attempt)
+
+    def finished(self, handles: Sequence[Future[Record]]) -> list[tuple[Future[Record], Record]]:
+        """See Pool."""
+        ended, _ = wait(handles, timeout=WAIT_S, return_when=FIRST_COMPLETED)
+        return [(handle, _result(handle)) for handle in ended]
+
+    def close(self) -> None:
+        """Start no other job, and wait for those that run."""
+        self._pool.shutdown(cancel_futures=True)
+
+
+def _result(handle: Future[Record]) -> Record:
+    try:
+        return handle.result()
+    except Exception as error:
+        return lost_worker(f"{type(error).__name__}: {error}")
+
+
+class Watch(Generic[Work]):
+    """Follows a sweep; by itself it says nothing and leaves nothing out."""
+
+    def found(self, job: Job[Work], record: Record) -> None:
+        """An earlier sweep has done the job."""
+
+    def begin(self, job: Job[Work]) -> bool:
+        """A job's turn has come, also once more; False leaves it out."""
+        return True
+
+    def again(self, job: Job[Work], record: Record, attempt: int) -> None:
+        """An attempt failed, and another one follows."""
+
+    def end(self, job: Job[Work], record: Record, attempts: int) -> None:
+        """A job is done, or given up."""
+
+    def skip(self, job: Job[Work], failed: Job[Work]) -> None:
+        """A job is not run, since one before it in its chain failed."""
+
+    def tick(self) -> None:
+        """Every ``WAIT_S``, and whenever jobs have ended."""
+
+
+def sweep(jobs: Sequence[Job[Work]], pool: Pool, watch: Watch[Work]) -> None:
+    """Run the jobs without a record, each up to its ``retries`` times again."""
+    chains: dict[object, deque[Job[Work]]] = {}
+    for job in jobs:
+        chains.setdefault(job if job.chain is None else job.chain, deque()).append(job)
+    ready = deque((chain[0], 1) for chain in chains.values())
+    running: dict[Any, tuple[Job[Work], int]] = {}
+
+    def proceed(job: Job[Work]) -> None:
+        chain = chains[job if job.chain is None else job.chain]
+        chain.popleft()
+        if chain:
+            ready.append((chain[0], 1))
+
+    def give_up(job: Job[Work]) -> None:
+        for later in list(chains[job if job.chain is None else job.chain])[1:]:
+            if later.record is None:
+                watch.skip(later, job)
+            else:
+                watch.found(later, later.record)
+
+    try:
+        while ready or running:
+            while ready and len(running) < pool.slots:
+                job, attempt = ready.popleft()
+                if job.record is not None:
+                    watch.found(job, job.record)
+                    proceed(job)
+                elif watch.begin(job):
+                    running[pool.submit(job.work, attempt)] = job, attempt
+            for handle, record in pool.finished(list(running)) if running else ():
+                job, attempt = running.pop(handle)
+                if record["status"] == FAILED and record.get("again") and attempt <= job.retries:
+                    watch.again(job, record, attempt)
+                    ready.append((job, attempt + 1))
+                    continue
+                watch.end(job, record, attempt)
+                if record["status"] == FAILED:
+                    give_up(job)
+                else:
+                    proceed(job)
+            watch.tick()
+    finally:
+        pool.close()
