@@ -27,9 +27,8 @@ __version__ = "0.1.0"
 # tests/test_public_api.py holds that this is the only one, and that nothing goes through it.
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras
-    from gvtools.completers.base import Completer, Completion, ContextView
+    from gvtools.completers.base import Completer, Completion, ContextView, complete
     from gvtools.completers.base import register as register_completer
-    from gvtools.completers.complete import complete
     from gvtools.errors import GvError
     from gvtools.evaluation.trajectories import absolute_errors as ate
     from gvtools.evaluation.trajectories import relative_errors as rpe
@@ -53,7 +52,7 @@ _SOURCES = {
     "SpatialMemory": "gvtools.memory.spatial_memory:SpatialMemory",
     "TiledMemory": "gvtools.memory.tiled_memory:TiledMemory",
     "ate": "gvtools.evaluation.trajectories:absolute_errors",
-    "complete": "gvtools.completers.complete:complete",
+    "complete": "gvtools.completers.base:complete",
     "evaluate": "pipelines.api:evaluate",
     "load_run": "gvtools.runs.run:load_run",
     "open_project": "gvtools.scenes.project:open_project",

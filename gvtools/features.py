@@ -293,7 +293,7 @@ def _load(network: Any, path: Path) -> None:
 
 def _published(path: Path) -> dict[str, Tensor]:
     """Tensors of a published file by the names of kornia's networks."""
-    from gvtools.networks.tensor_files import plain_tensors, read_pickled, read_tensors
+    from gvtools.networks.tensors import plain_tensors, read_pickled, read_tensors
 
     if path.suffix == ".safetensors":
         stored = read_tensors(path)

@@ -27,7 +27,7 @@ DOCTESTED = (
     "gvtools.appearance.turning",
     "gvtools.cameras",
     "gvtools.capture.matching",
-    "gvtools.completers.complete",
+    "gvtools.completers.base",
     "gvtools.errors",
     "gvtools.evaluation.splits",
     "gvtools.evaluation.picture_matching",

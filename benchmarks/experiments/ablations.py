@@ -19,16 +19,15 @@ from benchmarks.experiments.judging import COLUMNS, Judged, judge, perceptual, r
 from benchmarks.experiments.options import ExperimentOptions
 from benchmarks.experiments.rows import geoverse
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.control import ControlConfig
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
-from gvtools.completers.geoverse.video_prior.prior import VideoPriorConfig
-from gvtools.completers.geoverse.weights.folder import (
+from gvtools.completers.geoverse.video_injection import ControlConfig, SharedAttentionConfig
+from gvtools.completers.geoverse.video_prior import VideoPriorConfig
+from gvtools.completers.geoverse.weights import (
+    VIDEO_FOLDER,
     config_of,
     from_pretrained,
     save_pretrained,
 )
-from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
 from gvtools.errors import OptionError
 from gvtools.evaluation.tables import Table
 from gvtools.files import write_json
@@ -171,7 +170,7 @@ def _start(encoder: Path, config: GeoVerseConfig, folder: Path) -> Path:
 
 def _save_random_prior(folder: Path) -> None:
     """Wan VACE of four narrow blocks and its VAE, random, in the layout of a truncated folder."""
-    from gvtools.completers.geoverse.video_prior.wan_folder import network_class
+    from gvtools.completers.geoverse.wan import network_class
 
     with torch.random.fork_rng():
         torch.manual_seed(0)

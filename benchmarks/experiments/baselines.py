@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.experiments.cases import Case
 from benchmarks.experiments.classical import push_pulled
 from gvtools.completers.base import Completer, Completion, ContextView, create
-from gvtools.completers.holes import rim_distance
+from gvtools.completers.hole_depth import rim_distance
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 

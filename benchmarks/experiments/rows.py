@@ -10,7 +10,7 @@ from pathlib import Path
 from benchmarks.experiments.classical import CLASSICAL, classical
 from gvtools.completers.base import Completer, create
 from gvtools.completers.geoverse.completer import SHIPPED
-from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pretrained
+from gvtools.completers.geoverse.weights import from_pretrained, save_pretrained
 
 HINTS = "hint features decoded, no denoiser"
 FILL = "filled projection alone"

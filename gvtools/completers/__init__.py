@@ -6,11 +6,12 @@ from gvtools.completers.base import (
     Completer,
     Completion,
     ContextView,
+    ScaleAlignment,
+    ScaleStatus,
     available,
     create,
     register,
 )
-from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 
 __all__ = [
     "Completer",

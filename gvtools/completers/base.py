@@ -1,4 +1,4 @@
-"""What fills the holes of projected memory: the contract, its data, and the registry by name.
+"""The contract of completers, which fill the holes of projected memory, and their registry.
 
 A completer is added with one file, which holds a subclass of ``Completer``, and one line in
 ``_REGISTRY``. Its module is imported when the completer is created, not before.
@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import difflib
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from enum import Enum
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -19,33 +20,114 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.completers.scale_alignment import ScaleAlignment
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 
 if TYPE_CHECKING:
     from gvtools.kernels import KernelSet
+    from gvtools.similarity import ScaleFit
 
 Float32 = NDArray[np.float32]
 
 
+class ScaleStatus(str, Enum):
+    """How a view's generated depth was brought into scene units, or why it was refused."""
+
+    # One factor, fitted to the memory's depth on the pixels that both know.
+    MEMORY_DEPTH = "memory_depth"
+    # A smooth field of factors, fitted to the memory's depth.
+    MEMORY_FIELD = "memory_field"
+    # No factor: the memory's surfaces, in scene units, were continued into the holes.
+    MEMORY_SURFACES = "memory_surfaces"
+    # One factor, fitted to the depth of the context views.
+    CONTEXT_DEPTH = "context_depth"
+    # One factor, fitted between predicted and given camera centres.
+    CAMERA_CENTRES = "camera_centres"
+    # The view has no hole.
+    NOTHING_TO_COMPLETE = "nothing_to_complete"
+    # Refused: too few pixels or camera centres to fit a factor.
+    UNSUPPORTED = "unsupported"
+    # Refused: the depth differs from known depth by more than a factor.
+    CONTRADICTED = "contradicted"
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the view's generated depth may be fused."""
+        return self not in (ScaleStatus.UNSUPPORTED, ScaleStatus.CONTRADICTED)
+
+
+_IN_WORDS = {
+    ScaleStatus.MEMORY_DEPTH: "one factor to the memory's depth",
+    ScaleStatus.MEMORY_FIELD: "a smooth field of factors to the memory's depth",
+    ScaleStatus.MEMORY_SURFACES: "the memory's own surfaces, continued",
+    ScaleStatus.CONTEXT_DEPTH: "the depth of the context views",
+    ScaleStatus.CAMERA_CENTRES: "the camera centres",
+    ScaleStatus.NOTHING_TO_COMPLETE: "nothing to complete",
+    ScaleStatus.UNSUPPORTED: "refused: too little to find a scale from",
+    ScaleStatus.CONTRADICTED: "refused: known depth contradicts it",
+}
+
+
+@dataclass(frozen=True)
+class ScaleAlignment:
+    """The outcome of bringing one view's generated depth into scene units; unknown figures: NaN."""
+
+    status: ScaleStatus
+    # Multiply the completion's depth by this to get scene units; NaN if refused.
+    scale: float = 1.0
+    # Median relative deviation from the memory's depth (0.01 = 1 %).
+    residual: float = float("nan")
+    # Pixels with both depths; 0 also where they were not counted.
+    overlap_px: int = 0
+    # Weighted share of these within the fit's tolerance, 0 to 1.
+    inlier_share: float = float("nan")
+    # Camera centres in the fit; 0 if none were used.
+    centres: int = 0
+    # Between predicted and given camera centres, -1 to 1.
+    correlation: float = float("nan")
+
+    @classmethod
+    def of_fit(cls, fit: ScaleFit) -> ScaleAlignment:
+        """The outcome of comparing a completion's depth with the memory's."""
+        status = ScaleStatus.MEMORY_DEPTH
+        if not fit.ok:
+            compared = np.isfinite(fit.residual)
+            status = ScaleStatus.CONTRADICTED if compared else ScaleStatus.UNSUPPORTED
+        return cls(status, fit.scale, fit.residual, fit.support, fit.inlier_share)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the depth may be fused."""
+        return self.status.accepted
+
+    def describe(self) -> str:
+        """One line with the figures that are known."""
+        figures = [f"{self.overlap_px} common pixels"]
+        if np.isfinite(self.residual):
+            figures.append(f"median deviation {self.residual:.1%}")
+        if self.centres:
+            figures.append(f"{self.centres} camera centres")
+        if np.isfinite(self.correlation):
+            figures.append(f"correlation {self.correlation:.2f}")
+        return f"{_IN_WORDS[self.status]} ({', '.join(figures)})"
+
+    def to_json(self) -> dict[str, Any]:
+        """As a round's report holds it."""
+        figures = asdict(self)
+        status = figures.pop("status").value
+        told = {"accepted": self.accepted, "description": self.describe()}
+        return {"status": status, **told, **figures}
+
+
 @dataclass(frozen=True, eq=False)
 class ContextView:
-    """One observed view that a completer may look at.
-
-    Attributes:
-        name: the view's name in its scene.
-        camera: a batch of one.
-        rgb: (H, W, 3) float32 in [0, 1]; a photograph's uint8 is taken, too, and scaled.
-        depth: (H, W) float32 z-depth, scene units, 0 = none; None when the view has no depth.
-        confidence: (H, W) float32 >= 0 of the depth; None when unknown.
-    """
+    """One observed view that a completer may look at."""
 
     name: str
-    camera: Cameras
-    rgb: Float32
-    depth: Float32 | None = None
-    confidence: Float32 | None = None
+    camera: Cameras  # a batch of one
+    rgb: Float32  # (H, W, 3) in [0, 1]; a photograph's uint8 is taken, too, and scaled
+    depth: Float32 | None = None  # (H, W) z-depth, scene units, 0 = none
+    confidence: Float32 | None = None  # (H, W) >= 0, of the depth; None when unknown
 
     def __post_init__(self) -> None:
         if self.rgb.dtype == np.uint8:
@@ -77,24 +159,20 @@ class Completion:
 
     (Not in ``whole`` views.) So does its depth there, unless the completer's depth is in a unit of
     its own, which the run finds by comparing it with the guidance's (``scale_alignment`` None).
-
-    Attributes:
-        rgb: (V, H, W, 3) float32 in [0, 1].
-        depth: (V, H, W) float32 z-depth, scene units, 0 = none.
-        confidence: (V, H, W) float32 in [0, 1]; below 1 where generated, 0 where nothing is known.
-        rays: (V, H, W, 6) float32 Plücker rays in the world frame: unit direction d, then moment
-            c x d (scene units), c the camera centre; None if the completer predicts none.
-        scale_alignment: for each view, how the completer brought its depth into scene units; the
-            generated depth of a refused view is 0. None, of a view or of all, leaves the alignment
-            to the run, which compares depth with the memory's.
-        whole: all pixels are generated anew, those that the memory shows, too.
     """
 
-    rgb: Float32
-    depth: Float32
+    rgb: Float32  # (V, H, W, 3) in [0, 1]
+    depth: Float32  # (V, H, W) z-depth, scene units, 0 = none
+    # (V, H, W) in [0, 1]; below 1 where generated, 0 where nothing is known.
     confidence: Float32
+    # (V, H, W, 6) Plücker rays in the world frame: unit direction d, then moment c x d (scene
+    # units), c the camera centre; None if the completer predicts none.
     rays: Float32 | None = None
+    # For each view, how the completer brought its depth into scene units; the generated depth of a
+    # refused view is 0. None, of a view or of all, leaves the alignment to the run, which compares
+    # depth with the memory's.
     scale_alignment: tuple[ScaleAlignment | None, ...] | None = None
+    # All pixels are generated anew, those that the memory shows, too.
     whole: bool = False
 
     def __post_init__(self) -> None:
@@ -112,25 +190,82 @@ class Completion:
         if self.rays is not None and self.rays.shape != (*shape, 6):
             raise ShapeError(f"completion: rays {self.rays.shape}; expected {(*shape, 6)}")
 
+    @classmethod
+    def of_memory(cls, guidance: Guidance) -> Completion:
+        """What the memory knows, with holes of 0."""
+        valid, nothing = guidance.valid, np.float32(0)
+        return cls(
+            np.where(valid[..., None], guidance.rgb, nothing),
+            np.where(valid, guidance.depth, nothing),
+            np.where(valid, np.minimum(guidance.confidence, 1), 0).astype(np.float32),
+        )
+
+    def select(self, index: Sequence[int] | slice) -> Completion:
+        """Some views, in that order; a slice copies no image."""
+        rows = index if isinstance(index, slice) else list(index)
+        alignment = self.scale_alignment
+        if alignment is not None:
+            numbers = range(len(alignment))[rows] if isinstance(rows, slice) else rows
+            alignment = tuple(alignment[row] for row in numbers)
+        rays = None if self.rays is None else self.rays[rows]
+        return Completion(
+            self.rgb[rows], self.depth[rows], self.confidence[rows], rays, alignment, self.whole
+        )
+
+    @classmethod
+    def joined(
+        cls, parts: Iterable[tuple[Sequence[int], Completion]], cameras: Cameras
+    ) -> Completion:
+        """One completion of all of ``cameras``, of the rows and the completion of each part.
+
+        Parts are taken one after the other, so that only one need be in memory beside the whole.
+        Where some predict rays, the others have those of their cameras.
+        """
+        images: list[Float32] = []
+        rays: Float32 | None = None
+        alignments: list[ScaleAlignment | None] = [None] * len(cameras)
+        # A view that kept what the memory shows is not whole, so the others may not be taken so.
+        whole = True
+        for rows, part in parts:
+            at, new = list(rows), (part.rgb, part.depth, part.confidence)
+            if not images:
+                images = [np.zeros((len(cameras), *image.shape[1:]), image.dtype) for image in new]
+            for image, values in zip(images, new, strict=True):
+                image[at] = values
+            if part.rays is not None:
+                if rays is None:
+                    rays = camera_rays(cameras, images[1].shape)
+                rays[at] = part.rays
+            for row, alignment in zip(at, part.scale_alignment or [None] * len(at), strict=True):
+                alignments[row] = alignment
+            whole &= part.whole
+        rgb, depth, confidence = images
+        aligned = any(alignment is not None for alignment in alignments)
+        return cls(rgb, depth, confidence, rays, tuple(alignments) if aligned else None, whole)
+
+
+def camera_rays(cameras: Cameras, shape: tuple[int, ...]) -> Float32:
+    """(V, H, W, 6) Plücker rays of V cameras of one picture size; ``shape`` is (V, H, W)."""
+    rays = np.empty((*shape, 6), np.float32)
+    for row in range(len(cameras)):
+        rays[row] = cameras.plucker(row)
+    return rays
+
 
 class Completer(ABC):
-    """Fills what memory does not know of the target views. A run makes one and keeps it.
+    """Fills what memory does not know of the target views. A run makes one and keeps it."""
 
-    Attributes:
-        name: under which it is registered.
-        settings_type: its options, a subclass of ``gvtools.settings.Settings``; None if it has no
-            options. Annotated ``type[Any]``, so that this module does not import pydantic.
-        batches_targets: True: ``complete`` gets all targets of a round with equal image size at
-            once. False: one target at a time, projected after the previous one was fused.
-        costly: True leaves views with small holes to ``inpaint``, see ``EffortPolicy``.
-        kernels: compiled kernels of its own, which a run compiles before its first round.
-        settings: the options of this one.
-    """
-
+    # Under which it is registered.
     name: str
+    # Its options, a subclass of ``gvtools.settings.Settings``; None if it has none. Annotated
+    # ``type[Any]``, so that this module does not import pydantic.
     settings_type: ClassVar[type[Any] | None] = None
+    # True: ``complete`` gets all targets of a round with equal image size at once. False: one
+    # target at a time, projected after the previous one was fused.
     batches_targets: bool = False
+    # True leaves views with small holes to ``inpaint``, see ``EffortPolicy``.
     costly: bool = False
+    # Compiled kernels of its own, which a run compiles before its first round.
     kernels: ClassVar[tuple[KernelSet, ...]] = ()
 
     def __init__(self, **options: Any) -> None:
@@ -166,12 +301,23 @@ class Completer(ABC):
         """
 
 
+class NoneCompleter(Completer):
+    """Returns the guidance as it is; invalid pixels are 0 in colour, depth and confidence."""
+
+    name = "none"
+
+    def complete(
+        self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
+    ) -> Completion:
+        """Pass the valid pixels through; see ``Completer.complete``."""
+        check_views(context, guidance)
+        return Completion.of_memory(guidance)
+
+
 def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
     """Refuse colours or known depth with NaN or infinity: a network spreads one bad pixel to all.
 
-    Args:
-        context: their colours have to be finite; depth that is not finite counts as none.
-        guidance: colour, depth and confidence have to be finite where it is valid.
+    Depth of the context that is not finite counts as none.
     """
     shape = guidance.valid.shape
     if len(shape) != 3 or guidance.rgb.shape != (*shape, 3) or guidance.depth.shape != shape:
@@ -206,10 +352,7 @@ def run_completer(
     Where memory does not suffice for all target views, they are completed in halves, and halves of
     these; context and seed stay the same.
     """
-    completion = _completed(completer, context, guidance, seed=seed)
-    if not isinstance(completion, Completion):
-        found = type(completion).__name__
-        raise ShapeError(f"completer {completer.name} returned a {found}; expected a Completion")
+    completion = _complete_in_parts(completer, context, guidance, seed=seed)
     if completion.depth.shape != guidance.valid.shape:
         raise ShapeError(
             f"completer {completer.name} returned depth {completion.depth.shape}; expected "
@@ -230,12 +373,16 @@ def run_completer(
     return completion
 
 
-def _completed(
+def _complete_in_parts(
     completer: Completer, context: Sequence[ContextView], guidance: Guidance, *, seed: int
 ) -> Completion:
     """The completion of all views, in parts where memory does not suffice for the whole."""
     try:
-        return completer.complete(context, guidance, seed=seed)
+        completion = completer.complete(context, guidance, seed=seed)
+        if not isinstance(completion, Completion):
+            kind = type(completion).__name__
+            raise ShapeError(f"completer {completer.name} returned a {kind}; expected a Completion")
+        return completion
     except Exception as error:
         if not _lacks_memory(error):
             raise
@@ -248,13 +395,17 @@ def _completed(
             f"({said}); expected smaller pictures: --max-side {max(width, height) // 2}, or "
             "another completer"
         )
-    # Not copied: there is no memory for it.
-    halves = (slice(count // 2), slice(count // 2, count))
-    parts = [_completed(completer, context, guidance.select(rows), seed=seed) for rows in halves]
-    if not all(isinstance(part, Completion) for part in parts):
-        return parts[0]  # Its caller says what is wrong with it.
+    # By slices, which are not copied: there is no memory for it.
+    ends = ((0, count // 2), (count // 2, count))
+    parts = (
+        (
+            range(*end),
+            _complete_in_parts(completer, context, guidance.select(slice(*end)), seed=seed),
+        )
+        for end in ends
+    )
     try:
-        return _joined(parts)
+        return Completion.joined(parts, guidance.cameras)
     except MemoryError as error:
         raise OptionError(
             f"completer {completer.name}: memory does not suffice for the results of {count} views "
@@ -270,27 +421,8 @@ def _lacks_memory(error: Exception) -> bool:
     return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and lacks)
 
 
-def _joined(parts: Sequence[Completion]) -> Completion:
-    """Completions of consecutive views as one."""
-    rays = [part.rays for part in parts if part.rays is not None]
-    aligned = [
-        alignment
-        for part in parts
-        for alignment in part.scale_alignment or (None,) * len(part.depth)
-    ]
-    return Completion(
-        np.concatenate([part.rgb for part in parts]),
-        np.concatenate([part.depth for part in parts]),
-        np.concatenate([part.confidence for part in parts]),
-        rays=np.concatenate(rays) if len(rays) == len(parts) else None,
-        scale_alignment=None if all(part.scale_alignment is None for part in parts)
-        else tuple(aligned),
-        whole=all(part.whole for part in parts),
-    )  # fmt: skip
-
-
 _REGISTRY: dict[str, type[Completer] | str] = {
-    "none": "gvtools.completers.none:NoneCompleter",
+    "none": "gvtools.completers.base:NoneCompleter",
     "inpaint": "gvtools.completers.inpaint:InpaintCompleter",
     "geoverse": "gvtools.completers.geoverse.completer:GeoVerseCompleter",
 }
@@ -346,3 +478,49 @@ def completer_type(name: str) -> type[Completer]:
             f"completer {name}: {_REGISTRY[name]!r}; expected a subclass of Completer"
         )
     return kind
+
+
+def complete(
+    context: Sequence[ContextView],
+    guidance: Guidance,
+    *,
+    completer: str | Completer = "inpaint",
+    seed: int = 0,
+    **options: object,
+) -> Completion:
+    """Fill what memory does not know of the target views.
+
+    Args:
+        context: observed views that the completer may look at; may be empty.
+        guidance: memory projected into the target cameras (``memory.project(cameras)``).
+        completer: a registered name ("none", "inpaint", "geoverse", ...), or a completer that was
+            made before; make one yourself where it is called often and reads weights.
+        seed: the same input and seed give the same bytes on the same machine.
+        options: of the completer called by name.
+
+    Raises:
+        OptionError: an unknown completer or option, options of a completer that was made before,
+            or a completer that breaks its contract.
+        ShapeError: views that are damaged or do not fit each other.
+
+    >>> import numpy as np
+    >>> from gvtools import Cameras, Guidance
+    >>> camera = Cameras.pinhole(64, 48, focal=60.0)
+    >>> known = np.ones((1, 48, 64), bool)
+    >>> known[:, 20:28, 20:28] = False  # a hole in a grey wall, 2 units away
+    >>> weight = known.astype(np.float32)
+    >>> wall = Guidance(
+    ...     camera, 0.5 * weight[..., None].repeat(3, -1), 2 * weight, known, weight, ~known & False
+    ... )
+    >>> filled = complete((), wall, completer="inpaint")
+    >>> float(filled.depth[0, 24, 24].round(3))
+    2.0
+    """
+    if isinstance(completer, str):
+        completer = create(completer, **options)
+    elif options:
+        raise OptionError(
+            f"options {', '.join(options)} beside a completer that was made before; give them to "
+            "its class"
+        )
+    return run_completer(completer, context, guidance, seed=seed)

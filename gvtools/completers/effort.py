@@ -1,22 +1,13 @@
-"""How much effort a view's completion is worth, by the size of its holes."""
+"""The effort that a view's completion is worth, by the size of its holes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from gvtools.completers.base import (
-    Completer,
-    Completion,
-    ContextView,
-    create,
-)
-from gvtools.completers.holes import hole_radius
-from gvtools.completers.scale_alignment import ScaleAlignment
+from gvtools.completers.base import Completer, Completion, ContextView, create
 from gvtools.guidance import Guidance
 from gvtools.settings import Settings
 
@@ -30,7 +21,7 @@ class EffortPolicy(Settings):
     """Views whose holes have at most this radius, as a share of the image diagonal (see
     ``hole_radius``), are left to ``inpaint`` by a costly completer (geoverse); 0 leaves it none."""
 
-    def applied(self, completer: Completer) -> Completer:
+    def wrap(self, completer: Completer) -> Completer:
         """``completer`` under this policy."""
         if self.inpaint_below > 0 and completer.costly:
             return SmallHolesInpainted(completer, self.inpaint_below)
@@ -38,12 +29,9 @@ class EffortPolicy(Settings):
 
 
 class SmallHolesInpainted(Completer):
-    """Leaves views with small holes to a cheap completer and the others to a costly one.
+    """Leaves views whose ``hole_radius`` is at most ``below`` to a cheap completer (``inpaint``).
 
-    Attributes:
-        costly_one: completes the other views; its name, files and notes stand for both.
-        below: greatest ``hole_radius`` of a view that the cheap one completes.
-        cheap_one: ``inpaint``, unless another is given.
+    Name, files, notes and weights are the costly one's.
     """
 
     def __init__(self, costly_one: Completer, below: float, *, cheap_one: Completer | None = None):
@@ -72,34 +60,14 @@ class SmallHolesInpainted(Completer):
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:
         """Complete all views, each by one of the two; see ``Completer.complete``."""
+        from gvtools.completers.hole_depth import hole_radius  # needs numba
+
         small = [hole_radius(valid) <= self.below for valid in guidance.valid]
-        parts = []
-        for completer, cheap in ((self.cheap_one, True), (self.costly_one, False)):
-            rows = [row for row, is_small in enumerate(small) if is_small == cheap]
-            if rows:
-                completion = completer.complete(context, guidance.select(rows), seed=seed)
-                parts.append((rows, completion))
-        return _merged(guidance, parts)
 
+        def parts() -> Iterator[tuple[list[int], Completion]]:
+            for completer, cheap in ((self.cheap_one, True), (self.costly_one, False)):
+                rows = [row for row, is_small in enumerate(small) if is_small == cheap]
+                if rows:
+                    yield rows, completer.complete(context, guidance.select(rows), seed=seed)
 
-def _merged(guidance: Guidance, parts: Sequence[tuple[Sequence[int], Completion]]) -> Completion:
-    """The completions of some rows each, as one of all rows."""
-    shape = guidance.valid.shape
-    rgb, depth = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
-    confidence = np.zeros(shape, np.float32)
-    rays: NDArray[np.float32] | None = None
-    if any(part.rays is not None for _, part in parts):
-        every = [guidance.cameras.plucker(row) for row in range(len(guidance))]
-        rays = np.stack(every).astype(np.float32)
-    alignments: list[ScaleAlignment | None] = [None] * len(guidance)
-    for rows, part in parts:
-        at = list(rows)
-        rgb[at], depth[at], confidence[at] = part.rgb, part.depth, part.confidence
-        if rays is not None and part.rays is not None:
-            rays[at] = part.rays
-        for row, alignment in zip(at, part.scale_alignment or [None] * len(at), strict=True):
-            alignments[row] = alignment
-    unaligned = all(alignment is None for alignment in alignments)
-    # A view that kept what the memory shows is not whole, so the others may not be taken so either.
-    whole = all(part.whole for _, part in parts)
-    return Completion(rgb, depth, confidence, rays, None if unaligned else tuple(alignments), whole)
+        return Completion.joined(parts(), guidance.cameras)

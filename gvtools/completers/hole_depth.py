@@ -22,8 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Float64
-from gvtools.completers.hole_median import median_of_fill
-from gvtools.completers.holes import rim_distance
 from gvtools.kernels import compiled, in_threads
 
 # Eight directions (dy, dx); direction k + 8 is the opposite of k.
@@ -48,28 +46,39 @@ GENERATED = 0.3
 ENOUGH = 20_000
 
 
+def rim_distance(known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(H, W) distance of each pixel to the nearest known one, pixels; infinite without any."""
+    from scipy.ndimage import distance_transform_edt
+
+    if not known.any():
+        return np.full(known.shape, np.inf)
+    # OpenCV is faster, and its last digit differs from call to call.
+    return np.asarray(distance_transform_edt(~known), np.float64)
+
+
+def hole_radius(valid: NDArray[np.bool_]) -> float:
+    """Largest distance of a hole's pixel to a valid one (H, W), as a share of the image diagonal.
+
+    0 without holes, infinity where nothing is known.
+    """
+    return float(rim_distance(valid).max()) / float(np.hypot(*valid.shape))
+
+
 @dataclass(frozen=True, eq=False)
 class HoleDepth:
-    """What ``fill_depth`` found.
+    """A filled depth map and what it rests on."""
 
-    Attributes:
-        inverse: (H, W) float64, 1 / scene units; the input where valid, the fill elsewhere, 0
-            where nothing is known.
-        hits: (16, H, W) int32, row-major index of the first rim pixel in each of ``DIRECTIONS``,
-            -1 where the image ends before.
-        planes: (R, 5) float64, for each rim pixel: inverse depth, its x and y gradients per pixel,
-            trust in [0, 1], relative rms of the fit.
-        plane_of: (H, W) int32, row of ``planes``, -1 elsewhere.
-        spread: (H, W) float64, relative disagreement of the directions about a filled pixel.
-        distance: (H, W) float64, to the nearest known pixel, pixels; infinite without any.
-    """
-
+    # (H, W), 1 / scene units; the input where valid, the fill elsewhere, 0 where nothing is known.
     inverse: Float64
+    # (16, H, W) row-major index of the first rim pixel in each of ``DIRECTIONS``, -1 where the
+    # image ends before.
     hits: NDArray[np.int32]
+    # (R, 5) for each rim pixel: inverse depth, its x and y gradients per pixel, trust in [0, 1],
+    # relative rms of the fit.
     planes: Float64
-    plane_of: NDArray[np.int32]
-    spread: Float64
-    distance: Float64
+    plane_of: NDArray[np.int32]  # (H, W) row of ``planes``, -1 elsewhere
+    spread: Float64  # (H, W) relative disagreement of the directions about a filled pixel
+    distance: Float64  # (H, W) to the nearest known pixel, pixels; infinite without any
 
 
 def fill_depth(
@@ -85,10 +94,10 @@ def fill_depth(
 
     Args:
         depth: (H, W) z-depth, scene units.
-        valid: (H, W) bool, where ``depth`` (> 0) is known.
-        focal: focal length, pixels.
+        valid: (H, W), where ``depth`` (> 0) is known.
+        focal: pixels.
         steepest_deg: a surface seen at a more grazing angle counts as a step.
-        generated: (H, W) bool, known pixels that a completer made; None where all were observed.
+        generated: (H, W) known pixels that a completer made; None where all were observed.
         smoothing: whether medians, wider the farther from the rim, settle the fill.
     """
     known = valid & (depth > 0) & np.isfinite(depth)
@@ -120,7 +129,9 @@ def fill_depth(
     )  # fmt: skip
     if smoothing:
         for step in (8, 4, 2, 1, 1):
-            inverse = median_of_fill(inverse, known, distance, step=step)
+            settled = inverse.copy()
+            in_threads(_median_rows, len(inverse), inverse, known, distance, step, settled)
+            inverse = settled
     return HoleDepth(inverse, hits, planes, plane_of, spread, distance)
 
 
@@ -359,3 +370,60 @@ def _weighted_quantile(values, weights, count, share):
         if left <= 0:
             return values[i], total
     return values[count - 1], total
+
+
+@compiled()
+def _median_rows(first, last, inverse, known, distance, step, result):
+    """5x5 median with holes of ``step`` pixels between its taps, over the fill alone.
+
+    The taps are point-symmetric sets of hole pixels, so planes stay exact. A wide one acts only
+    deep inside, where directions far apart at the rim meet in shards.
+    """
+    height, width = inverse.shape
+    values = np.zeros(25)
+    for y in range(first, last):
+        for x in range(width):
+            if inverse[y, x] == 0 or distance[y, x] < (1 if step == 1 else 4 * step):
+                continue
+            values[0] = inverse[y, x]
+            count = np.int64(1)
+            for dy in range(3):
+                for dx in range(-2, 3):
+                    if dy == 0 and dx <= 0:
+                        continue
+                    ya, xa = y + dy * step, x + dx * step
+                    yb, xb = y - dy * step, x - dx * step
+                    if ya >= height or yb < 0 or min(xa, xb) < 0 or max(xa, xb) >= width:
+                        continue
+                    if known[ya, xa] or known[yb, xb]:
+                        continue
+                    if inverse[ya, xa] == 0 or inverse[yb, xb] == 0:
+                        continue
+                    values[count], values[count + 1] = inverse[ya, xa], inverse[yb, xb]
+                    count += 2
+            # The sets have odd size: the centre and pairs.
+            result[y, x] = _middle(values, count)
+
+
+@compiled()
+def _middle(values, count):
+    """The median of the first ``count`` values, an odd number; they are rearranged (Hoare 1961)."""
+    middle = count // 2
+    low, high = 0, count - 1
+    while low < high:
+        pivot = values[middle]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if j < middle:
+            low = i
+        if middle < i:
+            high = j
+    return values[middle]

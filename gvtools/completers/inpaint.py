@@ -1,8 +1,7 @@
 """The fast classical completer: continued planes, diffused colour, photographs where they show it.
 
 Nothing here is learnt. Depth comes from the planes around a hole (``hole_depth``), colour from the
-same surface (``hole_color``) and, where a context photograph sees the filled point, from there
-(``context_color``).
+same surface and, where a context photograph sees the filled point, from there (``hole_color``).
 """
 
 from __future__ import annotations
@@ -15,8 +14,7 @@ from pydantic import Field
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completer, Completion, ContextView, check_views
-from gvtools.completers.context_color import depth_error, look_up
-from gvtools.completers.hole_color import fill_color, relax
+from gvtools.completers.hole_color import depth_error, fill_color, look_up, relax
 from gvtools.completers.hole_depth import HoleDepth, fill_depth
 from gvtools.completers.settings import CompleterSettings
 from gvtools.guidance import Guidance
@@ -77,47 +75,28 @@ class InpaintCompleter(Completer):
     ) -> tuple[Completion, NDArray[np.float32]]:
         """The completion, and (V, H, W) the weight of the photographs that holes were seen in."""
         check_views(context, guidance)
-        valid = guidance.valid
-        rgb = np.where(valid[..., None], guidance.rgb, np.float32(0))
-        depth = np.where(valid, guidance.depth, np.float32(0))
-        confidence = np.where(valid, np.minimum(guidance.confidence, 1), 0).astype(np.float32)
-        looked_up = np.zeros_like(depth)
-        for index in range(len(guidance)):
-            if valid[index].all() or valid[index].sum() < self.settings.min_support:
-                continue
-            view = (rgb[index], depth[index], confidence[index])
-            looked_up[index] = self._fill(
-                view, valid[index], guidance.cameras[index],
-                generated=guidance.generated[index], context=context,
-            )  # fmt: skip
-        return Completion(rgb, depth, confidence), looked_up
+        completion, valid = Completion.of_memory(guidance), guidance.valid
+        looked_up = np.zeros_like(completion.depth)
+        for row in range(len(guidance)):
+            if not valid[row].all() and valid[row].sum() >= self.settings.min_support:
+                looked_up[row] = self._fill(
+                    completion.select(slice(row, row + 1)), guidance[row], context
+                )
+        return completion, looked_up
 
     def _fill(
-        self,
-        view: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
-        valid: NDArray[np.bool_],
-        camera: Cameras,
-        *,
-        generated: NDArray[np.bool_],
-        context: Sequence[ContextView],
+        self, completion: Completion, guidance: Guidance, context: Sequence[ContextView]
     ) -> NDArray[np.float32]:
-        """Write depth, then colour, then confidence into a view's holes.
-
-        Args:
-            view: colour (H, W, 3), depth (H, W) and confidence (H, W) of one view.
-            valid: (H, W) where the memory knows them.
-            camera: a batch of one.
-            generated: (H, W) which of these a completer made.
-            context: photographs to look points up in.
-
-        Returns:
-            (H, W) weight of the photographs that a hole's point was seen in.
-        """
-        rgb, depth, confidence = view
-        options = self.settings
+        """Write depth, colour and confidence into a view's holes; (H, W) weight of photographs."""
+        rgb, depth, confidence = completion.rgb[0], completion.depth[0], completion.confidence[0]
+        camera, valid, options = guidance.cameras, guidance.valid[0], self.settings
         focal = float(np.sqrt(camera.K[0, 0, 0] * camera.K[0, 1, 1]))
         surface = fill_depth(
-            depth, valid, focal=focal, steepest_deg=options.steepest_deg, generated=generated
+            depth,
+            valid,
+            focal=focal,
+            steepest_deg=options.steepest_deg,
+            generated=guidance.generated[0],
         )
         holes = ~valid & (surface.inverse > 0)
         if options.reach is not None:

@@ -7,14 +7,14 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.correction import composed
+from gvtools.completers.geoverse.composition import composed
 from gvtools.completers.geoverse.flow import (
     clean_from_velocity,
     interpolate,
     velocity_target,
 )
-from gvtools.completers.geoverse.objective.objective import Prediction, Reference, objective
-from gvtools.completers.geoverse.passes import Prepared
+from gvtools.completers.geoverse.model import Prepared
+from gvtools.completers.geoverse.objective import Prediction, Reference, objective
 from gvtools.networks.depth_anything.rays import camera_centres
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws

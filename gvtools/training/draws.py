@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse.noise import seeded_noise, view_seed
+from gvtools.completers.geoverse.flow import seeded_noise, view_seed
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from torch import Tensor, nn
 
 from gvtools.completers.geoverse.conditioning import ViewBatch, encode_views, filled
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.objective.losses import high_gradient_loss
-from gvtools.networks.depth_anything.camera_token import encode_cameras
-from gvtools.networks.depth_anything.encoder import patch_rays
+from gvtools.completers.geoverse.objective import high_gradient_loss
+from gvtools.networks.depth_anything.encoder import encode_cameras, patch_rays
 from gvtools.networks.depth_anything.geometry_head import Geometry
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws

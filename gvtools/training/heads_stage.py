@@ -13,8 +13,8 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.correction import composed
-from gvtools.completers.geoverse.objective.losses import high_gradient_loss, rgb_loss
+from gvtools.completers.geoverse.composition import composed
+from gvtools.completers.geoverse.objective import high_gradient_loss, rgb_loss
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 from gvtools.training.encoder_stage import (

@@ -9,7 +9,7 @@ import numpy as np
 
 from gvtools.completers.base import ContextView
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.resampling import model_size
+from gvtools.completers.geoverse.views import model_size
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance
 from gvtools.scenes.scene import Scene

@@ -22,7 +22,7 @@ import torch
 from torch import nn
 
 from gvtools.errors import OptionError
-from gvtools.networks.precision import autocast, training_type
+from gvtools.networks.compute import autocast, training_type
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.distributed import Replicated
 from gvtools.training.draws import Draws

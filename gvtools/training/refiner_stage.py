@@ -14,8 +14,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from gvtools.completers.geoverse.composition import composed, corrected_depth, seamless
 from gvtools.completers.geoverse.conditioning import ViewBatch, filled
-from gvtools.completers.geoverse.correction import composed, corrected_depth, seamless
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.refiner import CompletedViews, completed_views, cropped
 from gvtools.errors import OptionError

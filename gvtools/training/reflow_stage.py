@@ -8,14 +8,15 @@ from collections.abc import Iterable
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse.flow import (
+    fast_loss,
     guided,
     interpolate,
+    interval_times,
+    reflow_pair,
     velocity_target,
 )
-from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.objective.losses import flow_matching_loss
-from gvtools.completers.geoverse.passes import Prepared
-from gvtools.completers.geoverse.reflow import fast_loss, interval_times, reflow_pair
+from gvtools.completers.geoverse.model import GeoVerse, Prepared
+from gvtools.completers.geoverse.objective import flow_matching_loss
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 from gvtools.training.options import ReflowStageOptions

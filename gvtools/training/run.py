@@ -14,13 +14,18 @@ import torch
 from gvtools.completers.geoverse.config import FlowConfig, GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.refiner import Refiner
-from gvtools.completers.geoverse.video_prior.prior import VideoPrior
-from gvtools.completers.geoverse.weights.folder import config_of, from_pretrained, save_pretrained
-from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER, WHOLE_FILE
+from gvtools.completers.geoverse.video_prior import VideoPrior
+from gvtools.completers.geoverse.weights import (
+    VIDEO_FOLDER,
+    WHOLE_FILE,
+    config_of,
+    from_pretrained,
+    save_pretrained,
+)
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text
+from gvtools.networks.compute import name_of, training_type
 from gvtools.networks.config_json import to_json
-from gvtools.networks.precision import name_of, training_type
 from gvtools.procedural.photographs import photograph_names
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.denoiser_stage import DenoiserStage

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
-from gvtools.completers.geoverse.resampling import resampled
+from gvtools.completers.geoverse.views import resampled
 from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.collection import SceneCollection
 from gvtools.scenes.scene import View

@@ -21,7 +21,7 @@ from torch.distributed.fsdp import FSDPModule, fully_shard, register_fsdp_forwar
 from torch.distributed.tensor import DTensor, distribute_tensor
 
 from gvtools.completers.geoverse.model import GeoVerse, empty_model
-from gvtools.completers.geoverse.video_prior.prior import VideoPrior
+from gvtools.completers.geoverse.video_prior import VideoPrior
 from gvtools.networks.tensors import load
 from gvtools.training.distributed import Replicated, models_of
 

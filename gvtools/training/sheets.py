@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gvtools.completers.geoverse.composition import composed
 from gvtools.completers.geoverse.conditioning import encode_views, filled
-from gvtools.completers.geoverse.correction import composed
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.files import replaced_when_written
 from gvtools.training.batch import TrainingBatch

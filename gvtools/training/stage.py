@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from gvtools.completers.geoverse.flow import training_times
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.networks.recompute import set_recompute
+from gvtools.networks.compute import set_recompute
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.draws import Draws
 

@@ -11,7 +11,7 @@ import torch
 
 from gvtools.errors import CheckpointError
 from gvtools.files import replaced_when_written
-from gvtools.networks.tensor_files import first_line
+from gvtools.networks.tensors import first_line
 from gvtools.untrusted import archive
 
 FILE = "state.pt"

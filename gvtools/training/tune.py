@@ -22,13 +22,13 @@ from gvtools.completers.base import Completer
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.weights.folder import (
+from gvtools.completers.geoverse.weights import (
+    VIDEO_FOLDER,
     check_headers,
     config_of,
     from_pretrained,
     save_pretrained,
 )
-from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
 from gvtools.errors import CheckpointError, ProjectError
 from gvtools.files import folder_replaced_when_written, make_folder, write_json
 from gvtools.runs.identity import array_digest

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.model_views import view_batch
+from gvtools.completers.geoverse.views import view_batch
 from gvtools.completers.surface_fill import surface_fill
 from gvtools.errors import ShapeError
 from gvtools.training.batch import TrainingBatch

@@ -9,10 +9,9 @@ import torch
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.flow import interval_bounds
-from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.stages import DECODE
-from gvtools.completers.geoverse.weights.folder import from_pretrained
-from gvtools.networks.precision import name_of
+from gvtools.completers.geoverse.model import DECODE, GeoVerse
+from gvtools.completers.geoverse.weights import from_pretrained
+from gvtools.networks.compute import name_of
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
 from pipelines.bench.stage_clock import PEAK, forget_peak, peak_bytes, total, within

@@ -20,10 +20,9 @@ import torch
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.flow import interval_bounds
-from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.stages import DECODE, DECODING, VIDEO
-from gvtools.completers.geoverse.video_prior.prior import VideoPrior
-from gvtools.networks.precision import autocast, name_of
+from gvtools.completers.geoverse.model import DECODE, DECODING, VIDEO, GeoVerse
+from gvtools.completers.geoverse.video_prior import VideoPrior
+from gvtools.networks.compute import autocast, name_of
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.distributed import Processes, Replicated

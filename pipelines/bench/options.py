@@ -9,9 +9,9 @@ import torch
 from pydantic import Field, model_validator
 
 from gvtools.completers.geoverse.config import GeoVerseConfig, named
-from gvtools.completers.geoverse.weights.folder import config_of
+from gvtools.completers.geoverse.weights import config_of
 from gvtools.errors import OptionError
-from gvtools.networks.precision import inference_type, named_type
+from gvtools.networks.compute import inference_type, named_type
 from gvtools.settings import Settings
 
 Count = Annotated[int, Field(ge=1)]

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import torch
 
-from gvtools.completers.geoverse.stages import DECODE, DECODING
+from gvtools.completers.geoverse.model import DECODE, DECODING
 
 # Before the name of a part of the decoding.
 INSIDE = f"{DECODE}: "

@@ -13,10 +13,9 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.stages import LEVEL0, LEVEL1, no_clock
-from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
-from gvtools.networks.precision import autocast
+from gvtools.completers.geoverse.model import LEVEL0, LEVEL1, GeoVerse, no_clock
+from gvtools.completers.geoverse.video_prior import VideoFeatures
+from gvtools.networks.compute import autocast
 from pipelines.bench.stage_clock import StageClock, seconds, total
 
 PASS = "pass"

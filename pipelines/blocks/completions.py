@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gvtools.completers.base import Completer, Completion, ContextView
-from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
+from gvtools.completers.base import Completer, Completion, ContextView, ScaleAlignment, ScaleStatus
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance
 from gvtools.runs.run import RunTarget

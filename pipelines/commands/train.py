@@ -88,7 +88,7 @@ def _settings(args: argparse.Namespace) -> list[Settings]:
 
 def run(args: argparse.Namespace, console: Console) -> None:
     """Train the stages that were asked for."""
-    from gvtools.completers.geoverse.weights.published import WHOLE_FILE
+    from gvtools.completers.geoverse.weights import WHOLE_FILE
     from gvtools.files import check_parent, make_folder, write_text
     from gvtools.runs.folder_lock import folder_lock
     from gvtools.settings import with_texts

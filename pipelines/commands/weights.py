@@ -101,7 +101,7 @@ def _pack(args: argparse.Namespace, console: Console) -> None:
 
 
 def _check(args: argparse.Namespace, console: Console) -> None:
-    from gvtools.completers.geoverse.weights.folder import (
+    from gvtools.completers.geoverse.weights import (
         check_folder,
         check_is_folder,
         config_of,
@@ -142,8 +142,7 @@ def _create(args: argparse.Namespace, console: Console) -> None:
     import torch
 
     from gvtools.completers.geoverse.model import GeoVerse, empty_model
-    from gvtools.completers.geoverse.weights.folder import save_pretrained
-    from gvtools.completers.geoverse.weights.published import VIDEO_FOLDER
+    from gvtools.completers.geoverse.weights import VIDEO_FOLDER, save_pretrained
     from pipelines.weights.report import size_text
 
     config, folder = _config(args.config), args.folder
@@ -173,8 +172,8 @@ def _create(args: argparse.Namespace, console: Console) -> None:
 
 
 def _truncate(args: argparse.Namespace, console: Console) -> None:
-    from gvtools.completers.geoverse.video_prior.wan_checkpoint import truncate
-    from gvtools.completers.geoverse.video_prior.wan_folder import EMPTY_PROMPT
+    from gvtools.completers.geoverse.wan import EMPTY_PROMPT
+    from gvtools.completers.geoverse.wan_checkpoint import truncate
 
     progress = _progress(console)
     truncate(args.source, args.folder, blocks=args.blocks, vae=args.vae, progress=progress)
@@ -185,8 +184,8 @@ def _truncate(args: argparse.Namespace, console: Console) -> None:
 
 
 def _empty_prompt(args: argparse.Namespace, console: Console) -> None:
-    from gvtools.completers.geoverse.video_prior.wan_checkpoint import write_empty_prompt
-    from gvtools.completers.geoverse.video_prior.wan_folder import EMPTY_PROMPT
+    from gvtools.completers.geoverse.wan import EMPTY_PROMPT
+    from gvtools.completers.geoverse.wan_checkpoint import write_empty_prompt
 
     path = args.folder / EMPTY_PROMPT
     if not args.folder.is_dir():

@@ -64,7 +64,7 @@ def make_plan(
     config = _on_device(settings)
     _check(scene, config)
     scene = reduced(scene, config.max_side)
-    completer = config.effort.applied(create(config.completer, **config.completer_options))
+    completer = config.effort.wrap(create(config.completer, **config.completer_options))
     # By name: a project may list its views in any order, and merging depends on theirs.
     context = tuple(sorted(select(scene.names, config.context)))
     if config.tune.wanted:
@@ -470,4 +470,4 @@ def with_depth(scene: Scene, names: Sequence[str], cache: DepthCache) -> Scene:
 
 def _with_weights(plan: Plan, options: dict[str, Any], folder: Path) -> Completer:
     completer = create(plan.config.completer, **options, weights=str(folder))
-    return plan.config.effort.applied(completer)
+    return plan.config.effort.wrap(completer)

@@ -17,8 +17,13 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance, Picture, applied
 from gvtools.cameras import Cameras
-from gvtools.completers.base import Completer, Completion, ContextView, run_completer
-from gvtools.completers.scale_alignment import ScaleAlignment
+from gvtools.completers.base import (
+    Completer,
+    Completion,
+    ContextView,
+    ScaleAlignment,
+    run_completer,
+)
 from gvtools.depth.from_memory import MEMORY, depth_from_memory
 from gvtools.depth.scale_check import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap
@@ -520,21 +525,8 @@ def _completed_together(
         of_one_size = concatenate([guidances[index] for index in rows])
         completion = run_completer(completer, context, of_one_size, seed=seed)
         for place, index in enumerate(rows):
-            completions[index] = _row(completion, place)
+            completions[index] = completion.select(slice(place, place + 1))
     return [completions[index] for index in range(len(guidances))]
-
-
-def _row(completion: Completion, index: int) -> Completion:
-    rows = slice(index, index + 1)
-    rays = None if completion.rays is None else completion.rays[rows]
-    return Completion(
-        completion.rgb[rows],
-        completion.depth[rows],
-        completion.confidence[rows],
-        rays,
-        None if completion.scale_alignment is None else completion.scale_alignment[rows],
-        completion.whole,
-    )
 
 
 def _align_and_fuse(

@@ -9,8 +9,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from gvtools.completers.geoverse.weights.folder import config_of, from_pretrained, save_pretrained
-from gvtools.completers.geoverse.weights.published import CONFIG_FILE, WHOLE_FILE
+from gvtools.completers.geoverse.weights import (
+    CONFIG_FILE,
+    WHOLE_FILE,
+    config_of,
+    from_pretrained,
+    save_pretrained,
+)
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
 from gvtools.training.records import STAGES, read_log

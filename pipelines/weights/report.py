@@ -13,9 +13,8 @@ import torch
 from gvtools.completers.geoverse import config as configs
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse, empty_model
-from gvtools.completers.geoverse.video_prior.config import VideoPriorConfig
-from gvtools.completers.geoverse.weights.folder import PartReport
-from gvtools.completers.geoverse.weights.published import (
+from gvtools.completers.geoverse.video_prior import VideoPriorConfig
+from gvtools.completers.geoverse.weights import (
     CONFIG_FILE,
     VIDEO_FOLDER,
     VIDEO_SIZES,
@@ -23,11 +22,11 @@ from gvtools.completers.geoverse.weights.published import (
     VIDEO_TERMS,
     WHOLE,
     Part,
+    PartReport,
     expected_of,
     parts_of,
 )
-from gvtools.networks.depth_anything.network import DepthAnything3
-from gvtools.networks.depth_anything.weights import RELEASED, tied_norms
+from gvtools.networks.depth_anything.network import RELEASED, DepthAnything3, tied_norms
 from gvtools.networks.tensors import Shapes
 
 if TYPE_CHECKING:

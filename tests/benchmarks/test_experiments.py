@@ -13,7 +13,7 @@ from benchmarks.experiments.judging import COLUMNS, best, judge, records, table
 from benchmarks.experiments.rows import FILL, HINTS, INPAINT, with_heads_of
 from gvtools.completers import Completer, Completion
 from gvtools.completers.geoverse import from_pretrained
-from gvtools.completers.geoverse.weights.folder import save_pretrained
+from gvtools.completers.geoverse.weights import save_pretrained
 from gvtools.guidance import Guidance
 from pipelines.cli import main as run_command
 

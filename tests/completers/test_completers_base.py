@@ -19,8 +19,7 @@ from gvtools.completers import (
     create,
     register,
 )
-from gvtools.completers.base import _REGISTRY
-from gvtools.completers.complete import complete
+from gvtools.completers.base import _REGISTRY, complete
 from gvtools.completers.settings import CompleterSettings
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance

@@ -9,12 +9,13 @@ from gvtools.cameras import Cameras
 from gvtools.completers.base import (
     Completer,
     Completion,
+    ScaleAlignment,
+    ScaleStatus,
     create,
 )
 from gvtools.completers.effort import EffortPolicy, SmallHolesInpainted
-from gvtools.completers.holes import hole_radius
+from gvtools.completers.hole_depth import hole_radius
 from gvtools.completers.inpaint import InpaintCompleter
-from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 from gvtools.settings import with_values
@@ -113,13 +114,13 @@ def test_a_completer_without_views_is_not_called():
 def test_only_costly_completers_leave_views_to_inpaint():
     policy, off = EffortPolicy(inpaint_below=0.02), EffortPolicy(inpaint_below=0)
     costly = Recorder()
-    split = policy.applied(costly)
+    split = policy.wrap(costly)
     assert isinstance(split, SmallHolesInpainted)
     assert (split.name, split.batches_targets) == ("recorder", True)
     assert split.files == costly.files and split.notes == costly.notes
-    assert off.applied(costly) is costly
+    assert off.wrap(costly) is costly
     for cheap in map(create, ("inpaint", "none")):
-        assert policy.applied(cheap) is cheap
+        assert policy.wrap(cheap) is cheap
 
 
 def test_scale_alignment_is_absent_where_neither_has_a_scale_to_find():

@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save_file
 from tiny_scan import SQUARE, WALL, render, write_colmap_scan, write_scan
 
-from gvtools.completers.geoverse.resampling import resampled
+from gvtools.completers.geoverse.views import resampled
 from gvtools.depth.choice import choose_source
 from gvtools.depth.foundation import source as module
 from gvtools.depth.foundation.options import FoundationOptions
@@ -19,8 +19,12 @@ from gvtools.depth.source import MixedDepth
 from gvtools.errors import CheckpointError, DegenerateError, ProjectError
 from gvtools.networks.depth_anything.encoder import EncoderConfig
 from gvtools.networks.depth_anything.geometry_head import Geometry, GeometryHeadConfig
-from gvtools.networks.depth_anything.network import DepthAnything3, DepthAnythingConfig
-from gvtools.networks.depth_anything.weights import RELEASED, load_depth_anything
+from gvtools.networks.depth_anything.network import (
+    RELEASED,
+    DepthAnything3,
+    DepthAnythingConfig,
+    load_depth_anything,
+)
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.scene import Scene
 from gvtools.scenes.sevenscenes import read_sevenscenes

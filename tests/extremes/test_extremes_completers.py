@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gvtools.completers import Completer, Completion, ContextView, create
-from gvtools.completers.geoverse.correction import MOST, corrected_color, corrected_depth
+from gvtools.completers.geoverse.composition import MOST, corrected_color, corrected_depth
 from gvtools.completers.push_pull import push_pull, push_pull_depth
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance

@@ -15,18 +15,16 @@ from gvtools.completers.geoverse.flow import (
     integrate,
     interpolate,
     interval_bounds,
+    interval_times,
+    reflow_pair,
     sample,
+    seeded_noise,
     shift_time,
+    teacher_times,
     training_times,
     unshift_time,
     velocity_from_clean,
     velocity_target,
-)
-from gvtools.completers.geoverse.noise import seeded_noise
-from gvtools.completers.geoverse.reflow import (
-    interval_times,
-    reflow_pair,
-    teacher_times,
 )
 from gvtools.errors import OptionError
 

@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
+from gvtools.completers.geoverse.objective import center_similarity
 from gvtools.similarity import COLLINEAR, SimilarityFit, align_depth_scale, fit_similarity
 
 pytestmark = pytest.mark.filterwarnings("error")

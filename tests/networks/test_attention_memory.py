@@ -11,13 +11,12 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from gvtools.completers.geoverse.control import ControlBranch, ControlConfig
 from gvtools.completers.geoverse.denoiser import Denoiser, Positions
-from gvtools.completers.geoverse.injection import video_keys
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.rgb_head import RGBHead
-from gvtools.networks import attention
-from gvtools.networks.attention import attend
+from gvtools.completers.geoverse.video_injection import ControlBranch, ControlConfig, video_keys
+from gvtools.networks import compute
+from gvtools.networks.compute import attend
 from gvtools.networks.depth_anything.network import DepthAnything3
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -136,8 +135,8 @@ def test_chunks_of_queries_give_the_same_within_their_bound(monkeypatch, dtype):
     wanted = attend(q, k, v)
     gradients = torch.autograd.grad(wanted.square().sum(), (q, k, v))
     most = 2 * 3 * 200 * 17
-    monkeypatch.setattr(attention, "MOST_SCORES", most)
-    monkeypatch.setattr(attention, "_is_fused", lambda q: False)
+    monkeypatch.setattr(compute, "MOST_SCORES", most)
+    monkeypatch.setattr(compute, "_is_fused", lambda q: False)
     # As on such a card, only the kernel that builds the scores is there.
     kernel = torch.nn.attention.sdpa_kernel(torch.nn.attention.SDPBackend.MATH)
     with kernel, Largest() as largest:
@@ -167,7 +166,7 @@ def test_what_cards_have_fused_kernels_for(monkeypatch, capability, dtype, fused
 
     query: Any = Query()
     query.dtype = dtype
-    assert attention._is_fused(query) is fused
+    assert compute._is_fused(query) is fused
 
 
 def test_denoisers_are_what_the_networks_hold():

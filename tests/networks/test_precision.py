@@ -7,8 +7,8 @@ import torch
 
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
 from gvtools.errors import OptionError
-from gvtools.networks import precision
-from gvtools.networks.precision import autocast, half_type, inference_type, training_type
+from gvtools.networks import compute
+from gvtools.networks.compute import autocast, half_type, inference_type, training_type
 from gvtools.training.options import OptimizerOptions
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -40,19 +40,19 @@ def test_a_cpu_infers_in_float32_and_trains_in_what_is_faster(monkeypatch):
     assert inference_type("auto", CPU) == torch.float32
     assert half_type("bfloat16", CPU) == torch.bfloat16
     seconds = {torch.float32: 1.0, torch.bfloat16: 0.5}
-    monkeypatch.setattr(precision, "_least_seconds", seconds.__getitem__)
+    monkeypatch.setattr(compute, "_least_seconds", seconds.__getitem__)
     for share, wanted in ((0.5, torch.bfloat16), (0.95, torch.float32), (40.0, torch.float32)):
         seconds[torch.bfloat16] = share
-        precision.bfloat16_is_faster.cache_clear()
+        compute.bfloat16_is_faster.cache_clear()
         assert training_type("auto", CPU) == wanted
-    precision.bfloat16_is_faster.cache_clear()
+    compute.bfloat16_is_faster.cache_clear()
 
 
 def test_the_probe_times_both_ways_and_leaves_nothing_changed():
     torch.manual_seed(3)
     before = torch.get_rng_state()
     with torch.no_grad():
-        assert all(precision._least_seconds(dtype) > 0 for dtype in (torch.float32, *HALF[:1]))
+        assert all(compute._least_seconds(dtype) > 0 for dtype in (torch.float32, *HALF[:1]))
     assert torch.equal(torch.get_rng_state(), before)
     assert torch.get_num_threads() == 1
 

@@ -6,7 +6,7 @@ import geoverse_models as micro
 import pytest
 import torch
 
-from gvtools.networks.recompute import Recomputing, set_recompute
+from gvtools.networks.compute import Recomputing, set_recompute
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.draws import Draws

@@ -13,7 +13,7 @@ from geoverse_models import cameras
 from shared_data import shared_folder
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.weights.folder import check_folder, config_of, from_pretrained
+from gvtools.completers.geoverse.weights import check_folder, config_of, from_pretrained
 
 ORACLE = shared_folder() / "oracle"
 SIZE = (56, 70)

@@ -12,8 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from gvtools.completers.geoverse import from_pretrained
-from gvtools.completers.geoverse.weights.folder import save_pretrained
-from gvtools.completers.geoverse.weights.published import WHOLE_FILE
+from gvtools.completers.geoverse.weights import WHOLE_FILE, save_pretrained
 from gvtools.networks.config_json import to_json
 from pipelines.cli import build_parser, main
 

@@ -13,7 +13,7 @@ FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.p
 # A function that goes to a process of our own over a pipe, to compile kernels there.
 OWN_PIPE = {"gvtools/kernels.py"}
 # Its exceptions are caught by name; torch itself unpickles, weights only.
-ERRORS_ALONE = {"gvtools/networks/tensor_files.py"}
+ERRORS_ALONE = {"gvtools/networks/tensors.py"}
 MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "jsonpickle"}
 
 

@@ -10,7 +10,7 @@ from hostile import samples
 from hostile.run_samples import indexed_tensors, run, shards
 
 from gvtools.errors import CheckpointError, GvError, ProjectError
-from gvtools.networks.tensor_files import TensorFiles
+from gvtools.networks.tensors import TensorFiles
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.scenes.shards.reader import open_shards

@@ -13,11 +13,11 @@ from published_folder import write_published
 from torch import Tensor
 
 from gvtools.completers.geoverse import GeoVerse, from_pretrained
+from gvtools.completers.geoverse.camera_encoding import camera_condition
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig, named, read
 from gvtools.completers.geoverse.denoiser import Conditions
-from gvtools.completers.geoverse.plucker import camera_condition
-from gvtools.completers.geoverse.weights.folder import save_pretrained
+from gvtools.completers.geoverse.weights import save_pretrained
 from gvtools.networks.config_json import to_json
 from gvtools.training.options import SHIPPED, shipped_or_read
 from gvtools.training.samples import TrainingSamples

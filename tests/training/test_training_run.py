@@ -366,12 +366,12 @@ def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
 
 
 def test_auto_is_settled_once_said_and_kept(tmp_path, capsys, monkeypatch):
-    from gvtools.networks import precision
+    from gvtools.networks import compute
 
     auto = ("--set", "encoder.optimizer.precision=auto", "--set", "encoder.optimizer.steps=2")
     start = ["train", "micro", "--stage", "encoder", "--out", str(tmp_path), "--device", "cpu"]
     faster = [True]
-    monkeypatch.setattr(precision, "bfloat16_is_faster", lambda: faster[0])
+    monkeypatch.setattr(compute, "bfloat16_is_faster", lambda: faster[0])
     assert main([*start, "--sheets", "0", *SAMPLES, *auto, "--until", "1"]) == 0
     assert "encoder: products in bfloat16" in capsys.readouterr().out
     state = torch.load(tmp_path / "encoder" / "state.pt", weights_only=True)

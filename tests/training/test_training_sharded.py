@@ -19,7 +19,7 @@ from PIL import Image
 
 from gvtools.completers.geoverse import GeoVerse, from_pretrained
 from gvtools.completers.geoverse.config import GeoVerseConfig, read
-from gvtools.completers.geoverse.weights.folder import save_pretrained
+from gvtools.completers.geoverse.weights import save_pretrained
 from gvtools.networks.config_json import to_json
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.draws import Draws

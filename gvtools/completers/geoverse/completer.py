@@ -3,60 +3,96 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from pydantic import Field
 
 from gvtools.completers.base import (
     Completer,
     Completion,
     ContextView,
+    ScaleAlignment,
+    ScaleStatus,
+    camera_rays,
     check_views,
 )
-from gvtools.completers.geoverse.completer_settings import GeoVerseSettings
-from gvtools.completers.geoverse.conditioning import filled
-from gvtools.completers.geoverse.context_views import chosen_views
-from gvtools.completers.geoverse.correction import seamless
-from gvtools.completers.geoverse.flow import interval_bounds
-from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.model_views import context_depth, view_batch
-from gvtools.completers.geoverse.postprocess import (
+from gvtools.completers.geoverse.composition import (
     Completed,
     averaged,
     corrected,
     refined,
+    seamless,
     to_scene_scale,
 )
-from gvtools.completers.geoverse.resampling import model_size
-from gvtools.completers.geoverse.weights.folder import check_headers, from_pretrained
+from gvtools.completers.geoverse.conditioning import filled
+from gvtools.completers.geoverse.flow import interval_bounds
+from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.completers.geoverse.views import chosen_views, context_depth, model_size, view_batch
+from gvtools.completers.geoverse.weights import check_headers, from_pretrained
 from gvtools.completers.push_pull import Filled
-from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
+from gvtools.completers.settings import CompleterSettings
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
-from gvtools.networks.precision import autocast, inference_type
+from gvtools.networks.compute import Precision, autocast, inference_type
+
+
+class GeoVerseSettings(CompleterSettings):
+    """Options of ``geoverse``; none takes the model's own value."""
+
+    weights: str | None = None
+    """Folder of a GeoVerse model, see ``gvtools weights list``; none takes the small model that
+    ships."""
+    steps: int | None = Field(None, ge=0)
+    """Level-1 steps, equally spaced in time before the model's time shift; 0 decodes the features
+    of the filled projections."""
+    cascade_steps: int | None = Field(None, ge=1)
+    """Level-0 steps, likewise."""
+    cfg_scale: float | None = Field(None, ge=0)
+    """Scale of classifier-free guidance over the cameras, of level 1; 1 does without."""
+    cascade_cfg_scale: float | None = Field(None, ge=0)
+    """Likewise, of level 0."""
+    output: Literal["holes", "views"] = "holes"
+    """``holes`` keeps what the memory shows of a view and takes the model's pixels elsewhere;
+    ``views`` gives whole views as the model decodes them (the paper)."""
+    temperature: float | None = Field(None, ge=0)
+    """Standard deviation of the noise that level 1 starts from."""
+    context_views: int | None = Field(None, ge=1)
+    """Most photographs in a pass."""
+    context_selection: Literal["covisible", "nearest"] = "covisible"
+    """The photographs of a pass: those that show most of what the targets show, or those that
+    stand and look most like them."""
+    views: int | None = Field(None, ge=2)
+    """Most views in a pass, photographs and targets."""
+    alignment: Literal["centres", "hint", "field"] | None = None
+    """How decoded depth gets the memory's scale: by camera centres, by one factor to the memory's
+    depth, or by a smooth field of factors."""
+    color_alignment: Literal["unchanged", "field"] | None = None
+    """Whether decoded colours follow the memory's by a smooth field."""
+    composition: Literal["decoded", "correction"] | None = None
+    """``decoded`` shows the decoding itself where the model corrects filled projections."""
+    shared_fill: bool = True
+    """Whether targets of a call share what their holes are filled with."""
+    image_size: int | None = Field(None, ge=1)
+    """Longer side of the pictures in a pass, pixels, rounded to whole patches; the model's own is
+    also the most."""
+    precision: Precision = "auto"
+    """``auto`` is float32 on a CPU and bfloat16 on a GPU, float16 before compute capability 8.0."""
+    offload: Literal["auto", "always", "never"] = "auto"
+    """Whether the video prior's weights leave the GPU between passes; ``auto`` where they would
+    leave too little memory for the rest of a pass."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """``auto`` takes a GPU where there is one."""
+
 
 # The model that ships: see MODEL_CARD.md there.
 SHIPPED = Path(__file__).parent / "pretrained" / "tiny"
-
-
-@dataclass(frozen=True)
-class _Sampling:
-    """Sampling schedule and image size of a pass.
-
-    Attributes:
-        bounds: times 1 = tau_0 > ... > tau_K = 0 of the K Euler steps that denoise the level-1
-            features (see ``model.py``); empty if nothing is denoised.
-        size: (H, W) of the model's images, pixels.
-    """
-
-    bounds: tuple[float, ...]
-    size: tuple[int, int]
 
 
 class GeoVerseCompleter(Completer):
@@ -126,26 +162,33 @@ class GeoVerseCompleter(Completer):
         if not context:
             raise OptionError("completer geoverse needs at least one context view, and got none")
         check_views(context, guidance)
-        canvas = _Canvas(guidance, whole=self.settings.output == "views")
+        whole = self.settings.output == "views"
+        has_holes = ~guidance.valid.all(axis=(1, 2)) | whole
+        incomplete, complete = (np.flatnonzero(which).tolist() for which in (has_holes, ~has_holes))
         # A pass is one run of the model over at most ``views`` views: first the context views,
         # then as many targets as still fit.
-        incomplete = [index for index in range(len(guidance)) if not canvas.kept[index].all()]
         views = self.settings.views or self.config.views
         context_count = min(self.settings.context_views or self.config.context, views - 1)
         targets_per_pass = views - min(context_count, len(context))
-        filled = self._filled(context, guidance.select(incomplete)) if incomplete else None
-        for first in range(0, len(incomplete), targets_per_pass):
-            rows = incomplete[first : first + targets_per_pass]
-            part = guidance.select(rows)
-            fill = None if filled is None else filled.rows(range(first, first + len(rows)))
-            depth = part.depth if fill is None else fill.depth
-            selection = self.settings.context_selection
-            chosen = chosen_views(
-                context, part.cameras, depth, count=context_count, selection=selection
-            )
-            sampling = self._sampling(part)
-            canvas.put(rows, self._pass(chosen, part, fill, sampling=sampling, seed=seed))
-        return canvas.completion()
+
+        def parts() -> Iterator[tuple[list[int], Completion]]:
+            if complete or not incomplete:
+                known = Completion.of_memory(guidance.select(complete))
+                nothing = (ScaleAlignment(ScaleStatus.NOTHING_TO_COMPLETE),) * len(complete)
+                rays = camera_rays(guidance.cameras[complete], known.depth.shape)
+                yield complete, replace(known, rays=rays, scale_alignment=nothing, whole=whole)
+            filled = self._filled(context, guidance.select(incomplete)) if incomplete else None
+            for first in range(0, len(incomplete), targets_per_pass):
+                rows = incomplete[first : first + targets_per_pass]
+                part = guidance.select(rows)
+                fill = None if filled is None else filled.rows(range(first, first + len(rows)))
+                chosen = chosen_views(
+                    context, part.cameras, part.depth if fill is None else fill.depth,
+                    count=context_count, selection=self.settings.context_selection,
+                )  # fmt: skip
+                yield rows, self._pass(chosen, part, fill, seed=seed).over(part, whole=whole)
+
+        return Completion.joined(parts(), guidance.cameras)
 
     def _filled(self, context: Sequence[ContextView], guidance: Guidance) -> Filled | None:
         """Fill of the holes that the model gets as hint; None if the model fills them itself."""
@@ -156,26 +199,20 @@ class GeoVerseCompleter(Completer):
 
         return surface_fill(context, guidance, shared=self.settings.shared_fill)
 
-    def _sampling(self, part: Guidance) -> _Sampling:
-        """The model's own steps and picture size, or those of the settings."""
-        bounds, steps = self.config.flow.level1, self.settings.steps
-        if steps is not None:
-            bounds = interval_bounds(steps, shift=self._shift) if steps else ()
-        longest = min(self.settings.image_size or math.inf, self.config.image_size)
-        size = model_size(*part.depth.shape[1:], longest=int(longest), patch=self.config.patch)
-        return _Sampling(bounds, size)
-
     def _pass(
-        self,
-        context: Sequence[ContextView],
-        part: Guidance,
-        fill: Filled | None,
-        *,
-        sampling: _Sampling,
-        seed: int,
+        self, context: Sequence[ContextView], part: Guidance, fill: Filled | None, *, seed: int
     ) -> Completed:
         """One pass of the model over context views and a few targets."""
-        options, size = self.settings, sampling.size
+        options, flow = self.settings, self.config.flow
+        longest = min(options.image_size or math.inf, self.config.image_size)
+        size = model_size(*part.depth.shape[1:], longest=int(longest), patch=self.config.patch)
+
+        def bounds(steps: int | None, own: tuple[float, ...]) -> tuple[float, ...]:
+            """Times 1 = tau_0 > ... > tau_K = 0 of K Euler steps; empty if nothing is denoised."""
+            if steps is None:
+                return own
+            return interval_bounds(steps, shift=flow.sampling_shift) if steps else ()
+
         batch, cameras = view_batch(context, part, size, fill=fill)
         # A photograph and a target of one name must not start from the same noise.
         names = [f"context {view.name}" for view in context]
@@ -189,16 +226,13 @@ class GeoVerseCompleter(Completer):
         # Depth of ``base`` is in scene units. Only its pixels without depth take decoded depth,
         # which has to be brought to the memory's scale first.
         base_is_complete = base is not None and bool((base.depth > 0).all())
-        cascade = options.cascade_steps
         with self._precision():
             generated = self.model.generate(
                 batch.to(self._device),
                 seed=seed,
                 names=[names],
-                bounds=sampling.bounds,
-                cascade_bounds=interval_bounds(cascade, shift=self._shift)
-                if cascade
-                else self.config.flow.cascade,
+                bounds=bounds(options.steps, flow.level1),
+                cascade_bounds=bounds(options.cascade_steps, flow.cascade),
                 cfg_scale=options.cfg_scale,
                 cascade_cfg_scale=options.cascade_cfg_scale,
                 temperature=options.temperature,
@@ -206,35 +240,24 @@ class GeoVerseCompleter(Completer):
             )
 
         def decoded_in_scene_units(color_alignment: str) -> Completed:
-            known = context_depth(context, part, size)
-            alignment = options.alignment or self.config.alignment
             return to_scene_scale(
                 generated,
                 part,
                 cameras,
-                known=known,
-                alignment=alignment,
+                known=context_depth(context, part, size),
+                alignment=options.alignment or self.config.alignment,
                 color_alignment=color_alignment,
             )
 
         if base is None:
             return decoded_in_scene_units(options.color_alignment or self.config.color_alignment)
         generated = seamless(generated, self.config.patch)
-        completed = corrected(
-            generated,
-            part,
-            base,
-            back=None if base_is_complete else decoded_in_scene_units("unchanged"),
-        )
-        refiner = self.model.refiner
-        if refiner is None:
+        back = None if base_is_complete else decoded_in_scene_units("unchanged")
+        completed = corrected(generated, part, base, back=back)
+        if self.model.refiner is None:
             return completed
         batch = filled(batch.to(self._device), self.config.hints)
-        return refined(completed, part, refiner, batch=batch, generated=generated)
-
-    @property
-    def _shift(self) -> float:
-        return self.config.flow.sampling_shift
+        return refined(completed, part, self.model.refiner, batch=batch, generated=generated)
 
     @property
     def _device(self) -> torch.device:
@@ -249,50 +272,3 @@ class GeoVerseCompleter(Completer):
     def _precision(self) -> AbstractContextManager[Any]:
         """Autocast to half precision if the settings ask for it, or by default on CUDA."""
         return autocast(self._device, self._compute_type)
-
-
-class _Canvas:
-    """The completion under construction: first the memory's pixels, then what each pass adds.
-
-    Args:
-        guidance: of all targets.
-        whole: whether the passes' pixels take the place of the memory's, too.
-
-    Attributes:
-        kept: (V, H, W) pixels that stay the memory's.
-    """
-
-    def __init__(self, guidance: Guidance, *, whole: bool) -> None:
-        valid = guidance.valid
-        self.whole, self.kept = whole, np.zeros_like(valid) if whole else valid
-        self.rgb = np.where(valid[..., None], guidance.rgb, np.float32(0))
-        self.depth = np.where(valid, guidance.depth, np.float32(0))
-        known = np.where(valid, np.minimum(guidance.confidence, 1), 0)
-        self.confidence = known.astype(np.float32)
-        self.rays = np.zeros((*valid.shape, 6), np.float32)
-        for index in range(len(guidance)):
-            self.rays[index] = guidance.cameras.plucker(index)
-        nothing = ScaleAlignment(ScaleStatus.NOTHING_TO_COMPLETE)
-        self.alignment = [nothing] * len(guidance)
-
-    def put(self, rows: Sequence[int], completed: Completed) -> None:
-        """Fill the holes of some views."""
-        for position, row in enumerate(rows):
-            hole = ~self.kept[row]
-            self.rgb[row][hole] = completed.rgb[position][hole]
-            self.depth[row][hole] = completed.depth[position][hole]
-            self.confidence[row][hole] = completed.confidence[position][hole]
-            if completed.rays is not None and np.isfinite(completed.scales[position]):
-                self.rays[row][hole] = completed.rays[position][hole]
-            self.alignment[row] = completed.alignment[position]
-
-    def completion(self) -> Completion:
-        """The result."""
-        return Completion(
-            self.rgb,
-            self.depth,
-            self.confidence,
-            self.rays,
-            scale_alignment=tuple(self.alignment),
-            whole=self.whole,
-        )

@@ -12,13 +12,12 @@ from importlib import resources
 from pathlib import Path
 
 from gvtools.completers.geoverse.conditioning import HintConfig
-from gvtools.completers.geoverse.control import ControlConfig
 from gvtools.completers.geoverse.denoiser import DenoiserConfig
 from gvtools.completers.geoverse.flow import check_bounds
 from gvtools.completers.geoverse.refiner import RefinerConfig
 from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
-from gvtools.completers.geoverse.shared_attention import SharedAttentionConfig
-from gvtools.completers.geoverse.video_prior.prior import VideoPriorConfig
+from gvtools.completers.geoverse.video_injection import ControlConfig, SharedAttentionConfig
+from gvtools.completers.geoverse.video_prior import VideoPriorConfig
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.networks.config_json import check_choice, check_range, from_json, to_json
 from gvtools.networks.depth_anything.network import DepthAnythingConfig

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
+from gvtools.completers.base import ScaleAlignment, ScaleStatus
+from gvtools.completers.geoverse.objective import center_similarity
 from gvtools.completers.push_pull import push_pull
-from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import DegenerateError
 from gvtools.networks.depth_anything.geometry_head import Geometry
 from gvtools.networks.depth_anything.rays import camera_centres

@@ -1,4 +1,12 @@
-"""GeoVerse: the whole model, from views and projections to target pictures, depth and rays.
+"""Names of a pass's stages, and a clock that a benchmark may put in.
+
+What a pass of the model hands from one stage to the next.
+
+The networks of GeoVerse, and what each computes in a pass; ``model.py`` has the passes.
+
+Equations are the paper's.
+
+GeoVerse: the whole model, from views and projections to target pictures, depth and rays.
 
 Data flow of one pass (tensor shapes in the README.md beside this file; equations are the paper's)::
 
@@ -10,35 +18,400 @@ Data flow of one pass (tensor shapes in the README.md beside this file; equation
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from gvtools.completers.geoverse import stages
+from gvtools.completers.geoverse.camera_encoding import camera_condition
 from gvtools.completers.geoverse.conditioning import (
+    Hints,
+    LatentStatistics,
     ViewBatch,
+    depth_condition,
+    encode_hints,
+    encode_latents,
+    filled,
 )
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.denoiser import Positions
+from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions, VideoKeys
 from gvtools.completers.geoverse.flow import (
     check_bounds,
+    over_state,
     sample,
+    seeded_noise,
+    velocity_from_clean,
+    view_seed,
 )
-from gvtools.completers.geoverse.model_networks import GeoVerseNetworks
-from gvtools.completers.geoverse.noise import seeded_noise, view_seed
-from gvtools.completers.geoverse.passes import Decoded, Generated, Prepared
-from gvtools.completers.geoverse.stages import Clock, no_clock
-from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
-from gvtools.errors import CheckpointError, GvError
-from gvtools.networks.tensor_files import first_line
+from gvtools.completers.geoverse.refiner import Refiner
+from gvtools.completers.geoverse.rgb_head import RGBHead
+from gvtools.completers.geoverse.video_injection import ControlBranch, SharedAttention, video_keys
+from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior
+from gvtools.errors import CheckpointError, GvError, ShapeError
+from gvtools.networks.compute import hold_in
+from gvtools.networks.depth_anything.geometry_head import Geometry
+from gvtools.networks.depth_anything.network import DepthAnything3
+from gvtools.networks.tensors import first_line
 
-__all__ = ["Decoded", "Generated", "GeoVerse", "Prepared"]
+HINTS = "hint encoding"
+VIDEO = "video features"
+LEVEL1 = "level-1 step"
+LEVEL0 = "cascade step"
+DECODE = "decoding"
+STAGES = (HINTS, VIDEO, LEVEL1, LEVEL0, DECODE)
+
+# Within decoding.
+BLOCKS = "encoder blocks"
+GEOMETRY = "geometry head"
+RGB = "RGB head"
+DECODING = (BLOCKS, GEOMETRY, RGB)
+
+Clock = Callable[[str], AbstractContextManager[None]]
 
 
-class GeoVerse(GeoVerseNetworks):
-    """The whole model: its networks, and the passes that sample and decode with them."""
+def no_clock(stage: str) -> AbstractContextManager[None]:
+    """Times nothing."""
+    return nullcontext()
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What stays constant over the denoising steps of a pass.
+
+    Attributes:
+        batch: the views, holes filled where the configuration says so.
+        hints: features of context and projections.
+        level1: conditions of the level-1 denoiser.
+        positions: its projective transforms.
+        adapted: video features at the control branch's width.
+        video: video features, where keys have to be made of them again for other cameras.
+        keys: their keys and values for the coupled blocks.
+    """
+
+    batch: ViewBatch
+    hints: Hints
+    level1: Conditions
+    positions: Positions
+    adapted: list[Tensor] | None = None
+    video: VideoFeatures | None = None
+    keys: dict[int, VideoKeys] | None = None
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Pictures and geometry of generated features.
+
+    Attributes:
+        rgb: (B, T, 3, H, W) of the target views, not clipped to [0, 1].
+        depth: (B, T, H, W) z-depth of the target views, in the model's unit.
+        depth_confidence: (B, T, H, W) > 1.
+        all_views: the geometry of all V views; None where the targets' depth alone was decoded.
+    """
+
+    rgb: Tensor
+    depth: Tensor
+    depth_confidence: Tensor
+    all_views: Geometry | None = None
+
+    @property
+    def geometry(self) -> Geometry:
+        """Of all V views, in the frame of the first view."""
+        if self.all_views is None:
+            raise ShapeError("the targets' depth alone was decoded, not the geometry of all views")
+        return self.all_views
+
+
+@dataclass(frozen=True)
+class Generated:
+    """The result of a pass.
+
+    Attributes:
+        level1: (B, V, C, h, w) normalised latents.
+        level0: (B, V, C, h, w) normalised latents.
+        decoded: pictures and geometry.
+        hint: of the filled projections' own features; None where nothing is composed of it.
+    """
+
+    level1: Tensor
+    level0: Tensor
+    decoded: Decoded
+    hint: Decoded | None = None
+
+
+class GeoVerse(nn.Module):
+    """See the module. The encoder, its heads and the video prior are frozen.
+
+    Args:
+        config: see ``GeoVerseConfig``; ``config.named("tiny")`` for the small one.
+    """
+
+    def __init__(self, config: GeoVerseConfig) -> None:
+        super().__init__()
+        self.config = config
+        channels = config.geometry.encoder.channels
+        self.geometry = DepthAnything3(config.geometry)
+        self.rgb_head = RGBHead(config.rgb)
+        self.level1 = Denoiser(config.level1)
+        self.cascade = None if config.cascade is None else Denoiser(config.cascade)
+        self.statistics = nn.ModuleList(LatentStatistics(channels) for _ in range(2))
+        self.control: ControlBranch | None = None
+        self.shared: SharedAttention | None = None
+        if config.video is not None and config.injection == "control":
+            self.control = ControlBranch(
+                config.control, self.level1, video_channels=config.video.channels
+            )
+        if config.video is not None and config.injection == "shared":
+            self.shared = SharedAttention(
+                config.shared,
+                width=config.level1.width,
+                heads=config.level1.heads,
+                video_channels=config.video.channels,
+            )
+        # Used on completions, see ``postprocess.refined``; it stays float32.
+        self.refiner = None if config.refiner is None else Refiner(config.refiner)
+        # Not a submodule: its weights live in a folder of their own and are never trained.
+        self._video: list[VideoPrior] = []
+        # True passes the video prior over: its branch is untrained and adds nothing.
+        self.without_video = False
+        self.freeze()
+
+    def freeze(self) -> None:
+        """Turn off gradients of the encoder and both heads; they still pass gradients through."""
+        self.geometry.requires_grad_(False)
+        self.rgb_head.requires_grad_(False)
+
+    def hold_in(self, dtype: torch.dtype) -> None:
+        """Keep the weights in the type that autocast computes in, for inference alone.
+
+        The same results, from half the memory: norms, tokens, tables, frequencies, statistics and
+        the geometry head stay float32 (``networks.precision``).
+        """
+        self.geometry.hold_in(dtype)
+        hold_in(dtype, self.rgb_head, self.level1, self.cascade, self.control, self.shared)
+
+    @property
+    def level_statistics(self) -> Sequence[LatentStatistics]:
+        """Statistics of level 0 and of level 1."""
+        return cast("Sequence[LatentStatistics]", self.statistics)
+
+    @property
+    def video(self) -> VideoPrior | None:
+        """The video prior, when one has been attached."""
+        return self._video[0] if self._video else None
+
+    def attach_video(self, prior: VideoPrior) -> None:
+        """Use this video prior for the features that the configuration asks for."""
+        self._video = [prior]
+
+    def prepare(
+        self,
+        batch: ViewBatch,
+        *,
+        seed: int | Sequence[Sequence[int]] = 0,
+        video: VideoFeatures | None = None,
+        clock: Clock = no_clock,
+    ) -> Prepared:
+        """Everything that the denoising steps share, computed once.
+
+        Args:
+            batch: context views, then targets.
+            seed: of the video prior's noise; one number, or B rows of V.
+            video: features computed before, for the same views; taken from the attached prior
+                when None.
+            clock: receives the stages' names.
+        """
+        config = self.config
+        with clock(HINTS):
+            source = batch
+            batch = filled(batch, config.hints)
+            camera = camera_condition(
+                torch.linalg.inv(batch.cam_from_world),
+                batch.K,
+                batch.size,
+                context=batch.context,
+                reference=config.camera.reference,
+                pixel_offset=config.camera.pixel_offset,
+            )
+            level0, level1 = self.level_statistics
+            hints = encode_hints(self.geometry, level0, level1, batch=batch, config=config.hints)
+            depth = None
+            if config.level1.depth_condition:
+                # Filled depth keeps the true validity beside it.
+                depth = depth_condition(batch.depth, batch.depth > 0, camera.scale)
+                depth = torch.cat((depth[:, :, :1], source.valid.to(depth.dtype)), dim=2)
+            conditions = Conditions(hints.level1, camera, depth=depth)
+            grid = (hints.level1.shape[-2], hints.level1.shape[-1])
+            positions = Positions(config.level1, camera, grid)
+            prepared = Prepared(batch, hints, conditions, positions)
+        if config.injection == "none" or (self.without_video and video is None):
+            return prepared
+        with clock(VIDEO):
+            features = self._video_features(source, seed) if video is None else video
+            return self.with_video(prepared, features)
+
+    @torch.no_grad()
+    def clean_latents(self, batch: ViewBatch) -> tuple[Tensor, Tensor]:
+        """Level-0 and level-1 latents, (B, V, C, h, w) each, of true pictures of all views."""
+        level0, level1 = self.level_statistics
+        return encode_latents(self.geometry, level0, level1, batch=batch, config=self.config.hints)
+
+    def with_video(self, prepared: Prepared, features: VideoFeatures) -> Prepared:
+        """``prepared`` with video features; gradients reach the adapters."""
+        latents = prepared.hints.level1
+        grid = (latents.shape[-2], latents.shape[-1])
+        if self.control is not None:
+            return replace(prepared, adapted=self.control.adapted(features.tensors, grid))
+        keys = video_keys(
+            self.shared, self.config.level1, prepared.level1.camera, features=features, grid=grid
+        )
+        return replace(prepared, video=features, keys=keys)
+
+    def _video_features(
+        self, batch: ViewBatch, seeds: int | Sequence[Sequence[int]]
+    ) -> VideoFeatures:
+        if self.video is None:
+            raise CheckpointError(
+                "this GeoVerse configuration needs the video prior and none was loaded; put the "
+                "truncated Wan2.2-VACE folder at video/ (gvtools weights list), or use a "
+                "configuration with injection = 'none'"
+            )
+        return self.video.features(batch.images, batch.valid, batch.context, seed=seeds)
+
+    def velocity1(
+        self,
+        prepared: Prepared,
+        state: Tensor,
+        t: Tensor,
+        *,
+        least: float | None = None,
+    ) -> Tensor:
+        """The level-1 velocity (Eq. 2).
+
+        Args:
+            prepared: what stays constant.
+            state: (B, V, C, h, w).
+            t: (B,) or (B, V).
+            least: instead of the configuration's ``flow.least_time``.
+        """
+        residuals = None
+        if self.control is not None and prepared.adapted is not None:
+            residuals = self.control(
+                self.level1,
+                state,
+                t,
+                prepared.level1,
+                adapted=prepared.adapted,
+                positions=prepared.positions,
+            )
+        out = self.level1(
+            state,
+            t,
+            prepared.level1,
+            residuals=residuals,
+            video=prepared.keys,
+            positions=prepared.positions,
+        )
+        flow = self.config.flow
+        if flow.prediction == "velocity":
+            return out
+        clean = out + prepared.hints.unmasked if flow.skip else out
+        return velocity_from_clean(clean, state, t, least=least or flow.least_time)
+
+    def velocity_wanted(self, velocity: Tensor, t: Tensor) -> Tensor:
+        """What ``velocity1`` should give at ``t`` where ``velocity`` (B, V, C, h, w) is right.
+
+        A clean prediction's velocity is divided by no less than ``flow.least_time``; a target that
+        is not would have the prediction wrong below it.
+        """
+        flow = self.config.flow
+        if flow.prediction == "velocity":
+            return velocity
+        return velocity * over_state((t / flow.least_time).clamp(max=1), velocity)
+
+    def cascade_conditions(self, prepared: Prepared, level1: Tensor) -> Conditions:
+        """What the cascade knows: clean context level 0, level 1 of all views, cameras (Eq. 3)."""
+        return replace(prepared.level1, latents=prepared.hints.level0, source=level1, depth=None)
+
+    def decode(
+        self,
+        prepared: Prepared,
+        level0: Tensor,
+        level1: Tensor,
+        *,
+        targets_alone: bool = False,
+        clock: Clock = no_clock,
+    ) -> Decoded:
+        """Pictures and depth of the targets, geometry of all views; gradients reach the latents.
+
+        Args:
+            prepared: of the pass.
+            level0: (B, V, C, h, w) normalised latents.
+            level1: (B, V, C, h, w) normalised latents.
+            targets_alone: without all views' geometry; the same pictures and depth, sooner.
+            clock: receives the stages' names.
+        """
+        grid = (level1.shape[-2], level1.shape[-1])
+        encoder = self.geometry.encoder
+        context = prepared.batch.context
+        with clock(BLOCKS):
+            pyramid = self.pyramid(level0, level1, prepared.hints.token)
+            normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
+        targets = [level[:, context:] for level in normed]
+        head, together, all_views = self.geometry.head, self.config.decode_views, None
+        with clock(GEOMETRY):
+            if targets_alone:
+                depth, confidence = head.depth(targets, grid, views_at_once=together)
+            else:
+                all_views = head(normed, grid, views_at_once=together)
+                depth, confidence = (
+                    value[:, context:] for value in (all_views.depth, all_views.depth_confidence)
+                )
+        with clock(RGB):
+            features = torch.cat(targets, dim=-1)
+            shape = features.shape[:2]
+            rgb = self.rgb_head(features.flatten(0, 1), grid, chunk=together)
+            rgb = rgb.unflatten(0, shape)
+        return Decoded(rgb, depth, confidence, all_views)
+
+    def pyramid(self, level0: Tensor, level1: Tensor, token: Tensor) -> list[Tensor]:
+        """Four raw (B, V, 1 + N, C) levels of two (B, V, C, h, w) latents and token 0 (B, V, C)."""
+        grid = (level1.shape[-2], level1.shape[-1])
+        raw = []
+        for statistics, latent in zip(self.level_statistics, (level0, level1), strict=True):
+            tokens = statistics.denormalise(latent).flatten(3).transpose(2, 3)
+            raw.append(torch.cat((token[:, :, None].to(tokens.dtype), tokens), dim=2))
+        return [*raw, *self.geometry.encoder.propagate(raw[1], grid)]
+
+    def without_cameras(self, prepared: Prepared, drop: Tensor | None = None) -> Prepared:
+        """Without cameras, as GLD's guidance has it: latents, hints and video are kept.
+
+        Args:
+            prepared: from ``prepare``.
+            drop: (B,) bool, samples that lose their cameras; None for all.
+        """
+        known = prepared.level1.camera
+        camera = known.unconditional()
+        if drop is not None:
+            at = drop[:, None, None, None]
+            camera = replace(
+                camera,
+                map=torch.where(at[..., None], camera.map, known.map),
+                cam_from_world=torch.where(at, camera.cam_from_world, known.cam_from_world),
+                K=torch.where(at, camera.K, known.K),
+            )
+        grid = (prepared.hints.level1.shape[-2], prepared.hints.level1.shape[-1])
+        video = prepared.video
+        return replace(
+            prepared,
+            level1=replace(prepared.level1, camera=camera),
+            positions=Positions(self.config.level1, camera, grid),
+            keys=None
+            if video is None
+            else video_keys(self.shared, self.config.level1, camera, features=video, grid=grid),
+        )
 
     def sample1(
         self,
@@ -70,11 +443,11 @@ class GeoVerse(GeoVerseNetworks):
         least = min(flow.least_time, tau[-2])
 
         def velocity(state: Tensor, t: Tensor) -> Tensor:
-            with clock(stages.LEVEL1):
+            with clock(LEVEL1):
                 return self.velocity1(prepared, state, t, least=least)
 
         def unconditional(state: Tensor, t: Tensor) -> Tensor:
-            with clock(stages.LEVEL1):
+            with clock(LEVEL1):
                 return self.velocity1(without, state, t, least=least)
 
         return sample(velocity, noise, tau, unconditional=unconditional, cfg_scale=scale)
@@ -98,7 +471,7 @@ class GeoVerse(GeoVerseNetworks):
         positions = Positions(cascade.config, conditions.camera, grid)
 
         def velocity(state: Tensor, t: Tensor) -> Tensor:
-            with clock(stages.LEVEL0):
+            with clock(LEVEL0):
                 return cascade(state, t, conditions, positions=positions)
 
         flow = self.config.flow
@@ -110,7 +483,7 @@ class GeoVerse(GeoVerseNetworks):
         elsewhere = Positions(cascade.config, without.camera, grid)
 
         def unconditional(state: Tensor, t: Tensor) -> Tensor:
-            with clock(stages.LEVEL0):
+            with clock(LEVEL0):
                 return cascade(state, t, without, positions=elsewhere)
 
         return sample(
@@ -179,7 +552,7 @@ class GeoVerse(GeoVerseNetworks):
             cfg_scale=cascade_cfg_scale,
             clock=clock,
         )
-        with clock(stages.DECODE):
+        with clock(DECODE):
             decoded = self.decode(
                 prepared, level0, level1, targets_alone=targets_alone, clock=clock
             )

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.resampling import resampled
+from gvtools.completers.geoverse.views import resampled
 from gvtools.completers.push_pull import push_pull
 from gvtools.networks.config_json import check_range
 

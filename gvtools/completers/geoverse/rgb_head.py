@@ -13,9 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gvtools.networks.attention import attend
+from gvtools.networks.compute import Recomputing, attend
 from gvtools.networks.depth_anything.encoder import IMAGENET_MEAN, IMAGENET_STD
-from gvtools.networks.recompute import Recomputing
 
 SINE_BASE = 10000.0
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
+from gvtools.completers.geoverse.objective import center_similarity
 from gvtools.depth.scale_check import depth_of_points
 from gvtools.scenes.scene import Scene
 from gvtools.similarity import align_depth_scale

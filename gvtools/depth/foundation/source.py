@@ -15,17 +15,21 @@ import numpy as np
 import torch
 
 from gvtools.cameras import concatenate
-from gvtools.completers.geoverse.plucker import normalised_poses
-from gvtools.completers.geoverse.resampling import model_size, resampled, resampled_depth
+from gvtools.completers.geoverse.camera_encoding import normalised_poses
+from gvtools.completers.geoverse.views import model_size, resampled, resampled_depth
 from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.foundation.scale import FoundationScale, Pass, fit_scale
 from gvtools.depth.source import DepthMap
 from gvtools.errors import CheckpointError, DegenerateError, OptionError
+from gvtools.networks.compute import autocast, inference_type
 from gvtools.networks.depth_anything.geometry_head import Geometry
-from gvtools.networks.depth_anything.network import DepthAnything3, relative_cameras
+from gvtools.networks.depth_anything.network import (
+    DepthAnything3,
+    find_weights,
+    load_depth_anything,
+    relative_cameras,
+)
 from gvtools.networks.depth_anything.rays import camera_centres
-from gvtools.networks.depth_anything.weights import find_weights, load_depth_anything
-from gvtools.networks.precision import autocast, inference_type
 from gvtools.scenes.scene import Frame, Scene, View
 
 

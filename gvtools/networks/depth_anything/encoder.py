@@ -1,4 +1,12 @@
-"""The geometric encoder: Depth Anything 3's backbone, split at the synthesis boundary.
+"""Layers of the vision transformer that Depth Anything 3 is built from.
+
+Parameter names are those of the published checkpoints (``norm1``, ``attn.qkv``, ``ls1.gamma`` ...).
+Source: DINOv2 (Oquab et al. 2023) with the query/key norm and 2-D rotary positions of Depth
+Anything 3 (Lin et al. 2025).
+
+Depth Anything 3's camera encoder and decoder: poses to camera tokens and back.
+
+The geometric encoder: Depth Anything 3's backbone, split at the synthesis boundary.
 
 ``encode`` runs the blocks up to a given one and keeps the taps; ``propagate`` runs the rest from
 features that a denoiser made. Blocks alternate from ``alternate_from`` on: even ones attend within
@@ -16,8 +24,217 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gvtools.errors import ShapeError
-from gvtools.networks.depth_anything.vit import Block, RotaryTable
-from gvtools.networks.recompute import Recomputing
+from gvtools.networks.compute import Recomputing, attend
+
+
+@dataclass(frozen=True)
+class RotaryTable:
+    """Cosines and sines of 2-D rotary positions, computed once for all blocks of a pass.
+
+    Attributes:
+        cos: (T, 2, head_dim / 4) of each token: axis y, then axis x.
+        sin: likewise.
+    """
+
+    cos: Tensor
+    sin: Tensor
+
+    @classmethod
+    def of(cls, positions: Tensor, head_dim: int, *, base: float = 100.0) -> RotaryTable:
+        """The table of (T, 2) positions, y before x; angles are computed in float32."""
+        frequencies = head_dim // 4
+        exponent = torch.arange(frequencies, device=positions.device) / frequencies
+        angle = positions.float()[:, :, None] * base**-exponent
+        return cls(angle.cos(), angle.sin())
+
+    def rotate(self, x: Tensor) -> Tensor:
+        """(B, heads, T, head_dim) rotated; the pairs of an axis are its two halves."""
+        first, second = x.unflatten(-1, (2, 2, -1)).unbind(-2)
+        cos, sin = self.cos.to(x.dtype), self.sin.to(x.dtype)
+        rotated = torch.stack((first * cos - second * sin, second * cos + first * sin), dim=-2)
+        return rotated.flatten(-3)
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention, optionally with normed queries and keys.
+
+    Args:
+        width: channels.
+        heads: divides ``width``.
+        qk_norm: LayerNorm over each head's queries and keys.
+    """
+
+    def __init__(self, width: int, heads: int, *, qk_norm: bool = False) -> None:
+        super().__init__()
+        self.heads = heads
+        head_dim = width // heads
+        self.qkv = nn.Linear(width, 3 * width)
+        self.q_norm: nn.Module = nn.LayerNorm(head_dim) if qk_norm else nn.Identity()
+        self.k_norm: nn.Module = nn.LayerNorm(head_dim) if qk_norm else nn.Identity()
+        self.proj = nn.Linear(width, width)
+
+    def forward(self, x: Tensor, rotary: RotaryTable | None = None) -> Tensor:
+        """(B, T, width) to the same; ``rotary`` has the positions of the T tokens."""
+        q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        q, k = self.q_norm(q), self.k_norm(k)
+        if rotary is not None:
+            q, k = rotary.rotate(q), rotary.rotate(k)
+        return self.proj(attend(q, k, v).transpose(1, 2).flatten(2))
+
+
+class LayerScale(nn.Module):
+    """One learned factor a channel."""
+
+    def __init__(self, width: int, initial: float = 1.0) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.full((width,), initial))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., width) scaled."""
+        return x * self.gamma
+
+
+class Mlp(nn.Module):
+    """Two linear layers with the exact GELU between them."""
+
+    def __init__(self, width: int, hidden: int, out: int | None = None) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(width, hidden)
+        self.act = nn.GELU()
+        self.fc2 = nn.Linear(hidden, out or width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., width) to (..., out)."""
+        return self.fc2(self.act(self.fc1(x)))
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block with layer scale.
+
+    Args:
+        width: channels.
+        heads: divides ``width``.
+        mlp_ratio: hidden width of the MLP over ``width``.
+        qk_norm: see ``Attention``.
+        eps: of the two LayerNorms: 1e-6 in the backbone, 1e-5 in the camera encoder.
+        layer_scale: initial factor of both branches.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        heads: int,
+        *,
+        mlp_ratio: float = 4.0,
+        qk_norm: bool = False,
+        eps: float = 1e-6,
+        layer_scale: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width, eps=eps)
+        self.attn = Attention(width, heads, qk_norm=qk_norm)
+        self.ls1 = LayerScale(width, layer_scale)
+        self.norm2 = nn.LayerNorm(width, eps=eps)
+        self.mlp = Mlp(width, int(width * mlp_ratio))
+        self.ls2 = LayerScale(width, layer_scale)
+
+    def forward(self, x: Tensor, rotary: RotaryTable | None = None) -> Tensor:
+        """(B, T, width) to the same."""
+        x = x + self.ls1(self.attn(self.norm1(x), rotary))
+        return x + self.ls2(self.mlp(self.norm2(x)))
+
+
+POSE_CHANNELS = 9
+
+
+class CameraEncoder(nn.Module):
+    """Known cameras to the tokens that replace the learned camera token.
+
+    Args:
+        width: channels of a token.
+        heads: of the attention over views.
+        depth: number of blocks.
+        layer_scale: initial factor of the blocks' branches.
+    """
+
+    def __init__(
+        self, width: int, heads: int = 16, depth: int = 4, *, layer_scale: float = 0.01
+    ) -> None:
+        super().__init__()
+        self.pose_branch = Mlp(POSE_CHANNELS, width // 2, width)
+        self.token_norm = nn.LayerNorm(width)
+        self.trunk = nn.Sequential(
+            *(Block(width, heads, eps=1e-5, layer_scale=layer_scale) for _ in range(depth))
+        )
+        self.trunk_norm = nn.LayerNorm(width)
+
+    def forward(self, cam_from_world: Tensor, K: Tensor, size: tuple[int, int]) -> Tensor:
+        """Tokens of cameras.
+
+        Args:
+            cam_from_world: (B, V, 4, 4), OpenCV, relative to the reference view for a trained
+                model (``DepthAnything3.relative_cameras``).
+            K: (B, V, 3, 3), px of the network's input.
+            size: (H, W) of the network's input.
+
+        Returns:
+            (B, V, width).
+        """
+        encoding = encode_cameras(cam_from_world, K, size)
+        tokens = self.token_norm(self.pose_branch(encoding.to(self.token_norm.weight.dtype)))
+        return self.trunk_norm(self.trunk(tokens))
+
+
+class CameraDecoder(nn.Module):
+    """The camera token of the last level to a pose encoding.
+
+    Of no use on generated features, whose camera token is a stand-in: there poses come from rays.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.backbone = nn.Sequential(
+            nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, channels), nn.ReLU()
+        )
+        self.fc_t = nn.Linear(channels, 3)
+        self.fc_qvec = nn.Linear(channels, 4)
+        self.fc_fov = nn.Sequential(nn.Linear(channels, 2), nn.ReLU())
+
+    def forward(self, token: Tensor) -> Tensor:
+        """(B, V, channels) raw token 0 to (B, V, 9): T, quaternion xyzw, fov_h, fov_w (rad)."""
+        features = self.backbone(token)
+        parts = (self.fc_t(features), self.fc_qvec(features), self.fc_fov(features))
+        return torch.cat(parts, dim=-1)
+
+
+def encode_cameras(cam_from_world: Tensor, K: Tensor, size: tuple[int, int]) -> Tensor:
+    """(B, V, 9): camera centre, quaternion xyzw of ``world_from_cam``, fov_h and fov_w in rad."""
+    rotation = cam_from_world[..., :3, :3].transpose(-1, -2)
+    centre = -(rotation @ cam_from_world[..., :3, 3:])[..., 0]
+    fov_h = 2 * torch.atan(size[0] / 2 / K[..., 1, 1])
+    fov_w = 2 * torch.atan(size[1] / 2 / K[..., 0, 0])
+    return torch.cat((centre, quaternion_xyzw(rotation), fov_h[..., None], fov_w[..., None]), -1)
+
+
+def quaternion_xyzw(rotation: Tensor) -> Tensor:
+    """(..., 3, 3) rotations to (..., 4) unit quaternions, scalar last and not negative.
+
+    Of the four algebraically equal forms, the one with the largest divisor is taken.
+    """
+    m = rotation
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    squared = torch.stack(
+        (1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz), dim=-1
+    )
+    a, b, c = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2]
+    x, y, z = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    sx, sy, sz, sw = squared.unbind(-1)
+    rows = torch.stack((sx, a, b, x, a, sy, c, y, b, c, sz, z, x, y, z, sw), dim=-1)
+    best = squared.argmax(dim=-1)[..., None, None].expand(*squared.shape[:-1], 1, 4)
+    chosen = torch.gather(rows.unflatten(-1, (4, 4)), -2, best)[..., 0, :]
+    quaternion = chosen / torch.linalg.norm(chosen, dim=-1, keepdim=True)
+    return torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)

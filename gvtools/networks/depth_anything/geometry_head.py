@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gvtools.networks.recompute import Recomputing
+from gvtools.networks.compute import Recomputing
 
 
 @dataclass(frozen=True)

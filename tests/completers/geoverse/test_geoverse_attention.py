@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gvtools.networks.attention import attend
+from gvtools.networks.compute import attend
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 

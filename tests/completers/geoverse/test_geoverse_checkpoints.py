@@ -27,9 +27,8 @@ from safetensors.torch import load_file, save_file
 from gvtools.completers.geoverse import GeoVerse, named
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import empty_model
-from gvtools.completers.geoverse.weights.folder import save_pretrained
-from gvtools.completers.geoverse.weights.published import PARTS, expected_of
-from gvtools.networks.tensor_files import STORED_TYPES, TensorFiles
+from gvtools.completers.geoverse.weights import PARTS, expected_of, save_pretrained
+from gvtools.networks.tensors import STORED_TYPES, TensorFiles
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

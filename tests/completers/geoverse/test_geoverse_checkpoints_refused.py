@@ -19,8 +19,7 @@ from published_folder import CASCADE, GEOMETRY, LEVEL1, RGB_HEAD, STATISTICS
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from gvtools.completers.geoverse.weights.folder import check_folder
-from gvtools.completers.geoverse.weights.published import WHOLE_FILE
+from gvtools.completers.geoverse.weights import WHOLE_FILE, check_folder
 from gvtools.errors import CheckpointError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -199,7 +198,7 @@ def test_other_contents_of_a_pytorch_file_are_refused(folder: Path) -> None:
 @pytest.mark.parametrize("file", [STATISTICS[0], Path("a.safetensors")], ids=lambda f: f.suffix)
 def test_no_damage_ends_in_another_error(folder: Path, file: Path) -> None:
     """Every ending, and random bytes: either it is read, or the error is our own."""
-    from gvtools.networks.tensor_files import read_tensors
+    from gvtools.networks.tensors import read_tensors
 
     path = folder / file
     if file.suffix == ".safetensors":

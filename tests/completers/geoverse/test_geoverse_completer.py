@@ -17,11 +17,11 @@ from gvtools.completers import Completer, Completion, ContextView, ScaleStatus, 
 from gvtools.completers.base import run_completer
 from gvtools.completers.geoverse import completer as completer_module
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
+from gvtools.completers.geoverse.composition import GENERATED
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.context_views import chosen_views
 from gvtools.completers.geoverse.depth_scale import PassScale
 from gvtools.completers.geoverse.model import Generated, GeoVerse
-from gvtools.completers.geoverse.postprocess import GENERATED
+from gvtools.completers.geoverse.views import chosen_views
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.guidance import Guidance
 
@@ -241,7 +241,7 @@ def test_a_pass_that_went_wrong_leaves_holes_and_says_so(weights, monkeypatch):
 def test_without_any_support_for_a_scale_there_is_no_depth(weights, monkeypatch):
     """The requested cameras' rays stand where the predicted ones have no unit."""
     monkeypatch.setattr(
-        "gvtools.completers.geoverse.postprocess.pass_scale",
+        "gvtools.completers.geoverse.composition.pass_scale",
         lambda *a: PassScale(float("nan"), ScaleStatus.UNSUPPORTED),
     )
     known = micro.guidance(2, share=-1.0)

@@ -13,6 +13,7 @@ from gvtools.completers.geoverse.conditioning import (
     LOG_DEPTH_LIMIT,
     HintConfig,
     Hints,
+    LatentStatistics,
     ViewBatch,
     depth_condition,
     encode_hints,
@@ -20,7 +21,6 @@ from gvtools.completers.geoverse.conditioning import (
     feature_mask,
     filled,
 )
-from gvtools.completers.geoverse.statistics import LatentStatistics
 from gvtools.errors import OptionError, ShapeError
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gvtools.completers.geoverse.control import ControlBranch, ControlConfig
 from gvtools.completers.geoverse.denoiser import Conditions, Positions
+from gvtools.completers.geoverse.video_injection import ControlBranch, ControlConfig
 from gvtools.errors import OptionError
 
 pytestmark = pytest.mark.usefixtures("one_thread")

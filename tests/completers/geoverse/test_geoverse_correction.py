@@ -10,17 +10,19 @@ import pytest
 import torch
 
 from gvtools.completers import Completion, ScaleStatus, create
-from gvtools.completers.geoverse.correction import (
+from gvtools.completers.geoverse.composition import (
     CERTAIN,
+    DOUBTED,
     MOST,
+    aligned_color,
     composed,
     corrected_color,
     corrected_depth,
+    depth_ratios,
     seamless,
     without_seams,
 )
-from gvtools.completers.geoverse.passes import Decoded, Generated
-from gvtools.completers.geoverse.postprocess import DOUBTED, aligned_color, depth_ratios
+from gvtools.completers.geoverse.model import Decoded, Generated
 from gvtools.completers.surface_fill import surface_fill
 from gvtools.errors import OptionError
 

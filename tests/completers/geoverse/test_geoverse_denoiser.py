@@ -8,11 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse.control import ControlBranch, ControlConfig
-from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
-from gvtools.completers.geoverse.denoiser_blocks import DenoiserBlock
-from gvtools.completers.geoverse.projective import Projective
-from gvtools.completers.geoverse.shared_attention import SharedAttention, SharedAttentionConfig
+from gvtools.completers.geoverse.camera_encoding import Projective
+from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, DenoiserBlock, Positions
+from gvtools.completers.geoverse.video_injection import (
+    ControlBranch,
+    ControlConfig,
+    SharedAttention,
+    SharedAttentionConfig,
+)
 from gvtools.errors import ShapeError
 
 pytestmark = pytest.mark.usefixtures("one_thread")

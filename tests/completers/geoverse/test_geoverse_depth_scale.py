@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from gvtools.completers.base import ScaleStatus
 from gvtools.completers.geoverse.depth_scale import (
     MAX_FIELD,
     PassScale,
@@ -15,8 +16,7 @@ from gvtools.completers.geoverse.depth_scale import (
     pass_scale,
     scaled_depth,
 )
-from gvtools.completers.geoverse.resampling import EDGE, resampled, resampled_depth
-from gvtools.completers.scale_alignment import ScaleStatus
+from gvtools.completers.geoverse.views import EDGE, resampled, resampled_depth
 from gvtools.networks.depth_anything.geometry_head import Geometry
 
 ALIGNMENTS = ("centres", "hint", "field")

@@ -13,9 +13,14 @@ from geoverse_folders import BARE, CONTROL, SHARED, equal, output, report
 
 from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.denoiser import Positions
-from gvtools.completers.geoverse.flow import gld_time_grid, latent_shift, sample
-from gvtools.completers.geoverse.noise import seeded_noise, view_seed
-from gvtools.completers.geoverse.weights.folder import config_of, from_pretrained, save_pretrained
+from gvtools.completers.geoverse.flow import (
+    gld_time_grid,
+    latent_shift,
+    sample,
+    seeded_noise,
+    view_seed,
+)
+from gvtools.completers.geoverse.weights import config_of, from_pretrained, save_pretrained
 from gvtools.errors import CheckpointError
 
 GLD = named("gld")

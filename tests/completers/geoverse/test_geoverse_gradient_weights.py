@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from gvtools.completers.geoverse.objective.gradient_weights import (
+from gvtools.completers.geoverse.objective import (
     gradient_weights,
     grayscale,
     sobel_magnitude,

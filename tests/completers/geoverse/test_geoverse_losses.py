@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gvtools.completers.geoverse.objective.losses import (
+from gvtools.completers.geoverse.objective import (
+    center_similarity,
     depth_loss,
     flow_matching_loss,
     high_gradient_loss,
     rgb_loss,
     view_errors,
 )
-from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 
 B, V, CONTEXT, H, W = 2, 5, 2, 5, 6
 T = V - CONTEXT

@@ -11,14 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse.conditioning import ViewBatch, encode_latents
+from gvtools.completers.geoverse.conditioning import LatentStatistics, ViewBatch, encode_latents
 from gvtools.completers.geoverse.config import FlowConfig
 from gvtools.completers.geoverse.denoiser import Denoiser
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.objective.losses import depth_loss, rgb_loss
-from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
-from gvtools.completers.geoverse.statistics import LatentStatistics
-from gvtools.completers.geoverse.video_prior.prior import VideoFeatures
+from gvtools.completers.geoverse.objective import center_similarity, depth_loss, rgb_loss
+from gvtools.completers.geoverse.video_prior import VideoFeatures
 from gvtools.errors import CheckpointError, ShapeError
 from gvtools.networks.depth_anything.network import DepthAnything3
 from gvtools.networks.depth_anything.rays import camera_centres
@@ -346,7 +344,7 @@ for module in ("open3d", "pycolmap", "scipy", "numba", "safetensors", "diffusers
     assert module not in names and module not in sys.modules, module
 sys.meta_path.insert(0, Refusal())
 import gvtools.completers.geoverse as geoverse
-import gvtools.completers.geoverse.video_prior.wan_checkpoint
+import gvtools.completers.geoverse.wan_checkpoint
 import geoverse_models as micro
 made = micro.model().generate(micro.batch(1))
 assert made.decoded.rgb.isfinite().all()

@@ -9,8 +9,7 @@ import torch
 
 from gvtools.cameras import Cameras
 from gvtools.completers import ContextView
-from gvtools.completers.geoverse.model_views import view_batch
-from gvtools.completers.geoverse.resampling import model_size
+from gvtools.completers.geoverse.views import model_size, view_batch
 
 
 def blob(camera: Cameras, point: np.ndarray, sigma: float) -> np.ndarray:

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvtools.completers.geoverse.noise import seeded_noise, view_seed
+from gvtools.completers.geoverse.flow import seeded_noise, view_seed
 
 NAMES = ["a", "b", "c", "d"]
 GRID = (5, 4, 6)

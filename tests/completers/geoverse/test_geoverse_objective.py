@@ -5,20 +5,18 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from gvtools.completers.geoverse.objective.losses import (
-    depth_loss,
-    flow_matching_loss,
-    high_gradient_loss,
-    rgb_loss,
-)
-from gvtools.completers.geoverse.objective.objective import (
+from gvtools.completers.geoverse.objective import (
     LossWeights,
     Objective,
     Prediction,
     Reference,
+    center_similarity,
+    depth_loss,
+    flow_matching_loss,
+    high_gradient_loss,
     objective,
+    rgb_loss,
 )
-from gvtools.completers.geoverse.objective.similarity_scale import center_similarity
 from gvtools.errors import OptionError
 
 B, V, CONTEXT = 2, 5, 2

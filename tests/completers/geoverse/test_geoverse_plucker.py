@@ -6,7 +6,7 @@ import torch
 from random_poses import cameras, rigid
 
 from gvtools.cameras import Cameras, invert_rigid
-from gvtools.completers.geoverse.plucker import (
+from gvtools.completers.geoverse.camera_encoding import (
     CENTRED,
     GLD_PIXEL_OFFSET,
     camera_condition,

@@ -5,8 +5,8 @@ import pytest
 import torch
 from random_poses import cameras, rigid
 
-from gvtools.completers.geoverse.projective import Projective, projection_matrices
-from gvtools.networks.attention import attend
+from gvtools.completers.geoverse.camera_encoding import Projective, projection_matrices
+from gvtools.networks.compute import attend
 
 SIZE = (84, 112)
 GRID = (3, 4)

@@ -7,7 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gvtools.errors import DegenerateError, OptionError, ShapeError
-from gvtools.networks.depth_anything import homography
+from gvtools.networks.depth_anything import rays as ray_fits
 from gvtools.networks.depth_anything.rays import (
     camera_centres,
     nearest_rotation,
@@ -140,7 +140,7 @@ def test_homographies_are_opencvs():
     H = np.eye(3) + rng.normal(0, 0.2, (3, 3))
     target = np.concatenate([source, np.ones((60, 1))], 1) @ H.T
     target = target[:, :2] / target[:, 2:]
-    found, share = homography.fit(*map(torch.from_numpy, (source, target, np.ones(60))))
+    found, share = ray_fits.fit(*map(torch.from_numpy, (source, target, np.ones(60))))
     expected, _ = cv2.findHomography(source, target)
     np.testing.assert_allclose(found / found[2, 2], expected, atol=1e-6)
     assert share > 1e-6
@@ -159,7 +159,7 @@ def test_homographies_of_noisy_points_are_the_singular_vector():
     )
     expected = np.linalg.svd(rows)[2][-1].reshape(3, 3)
     arrays = (np.stack([x, y], 1), np.stack([u, v], 1), weight)
-    found, _ = homography.fit(*map(torch.from_numpy, arrays))
+    found, _ = ray_fits.fit(*map(torch.from_numpy, arrays))
     np.testing.assert_allclose(
         found / found.norm() * np.sign(float(found[2, 2]) * expected[2, 2]), expected, atol=1e-9
     )
@@ -170,7 +170,7 @@ def test_factors_multiply_to_the_matrix(upper):
     generator = torch.Generator().manual_seed(7)
     H = torch.randn((3, 3), generator=generator, dtype=torch.float64)
     H = H * torch.linalg.det(H).sign()
-    R, K = homography.factor(H, upper=upper)
+    R, K = ray_fits.factor(H, upper=upper)
     torch.testing.assert_close(R @ R.mT, torch.eye(3).double())
     assert torch.linalg.det(R) > 0 and K[2, 2] == 1
     if upper:

@@ -10,8 +10,8 @@ import torch
 from scipy.ndimage import distance_transform_edt
 
 from gvtools.completers import create
+from gvtools.completers.geoverse.composition import REFINED
 from gvtools.completers.geoverse.conditioning import filled
-from gvtools.completers.geoverse.postprocess import REFINED
 from gvtools.completers.geoverse.refiner import (
     PRIOR_PIXELS,
     CompletedViews,
@@ -21,7 +21,7 @@ from gvtools.completers.geoverse.refiner import (
     cropped,
     distance_to,
 )
-from gvtools.completers.geoverse.weights.folder import from_pretrained, save_pretrained
+from gvtools.completers.geoverse.weights import from_pretrained, save_pretrained
 from gvtools.errors import OptionError
 
 pytestmark = pytest.mark.usefixtures("one_thread")

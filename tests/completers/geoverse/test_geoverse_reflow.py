@@ -10,20 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvtools.completers.geoverse.flow import (
+    fast_loss,
     integrate,
     interpolate,
-    sample,
-    unshift_time,
-    velocity_from_clean,
-)
-from gvtools.completers.geoverse.objective.losses import flow_matching_loss
-from gvtools.completers.geoverse.reflow import (
-    fast_loss,
     interval_ends,
     interval_times,
     reflow_pair,
+    sample,
     teacher_times,
+    unshift_time,
+    velocity_from_clean,
 )
+from gvtools.completers.geoverse.objective import flow_matching_loss
 from gvtools.errors import OptionError
 
 BOUNDS = (1.0, 0.75, 0.25, 0.0)

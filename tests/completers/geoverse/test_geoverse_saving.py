@@ -12,8 +12,7 @@ import torch
 from geoverse_folders import PLAIN, equal, load
 from safetensors.torch import load_file
 
-from gvtools.completers.geoverse.weights.folder import save_pretrained
-from gvtools.completers.geoverse.weights.published import WHOLE_FILE
+from gvtools.completers.geoverse.weights import WHOLE_FILE, save_pretrained
 from gvtools.errors import CheckpointError, GvError, ProjectError
 from gvtools.networks.tensors import save_tensors
 

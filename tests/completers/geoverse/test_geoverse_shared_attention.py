@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from gvtools.completers.geoverse.camera_encoding import Projective
 from gvtools.completers.geoverse.denoiser import Positions
-from gvtools.completers.geoverse.projective import Projective
-from gvtools.completers.geoverse.shared_attention import (
+from gvtools.completers.geoverse.video_injection import (
     SharedAttention,
     SharedAttentionConfig,
     VideoKeys,

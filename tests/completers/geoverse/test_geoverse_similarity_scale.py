@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvtools.completers.geoverse.objective.similarity_scale import DEFECTS, center_similarity
+from gvtools.completers.geoverse.objective import DEFECTS, center_similarity
 from gvtools.similarity import fit_similarity
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -12,7 +12,7 @@ pytest.importorskip("diffusers", reason="the extra wan is not installed")
 
 import tiny_wan as tiny
 
-from gvtools.completers.geoverse.video_prior.prior import ROOM, _leaves
+from gvtools.completers.geoverse.video_prior import ROOM, _leaves
 
 
 @pytest.fixture(scope="module")

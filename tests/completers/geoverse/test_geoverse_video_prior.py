@@ -13,10 +13,14 @@ pytest.importorskip("diffusers", reason="the extra wan is not installed")
 
 import tiny_wan as tiny
 
-from gvtools.completers.geoverse.noise import view_seed
-from gvtools.completers.geoverse.video_prior.layouts import packed_mask, view_layout
-from gvtools.completers.geoverse.video_prior.prior import VideoPrior, VideoPriorConfig
-from gvtools.completers.geoverse.video_prior.views import resized
+from gvtools.completers.geoverse.flow import view_seed
+from gvtools.completers.geoverse.video_prior import (
+    VideoPrior,
+    VideoPriorConfig,
+    packed_mask,
+    resized,
+    view_layout,
+)
 from gvtools.errors import CheckpointError, OptionError
 
 LAYOUTS = ("per_view", "video9", "repeat4")

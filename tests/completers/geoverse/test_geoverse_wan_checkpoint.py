@@ -20,22 +20,23 @@ import tiny_wan as tiny
 from safetensors.torch import load_file, save_file
 from tiny_wan import FILE, original_name, save_original
 
-from gvtools.completers.geoverse.video_prior import wan_checkpoint, wan_folder
-from gvtools.completers.geoverse.video_prior.prior import VideoPrior
-from gvtools.completers.geoverse.video_prior.wan_checkpoint import (
+from gvtools.completers.geoverse.video_prior import VideoPrior
+from gvtools.completers.geoverse.wan import (
+    EMPTY_PROMPT,
+    dtype_of,
+    expected_tensors,
+    load_network,
+    network_class,
+    read_empty_prompt,
+)
+from gvtools.completers.geoverse.wan_checkpoint import (
     by_diffusers_name,
     truncate,
     write_empty_prompt,
 )
-from gvtools.completers.geoverse.video_prior.wan_folder import (
-    EMPTY_PROMPT,
-    dtype_of,
-    expected_tensors,
-    network_class,
-)
-from gvtools.completers.geoverse.weights.published import VIDEO_SIZES
+from gvtools.completers.geoverse.weights import VIDEO_SIZES
 from gvtools.errors import CheckpointError, OptionError, ProjectError
-from gvtools.networks.tensor_files import TensorFiles
+from gvtools.networks.tensors import TensorFiles
 
 # Of a Wan with six blocks and hints at 0, 2 and 4, the first four blocks and two hints.
 LAYERS, HINTS = 6, (0, 2, 4)
@@ -141,8 +142,8 @@ def test_bfloat16_is_what_diffusers_makes_of_it(diffusers_source: Path, tmp_path
         vace_layers=[0, 2],
         torch_dtype=torch.bfloat16,
     )
-    loaded = wan_folder.load_network(tmp_path / "out", "transformer")
-    also = wan_folder.load_network(tmp_path / "out", "transformer", dtype=torch.float32)
+    loaded = load_network(tmp_path / "out", "transformer")
+    also = load_network(tmp_path / "out", "transformer", dtype=torch.float32)
     for name, tensor in wanted.state_dict().items():
         found = loaded.state_dict()[name]
         assert found.dtype == tensor.dtype, name
@@ -182,7 +183,7 @@ def test_nothing_is_read_that_is_not_needed(
 def test_several_files_are_written_where_one_would_be_large(
     diffusers_source: Path, truncated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(wan_checkpoint, "_PART", 300_000)
+    monkeypatch.setattr("gvtools.completers.geoverse.wan_checkpoint._PART", 300_000)
     steps: list[tuple[int, int]] = []
     out = tmp_path / "out"
     truncate(
@@ -193,7 +194,7 @@ def test_several_files_are_written_where_one_would_be_large(
     assert all(f.stat().st_size < 320_000 for f in files)
     theirs = network_class("transformer").from_pretrained(out / "transformer")
     wanted = load_file(truncated / "transformer" / FILE)
-    for network in (theirs, wan_folder.load_network(out, "transformer")):
+    for network in (theirs, load_network(out, "transformer")):
         assert network.state_dict().keys() == wanted.keys()
         assert all(torch.equal(network.state_dict()[n], wanted[n]) for n in wanted)
     done, totals = zip(*steps, strict=True)
@@ -384,7 +385,7 @@ def test_the_empty_prompt_is_the_encoding_of_the_end_token(tmp_path: Path) -> No
     tokens[0, 0], mask[0, 0] = 1, 1
     with torch.no_grad():
         padded = encoder(tokens, attention_mask=mask).last_hidden_state[0, :1]
-    torch.testing.assert_close(wan_folder.read_empty_prompt(tmp_path), padded, rtol=0, atol=1e-5)
+    torch.testing.assert_close(read_empty_prompt(tmp_path), padded, rtol=0, atol=1e-5)
     with pytest.raises(CheckpointError, match="is no folder"):
         write_empty_prompt(tmp_path / "absent", tmp_path)
 

@@ -11,8 +11,7 @@ import geoverse_models as micro
 import pytest
 from geoverse_folders import CONTROL, PLAIN, SHARED, load, refused, report
 
-from gvtools.completers.geoverse.weights.folder import check_folder, from_pretrained
-from gvtools.completers.geoverse.weights.published import WHOLE_FILE
+from gvtools.completers.geoverse.weights import WHOLE_FILE, check_folder, from_pretrained
 from gvtools.errors import CheckpointError
 from gvtools.networks.config_json import to_json
 

@@ -11,7 +11,7 @@ from benchmarks.experiments.classical import CLASSICAL
 from benchmarks.experiments.options import ExperimentOptions
 from gvtools.completers.base import create
 from gvtools.completers.geoverse.completer import SHIPPED, GeoVerseCompleter
-from gvtools.completers.geoverse.weights.folder import config_of
+from gvtools.completers.geoverse.weights import config_of
 from gvtools.training.records import STAGES
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -8,12 +8,12 @@ import geoverse_models as micro
 import pytest
 import torch
 
-from gvtools.completers.geoverse import stages
+from gvtools.completers.geoverse import model as stages
 from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.flow import interval_bounds
-from gvtools.completers.geoverse.stages import LEVEL0, LEVEL1
+from gvtools.completers.geoverse.model import LEVEL0, LEVEL1
 from gvtools.errors import OptionError
-from gvtools.networks.attention import attend
+from gvtools.networks.compute import attend
 from pipelines.bench import side_by_side
 from pipelines.bench.complete import parameters, weight_bytes
 from pipelines.bench.options import parsed_size

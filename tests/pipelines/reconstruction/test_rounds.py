@@ -9,8 +9,9 @@ from gvtools.cameras import Cameras
 from gvtools.completers.base import (
     Completer,
     Completion,
+    ScaleAlignment,
+    ScaleStatus,
 )
-from gvtools.completers.scale_alignment import ScaleAlignment, ScaleStatus
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from gvtools.completers.geoverse.video_prior.wan_folder import (
+from gvtools.completers.geoverse.wan import (
     COMPONENTS,
     EMPTY_PROMPT,
     cast,
@@ -28,8 +28,7 @@ from gvtools.completers.geoverse.video_prior.wan_folder import (
 )
 from gvtools.errors import CheckpointError, OptionError, ProjectError
 from gvtools.files import replaced_when_written
-from gvtools.networks.tensor_files import INDEX, TensorFiles
-from gvtools.networks.tensors import check_fit
+from gvtools.networks.tensors import INDEX, TensorFiles, check_fit
 from gvtools.untrusted import read_json
 
 _WEIGHTS = "diffusion_pytorch_model"

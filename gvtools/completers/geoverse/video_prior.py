@@ -1,4 +1,13 @@
-"""Features of a frozen video model, computed once for all denoising steps.
+"""How views become the frames of clips for a causal video VAE, and which latent holds which view.
+
+The VAE takes clips of 4k + 1 frames and gives 1 + k latents: the first frame alone, then four by
+four. It drops the rest of other lengths without a word, so clips have such a length here.
+
+How features are taken from the video model, as far as the paper leaves it open.
+
+What enters the video model: views at its resolution, where they are valid, and their seeds.
+
+Features of a frozen video model, computed once for all denoising steps.
 
 Eq. 4 and the appendix on Wan VACE: projections are noised slightly and encoded by the video VAE
 (z_proxy); x_t = (1 - sigma) z_proxy + sigma eps enters the backbone and [z_proxy, V] its VACE
@@ -9,26 +18,201 @@ Where the paper leaves a choice, ``VideoPriorConfig`` says which one is taken.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from gvtools.completers.geoverse.noise import seeded_noise, view_seed
-from gvtools.completers.geoverse.video_prior.config import VideoPriorConfig
-from gvtools.completers.geoverse.video_prior.layouts import (
-    ViewLayout,
-    packed_mask,
-    view_layout,
-)
-from gvtools.completers.geoverse.video_prior.views import resized, seed_rows
-from gvtools.completers.geoverse.video_prior.wan_folder import load_network, read_empty_prompt
-from gvtools.completers.geoverse.video_prior.wan_networks import STRIDE, WanNetworks
-from gvtools.errors import CheckpointError
-from gvtools.networks.precision import half_type
+from gvtools.completers.geoverse.flow import seeded_noise, view_seed
+from gvtools.completers.geoverse.wan import STRIDE, WanNetworks, load_network, read_empty_prompt
+from gvtools.errors import CheckpointError, OptionError
+from gvtools.networks.compute import half_type
+from gvtools.networks.config_json import check_choice, check_range
+
+GROUP = 4
+
+
+@dataclass(frozen=True)
+class ViewLayout:
+    """Views in clips.
+
+    Attributes:
+        clips: the view shown by each frame of each clip; all clips have 4k + 1 frames.
+    """
+
+    clips: tuple[tuple[int, ...], ...]
+
+    @property
+    def views_of_latent(self) -> tuple[tuple[int, ...], ...]:
+        """The views that each latent holds, clip after clip."""
+        views = []
+        for clip in self.clips:
+            groups = [clip[:1]] + [clip[i : i + GROUP] for i in range(1, len(clip), GROUP)]
+            views += [tuple(sorted(set(group))) for group in groups]
+        return tuple(views)
+
+    @property
+    def latent_of_view(self) -> tuple[int, ...]:
+        """The latent that each view is in."""
+        where = {v: i for i, views in enumerate(self.views_of_latent) for v in views}
+        return tuple(where[view] for view in sorted(where))
+
+
+def _each_alone(views: int) -> tuple[tuple[int, ...], ...]:
+    return tuple((view,) for view in range(views))
+
+
+def _as_video(views: int) -> tuple[tuple[int, ...], ...]:
+    repeats = (1 - views) % GROUP
+    return ((*range(views), *[views - 1] * repeats),)
+
+
+def _four_times(views: int) -> tuple[tuple[int, ...], ...]:
+    return ((0, *(view for view in range(1, views) for _ in range(GROUP))),)
+
+
+_LAYOUTS: dict[str, Callable[[int], tuple[tuple[int, ...], ...]]] = {
+    "per_view": _each_alone,
+    "video9": _as_video,
+    "repeat4": _four_times,
+}
+LAYOUTS = tuple(_LAYOUTS)
+
+
+def view_layout(name: str, views: int) -> ViewLayout:
+    """One of the ways to show views to the VAE.
+
+    Args:
+        name: "per_view": each view is a clip of one frame, as Wan encodes reference images.
+            "video9": one clip of all views, the last one repeated up to 4k + 1 frames (nine for
+            eight views); after the first, four views share a latent. "repeat4": one clip, the
+            first view once and every other one four times, so each has its latent.
+        views: how many.
+    """
+    if name not in _LAYOUTS:
+        raise OptionError(f"video layout {name!r}; expected one of {', '.join(LAYOUTS)}")
+    return ViewLayout(_LAYOUTS[name](views))
+
+
+def packed_mask(generate: Tensor, layout: ViewLayout, *, stride: int = 8) -> Tensor:
+    """VACE's mask channels: the pixels of each latent's block side by side.
+
+    A latent of several views is to be generated where any of them is: resampling the mask in time,
+    as VACE does for true video, would give a latent the mask of a view that it does not hold.
+
+    Args:
+        generate: (B, V, 1, H, W), 1 = to be generated.
+        layout: of the views.
+        stride: pixels of a latent's edge.
+
+    Returns:
+        (B, stride^2, F, H / stride, W / stride); channel = row * stride + column.
+    """
+    latents = [generate[:, list(views), 0].amax(dim=1) for views in layout.views_of_latent]
+    packed = [F.pixel_unshuffle(mask[:, None], stride) for mask in latents]
+    return torch.stack(packed, dim=2)
+
+
+_DTYPES = ("float32", "bfloat16", "float16")
+
+
+@dataclass(frozen=True)
+class VideoPriorConfig:
+    """How features are taken from the video model.
+
+    Attributes:
+        layout: how views become video, see ``video_layouts.view_layout``. The paper does not say;
+            "per_view" has each view's own latent and mask.
+        taps: backbone blocks whose outputs, VACE hint included, are the features.
+        channels: of a feature, the backbone's width; checked against the weights.
+        timestep: of the single forward, 0 to 1000.
+        sigma: share of noise in x_t; None: timestep / 1000, as in Wan's schedulers whatever their
+            shift.
+        proxy_noise: standard deviation of the noise on valid target pixels, range [-1, 1].
+        resolution: (rows, columns) in px that views are resized to, each rounded to the nearest
+            multiple; None: their own size, rounded. 576 gives 504-px views the tokens of a 14-px
+            patch, 36 x 36.
+        multiple: of both sides, px; itself a multiple of a token's 16.
+        dtype: of the transformer; None as stored. What diffusers keeps in float32 stays so.
+        prompt: "empty", Wan's embedding of the empty prompt; or "zeros", for tests and tiny
+            configurations: Wan was not trained on it.
+        prompt_rows: rows that the prompt's embedding is padded to with zeros.
+    """
+
+    layout: str = "per_view"
+    taps: tuple[int, ...] = (0, 5, 10, 15)
+    channels: int = 5120
+    timestep: float = 500.0
+    sigma: float | None = None
+    proxy_noise: float = 0.1
+    resolution: tuple[int, int] | None = None
+    multiple: int = 16
+    dtype: str | None = None
+    prompt: str = "empty"
+    prompt_rows: int = 512
+
+    def __post_init__(self) -> None:
+        check_choice("video.layout", self.layout, LAYOUTS)
+        check_choice("video.prompt", self.prompt, ("empty", "zeros"))
+        check_choice("video.dtype", self.dtype, (None, *_DTYPES))
+        if not self.taps or list(self.taps) != sorted({*self.taps}) or self.taps[0] < 0:
+            raise OptionError(f"video.taps = {self.taps}; expected ascending block numbers")
+        if self.multiple < 1 or self.multiple % 16:
+            raise OptionError(f"video.multiple = {self.multiple}; expected a multiple of 16")
+        check_range("video.timestep", self.timestep, ge=0, le=1000)
+        check_range("video.sigma", self.sigma, ge=0, le=1)
+        check_range("video.proxy_noise", self.proxy_noise, ge=0)
+        check_range("video.prompt_rows", self.prompt_rows, ge=1)
+
+    def size(self, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns in px that views of a size are resized to."""
+        rows, columns = self.resolution or (height, width)
+        unit = self.multiple
+        return max(1, round(rows / unit)) * unit, max(1, round(columns / unit)) * unit
+
+
+def resized(images: Tensor, valid: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Views and their validity in another size; colours of invalid pixels do not bleed in.
+
+    Args:
+        images: (B, V, 3, H, W).
+        valid: (B, V, 1, H, W), bool or 1 = valid.
+        size: rows and columns in px.
+
+    Returns:
+        Images (B, V, 3, *size) float32, 0 where not valid, and validity (B, V, 1, *size) float32,
+        of the nearest pixel, 0 or 1.
+    """
+    usable = (valid if valid.dtype == torch.bool else valid > 0.5).flatten(0, 1)
+    weight = usable.float()
+    seen = torch.where(usable, images.flatten(0, 1).float(), 0.0)
+    if tuple(images.shape[-2:]) != size:
+        seen, share = (
+            F.interpolate(x, size=size, mode="bilinear", antialias=True) for x in (seen, weight)
+        )
+        weight = F.interpolate(weight, size=size, mode="nearest-exact")
+        # The nearest pixel has the largest share, so the divisor is far from 0 where it counts.
+        seen = torch.where(weight > 0, seen / share.clamp_min(1e-6), 0.0)
+    count = images.shape[:2]
+    return seen.unflatten(0, count), weight.unflatten(0, count)
+
+
+def seed_rows(seed: int | Sequence[Sequence[int]], batch: int, views: int) -> list[list[int]]:
+    """A seed for each view, B rows of V.
+
+    Args:
+        seed: one number for all, or the rows themselves.
+        batch: B.
+        views: V.
+    """
+    if isinstance(seed, int):
+        return [[view_seed(seed, item, view) for view in range(views)] for item in range(batch)]
+    return [list(row) for row in seed]
+
 
 __all__ = ["VideoFeatures", "VideoPrior", "VideoPriorConfig"]
 

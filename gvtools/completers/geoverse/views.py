@@ -1,4 +1,8 @@
-"""Pictures and projections of any size to the model's grid, and its results back.
+"""Picture sizes that a network with patches takes, and maps from one size to another.
+
+Which photographs a pass looks at: those that see what its targets show, or the nearest.
+
+Pictures and projections of any size to the model's grid, and its results back.
 
 Context pictures are cropped about their centre to the targets' aspect and resampled; the cameras
 follow. A projection's colour is the mean of the valid pixels under a cell; its depth is that of
@@ -19,9 +23,74 @@ from torch import Tensor
 from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.base import ContextView
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.resampling import resampled
 from gvtools.completers.push_pull import Filled
 from gvtools.guidance import Guidance
+from gvtools.view_selection import covisible_views, nearest_views
+
+# Neighbours whose depths differ by more than this factor lie on two surfaces.
+EDGE = 1.1
+
+
+def model_size(height: int, width: int, *, longest: int, patch: int) -> tuple[int, int]:
+    """(H, W) of a network's pictures: the aspect kept as well as multiples of the patch allow."""
+    factor = longest / max(height, width)
+    rows, columns = (max(1, round(side * factor / patch)) * patch for side in (height, width))
+    return rows, columns
+
+
+def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """(B, C, h, w) to (B, C, H, W): bilinear, with an antialias filter where it shrinks."""
+    if tuple(x.shape[-2:]) == size:
+        return x
+    return F.interpolate(x, size=size, mode="bilinear", align_corners=False, antialias=True)
+
+
+def resampled_depth(depth: Tensor, size: tuple[int, int]) -> Tensor:
+    """(T, h, w) depth > 0 to (T, H, W), with none that lies between two surfaces.
+
+    Within a surface the inverse of the depth is interpolated, which keeps a plane a plane; at an
+    edge, and where the picture shrinks, a pixel takes the depth of the one that it lies in.
+    """
+    before = depth.shape[-2], depth.shape[-1]
+    if before == size:
+        return depth
+    nearest = F.interpolate(depth[:, None], size=size, mode="nearest-exact")
+    if size[0] < before[0] or size[1] < before[1]:
+        return nearest[:, 0]
+    farthest = F.max_pool2d(depth[:, None], 3, stride=1, padding=1)
+    closest = -F.max_pool2d(-depth[:, None], 3, stride=1, padding=1)
+    edge = F.interpolate((farthest > EDGE * closest).float(), size=size, mode="nearest-exact")
+    smooth = 1 / resampled(1 / depth[:, None], size)
+    return torch.where(edge > 0, nearest, smooth)[:, 0]
+
+
+def chosen_views(
+    context: Sequence[ContextView],
+    targets: Cameras,
+    depth: NDArray[np.float32],
+    *,
+    count: int,
+    selection: str,
+) -> list[ContextView]:
+    """At most ``count`` context views, the best first.
+
+    Args:
+        context: to choose from.
+        targets: V cameras of one picture size.
+        depth: (V, H, W) z-depth of the targets, scene units, filled where that is possible.
+        count: how many at most.
+        selection: "covisible" or "nearest", see ``gvtools.view_selection``.
+    """
+    if not context:
+        return []
+    cameras = concatenate([view.camera for view in context])
+    if selection == "covisible":
+        depths = [view.depth for view in context]
+        rows = covisible_views(cameras, targets, depth, count=count, depths=depths)
+    else:
+        rows = nearest_views(cameras, targets, count)
+    return [context[row] for row in rows]
+
 
 # A cell of the model's grid counts as valid from this share of valid pixels on.
 VALID_SHARE = 0.5

@@ -1,0 +1,464 @@
+"""Where a reference picture has edges and texture: weights in [0, 1] from its gradient.
+
+w(p) = clip((g(p) - q_0.50) / (q_0.98 - q_0.50 + delta)), g the Sobel magnitude of the grayscale
+picture, the quantiles taken over all valid pixels of a sample's views (appendix "RGB supervision").
+
+One scale a sample between predicted and reference cameras, by their centres.
+
+(s*, Q*, b*) minimises sum_j |s Q o^_j + b - o_j|^2 over s > 0, Q in SO(3), b (appendix
+"Scale-aligned depth supervision"). The scale, unlike the rotation, is determined by two centres or
+by centres on a line, so these are solved; where the scale stays open the status says so, and its
+numbers are NaN.
+
+The terms of the training objective, each (B,): one value a sample, to be averaged by the caller.
+
+Appendix "Loss Definitions and Computation". Latent terms see all views, context first; decoded
+terms see target views only. What lies outside a mask may hold anything, NaN too: neither a loss nor
+a gradient sees it. A sample without a valid pixel gives 0, still part of the graph. References
+never receive a gradient. Half-precision inputs are compared in float32.
+
+The whole training objective: five terms, their coefficients, and what each stood on.
+
+L = l_1 L_FM^1 + l_0 L_FM^0 + l_rgb L_rgb + l_hf L_hf + l_depth L_depth
+(Eq. "complete_training_loss" of the paper).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, fields
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gvtools.errors import OptionError
+from gvtools.networks.config_json import check_range
+
+DELTA = 1e-6
+# ITU-R BT.601; the paper says "grayscale" only.
+LUMA = (0.299, 0.587, 0.114)
+QUANTILES = (0.50, 0.98)
+
+
+@torch.no_grad()
+def gradient_weights(reference: Tensor, valid: Tensor) -> Tensor:
+    """Weights (B, T, H, W) of the reference pictures' gradients; no gradient flows through them.
+
+    Args:
+        reference: (B, T, 3, H, W), in the normalisation that the loss compares.
+        valid: (B, T, H, W) bool; other pixels have weight 0 and may hold anything.
+    """
+    magnitude = sobel_magnitude(grayscale(reference), valid)
+    weights = torch.zeros_like(magnitude)
+    for b in range(len(magnitude)):
+        values = magnitude[b][valid[b]]
+        if values.numel():
+            bottom, top = torch.quantile(values, values.new_tensor(QUANTILES))
+            share = (magnitude[b] - bottom) / (top - bottom + DELTA)
+            weights[b] = torch.where(valid[b], share.clamp(0, 1), 0.0)
+    return weights
+
+
+def grayscale(image: Tensor) -> Tensor:
+    """Luma (..., H, W) of (..., 3, H, W), float32 at least."""
+    red, green, blue = image.to(torch.promote_types(image.dtype, torch.float32)).unbind(-3)
+    return LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+
+
+def sobel_magnitude(gray: Tensor, valid: Tensor) -> Tensor:
+    """Length (B, T, H, W) of the 3x3 Sobel gradient, kernel sums of 4 a side; 0 where not valid.
+
+    The picture's border is repeated outwards. A neighbour that is not valid counts as equal to the
+    pixel itself, so the edge of a mask is no edge of the picture.
+
+    Args:
+        gray: (B, T, H, W).
+        valid: (B, T, H, W) bool.
+    """
+    height, width = gray.shape[-2:]
+    center = torch.where(valid, gray, 0.0)
+    padded = F.pad(center, (1, 1, 1, 1), mode="replicate")
+    known = F.pad(valid.to(gray.dtype), (1, 1, 1, 1), mode="replicate") > 0
+
+    def step(dy: int, dx: int) -> Tensor:
+        window = (..., slice(1 + dy, 1 + dy + height), slice(1 + dx, 1 + dx + width))
+        return torch.where(known[window], padded[window] - center, 0.0)
+
+    # Differences of opposite sides, so that a flat picture gives 0 and not a rounding.
+    x = sum(k * (step(d, 1) - step(d, -1)) for d, k in ((-1, 1), (0, 2), (1, 1)))
+    y = sum(k * (step(1, d) - step(-1, d)) for d, k in ((-1, 1), (0, 2), (1, 1)))
+    return torch.where(valid, torch.hypot(torch.as_tensor(x), torch.as_tensor(y)), 0.0)
+
+
+DEFECTS = (
+    "aligned",
+    "fewer than 2 valid centres",
+    "coincident predicted centres",
+    "coincident reference centres",
+    "unrelated centres",
+)
+# Spreads below this many roundings of the coordinates' magnitude are no geometry.
+ROUNDINGS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class CenterSimilarity:
+    """reference ≈ scale · rotation · predicted + translation, for each sample.
+
+    Attributes:
+        scale: (B,) reference units per predicted unit; NaN where not ``ok``.
+        rotation: (B, 3, 3) in SO(3); any of the best ones where the centres leave it open; NaN
+            where not ``ok``.
+        translation: (B, 3), reference units; NaN where not ``ok``.
+        ok: (B,) bool, whether the scale holds.
+        defect: (B,) int64, index into ``DEFECTS``.
+        used: (B,) int64, centres the fit stands on.
+        correlation: (B,) in [0, 1], 1 where the similarity maps the centres exactly; NaN where not
+            ``ok``. The share of the reference's spread left over is 1 - correlation^2.
+    """
+
+    scale: Tensor
+    rotation: Tensor
+    translation: Tensor
+    ok: Tensor
+    defect: Tensor
+    used: Tensor
+    correlation: Tensor
+
+    @property
+    def status(self) -> tuple[str, ...]:
+        """What ``DEFECTS`` says of each sample."""
+        return tuple(DEFECTS[index] for index in self.defect.tolist())
+
+
+@torch.no_grad()
+def center_similarity(predicted: Tensor, reference: Tensor) -> CenterSimilarity:
+    """Fit one similarity a sample, by centring and SVD of the cross-covariance.
+
+    Solved in float64 on the CPU, a handful of numbers, so that every device gives the same scale.
+
+    Args:
+        predicted: (B, V, 3) camera centres o^; those that are not finite are left out.
+        reference: (B, V, 3) camera centres o, any other frame and unit; likewise.
+    """
+    x, y = (z.to("cpu").to(torch.float64) for z in (predicted, reference))
+    use = (x.isfinite() & y.isfinite()).all(-1)
+    count = use.sum(1)
+    x, x_center, x_flat = _centered(x, use, torch.finfo(predicted.dtype).eps)
+    y, y_center, y_flat = _centered(y, use, torch.finfo(reference.dtype).eps)
+    x_spread, y_spread = (x**2).sum((1, 2)), (y**2).sum((1, 2))
+
+    covariance = y.mT @ x
+    u, _, vt = torch.linalg.svd(covariance)
+    sign = torch.ones_like(u[..., 0])
+    sign[:, 2] = torch.where(torch.linalg.det(u) * torch.linalg.det(vt) < 0, -1.0, 1.0)
+    rotation = (u * sign[:, None, :]) @ vt
+    matched = (rotation * covariance).sum((1, 2))  # d_0 + d_1 ± d_2 >= 0
+    size = (x_spread * y_spread).sqrt()
+    coarsest = max(torch.finfo(z.dtype).eps for z in (predicted, reference))
+    unrelated = matched <= ROUNDINGS * coarsest * size
+
+    defect = torch.zeros_like(count)
+    for index, holds in ((4, unrelated), (3, y_flat), (2, x_flat), (1, count < 2)):
+        defect = torch.where(holds, index, defect)
+    ok = defect == 0
+    scale = matched / x_spread
+    translation = y_center - scale[:, None] * (rotation @ x_center[..., None])[..., 0]
+    wide = torch.promote_types(predicted.dtype, torch.float32)
+    fitted = (
+        torch.where(ok.reshape(-1, *(1,) * (value.ndim - 1)), value, torch.nan)
+        for value in (scale, rotation, translation, (matched / size).clamp(max=1))
+    )
+    scale, rotation, translation, correlation = (
+        value.to(wide).to(predicted.device) for value in fitted
+    )
+    return CenterSimilarity(
+        scale, rotation, translation, ok.to(predicted.device), defect, count, correlation
+    )
+
+
+def _centered(points: Tensor, use: Tensor, eps: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Points about their centroid (0 where unused), the centroid, and whether they coincide."""
+    points = torch.where(use[..., None], points, 0.0)
+    count = use.sum(1).clamp(min=1)
+    center = points.sum(1) / count[:, None]
+    moved = torch.where(use[..., None], points - center[:, None], 0.0)
+    rms = (moved.square().sum((1, 2)) / count).sqrt()
+    return moved, center, rms <= ROUNDINGS * eps * points.abs().amax((1, 2))
+
+
+def view_errors(predicted: Tensor, target: Tensor) -> Tensor:
+    """Squared error (B, V) of each view's velocity (B, V, C, h, w), the mean over C h w."""
+    return (_wide(predicted) - _wide(target.detach())).square().flatten(2).mean(-1)
+
+
+def flow_matching_loss(
+    predicted: Tensor, target: Tensor, *, context: int, context_weight: float = 0.25
+) -> Tensor:
+    """L_FM (B,): sum_j alpha_j |u^_j - u_j|^2, of either level; with a reflow target, L_PRF.
+
+    The paper's sum is divided by V C h w here, a constant factor: the paper names no coefficient.
+    With ``context_weight`` 1 it is Geometric Latent Diffusion's loss.
+
+    Args:
+        predicted: (B, V, C, h, w) velocity.
+        target: (B, V, C, h, w), see ``flow.velocity_target``.
+        context: number of context views, which come first.
+        context_weight: alpha of context views; target views have 1.
+    """
+    errors = view_errors(predicted, target)
+    alpha = torch.ones_like(errors)
+    alpha[:, :context] = context_weight
+    return (errors * alpha).mean(1)
+
+
+def rgb_mask(reference: Tensor, valid: Tensor | None) -> Tensor:
+    """Omega^rgb (B, T, H, W): finite reference pixels that are ``valid``.
+
+    Args:
+        reference: (B, T, 3, H, W).
+        valid: (B, T, H, W) bool; None for all.
+    """
+    known = reference.isfinite().all(2)
+    return known if valid is None else known & valid
+
+
+def rgb_loss(predicted: Tensor, reference: Tensor, *, valid: Tensor | None = None) -> Tensor:
+    """L_rgb (B,): the mean of e(p) = |I^(p) - I(p)|_1 / 3 over the valid pixels of all views.
+
+    Args:
+        predicted: (B, T, 3, H, W), target views.
+        reference: (B, T, 3, H, W), normalised like ``predicted``.
+        valid: see ``rgb_mask``.
+    """
+    mask = rgb_mask(reference, valid)
+    return _pixel_mean(_rgb_error(predicted, reference, mask), mask)
+
+
+def high_gradient_loss(
+    predicted: Tensor, reference: Tensor, *, valid: Tensor | None = None
+) -> Tensor:
+    """L_hf (B,): the mean of e(p) weighted by the reference's gradient; 0 where all weights are 0.
+
+    Arguments are those of ``rgb_loss``; the weights are those of ``gradient_weights``.
+    """
+    mask = rgb_mask(reference, valid)
+    weight = gradient_weights(reference, mask)
+    error = _rgb_error(predicted, reference, mask)
+    return (weight * error).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=DELTA)
+
+
+def depth_mask(reference: Tensor, valid: Tensor | None) -> Tensor:
+    """Omega^depth (B, T, H, W): reference depth finite, above 0, ``valid``."""
+    known = reference.isfinite() & (reference > 0)
+    return known if valid is None else known & valid
+
+
+def depth_loss(
+    predicted: Tensor,
+    reference: Tensor,
+    *,
+    similarity: CenterSimilarity,
+    valid: Tensor | None = None,
+) -> Tensor:
+    """L_depth (B,): the mean of |s* D^(p) - D(p)| over the valid pixels of all views.
+
+    The scale aligns, and receives no gradient: the paper leaves that open, and the gradient would
+    grow as 1 / baseline.
+
+    Args:
+        predicted: (B, T, H, W) z-depth of target views, the unit of the predicted centres.
+        reference: (B, T, H, W) z-depth, the unit of the reference centres.
+        similarity: of all the sample's camera centres; a sample without a scale has a loss of 0.
+        valid: (B, T, H, W) bool or None, see ``depth_mask``.
+    """
+    mask = depth_mask(reference, valid) & similarity.ok[:, None, None, None]
+    scale = torch.where(similarity.ok, similarity.scale, 1.0)[:, None, None, None]
+    found = torch.where(mask, _wide(predicted), 0.0)
+    wanted = torch.where(mask, _wide(reference.detach()), 0.0)
+    return _pixel_mean((scale * found - wanted).abs(), mask)
+
+
+def _rgb_error(predicted: Tensor, reference: Tensor, mask: Tensor) -> Tensor:
+    difference = _wide(predicted) - _wide(reference.detach())
+    return torch.where(mask[:, :, None], difference, 0.0).abs().mean(2)
+
+
+def _pixel_mean(error: Tensor, mask: Tensor) -> Tensor:
+    """Sum of an error that is 0 outside the mask, over the mask's pixels, at least one."""
+    return error.sum((1, 2, 3)) / mask.sum((1, 2, 3)).clamp(min=1)
+
+
+def _wide(x: Tensor) -> Tensor:
+    return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Coefficients of the terms; the paper gives none.
+
+    Attributes:
+        level1: of L_FM^1.
+        level0: of L_FM^0.
+        rgb: of L_rgb.
+        hf: of L_hf.
+        depth: of L_depth.
+    """
+
+    level1: float = 1.0
+    level0: float = 1.0
+    rgb: float = 1.0
+    hf: float = 1.0
+    depth: float = 1.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            check_range(f"loss weight {item.name}", getattr(self, item.name), ge=0, lt=math.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What the model gave; what is None has no term. V views, context first; T target views.
+
+    Attributes:
+        level1: (B, V, C, h, w) velocity.
+        level0: (B, V, C, h, w) velocity.
+        image: (B, T, 3, H, W).
+        depth: (B, T, H, W) z-depth, model units.
+        centers: (B, V, 3) camera centres, model units; ``depth`` needs them.
+    """
+
+    level1: Tensor | None = None
+    level0: Tensor | None = None
+    image: Tensor | None = None
+    depth: Tensor | None = None
+    centers: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What it should have given; shapes as in ``Prediction``.
+
+    Attributes:
+        level1: velocity target.
+        level0: velocity target.
+        image: in the normalisation of the prediction.
+        depth: scene units; not finite or not above 0 = none.
+        centers: scene units.
+        image_valid: (B, T, H, W) bool, None = all.
+        depth_valid: (B, T, H, W) bool, None = all.
+    """
+
+    level1: Tensor | None = None
+    level0: Tensor | None = None
+    image: Tensor | None = None
+    depth: Tensor | None = None
+    centers: Tensor | None = None
+    image_valid: Tensor | None = None
+    depth_valid: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """The objective of one mini-batch.
+
+    Attributes:
+        total: (), the weighted sum.
+        terms: (), each term before its coefficient, averaged over the mini-batch; a term of
+            coefficient 0 is there to be logged and has no gradient.
+        counts: (), what the terms stood on: ``rgb_pixels``, ``depth_pixels``; ``rgb_empty`` and
+            ``depth_empty``, samples without a valid pixel; ``depth_without_scale``, samples whose
+            camera centres gave no scale.
+    """
+
+    total: Tensor
+    terms: dict[str, Tensor]
+    counts: dict[str, Tensor]
+
+    def record(self) -> dict[str, float]:
+        """Everything as numbers for a log: ``loss``, ``loss/TERM``, ``count/NAME``."""
+        values = {"loss": self.total}
+        values |= {f"loss/{name}": value for name, value in self.terms.items()}
+        values |= {f"count/{name}": value for name, value in self.counts.items()}
+        return {name: float(value.detach()) for name, value in values.items()}
+
+
+def objective(
+    prediction: Prediction,
+    reference: Reference,
+    *,
+    context: int,
+    weights: LossWeights | None = None,
+    context_weight: float = 0.25,
+) -> Objective:
+    """Every term that has a prediction, their weighted sum, and their counts.
+
+    Args:
+        prediction: see ``Prediction``.
+        reference: has to hold whatever is predicted.
+        context: number of context views, which come first.
+        weights: None is ``LossWeights()``.
+        context_weight: see ``flow_matching_loss``.
+    """
+    weights = weights or LossWeights()
+    parts, counts = _parts(prediction, reference, context, context_weight=context_weight)
+    if not parts:
+        raise OptionError("objective: nothing was predicted; give at least one term")
+    terms, total = {}, None
+    for name, part in parts.items():
+        weight = getattr(weights, name)
+        with nullcontext() if weight > 0 else torch.no_grad():
+            terms[name] = part().mean()
+        if weight > 0:
+            total = weight * terms[name] if total is None else total + weight * terms[name]
+    if total is None:
+        total = torch.zeros_like(next(iter(terms.values())))
+    return Objective(total, terms, counts)
+
+
+def _parts(
+    prediction: Prediction, reference: Reference, context: int, *, context_weight: float
+) -> tuple[dict[str, Callable[[], Tensor]], dict[str, Tensor]]:
+    """The terms, not yet computed, and what they stand on."""
+    parts: dict[str, Callable[[], Tensor]] = {}
+    counts: dict[str, Tensor] = {}
+    for level in ("level1", "level0"):
+        if (found := getattr(prediction, level)) is not None:
+            parts[level] = partial(
+                flow_matching_loss,
+                found,
+                _wanted(reference, level),
+                context=context,
+                context_weight=context_weight,
+            )
+    if (image := prediction.image) is not None:
+        wanted, valid = _wanted(reference, "image"), reference.image_valid
+        parts["rgb"] = partial(rgb_loss, image, wanted, valid=valid)
+        parts["hf"] = partial(high_gradient_loss, image, wanted, valid=valid)
+        _count(counts, "rgb", rgb_mask(wanted, valid))
+    if (depth := prediction.depth) is not None:
+        wanted, valid = _wanted(reference, "depth"), reference.depth_valid
+        if prediction.centers is None:
+            raise OptionError("predicted depth without predicted camera centres; give both")
+        similarity = center_similarity(prediction.centers, _wanted(reference, "centers"))
+        parts["depth"] = partial(depth_loss, depth, wanted, similarity=similarity, valid=valid)
+        _count(counts, "depth", depth_mask(wanted, valid))
+        counts["depth_without_scale"] = (~similarity.ok).sum()
+    return parts, counts
+
+
+def _wanted(reference: Reference, name: str) -> Tensor:
+    value: Tensor | None = getattr(reference, name)
+    if value is None:
+        raise OptionError(f"objective: {name} was predicted but the reference has none")
+    return value
+
+
+def _count(counts: dict[str, Tensor], name: str, mask: Tensor) -> None:
+    pixels = mask.sum((1, 2, 3))
+    counts[f"{name}_pixels"] = pixels.sum()
+    counts[f"{name}_empty"] = (pixels == 0).sum()

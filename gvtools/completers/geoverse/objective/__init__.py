@@ -1,1 +1,0 @@
-"""The training objective: its five terms, and the camera-centre scale."""

@@ -1,1 +1,0 @@
-"""Weights on disk: published files, strict loading, saving, and what does not fit."""
