@@ -18,19 +18,14 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Filled:
-    """Projections with their holes filled, however that was done.
+    """Projections with their holes filled, however that was done."""
 
-    Attributes:
-        rgb: (T, H, W, 3) in [0, 1].
-        depth: (T, H, W) z-depth, scene units; 0 = none.
-        confidence: (T, H, W) of the depth, in [0, 1]; None where the fill has no notion of it.
-        looked_up: (T, H, W) weight of the photographs that a hole's colour was seen in, in [0, 1];
-            None where none was looked at.
-    """
-
-    rgb: NDArray[np.float32]
-    depth: NDArray[np.float32]
+    rgb: NDArray[np.float32]  # (T, H, W, 3) in [0, 1]
+    depth: NDArray[np.float32]  # (T, H, W) z-depth, scene units; 0 = none
+    # (T, H, W) of the depth, in [0, 1]; None where the fill has no notion of it.
     confidence: NDArray[np.float32] | None = None
+    # (T, H, W) weight of the photographs that a hole's colour was seen in, in [0, 1]; None where
+    # none was looked at.
     looked_up: NDArray[np.float32] | None = None
 
     def rows(self, index: Sequence[int]) -> Filled:

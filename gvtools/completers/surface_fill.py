@@ -73,13 +73,10 @@ def _shared(
     completion: Completion,
     *,
     looked_up: NDArray[np.float32],
-) -> NDArray[np.bool_]:
+) -> NDArray[np.bool_]:  # (V, H, W) where memory or another view's fill knows
     """Carry fills from view to view, the best known view first.
 
     ``completion`` and ``looked_up`` are written into.
-
-    Returns:
-        (V, H, W) where memory or another view's fill knows.
     """
     known = guidance.valid.copy()
     memory: SpatialMemory | None = None

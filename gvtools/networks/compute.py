@@ -149,13 +149,10 @@ def _least_seconds(dtype: torch.dtype) -> float:
 
 
 class Recomputing(nn.Module):
-    """A network whose repeated layers can run a second time in the backward pass.
+    """A network whose repeated layers can run a second time in the backward pass."""
 
-    Attributes:
-        recompute: a layer keeps its inputs alone; everything within it is computed again when its
-            gradient is asked for. Results and gradients are the same.
-    """
-
+    # A layer keeps its inputs alone; everything within it is computed again when its gradient is
+    # asked for. Results and gradients are the same.
     recompute: bool = False
 
     def layer(self, run: Callable[..., Any], *inputs: Any) -> Any:
@@ -193,7 +190,7 @@ FUSED_MULTIPLE = 8
 MOST_SCORES = 2**26
 
 
-def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:  # (B, heads, N, d)
     """softmax(q kᵀ / sqrt(d)) v, in torch's fused kernels, whose memory is linear in N and M.
 
     On CUDA, torch takes flash attention in half precision (compute capability 8.0 and later, heads
@@ -211,9 +208,6 @@ def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         q: (B, heads, N, d).
         k: (B, heads, M, d).
         v: (B, heads, M, d), the dtype of ``q`` and ``k``.
-
-    Returns:
-        (B, heads, N, d).
     """
     if not _is_fused(q):
         return _in_chunks(q, k, v)

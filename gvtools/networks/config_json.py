@@ -15,24 +15,15 @@ T = TypeVar("T")
 
 
 def check_range(
-    name: str,
-    value: float | None,
+    name: str,  # as the user writes it
+    value: float | None,  # the number
     *,
-    ge: float | None = None,
-    gt: float | None = None,
-    le: float | None = None,
-    lt: float | None = None,
+    ge: float | None = None,  # lower end, included
+    gt: float | None = None,  # lower end, not included
+    le: float | None = None,  # upper end, included
+    lt: float | None = None,  # upper end, not included
 ) -> None:
-    """Refuse a number outside its range; None, for fields that may be left open, passes.
-
-    Args:
-        name: as the user writes it.
-        value: the number.
-        ge: lower end, included.
-        gt: lower end, not included.
-        le: upper end, included.
-        lt: upper end, not included.
-    """
+    """Refuse a number outside its range; None, for fields that may be left open, passes."""
     if value is None:
         return
     inside = (

@@ -39,21 +39,13 @@ _ALIGNMENT = 64
 
 @dataclass(frozen=True)
 class Fit:
-    """How stored tensors fit expected ones.
+    """How stored tensors fit expected ones."""
 
-    Attributes:
-        expected: how many tensors are asked for.
-        missing: names that are asked for and absent.
-        unexpected: names that are there and not asked for.
-        shape_mismatch: "NAME is (2, 3), expected (3, 2)".
-        dtype_mismatch: "NAME is int64, expected float32, float16, ...".
-    """
-
-    expected: int
-    missing: tuple[str, ...]
-    unexpected: tuple[str, ...]
-    shape_mismatch: tuple[str, ...]
-    dtype_mismatch: tuple[str, ...] = ()
+    expected: int  # how many tensors are asked for
+    missing: tuple[str, ...]  # names that are asked for and absent
+    unexpected: tuple[str, ...]  # names that are there and not asked for
+    shape_mismatch: tuple[str, ...]  # "NAME is (2, 3), expected (3, 2)"
+    dtype_mismatch: tuple[str, ...] = ()  # "NAME is int64, expected float32, float16, ..."
 
     @property
     def ok(self) -> bool:
@@ -125,20 +117,13 @@ def check_fit(stored: Mapping[str, Tensor], expected: Shapes, *, where: object) 
 
 
 def load(
-    module: nn.Module,
-    tensors: Mapping[str, Tensor],
+    module: nn.Module,  # may be on the meta device
+    tensors: Mapping[str, Tensor],  # by the names of its state dict, all of them
     *,
-    where: object,
-    device: torch.device | str = "cpu",
+    where: object,  # what the message names
+    device: torch.device | str = "cpu",  # of the module afterwards
 ) -> None:
-    """Put tensors into a module, in float32; what is so already may stay mapped from its file.
-
-    Args:
-        module: may be on the meta device.
-        tensors: by the names of its state dict, all of them.
-        where: what the message names.
-        device: of the module afterwards.
-    """
+    """Put tensors into a module, in float32; what is so already may stay mapped from its file."""
     check_fit(tensors, shapes(module.state_dict()), where=where)
     module.load_state_dict(
         {name: _placed(tensor, device) for name, tensor in tensors.items()}, assign=True
@@ -188,22 +173,14 @@ def share_tied(
 
 
 def save_tensors(
-    tensors: Mapping[str, Tensor],
-    file: Path,
+    tensors: Mapping[str, Tensor],  # by name
+    file: Path,  # to be written
     *,
-    dtype: str = "float32",
-    exact: Collection[str] = (),
-    about: str,
+    dtype: str = "float32",  # what floating-point tensors are stored as, one of ``DTYPES``
+    exact: Collection[str] = (),  # names that keep float32, because rounding them matters
+    about: str,  # goes into the file's metadata
 ) -> None:
-    """Write a .safetensors file under the name it is given, flushed to the disk.
-
-    Args:
-        tensors: by name.
-        file: to be written.
-        dtype: what floating-point tensors are stored as, one of ``DTYPES``.
-        exact: names that keep float32, because rounding them matters.
-        about: goes into the file's metadata.
-    """
+    """Write a .safetensors file under the name it is given, flushed to the disk."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 

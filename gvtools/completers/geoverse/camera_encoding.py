@@ -34,23 +34,14 @@ COINCIDENT = 8
 
 @dataclass(frozen=True, eq=False)
 class CameraCondition:
-    """What a denoiser is told of B x V cameras.
+    """What a denoiser is told of B x V cameras."""
 
-    Attributes:
-        map: (B, V, 7, H, W): 0 on context views and 1 on the others, then the Plücker map.
-        cam_from_world: (B, V, 4, 4), scaled, not re-based: PRoPE sees relative poses alone.
-        K: (B, V, 3, 3), pixels of an image of ``size``.
-        size: (H, W), pixels.
-        scale: (B,), scaled units per scene unit.
-        context: number of context views, which come first.
-    """
-
-    map: Tensor
-    cam_from_world: Tensor
-    K: Tensor
-    size: tuple[int, int]
-    scale: Tensor
-    context: int
+    map: Tensor  # (B, V, 7, H, W): 0 on context views and 1 on the others, then the Plücker map
+    cam_from_world: Tensor  # (B, V, 4, 4), scaled, not re-based: PRoPE sees relative poses alone
+    K: Tensor  # (B, V, 3, 3), pixels of an image of ``size``
+    size: tuple[int, int]  # (H, W), pixels
+    scale: Tensor  # (B,), scaled units per scene unit
+    context: int  # number of context views, which come first
 
     def unconditional(self, mode: str = "new") -> CameraCondition:
         """The condition without cameras, for classifier-free guidance; the view mask stays.
@@ -77,24 +68,15 @@ class CameraCondition:
 
 
 def camera_condition(
-    world_from_cam: Tensor,
-    K: Tensor,
-    size: tuple[int, int],
+    world_from_cam: Tensor,  # (B, V, 4, 4) rigid, OpenCV, scene units
+    K: Tensor,  # (B, V, 3, 3), pixels
+    size: tuple[int, int],  # (H, W) of the images, pixels
     *,
-    context: int,
-    reference: int = -1,
-    pixel_offset: tuple[float, float] = GLD_PIXEL_OFFSET,
+    context: int,  # number of context views
+    reference: int = -1,  # view whose frame the map is in
+    pixel_offset: tuple[float, float] = GLD_PIXEL_OFFSET,  # (x, y) added to column and row
 ) -> CameraCondition:
-    """The condition of B x V cameras, context views first.
-
-    Args:
-        world_from_cam: (B, V, 4, 4) rigid, OpenCV, scene units.
-        K: (B, V, 3, 3), pixels.
-        size: (H, W) of the images, pixels.
-        context: number of context views.
-        reference: view whose frame the map is in.
-        pixel_offset: (x, y) added to column and row.
-    """
+    """The condition of B x V cameras, context views first."""
     rebased, scale = normalised_poses(world_from_cam, reference=reference)
     views = rebased.shape[1]
     rays = plucker_map(rebased, K, size, pixel_offset=pixel_offset)
@@ -134,23 +116,13 @@ def normalised_poses(world_from_cam: Tensor, *, reference: int = -1) -> tuple[Te
 
 
 def plucker_map(
-    world_from_cam: Tensor,
-    K: Tensor,
-    size: tuple[int, int],
+    world_from_cam: Tensor,  # (B, V, 4, 4) rigid, OpenCV
+    K: Tensor,  # (B, V, 3, 3), pixels of an image of ``size``
+    size: tuple[int, int],  # (H, W), pixels
     *,
-    pixel_offset: tuple[float, float] = CENTRED,
-) -> Tensor:
-    """Plücker ray map: unit direction d and moment o x d of every pixel's ray, world frame.
-
-    Args:
-        world_from_cam: (B, V, 4, 4) rigid, OpenCV.
-        K: (B, V, 3, 3), pixels of an image of ``size``.
-        size: (H, W), pixels.
-        pixel_offset: (x, y) added to column and row.
-
-    Returns:
-        (B, V, 6, H, W).
-    """
+    pixel_offset: tuple[float, float] = CENTRED,  # (x, y) added to column and row
+) -> Tensor:  # (B, V, 6, H, W)
+    """Plücker ray map: unit direction d and moment o x d of every pixel's ray, world frame."""
     dtype = torch.promote_types(_precise(world_from_cam), K.dtype)
     world_from_cam, K = world_from_cam.to(dtype), K.to(dtype)
     height, width = size
@@ -198,17 +170,6 @@ class Projective:
     It holds tensors and no parameters. Matrices and angles are float32 (float64 for float64
     cameras) whatever the tokens are; the tokens' dtype is that of the result.
 
-    Args:
-        cam_from_world: (B, V, 4, 4) rigid, OpenCV; any scale, the same for all views of a sample.
-        K: (B, V, 3, 3) pixels of an image of ``size``; skew is not used.
-        size: (H, W), pixels, by which K is normalised.
-        grid: (h, w) tokens of a view, row-major.
-        head_dim: channels of an attention head, a multiple of 8.
-        base: of the rotary frequencies.
-        position_scale: (y, x) tokens of another grid per token of this one: keys that lie on a
-            coarser grid get the positions of their centres on the queries' grid.
-        invert_K: False for keys and values as in GLD's recorded outputs; see the module.
-
     Attributes:
         matrix: (B, V, 4, 4), P.
         key_matrix: (B, V, 4, 4), by which keys and values are multiplied.
@@ -216,14 +177,18 @@ class Projective:
 
     def __init__(
         self,
+        # (B, V, 4, 4) rigid, OpenCV; any scale, the same for all views of a sample.
         cam_from_world: Tensor,
-        K: Tensor,
-        size: tuple[int, int],
+        K: Tensor,  # (B, V, 3, 3) pixels of an image of ``size``; skew is not used
+        size: tuple[int, int],  # (H, W), pixels, by which K is normalised
         *,
-        grid: tuple[int, int],
-        head_dim: int,
-        base: float = 100.0,
+        grid: tuple[int, int],  # (h, w) tokens of a view, row-major
+        head_dim: int,  # channels of an attention head, a multiple of 8
+        base: float = 100.0,  # of the rotary frequencies
+        # (y, x) tokens of another grid per token of this one: keys that lie on a coarser grid get
+        # the positions of their centres on the queries' grid.
         position_scale: tuple[float, float] = (1.0, 1.0),
+        # False for keys and values as in GLD's recorded outputs; see the module.
         invert_K: bool = True,
     ) -> None:
         dtype = torch.promote_types(cam_from_world.dtype, torch.float32)
@@ -277,7 +242,7 @@ class Projective:
 
 def projection_matrices(
     cam_from_world: Tensor, K: Tensor, *, size: tuple[int, int], invert_K: bool = True
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:  # Two (..., 4, 4)
     """P = lift(K) · cam_from_world and its inverse, with K in shares of the image.
 
     fx / W, fy / H, cx / W - 0.5, cy / H - 0.5. Written out row by row: no matrix product whose
@@ -288,9 +253,6 @@ def projection_matrices(
         K: (..., 3, 3) pixels of an image of ``size``.
         size: (H, W), pixels.
         invert_K: False leaves K as it is in the second matrix.
-
-    Returns:
-        Two (..., 4, 4).
     """
     K = K.to(cam_from_world.dtype)
     height, width = size

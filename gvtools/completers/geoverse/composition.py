@@ -91,25 +91,17 @@ def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, *, valid: Tensor
 
 
 def corrected_depth(
-    filled: Tensor,
-    made: Tensor,
-    hint: Tensor,
+    filled: Tensor,  # (N, 1, H, W) z-depth, scene units; 0 = none, and stays so
+    made: Tensor,  # likewise, model units, above 0
+    hint: Tensor,  # likewise
     *,
-    valid: Tensor,
-    certain: float = CERTAIN,
-    most: float = MOST,
+    valid: Tensor,  # (N, 1, H, W) bool, where the memory knows
+    certain: float = CERTAIN,  # log-ratio that a correction counts from
+    most: float = MOST,  # largest factor
 ) -> Tensor:
     """The filled projection's depth by the ratio of two decodings.
 
     A pixel without a ratio (NaN, or 0 in both) is NaN, alone.
-
-    Args:
-        filled: (N, 1, H, W) z-depth, scene units; 0 = none, and stays so.
-        made: likewise, model units, above 0.
-        hint: likewise.
-        valid: (N, 1, H, W) bool, where the memory knows.
-        certain: log-ratio that a correction counts from.
-        most: largest factor.
     """
     change = made.log() - hint.log()
     change = change - push_pull(change, valid & change.isfinite())
@@ -184,24 +176,15 @@ class Completed:
 
 
 def to_scene_scale(
-    generated: Generated,
-    guidance: Guidance,
-    cameras: Cameras,
+    generated: Generated,  # of the pass
+    guidance: Guidance,  # its targets' projections
+    cameras: Cameras,  # of all views, at the model's size
     *,
-    known: NDArray[np.float32],
-    alignment: str,
-    color_alignment: str,
+    known: NDArray[np.float32],  # (C, h, w) depth of the context at the model's size
+    alignment: str,  # see ``depth_scale``
+    color_alignment: str,  # "field" for ``aligned_color``, or "unchanged"
 ) -> Completed:
-    """Pictures, depth, confidence and rays of the targets at their own size, in scene units.
-
-    Args:
-        generated: of the pass.
-        guidance: its targets' projections.
-        cameras: of all views, at the model's size.
-        known: (C, h, w) depth of the context at the model's size.
-        alignment: see ``depth_scale``.
-        color_alignment: "field" for ``aligned_color``, or "unchanged".
-    """
+    """Pictures, depth, confidence and rays of the targets at their own size, in scene units."""
     geometry, context = generated.decoded.geometry, len(known)
     full = (guidance.depth.shape[1], guidance.depth.shape[2])
     rgb = resampled(generated.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
@@ -302,22 +285,14 @@ def corrected(
 
 @torch.no_grad()
 def refined(
-    completed: Completed,
-    guidance: Guidance,
-    refiner: Refiner,
+    completed: Completed,  # at the targets' size
+    guidance: Guidance,  # the targets' projections
+    refiner: Refiner,  # on the device of the pass
     *,
-    batch: ViewBatch,
-    generated: Generated,
+    batch: ViewBatch,  # filled as the model saw it (``conditioning.filled``)
+    generated: Generated,  # of the pass, with the hints' decoding
 ) -> Completed:
-    """Completed views with the refiner's colours, and its confidence, in their holes.
-
-    Args:
-        completed: at the targets' size.
-        guidance: the targets' projections.
-        refiner: on the device of the pass.
-        batch: filled as the model saw it (``conditioning.filled``).
-        generated: of the pass, with the hints' decoding.
-    """
+    """Completed views with the refiner's colours, and its confidence, in their holes."""
     full = (guidance.depth.shape[1], guidance.depth.shape[2])
     made, _ = composed(batch, generated.decoded, generated.hint)
     finite = made.isfinite()

@@ -65,31 +65,27 @@ LOG_DEPTH_LIMIT = 6.0
 
 @dataclass(frozen=True)
 class HintConfig:
-    """How projections become features; the defaults are the paper's form.
+    """How projections become features; the defaults are the paper's form."""
 
-    Attributes:
-        fill: "none": holes are black; "push-pull": they are filled before encoding; "surfaces":
-            likewise, and callers fill what they can along surfaces first (``surface_fill``).
-        encode: "jointly": context and projections in one pass (Eq. 1); "alone": the context views
-            by themselves, and the projections with them in a second pass; "context": the context
-            views by themselves and no projections, as GLD does.
-        mask: features of a token count where at least this share of its pixels is valid; 0: the
-            features are not masked (of use with filled holes).
-        cameras: known cameras go into the encoder's camera tokens.
-        camera_unit: of those cameras: "median", the median distance of the centres from the first
-            (DA3); or "depth", the mean known depth of the context, where any is known.
-        cascade_context: level-0 features of the context come from the context "alone" (as GLD
-            trains its cascade) or from the "jointly" encoded sequence.
-        token: token 0 of generated features: "first-context" encoded alone and shared by all views
-            (GLD), or each view's "own" of the joint encoding.
-    """
-
+    # "none": holes are black; "push-pull": they are filled before encoding; "surfaces": likewise,
+    # and callers fill what they can along surfaces first (``surface_fill``).
     fill: str = "none"
+    # "jointly": context and projections in one pass (Eq. 1); "alone": the context views by
+    # themselves, and the projections with them in a second pass; "context": the context views by
+    # themselves and no projections, as GLD does.
     encode: str = "jointly"
+    # Features of a token count where at least this share of its pixels is valid; 0: the features
+    # are not masked (of use with filled holes).
     mask: float = 0.5
-    cameras: bool = False
+    cameras: bool = False  # known cameras go into the encoder's camera tokens
+    # Of those cameras: "median", the median distance of the centres from the first (DA3); or
+    # "depth", the mean known depth of the context, where any is known.
     camera_unit: str = "median"
+    # Level-0 features of the context come from the context "alone" (as GLD trains its cascade) or
+    # from the "jointly" encoded sequence.
     cascade_context: str = "alone"
+    # Token 0 of generated features: "first-context" encoded alone and shared by all views (GLD), or
+    # each view's "own" of the joint encoding.
     token: str = "first-context"
 
     def __post_init__(self) -> None:
@@ -103,27 +99,19 @@ class HintConfig:
 
 @dataclass(frozen=True)
 class ViewBatch:
-    """Context views, then target views, all of one size.
+    """Context views, then target views, all of one size."""
 
-    Attributes:
-        images: (B, V, 3, H, W) in [0, 1]: context pictures; projections on targets, holes at 0.
-        depth: (B, V, 1, H, W) z-depth in the unit of the sample's cameras; 0 = none. A hole of a
-            projection that has depth was filled by the caller, its picture too.
-        valid: (B, V, 1, H, W) bool: True on context; True where the projection knows a target.
-        cam_from_world: (B, V, 4, 4).
-        K: (B, V, 3, 3), px of ``images``, pixel centres at + 0.5.
-        context: number of context views, at least one.
-        evidence: (B, V, 2, H, W) what the caller's fill of holes rests on: the confidence of its
-            depth, and the weight of the photographs that its colour was seen in, in [0, 1]; None
-            without such a fill.
-    """
-
+    # (B, V, 3, H, W) in [0, 1]: context pictures; projections on targets, holes at 0.
     images: Tensor
+    # (B, V, 1, H, W) z-depth in the unit of the sample's cameras; 0 = none. A hole of a projection
+    # that has depth was filled by the caller, its picture too.
     depth: Tensor
-    valid: Tensor
-    cam_from_world: Tensor
-    K: Tensor
-    context: int
+    valid: Tensor  # (B, V, 1, H, W) bool: True on context; True where the projection knows a target
+    cam_from_world: Tensor  # (B, V, 4, 4)
+    K: Tensor  # (B, V, 3, 3), px of ``images``, pixel centres at + 0.5
+    context: int  # number of context views, at least one
+    # (B, V, 2, H, W) what the caller's fill of holes rests on: the confidence of its depth, and the
+    # weight of the photographs that its colour was seen in, in [0, 1]; None without such a fill.
     evidence: Tensor | None = None
 
     def __post_init__(self) -> None:
@@ -170,21 +158,13 @@ class ViewBatch:
 
 @dataclass(frozen=True)
 class Hints:
-    """Features of context and projections.
+    """Features of context and projections."""
 
-    Attributes:
-        level1: (B, V, C, h, w) normalised and masked: what the denoiser is conditioned on.
-        unmasked: (B, V, C, h, w) normalised: where a hint skip starts from.
-        level0: (B, V, C, h, w) normalised on context views, zeros on targets.
-        token: (B, V, C) raw token 0 of level 1, for ``Backbone.propagate``.
-        mask: (B, V, 1, h, w) in {0, 1}.
-    """
-
-    level1: Tensor
-    unmasked: Tensor
-    level0: Tensor
-    token: Tensor
-    mask: Tensor
+    level1: Tensor  # (B, V, C, h, w) normalised and masked: what the denoiser is conditioned on
+    unmasked: Tensor  # (B, V, C, h, w) normalised: where a hint skip starts from
+    level0: Tensor  # (B, V, C, h, w) normalised on context views, zeros on targets
+    token: Tensor  # (B, V, C) raw token 0 of level 1, for ``Backbone.propagate``
+    mask: Tensor  # (B, V, 1, h, w) in {0, 1}
 
 
 def feature_mask(valid: Tensor, grid: tuple[int, int], share: float) -> Tensor:
@@ -226,22 +206,14 @@ def filled(batch: ViewBatch, config: HintConfig) -> ViewBatch:
 
 @torch.no_grad()
 def encode_hints(
-    network: DepthAnything3,
-    level0: LatentStatistics,
-    level1: LatentStatistics,
+    network: DepthAnything3,  # the frozen encoder
+    level0: LatentStatistics,  # statistics of level 0
+    level1: LatentStatistics,  # statistics of level 1
     *,
-    batch: ViewBatch,
-    config: HintConfig,
+    batch: ViewBatch,  # its holes filled already where they should be (``filled``)
+    config: HintConfig,  # see ``HintConfig``
 ) -> Hints:
-    """Eq. 1 for every sample of a batch (see the module).
-
-    Args:
-        network: the frozen encoder.
-        level0: statistics of level 0.
-        level1: statistics of level 1.
-        batch: its holes filled already where they should be (``filled``).
-        config: see ``HintConfig``.
-    """
+    """Eq. 1 for every sample of a batch (see the module)."""
     grid, context = network.encoder.grid(*batch.size), batch.context
     mask = feature_mask(batch.valid, grid, config.mask)
     mask[:, :context] = 1
@@ -274,22 +246,14 @@ def encode_hints(
 
 
 def _encode_jointly(
-    network: DepthAnything3,
-    batch: ViewBatch,
-    informative: Tensor,
+    network: DepthAnything3,  # the frozen encoder
+    batch: ViewBatch,  # all views
+    informative: Tensor,  # which views are encoded; samples that agree in it share a pass
     *,
-    config: HintConfig,
-    alone: Callable[[], list[Tensor]],
+    config: HintConfig,  # see ``HintConfig``
+    alone: Callable[[], list[Tensor]],  # the context's levels where nothing else is encoded
 ) -> list[Tensor]:
-    """Raw levels 0 and 1, token 0 included, of each sample's ``informative`` (B, V) views; else 0.
-
-    Args:
-        network: the frozen encoder.
-        batch: all views.
-        informative: which views are encoded; samples that agree in it share a pass.
-        config: see ``HintConfig``.
-        alone: the context's levels where nothing else is encoded.
-    """
+    """Raw levels 0 and 1, token 0 included, of the ``informative`` (B, V) views; else 0."""
     rows, columns = network.encoder.grid(*batch.size)
     shape = (*informative.shape, 1 + rows * columns, network.config.encoder.channels)
     dtype = network.encoder.cls_token.dtype
@@ -308,25 +272,14 @@ def _encode_jointly(
 
 @torch.no_grad()
 def encode_latents(
-    network: DepthAnything3,
-    level0: LatentStatistics,
-    level1: LatentStatistics,
+    network: DepthAnything3,  # the frozen encoder
+    level0: LatentStatistics,  # statistics of level 0
+    level1: LatentStatistics,  # statistics of level 1
     *,
-    batch: ViewBatch,
-    config: HintConfig,
-) -> tuple[Tensor, Tensor]:
-    """Clean level-0 and level-1 latents of true pictures of all views, encoded jointly.
-
-    Args:
-        network: the frozen encoder.
-        level0: statistics of level 0.
-        level1: statistics of level 1.
-        batch: true pictures on all views.
-        config: see ``HintConfig``.
-
-    Returns:
-        Two (B, V, C, h, w) tensors, normalised.
-    """
+    batch: ViewBatch,  # true pictures on all views
+    config: HintConfig,  # see ``HintConfig``
+) -> tuple[Tensor, Tensor]:  # Two (B, V, C, h, w) tensors, normalised
+    """Clean level-0 and level-1 latents of true pictures of all views, encoded jointly."""
     grid = network.encoder.grid(*batch.size)
     both = encode_views(network, batch, slice(None), config=config)
     return level0.normalise(_maps(both[0], grid)), level1.normalise(_maps(both[1], grid))

@@ -28,36 +28,27 @@ NAMES = ("base", "gld", "tiny")
 
 @dataclass(frozen=True)
 class FlowConfig:
-    """How latents are sampled.
+    """How latents are sampled."""
 
-    Attributes:
-        prediction: what the level-1 denoiser is trained to return: "velocity" (the paper) or
-            "clean" latents, from which the velocity follows.
-        skip: with "clean": the denoiser returns the difference from the hints' features.
-        least_time: t below which a clean prediction's velocity is not divided further.
-        level1: interval bounds of level 1, from 1 to 0 (Geometric Latent Diffusion ends a little
-            above); one denoiser evaluation an interval.
-        cascade: interval bounds of level 0.
-        sampling_shift: of steps whose number the user chooses instead, as ``shift``.
-        shift: of the training times, t' = s t / (1 + (s - 1) t); 1 for none (the paper).
-        most_time: training times are drawn below it, before the shift; 1 for the paper's U(0, 1),
-            0.999 is Geometric Latent Diffusion's.
-        cfg_scale: classifier-free guidance scale over the cameras; 1 for none (the paper).
-        cascade_cfg_scale: likewise, of level 0.
-        temperature: of the noise that level 1 starts from, its standard deviation; 1 draws from
-            what the model has learned (the paper), less stays nearer to its mean.
-    """
-
+    # What the level-1 denoiser is trained to return: "velocity" (the paper) or "clean" latents,
+    # from which the velocity follows.
     prediction: str = "velocity"
-    skip: bool = False
-    least_time: float = 0.05
+    skip: bool = False  # with "clean": the denoiser returns the difference from the hints' features
+    least_time: float = 0.05  # t below which a clean prediction's velocity is not divided further
+    # Interval bounds of level 1, from 1 to 0 (Geometric Latent Diffusion ends a little above); one
+    # denoiser evaluation an interval.
     level1: tuple[float, ...] = (1.0, 2 / 3, 1 / 3, 0.0)
-    cascade: tuple[float, ...] = (1.0, 0.0)
-    sampling_shift: float = 1.0
-    shift: float = 1.0
+    cascade: tuple[float, ...] = (1.0, 0.0)  # interval bounds of level 0
+    sampling_shift: float = 1.0  # of steps whose number the user chooses instead, as ``shift``
+    shift: float = 1.0  # of the training times, t' = s t / (1 + (s - 1) t); 1 for none (the paper)
+    # Training times are drawn below it, before the shift; 1 for the paper's U(0, 1), 0.999 is
+    # Geometric Latent Diffusion's.
     most_time: float = 0.999
+    # Classifier-free guidance scale over the cameras; 1 for none (the paper).
     cfg_scale: float = 1.0
-    cascade_cfg_scale: float = 1.0
+    cascade_cfg_scale: float = 1.0  # likewise, of level 0
+    # Of the noise that level 1 starts from, its standard deviation; 1 draws from what the model has
+    # learned (the paper), less stays nearer to its mean.
     temperature: float = 1.0
 
     def __post_init__(self) -> None:
@@ -77,77 +68,60 @@ class FlowConfig:
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """Camera conventions of the denoisers.
+    """Camera conventions of the denoisers."""
 
-    Attributes:
-        pixel_offset: what is added to a pixel's column and row before it becomes a ray. GLD's
-            checkpoints were trained with (-0.5, 0.5); (0.5, 0.5) is the centre of the pixel.
-        reference: index, of the views of a pass, of the one whose frame the Plücker rays are
-            given in; GLD's is the last, -1.
-    """
-
+    # What is added to a pixel's column and row before it becomes a ray. GLD's checkpoints were
+    # trained with (-0.5, 0.5); (0.5, 0.5) is the centre of the pixel.
     pixel_offset: tuple[float, float] = (-0.5, 0.5)
+    # Index, of the views of a pass, of the one whose frame the Plücker rays are given in; GLD's is
+    # the last, -1.
     reference: int = -1
 
 
 @dataclass(frozen=True)
 class GeoVerseConfig:
-    """Everything that is needed to build the model; the defaults are ``base``.
+    """Everything that is needed to build the model; the defaults are ``base``."""
 
-    Attributes:
-        name: of the configuration.
-        image_size: longest side of the model's pictures, px, a multiple of the patch.
-        views: views of a pass, context and targets.
-        context: most context views of a pass.
-        decode_views: views that the geometry head and the RGB head decode together; bounds the
-            memory, not the result.
-        geometry: the frozen encoder and geometry head.
-        rgb: the RGB head.
-        level1: the level-1 denoiser.
-        cascade: the level-0 denoiser; None: level 0 is left at its mean.
-        hints: how projections become features.
-        flow: how latents are sampled.
-        camera: camera conventions.
-        alignment: how generated depth gets the memory's scale, see ``depth_scale``: "centres" (the
-            paper), "hint" or "field".
-        composition: the completion is the model's "decoded" pictures and depth (the paper), or a
-            "correction" of the filled projection, see ``correction``; it needs ``hints.fill``.
-        color_alignment: whether generated colours stay "unchanged" (the paper) or follow the
-            memory's by a "field", see ``postprocess.aligned_color``.
-        refiner: what is asked how far completions are to be trusted, see ``refiner``; None for a
-            model without one. It needs ``composition = "correction"``.
-        video: the video prior; None for a model without one.
-        injection: how video features enter: "control", "shared" (MoT) or "none".
-        control: of the control branch.
-        shared: of the MoT variant.
-        trained: False beside weights that no training has made useful yet.
-    """
-
-    name: str = "base"
-    image_size: int = 504
-    views: int = 8
-    context: int = 4
+    name: str = "base"  # of the configuration
+    image_size: int = 504  # longest side of the model's pictures, px, a multiple of the patch
+    views: int = 8  # views of a pass, context and targets
+    context: int = 4  # most context views of a pass
+    # Views that the geometry head and the RGB head decode together; bounds the memory, not the
+    # result.
     decode_views: int = 8
+    # The frozen encoder and geometry head.
     geometry: DepthAnythingConfig = field(default_factory=DepthAnythingConfig)
-    rgb: RGBHeadConfig = field(default_factory=RGBHeadConfig)
+    rgb: RGBHeadConfig = field(default_factory=RGBHeadConfig)  # the RGB head
+    # The level-1 denoiser.
     level1: DenoiserConfig = field(default_factory=lambda: DenoiserConfig(depth_condition=True))
+    # The level-0 denoiser; None: level 0 is left at its mean.
     cascade: DenoiserConfig | None = field(
         default_factory=lambda: DenoiserConfig(
             head_depth=2, source=True, separate_embedders=False, projective_size=504
         )
     )
-    hints: HintConfig = field(default_factory=HintConfig)
-    flow: FlowConfig = field(default_factory=FlowConfig)
-    camera: CameraConfig = field(default_factory=CameraConfig)
+    hints: HintConfig = field(default_factory=HintConfig)  # how projections become features
+    flow: FlowConfig = field(default_factory=FlowConfig)  # how latents are sampled
+    camera: CameraConfig = field(default_factory=CameraConfig)  # camera conventions
+    # How generated depth gets the memory's scale, see ``depth_scale``: "centres" (the paper),
+    # "hint" or "field".
     alignment: str = "centres"
+    # Whether generated colours stay "unchanged" (the paper) or follow the memory's by a "field",
+    # see ``postprocess.aligned_color``.
     color_alignment: str = "unchanged"
+    # The completion is the model's "decoded" pictures and depth (the paper), or a "correction" of
+    # the filled projection, see ``correction``; it needs ``hints.fill``.
     composition: str = "decoded"
+    # What is asked how far completions are to be trusted, see ``refiner``; None for a model without
+    # one. It needs ``composition = "correction"``.
     refiner: RefinerConfig | None = None
+    # The video prior; None for a model without one.
     video: VideoPriorConfig | None = field(default_factory=VideoPriorConfig)
-    injection: str = "control"
-    control: ControlConfig = field(default_factory=ControlConfig)
+    injection: str = "control"  # how video features enter: "control", "shared" (MoT) or "none"
+    control: ControlConfig = field(default_factory=ControlConfig)  # of the control branch
+    # Of the MoT variant.
     shared: SharedAttentionConfig = field(default_factory=SharedAttentionConfig)
-    trained: bool = True
+    trained: bool = True  # False beside weights that no training has made useful yet
 
     def __post_init__(self) -> None:
         encoder = self.geometry.encoder

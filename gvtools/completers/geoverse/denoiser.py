@@ -30,17 +30,11 @@ from gvtools.networks.compute import Recomputing, attend
 
 @dataclass(frozen=True)
 class VideoKeys:
-    """Keys and values of the video tokens for one block.
+    """Keys and values of the video tokens for one block."""
 
-    Attributes:
-        key: (B, heads, V * M, head_dim), projectively transformed.
-        value: likewise.
-        gate: share of the joint attention; None for all of it.
-    """
-
-    key: Tensor
-    value: Tensor
-    gate: Tensor | None
+    key: Tensor  # (B, heads, V * M, head_dim), projectively transformed
+    value: Tensor  # likewise
+    gate: Tensor | None  # share of the joint attention; None for all of it
 
     def attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         """Attention of (B, heads, T, head_dim) over both kinds of tokens."""
@@ -131,19 +125,12 @@ class DenoiserBlock(nn.Module):
 
     def forward(
         self,
-        x: Tensor,
-        c: Tensor,
-        positions: Projective,
-        video: VideoKeys | None = None,
+        x: Tensor,  # (B, V, N, width)
+        c: Tensor,  # (B, V, 1 or N, width)
+        positions: Projective,  # of the V * N tokens
+        video: VideoKeys | None = None,  # see ``CameraAttention``
     ) -> Tensor:
-        """Tokens under their conditioning.
-
-        Args:
-            x: (B, V, N, width).
-            c: (B, V, 1 or N, width).
-            positions: of the V * N tokens.
-            video: see ``CameraAttention``.
-        """
+        """Tokens under their conditioning."""
         shift1, scale1, gate1, shift2, scale2, gate2 = self.adaLN_modulation(c).chunk(6, dim=-1)
         inner = modulated(self.norm1(x), shift1, scale1).flatten(1, 2)
         x = x + gate1 * self.attn(inner, positions, video).view_as(x)
@@ -176,42 +163,28 @@ DEPTH_CHANNELS = 2
 
 @dataclass(frozen=True)
 class DenoiserConfig:
-    """Dimensions of a denoiser; the defaults are GLD's level 1.
+    """Dimensions of a denoiser; the defaults are GLD's level 1."""
 
-    Attributes:
-        channels: of the latents.
-        width: channels of the encoder's tokens.
-        depth: blocks of the encoder.
-        heads: attention heads of the encoder.
-        head_width: channels of the head's tokens.
-        head_depth: blocks of the head.
-        head_heads: attention heads of the head.
-        mlp_ratio: hidden width of a block's MLP over 1.5 times its width (SwiGLU).
-        frequencies: of the time embedding.
-        camera_patch: pixels of the camera map a token.
-        source: the encoder's second input is a source latent (the cascade), not the noisy one.
-        separate_embedders: context and target views have their own embedders.
-        projective_size: K is normalised by this square, px; by the image's size where None. The
-            released cascade has a fixed square.
-        invert_K: keys and values carry K's inverse, as the projective encoding is published; GLD's
-            checkpoints were trained with K itself in its place.
-        depth_condition: projected depth and validity enter through a zero-initialised embedder.
-    """
-
-    channels: int = 1536
-    width: int = 768
-    depth: int = 28
-    heads: int = 16
-    head_width: int = 2048
-    head_depth: int = 6
-    head_heads: int = 16
-    mlp_ratio: float = 4.0
-    frequencies: int = 256
-    camera_patch: int = 14
+    channels: int = 1536  # of the latents
+    width: int = 768  # channels of the encoder's tokens
+    depth: int = 28  # blocks of the encoder
+    heads: int = 16  # attention heads of the encoder
+    head_width: int = 2048  # channels of the head's tokens
+    head_depth: int = 6  # blocks of the head
+    head_heads: int = 16  # attention heads of the head
+    mlp_ratio: float = 4.0  # hidden width of a block's MLP over 1.5 times its width (SwiGLU)
+    frequencies: int = 256  # of the time embedding
+    camera_patch: int = 14  # pixels of the camera map a token
+    # The encoder's second input is a source latent (the cascade), not the noisy one.
     source: bool = False
-    separate_embedders: bool = True
+    separate_embedders: bool = True  # context and target views have their own embedders
+    # K is normalised by this square, px; by the image's size where None. The released cascade has a
+    # fixed square.
     projective_size: int | None = None
+    # Keys and values carry K's inverse, as the projective encoding is published; GLD's checkpoints
+    # were trained with K itself in its place.
     invert_K: bool = False
+    # Projected depth and validity enter through a zero-initialised embedder.
     depth_condition: bool = False
 
     def __post_init__(self) -> None:
@@ -228,19 +201,12 @@ class DenoiserConfig:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a denoiser knows, constant over the steps.
+    """What a denoiser knows, constant over the steps."""
 
-    Attributes:
-        latents: (B, V, C, h, w) normalised: clean context, hints or zeros on targets.
-        camera: Plücker map, cameras and image size.
-        source: (B, V, C, h, w) normalised level-1 latents, for the cascade.
-        depth: (B, V, 2, H, W) from ``conditioning.depth_condition``, or None.
-    """
-
-    latents: Tensor
-    camera: CameraCondition
-    source: Tensor | None = None
-    depth: Tensor | None = None
+    latents: Tensor  # (B, V, C, h, w) normalised: clean context, hints or zeros on targets
+    camera: CameraCondition  # Plücker map, cameras and image size
+    source: Tensor | None = None  # (B, V, C, h, w) normalised level-1 latents, for the cascade
+    depth: Tensor | None = None  # (B, V, 2, H, W) from ``conditioning.depth_condition``, or None
 
 
 class Positions:
@@ -340,27 +306,18 @@ class Denoiser(Recomputing):
 
     def forward(
         self,
-        noisy: Tensor,
-        t: Tensor,
-        conditions: Conditions,
+        noisy: Tensor,  # (B, V, C, h, w)
+        t: Tensor,  # (B,) or (B, V) in [0, 1]; 1 is noise
+        conditions: Conditions,  # see ``Conditions``; its context views come first
         *,
+        # What is added after an encoder block, (B, V, N, width), by its index.
         residuals: Mapping[int, Tensor] | None = None,
+        # Further keys and values of an encoder block, by its index.
         video: Mapping[int, VideoKeys] | None = None,
+        # Of this grid and cameras, when the caller has them already.
         positions: Positions | None = None,
-    ) -> Tensor:
-        """The velocity of every view.
-
-        Args:
-            noisy: (B, V, C, h, w).
-            t: (B,) or (B, V) in [0, 1]; 1 is noise.
-            conditions: see ``Conditions``; its context views come first.
-            residuals: what is added after an encoder block, (B, V, N, width), by its index.
-            video: further keys and values of an encoder block, by its index.
-            positions: of this grid and cameras, when the caller has them already.
-
-        Returns:
-            (B, V, C, h, w).
-        """
+    ) -> Tensor:  # (B, V, C, h, w)
+        """The velocity of every view."""
         grid = (noisy.shape[-2], noisy.shape[-1])
         positions = positions or Positions(self.config, conditions.camera, grid)
         s, x = self.embed(noisy, conditions)

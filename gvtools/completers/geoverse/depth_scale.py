@@ -39,49 +39,34 @@ FITTED = 100_000
 
 @dataclass(frozen=True)
 class ScaledDepth:
-    """Depth in scene units, and how it got there.
+    """Depth in scene units, and how it got there."""
 
-    Attributes:
-        depth: (T, H, W) z-depth; 0 where the model's is not finite, and for views without a
-            supported scale.
-        scale: (T,) scene units per unit of the model, the field's median; NaN where refused.
-        alignment: for each view, what its scale rests on.
-    """
-
+    # (T, H, W) z-depth; 0 where the model's is not finite, and for views without a supported scale.
     depth: NDArray[np.float32]
+    # (T,) scene units per unit of the model, the field's median; NaN where refused.
     scale: NDArray[np.float64]
-    alignment: tuple[ScaleAlignment, ...]
+    alignment: tuple[ScaleAlignment, ...]  # for each view, what its scale rests on
 
 
 @dataclass(frozen=True)
 class PassScale:
-    """One scale for all views of a pass.
+    """One scale for all views of a pass."""
 
-    Attributes:
-        scale: scene units per unit of the model; NaN where refused.
-        status: what it rests on: camera centres or the depth of the context, or why it is refused.
-        centres: camera centres that were compared; 0 where the predicted rays give none.
-        correlation: of predicted and given centres; NaN where they fit no similarity.
-    """
-
-    scale: float
+    scale: float  # scene units per unit of the model; NaN where refused
+    # What it rests on: camera centres or the depth of the context, or why it is refused.
     status: ScaleStatus = ScaleStatus.CAMERA_CENTRES
-    centres: int = 0
+    centres: int = 0  # camera centres that were compared; 0 where the predicted rays give none
+    # Of predicted and given centres; NaN where they fit no similarity.
     correlation: float = float("nan")
 
 
 def pass_scale(
-    geometry: Geometry,
-    world_from_cam: NDArray[np.float64],
+    geometry: Geometry,  # (1, V, ...) of a pass
+    world_from_cam: NDArray[np.float64],  # (V, 4, 4), scene units
+    # (C, H, W) depth of the context views at the model's size, scene units; 0 = none.
     known: NDArray[np.float32],
 ) -> PassScale:
-    """s* from the camera centres, unless the context's own depth says otherwise.
-
-    Args:
-        geometry: (1, V, ...) of a pass.
-        world_from_cam: (V, 4, 4), scene units.
-        known: (C, H, W) depth of the context views at the model's size, scene units; 0 = none.
-    """
+    """s* from the camera centres, unless the context's own depth says otherwise."""
     centres = centre_scale(geometry, world_from_cam)
     generated = geometry.depth[0, : len(known)].float().cpu().numpy().astype(np.float64)
     fit = _fitted(generated, known, known > 0)
@@ -120,22 +105,14 @@ def centre_scale(geometry: Geometry, world_from_cam: NDArray[np.float64]) -> Pas
 
 
 def scaled_depth(
-    depth: Tensor,
-    hint: NDArray[np.float32],
-    valid: NDArray[np.bool_],
+    depth: Tensor,  # (T, H, W) of the model, at the hint's resolution
+    hint: NDArray[np.float32],  # (T, H, W) the memory's depth, scene units
+    valid: NDArray[np.bool_],  # (T, H, W) where it is known
     *,
-    whole: PassScale,
-    alignment: str,
+    whole: PassScale,  # the scale of the pass
+    alignment: str,  # "centres", "hint" or "field"
 ) -> ScaledDepth:
-    """Depth of target views in scene units.
-
-    Args:
-        depth: (T, H, W) of the model, at the hint's resolution.
-        hint: (T, H, W) the memory's depth, scene units.
-        valid: (T, H, W) where it is known.
-        whole: the scale of the pass.
-        alignment: "centres", "hint" or "field".
-    """
+    """Depth of target views in scene units."""
     unscaled = depth.float().cpu().numpy().astype(np.float32)
     result = np.zeros_like(unscaled)
     scale = np.full(len(unscaled), np.nan)

@@ -192,22 +192,17 @@ def guided(velocity: Velocity, unconditional: Velocity | None, scale: float) -> 
 
 
 def integrate(
-    velocity: Velocity,
-    state: Tensor,
-    times: Sequence[float] | Tensor,
+    velocity: Velocity,  # of (B, ...) and t (B,), returns (B, ...)
+    state: Tensor,  # (B, ...) at the first time
+    times: Sequence[float] | Tensor,  # (S + 1,), or (S + 1, B) for times of each sample's own
     *,
+    # Receives the number of steps made, their time (B,) and the state (B, ...).
     callback: Callable[[int, Tensor, Tensor], None] | None = None,
 ) -> Tensor:
     """Euler steps of dx/dt = velocity(x, t) along ``times``.
 
     The state is carried in float32 at least, so that small steps do not vanish in bfloat16; the
     network receives it in its own dtype. Gradients flow unless the caller turns them off.
-
-    Args:
-        velocity: of (B, ...) and t (B,), returns (B, ...).
-        state: (B, ...) at the first time.
-        times: (S + 1,), or (S + 1, B) for times of each sample's own.
-        callback: receives the number of steps made, their time (B,) and the state (B, ...).
 
     Returns:
         The state at the last time, dtype of ``state``; infinite where that dtype ends (float16 at
@@ -228,27 +223,16 @@ def integrate(
 
 
 def sample(
-    velocity: Velocity,
-    noise: Tensor,
-    bounds: Sequence[float],
+    velocity: Velocity,  # see ``integrate``
+    noise: Tensor,  # (B, ...), the state at t = 1
+    bounds: Sequence[float],  # K + 1 times, see ``check_bounds``; the last is 0 in GeoVerse
     *,
+    # The network without the condition that ``cfg_scale`` is to strengthen.
     unconditional: Velocity | None = None,
-    cfg_scale: float = 1.0,
-    callback: Callable[[int, Tensor, Tensor], None] | None = None,
-) -> Tensor:
-    """From noise to clean with one Euler step an interval.
-
-    Args:
-        velocity: see ``integrate``.
-        noise: (B, ...), the state at t = 1.
-        bounds: K + 1 times, see ``check_bounds``; the last is 0 in GeoVerse.
-        unconditional: the network without the condition that ``cfg_scale`` is to strengthen.
-        cfg_scale: of classifier-free guidance, 1 = none, see ``guided``.
-        callback: see ``integrate``.
-
-    Returns:
-        The state (B, ...) at the last bound.
-    """
+    cfg_scale: float = 1.0,  # of classifier-free guidance, 1 = none, see ``guided``
+    callback: Callable[[int, Tensor, Tensor], None] | None = None,  # see ``integrate``
+) -> Tensor:  # The state (B, ...) at the last bound
+    """From noise to clean with one Euler step an interval."""
     step = guided(velocity, unconditional, cfg_scale)
     return integrate(step, noise, check_bounds(bounds), callback=callback)
 
@@ -260,20 +244,13 @@ def view_seed(seed: int, *names: int | str) -> int:
 
 
 def seeded_noise(
-    shape: Sequence[int],
-    seeds: Sequence[Sequence[int]],
+    shape: Sequence[int],  # (B, V, C, h, w); anything after B, V
+    seeds: Sequence[Sequence[int]],  # B rows of V seeds, see ``view_seed``
     *,
-    device: torch.device | str | None = None,
-    dtype: torch.dtype = torch.float32,
+    device: torch.device | str | None = None,  # of the result
+    dtype: torch.dtype = torch.float32,  # of the result
 ) -> Tensor:
-    """Standard normal noise, drawn view by view in float32 on the CPU.
-
-    Args:
-        shape: (B, V, C, h, w); anything after B, V.
-        seeds: B rows of V seeds, see ``view_seed``.
-        device: of the result.
-        dtype: of the result.
-    """
+    """Standard normal noise, drawn view by view in float32 on the CPU."""
     views = [
         torch.randn(tuple(shape[2:]), generator=torch.Generator().manual_seed(value))
         for row in seeds
@@ -286,18 +263,13 @@ def seeded_noise(
 
 @dataclass(frozen=True, eq=False)
 class ReflowPair:
-    """One batch of what a student learns from.
+    """One batch of what a student learns from."""
 
-    Attributes:
-        state: (B, ...) X~_t = eta X+ + (1 - eta) X-, between the noisy end X+ of the interval and
-            its cleaner end X-, eta = (t - tau_{a+1}) / (tau_a - tau_{a+1}).
-        t: (B,) float32, its time.
-        velocity: (B, ...) u^T_a = (X+ - X-) / (tau_a - tau_{a+1}), that line's velocity.
-    """
-
+    # (B, ...) X~_t = eta X+ + (1 - eta) X-, between the noisy end X+ of the interval and its
+    # cleaner end X-, eta = (t - tau_{a+1}) / (tau_a - tau_{a+1}).
     state: Tensor
-    t: Tensor
-    velocity: Tensor
+    t: Tensor  # (B,) float32, its time
+    velocity: Tensor  # (B, ...) u^T_a = (X+ - X-) / (tau_a - tau_{a+1}), that line's velocity
 
 
 def interval_ends(intervals: Tensor, bounds: Sequence[float]) -> tuple[Tensor, Tensor]:
@@ -333,28 +305,18 @@ def teacher_times(upper: Tensor, lower: Tensor, *, steps: int, shift: float = 1.
 
 
 def reflow_pair(
+    # The many-step velocity of (B, ...) and t (B,); with guidance, see ``flow.guided``.
     teacher: Velocity,
-    clean: Tensor,
-    noise: Tensor,
+    clean: Tensor,  # (B, ...) reference latents F^1
+    noise: Tensor,  # (B, ...)
     *,
-    intervals: Tensor,
-    t: Tensor,
-    bounds: Sequence[float],
-    steps: int,
-    shift: float = 1.0,
+    intervals: Tensor,  # (B,) int64, a
+    t: Tensor,  # (B,) in each interval, see ``interval_times``
+    bounds: Sequence[float],  # tau_0 .. tau_K
+    steps: int,  # of the teacher in each interval
+    shift: float = 1.0,  # of the teacher's time, see ``flow.shift_time``
 ) -> ReflowPair:
-    """Run the frozen teacher through one interval a sample and draw the straight line.
-
-    Args:
-        teacher: the many-step velocity of (B, ...) and t (B,); with guidance, see ``flow.guided``.
-        clean: (B, ...) reference latents F^1.
-        noise: (B, ...).
-        intervals: (B,) int64, a.
-        t: (B,) in each interval, see ``interval_times``.
-        bounds: tau_0 .. tau_K.
-        steps: of the teacher in each interval.
-        shift: of the teacher's time, see ``flow.shift_time``.
-    """
+    """Run the frozen teacher through one interval a sample and draw the straight line."""
     upper, lower = interval_ends(intervals, bounds)
     # The share is 1 at the noisy end; a time is rounded to float32, and may lie just outside.
     eta = ((t.to("cpu", torch.float64) - lower) / (upper - lower)).clamp(0, 1)

@@ -79,41 +79,26 @@ def no_clock(stage: str) -> AbstractContextManager[None]:
 
 @dataclass(frozen=True)
 class Prepared:
-    """What stays constant over the denoising steps of a pass.
+    """What stays constant over the denoising steps of a pass."""
 
-    Attributes:
-        batch: the views, holes filled where the configuration says so.
-        hints: features of context and projections.
-        level1: conditions of the level-1 denoiser.
-        positions: its projective transforms.
-        adapted: video features at the control branch's width.
-        video: video features, where keys have to be made of them again for other cameras.
-        keys: their keys and values for the coupled blocks.
-    """
-
-    batch: ViewBatch
-    hints: Hints
-    level1: Conditions
-    positions: Positions
-    adapted: list[Tensor] | None = None
+    batch: ViewBatch  # the views, holes filled where the configuration says so
+    hints: Hints  # features of context and projections
+    level1: Conditions  # conditions of the level-1 denoiser
+    positions: Positions  # its projective transforms
+    adapted: list[Tensor] | None = None  # video features at the control branch's width
+    # Video features, where keys have to be made of them again for other cameras.
     video: VideoFeatures | None = None
-    keys: dict[int, VideoKeys] | None = None
+    keys: dict[int, VideoKeys] | None = None  # their keys and values for the coupled blocks
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """Pictures and geometry of generated features.
+    """Pictures and geometry of generated features."""
 
-    Attributes:
-        rgb: (B, T, 3, H, W) of the target views, not clipped to [0, 1].
-        depth: (B, T, H, W) z-depth of the target views, in the model's unit.
-        depth_confidence: (B, T, H, W) > 1.
-        all_views: the geometry of all V views; None where the targets' depth alone was decoded.
-    """
-
-    rgb: Tensor
-    depth: Tensor
-    depth_confidence: Tensor
+    rgb: Tensor  # (B, T, 3, H, W) of the target views, not clipped to [0, 1]
+    depth: Tensor  # (B, T, H, W) z-depth of the target views, in the model's unit
+    depth_confidence: Tensor  # (B, T, H, W) > 1
+    # The geometry of all V views; None where the targets' depth alone was decoded.
     all_views: Geometry | None = None
 
     @property
@@ -126,18 +111,12 @@ class Decoded:
 
 @dataclass(frozen=True)
 class Generated:
-    """The result of a pass.
+    """The result of a pass."""
 
-    Attributes:
-        level1: (B, V, C, h, w) normalised latents.
-        level0: (B, V, C, h, w) normalised latents.
-        decoded: pictures and geometry.
-        hint: of the filled projections' own features; None where nothing is composed of it.
-    """
-
-    level1: Tensor
-    level0: Tensor
-    decoded: Decoded
+    level1: Tensor  # (B, V, C, h, w) normalised latents
+    level0: Tensor  # (B, V, C, h, w) normalised latents
+    decoded: Decoded  # pictures and geometry
+    # Of the filled projections' own features; None where nothing is composed of it.
     hint: Decoded | None = None
 
 
@@ -208,21 +187,15 @@ class GeoVerse(nn.Module):
 
     def prepare(
         self,
-        batch: ViewBatch,
+        batch: ViewBatch,  # context views, then targets
         *,
+        # Of the video prior's noise; one number, or B rows of V.
         seed: int | Sequence[Sequence[int]] = 0,
+        # Features computed before, for the same views; taken from the attached prior when None.
         video: VideoFeatures | None = None,
-        clock: Clock = no_clock,
+        clock: Clock = no_clock,  # receives the stages' names
     ) -> Prepared:
-        """Everything that the denoising steps share, computed once.
-
-        Args:
-            batch: context views, then targets.
-            seed: of the video prior's noise; one number, or B rows of V.
-            video: features computed before, for the same views; taken from the attached prior
-                when None.
-            clock: receives the stages' names.
-        """
+        """Everything that the denoising steps share, computed once."""
         config = self.config
         with clock(HINTS):
             source = batch
@@ -282,20 +255,13 @@ class GeoVerse(nn.Module):
 
     def velocity1(
         self,
-        prepared: Prepared,
-        state: Tensor,
-        t: Tensor,
+        prepared: Prepared,  # what stays constant
+        state: Tensor,  # (B, V, C, h, w)
+        t: Tensor,  # (B,) or (B, V)
         *,
-        least: float | None = None,
+        least: float | None = None,  # instead of the configuration's ``flow.least_time``
     ) -> Tensor:
-        """The level-1 velocity (Eq. 2).
-
-        Args:
-            prepared: what stays constant.
-            state: (B, V, C, h, w).
-            t: (B,) or (B, V).
-            least: instead of the configuration's ``flow.least_time``.
-        """
+        """The level-1 velocity (Eq. 2)."""
         residuals = None
         if self.control is not None and prepared.adapted is not None:
             residuals = self.control(
@@ -337,22 +303,15 @@ class GeoVerse(nn.Module):
 
     def decode(
         self,
-        prepared: Prepared,
-        level0: Tensor,
-        level1: Tensor,
+        prepared: Prepared,  # of the pass
+        level0: Tensor,  # (B, V, C, h, w) normalised latents
+        level1: Tensor,  # (B, V, C, h, w) normalised latents
         *,
+        # Without all views' geometry; the same pictures and depth, sooner.
         targets_alone: bool = False,
-        clock: Clock = no_clock,
+        clock: Clock = no_clock,  # receives the stages' names
     ) -> Decoded:
-        """Pictures and depth of the targets, geometry of all views; gradients reach the latents.
-
-        Args:
-            prepared: of the pass.
-            level0: (B, V, C, h, w) normalised latents.
-            level1: (B, V, C, h, w) normalised latents.
-            targets_alone: without all views' geometry; the same pictures and depth, sooner.
-            clock: receives the stages' names.
-        """
+        """Pictures and depth of the targets, geometry of all views; gradients reach the latents."""
         grid = (level1.shape[-2], level1.shape[-1])
         encoder = self.geometry.encoder
         context = prepared.batch.context
@@ -415,24 +374,15 @@ class GeoVerse(nn.Module):
 
     def sample1(
         self,
-        prepared: Prepared,
-        noise: Tensor,
+        prepared: Prepared,  # what stays constant
+        noise: Tensor,  # (B, V, C, h, w)
         *,
-        bounds: Sequence[float] | None = None,
-        cfg_scale: float | None = None,
-        temperature: float | None = None,
-        clock: Clock = no_clock,
+        bounds: Sequence[float] | None = None,  # see ``generate``, as the others
+        cfg_scale: float | None = None,  # of classifier-free guidance over the cameras
+        temperature: float | None = None,  # of the noise
+        clock: Clock = no_clock,  # receives the stages' names
     ) -> Tensor:
-        """Level-1 latents from (B, V, C, h, w) noise, one Euler step an interval.
-
-        Args:
-            prepared: what stays constant.
-            noise: (B, V, C, h, w).
-            bounds: see ``generate``, as the others.
-            cfg_scale: of classifier-free guidance over the cameras.
-            temperature: of the noise.
-            clock: receives the stages' names.
-        """
+        """Level-1 latents from (B, V, C, h, w) noise, one Euler step an interval."""
         flow = self.config.flow
         noise = noise * (flow.temperature if temperature is None else temperature)
         scale = flow.cfg_scale if cfg_scale is None else cfg_scale
@@ -493,36 +443,27 @@ class GeoVerse(nn.Module):
     @torch.no_grad()
     def generate(
         self,
-        batch: ViewBatch,
+        batch: ViewBatch,  # context views, then targets
         *,
-        seed: int = 0,
+        seed: int = 0,  # of all noise
+        # B rows of V names; a view's noise depends on the seed and its name alone. Its index by
+        # default.
         names: Sequence[Sequence[int | str]] | None = None,
+        # Level-1 interval bounds; the configuration's by default. Empty: nothing is denoised, and
+        # the hints' own features stand for level 1.
         bounds: Sequence[float] | None = None,
+        # Level-0 interval bounds; the configuration's by default.
         cascade_bounds: Sequence[float] | None = None,
+        # Of classifier-free guidance; the configuration's by default.
         cfg_scale: float | None = None,
-        cascade_cfg_scale: float | None = None,
-        temperature: float | None = None,
-        video: VideoFeatures | None = None,
+        cascade_cfg_scale: float | None = None,  # likewise, of level 0
+        temperature: float | None = None,  # of level 1; the configuration's by default
+        video: VideoFeatures | None = None,  # features computed before, for the same views
+        # Without all views' geometry; the same pictures and depth, sooner.
         targets_alone: bool = False,
-        clock: Clock = no_clock,
+        clock: Clock = no_clock,  # receives the stages' names
     ) -> Generated:
-        """One pass: prepare, sample level 1 and level 0, decode.
-
-        Args:
-            batch: context views, then targets.
-            seed: of all noise.
-            names: B rows of V names; a view's noise depends on the seed and its name alone. Its
-                index by default.
-            bounds: level-1 interval bounds; the configuration's by default. Empty: nothing is
-                denoised, and the hints' own features stand for level 1.
-            cascade_bounds: level-0 interval bounds; the configuration's by default.
-            cfg_scale: of classifier-free guidance; the configuration's by default.
-            cascade_cfg_scale: likewise, of level 0.
-            temperature: of level 1; the configuration's by default.
-            video: features computed before, for the same views.
-            targets_alone: without all views' geometry; the same pictures and depth, sooner.
-            clock: receives the stages' names.
-        """
+        """One pass: prepare, sample level 1 and level 0, decode."""
         rows = names or [list(range(batch.images.shape[1]))] * len(batch.images)
 
         def seeds(draw: str) -> list[list[int]]:

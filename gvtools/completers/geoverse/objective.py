@@ -107,26 +107,18 @@ ROUNDINGS = 4
 
 @dataclass(frozen=True, eq=False)
 class CenterSimilarity:
-    """reference ≈ scale · rotation · predicted + translation, for each sample.
+    """reference ≈ scale · rotation · predicted + translation, for each sample."""
 
-    Attributes:
-        scale: (B,) reference units per predicted unit; NaN where not ``ok``.
-        rotation: (B, 3, 3) in SO(3); any of the best ones where the centres leave it open; NaN
-            where not ``ok``.
-        translation: (B, 3), reference units; NaN where not ``ok``.
-        ok: (B,) bool, whether the scale holds.
-        defect: (B,) int64, index into ``DEFECTS``.
-        used: (B,) int64, centres the fit stands on.
-        correlation: (B,) in [0, 1], 1 where the similarity maps the centres exactly; NaN where not
-            ``ok``. The share of the reference's spread left over is 1 - correlation^2.
-    """
-
-    scale: Tensor
+    scale: Tensor  # (B,) reference units per predicted unit; NaN where not ``ok``
+    # (B, 3, 3) in SO(3); any of the best ones where the centres leave it open; NaN where not
+    # ``ok``.
     rotation: Tensor
-    translation: Tensor
-    ok: Tensor
-    defect: Tensor
-    used: Tensor
+    translation: Tensor  # (B, 3), reference units; NaN where not ``ok``
+    ok: Tensor  # (B,) bool, whether the scale holds
+    defect: Tensor  # (B,) int64, index into ``DEFECTS``
+    used: Tensor  # (B,) int64, centres the fit stands on
+    # (B,) in [0, 1], 1 where the similarity maps the centres exactly; NaN where not ``ok``. The
+    # share of the reference's spread left over is 1 - correlation^2.
     correlation: Tensor
 
     @property
@@ -259,22 +251,17 @@ def depth_mask(reference: Tensor, valid: Tensor | None) -> Tensor:
 
 
 def depth_loss(
-    predicted: Tensor,
-    reference: Tensor,
+    predicted: Tensor,  # (B, T, H, W) z-depth of target views, the unit of the predicted centres
+    reference: Tensor,  # (B, T, H, W) z-depth, the unit of the reference centres
     *,
+    # Of all the sample's camera centres; a sample without a scale has a loss of 0.
     similarity: CenterSimilarity,
-    valid: Tensor | None = None,
+    valid: Tensor | None = None,  # (B, T, H, W) bool or None, see ``depth_mask``
 ) -> Tensor:
     """L_depth (B,): the mean of |s* D^(p) - D(p)| over the valid pixels of all views.
 
     The scale aligns, and receives no gradient: the paper leaves that open, and the gradient would
     grow as 1 / baseline.
-
-    Args:
-        predicted: (B, T, H, W) z-depth of target views, the unit of the predicted centres.
-        reference: (B, T, H, W) z-depth, the unit of the reference centres.
-        similarity: of all the sample's camera centres; a sample without a scale has a loss of 0.
-        valid: (B, T, H, W) bool or None, see ``depth_mask``.
     """
     mask = depth_mask(reference, valid) & similarity.ok[:, None, None, None]
     scale = torch.where(similarity.ok, similarity.scale, 1.0)[:, None, None, None]
@@ -299,21 +286,13 @@ def _wide(x: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Coefficients of the terms; the paper gives none.
+    """Coefficients of the terms; the paper gives none."""
 
-    Attributes:
-        level1: of L_FM^1.
-        level0: of L_FM^0.
-        rgb: of L_rgb.
-        hf: of L_hf.
-        depth: of L_depth.
-    """
-
-    level1: float = 1.0
-    level0: float = 1.0
-    rgb: float = 1.0
-    hf: float = 1.0
-    depth: float = 1.0
+    level1: float = 1.0  # of L_FM^1
+    level0: float = 1.0  # of L_FM^0
+    rgb: float = 1.0  # of L_rgb
+    hf: float = 1.0  # of L_hf
+    depth: float = 1.0  # of L_depth
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -322,61 +301,39 @@ class LossWeights:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What the model gave; what is None has no term. V views, context first; T target views.
+    """What the model gave; what is None has no term. V views, context first; T target views."""
 
-    Attributes:
-        level1: (B, V, C, h, w) velocity.
-        level0: (B, V, C, h, w) velocity.
-        image: (B, T, 3, H, W).
-        depth: (B, T, H, W) z-depth, model units.
-        centers: (B, V, 3) camera centres, model units; ``depth`` needs them.
-    """
-
-    level1: Tensor | None = None
-    level0: Tensor | None = None
-    image: Tensor | None = None
-    depth: Tensor | None = None
-    centers: Tensor | None = None
+    level1: Tensor | None = None  # (B, V, C, h, w) velocity
+    level0: Tensor | None = None  # (B, V, C, h, w) velocity
+    image: Tensor | None = None  # (B, T, 3, H, W)
+    depth: Tensor | None = None  # (B, T, H, W) z-depth, model units
+    centers: Tensor | None = None  # (B, V, 3) camera centres, model units; ``depth`` needs them
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """What it should have given; shapes as in ``Prediction``.
+    """What it should have given; shapes as in ``Prediction``."""
 
-    Attributes:
-        level1: velocity target.
-        level0: velocity target.
-        image: in the normalisation of the prediction.
-        depth: scene units; not finite or not above 0 = none.
-        centers: scene units.
-        image_valid: (B, T, H, W) bool, None = all.
-        depth_valid: (B, T, H, W) bool, None = all.
-    """
-
-    level1: Tensor | None = None
-    level0: Tensor | None = None
-    image: Tensor | None = None
-    depth: Tensor | None = None
-    centers: Tensor | None = None
-    image_valid: Tensor | None = None
-    depth_valid: Tensor | None = None
+    level1: Tensor | None = None  # velocity target
+    level0: Tensor | None = None  # velocity target
+    image: Tensor | None = None  # in the normalisation of the prediction
+    depth: Tensor | None = None  # scene units; not finite or not above 0 = none
+    centers: Tensor | None = None  # scene units
+    image_valid: Tensor | None = None  # (B, T, H, W) bool, None = all
+    depth_valid: Tensor | None = None  # (B, T, H, W) bool, None = all
 
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """The objective of one mini-batch.
+    """The objective of one mini-batch."""
 
-    Attributes:
-        total: (), the weighted sum.
-        terms: (), each term before its coefficient, averaged over the mini-batch; a term of
-            coefficient 0 is there to be logged and has no gradient.
-        counts: (), what the terms stood on: ``rgb_pixels``, ``depth_pixels``; ``rgb_empty`` and
-            ``depth_empty``, samples without a valid pixel; ``depth_without_scale``, samples whose
-            camera centres gave no scale.
-    """
-
-    total: Tensor
+    total: Tensor  # (), the weighted sum
+    # (), each term before its coefficient, averaged over the mini-batch; a term of coefficient 0 is
+    # there to be logged and has no gradient.
     terms: dict[str, Tensor]
+    # (), what the terms stood on: ``rgb_pixels``, ``depth_pixels``; ``rgb_empty`` and
+    # ``depth_empty``, samples without a valid pixel; ``depth_without_scale``, samples whose camera
+    # centres gave no scale.
     counts: dict[str, Tensor]
 
     def record(self) -> dict[str, float]:
@@ -388,22 +345,14 @@ class Objective:
 
 
 def objective(
-    prediction: Prediction,
-    reference: Reference,
+    prediction: Prediction,  # see ``Prediction``
+    reference: Reference,  # has to hold whatever is predicted
     *,
-    context: int,
-    weights: LossWeights | None = None,
-    context_weight: float = 0.25,
+    context: int,  # number of context views, which come first
+    weights: LossWeights | None = None,  # None is ``LossWeights()``
+    context_weight: float = 0.25,  # see ``flow_matching_loss``
 ) -> Objective:
-    """Every term that has a prediction, their weighted sum, and their counts.
-
-    Args:
-        prediction: see ``Prediction``.
-        reference: has to hold whatever is predicted.
-        context: number of context views, which come first.
-        weights: None is ``LossWeights()``.
-        context_weight: see ``flow_matching_loss``.
-    """
+    """Every term that has a prediction, their weighted sum, and their counts."""
     weights = weights or LossWeights()
     parts, counts = _parts(prediction, reference, context, context_weight=context_weight)
     if not parts:

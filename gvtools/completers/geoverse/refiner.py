@@ -41,15 +41,11 @@ TRUST = 3.0
 
 @dataclass(frozen=True)
 class RefinerConfig:
-    """Size of the refiner.
+    """Size of the refiner."""
 
-    Attributes:
-        widths: channels of each level, each of half the level's before resolution.
-        offset: most that it adds to a colour.
-    """
-
+    # Channels of each level, each of half the level's before resolution.
     widths: tuple[int, ...] = (16, 40, 80)
-    offset: float = 0.2
+    offset: float = 0.2  # most that it adds to a colour
 
     def __post_init__(self) -> None:
         check_range("refiner.offset", self.offset, ge=0, le=1)
@@ -61,38 +57,23 @@ class RefinerConfig:
 
 @dataclass(frozen=True, eq=False)
 class CompletedViews:
-    """N target views as the core leaves them, at the model's size.
+    """N target views as the core leaves them, at the model's size."""
 
-    Attributes:
-        filled: (N, 3, H, W) the projections, holes filled.
-        depth: (N, 1, H, W) of the fill, in any unit; 0 = none.
-        valid: (N, 1, H, W) bool, where the memory knows.
-        evidence: (N, 2, H, W) see ``ViewBatch``.
-        made: (N, 3, H, W) the core's pictures.
-        mean: (N, 3) mean colour of the view's context.
-    """
-
-    filled: Tensor
-    depth: Tensor
-    valid: Tensor
-    evidence: Tensor
-    made: Tensor
-    mean: Tensor
+    filled: Tensor  # (N, 3, H, W) the projections, holes filled
+    depth: Tensor  # (N, 1, H, W) of the fill, in any unit; 0 = none
+    valid: Tensor  # (N, 1, H, W) bool, where the memory knows
+    evidence: Tensor  # (N, 2, H, W) see ``ViewBatch``
+    made: Tensor  # (N, 3, H, W) the core's pictures
+    mean: Tensor  # (N, 3) mean colour of the view's context
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """What the refiner says, at half the model's grid.
+    """What the refiner says, at half the model's grid."""
 
-    Attributes:
-        share: (N, 1, h, w) of the core's picture.
-        rest: (N, 3, h, w) colour that is added to it.
-        depth_right: (N, 1, h, w) logit that the depth is within 10 % of the true one.
-    """
-
-    share: Tensor
-    rest: Tensor
-    depth_right: Tensor
+    share: Tensor  # (N, 1, h, w) of the core's picture
+    rest: Tensor  # (N, 3, h, w) colour that is added to it
+    depth_right: Tensor  # (N, 1, h, w) logit that the depth is within 10 % of the true one
 
     def colors(self, made: Tensor, valid: Tensor) -> Tensor:
         """(N, 3, H, W) refined pictures of any size; what the memory knows stays.
@@ -201,15 +182,10 @@ class _Block(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class _Half(CompletedViews):
-    """Views at half the grid; ``filled`` and ``made`` are means.
+    """Views at half the grid; ``filled`` and ``made`` are means."""
 
-    Attributes:
-        share: (N, 1, h, w) of known pixels.
-        known: (N, 3, h, w) sum of known colours, in shares of the pixels.
-    """
-
-    share: Tensor
-    known: Tensor
+    share: Tensor  # (N, 1, h, w) of known pixels
+    known: Tensor  # (N, 3, h, w) sum of known colours, in shares of the pixels
 
 
 def _halved(views: CompletedViews) -> _Half:

@@ -21,27 +21,17 @@ SINE_BASE = 10000.0
 
 @dataclass(frozen=True)
 class RGBHeadConfig:
-    """Dimensions; the defaults are the published decoder for Depth Anything 3 Base.
+    """Dimensions; the defaults are the published decoder for Depth Anything 3 Base."""
 
-    Attributes:
-        in_channels: of a token: the four levels of 2 x 768, one after the other.
-        width: channels of the transformer.
-        depth: its layers.
-        heads: its attention heads.
-        mlp: hidden width of its MLPs.
-        patch: patch edge, px.
-        base_grid: (h, w) of the position table, patches; other grids are interpolated.
-        eps: of the LayerNorms.
-    """
-
-    in_channels: int = 6144
-    width: int = 1152
-    depth: int = 28
-    heads: int = 16
-    mlp: int = 4096
-    patch: int = 14
+    in_channels: int = 6144  # of a token: the four levels of 2 x 768, one after the other
+    width: int = 1152  # channels of the transformer
+    depth: int = 28  # its layers
+    heads: int = 16  # its attention heads
+    mlp: int = 4096  # hidden width of its MLPs
+    patch: int = 14  # patch edge, px
+    # (h, w) of the position table, patches; other grids are interpolated.
     base_grid: tuple[int, int] = (36, 36)
-    eps: float = 1e-12
+    eps: float = 1e-12  # of the LayerNorms
 
 
 class RGBHead(Recomputing):
@@ -62,16 +52,13 @@ class RGBHead(Recomputing):
 
     def forward(
         self, features: Tensor, grid: tuple[int, int], *, chunk: int | None = None
-    ) -> Tensor:
+    ) -> Tensor:  # (B', 3, h * patch, w * patch) RGB, in [0, 1] but for overshoot
         """Pictures, not clipped.
 
         Args:
             features: (B', N, in_channels), N = h * w tokens row-major, levels 0 to 3 concatenated.
             grid: (h, w) in patches.
             chunk: views at a time, which bounds the memory; None for all. The result is the same.
-
-        Returns:
-            (B', 3, h * patch, w * patch) RGB, in [0, 1] but for overshoot.
         """
         return self.image(self.logits(features, grid, chunk=chunk), grid)
 

@@ -40,13 +40,10 @@ from gvtools.networks.compute import Recomputing
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """Where the control branch enters.
+    """Where the control branch enters."""
 
-    Attributes:
-        layers: encoder blocks of the denoiser after which a residual is added, one for each video
-            level. The paper does not name them: spread over GLD's 28 by default.
-    """
-
+    # Encoder blocks of the denoiser after which a residual is added, one for each video level. The
+    # paper does not name them: spread over GLD's 28 by default.
     layers: tuple[int, ...] = (0, 7, 14, 21)
 
 
@@ -95,24 +92,15 @@ class ControlBranch(Recomputing):
 
     def forward(
         self,
-        denoiser: Denoiser,
-        noisy: Tensor,
-        t: Tensor,
-        conditions: Conditions,
+        denoiser: Denoiser,  # whose embedders and time embedding the branch shares
+        noisy: Tensor,  # (B, V, C, h, w)
+        t: Tensor,  # (B,) or (B, V)
+        conditions: Conditions,  # as the denoiser gets them
         *,
-        adapted: Sequence[Tensor],
-        positions: Positions,
+        adapted: Sequence[Tensor],  # from ``adapted``
+        positions: Positions,  # as the denoiser gets them
     ) -> dict[int, Tensor]:
-        """The residuals of this step, (B, V, N, width) by encoder block.
-
-        Args:
-            denoiser: whose embedders and time embedding the branch shares.
-            noisy: (B, V, C, h, w).
-            t: (B,) or (B, V).
-            conditions: as the denoiser gets them.
-            adapted: from ``adapted``.
-            positions: as the denoiser gets them.
-        """
+        """The residuals of this step, (B, V, N, width) by encoder block."""
         stream = denoiser.encoder_tokens(noisy, conditions)
         c = F.silu(denoiser.time(t, noisy.shape[1]).to(stream.dtype))
         residuals = {}
@@ -125,16 +113,13 @@ class ControlBranch(Recomputing):
 
 @dataclass(frozen=True)
 class SharedAttentionConfig:
-    """Where and how video features enter the denoiser's attention.
+    """Where and how video features enter the denoiser's attention."""
 
-    Attributes:
-        layers: encoder blocks that are coupled, one for each video level.
-        gated: the joint attention replaces the geometric one by a learned share that starts at
-            zero, so that a fresh extension leaves a pretrained denoiser as it is. Without it the
-            attention is joint from the first step: the paper's form.
-    """
-
+    # Encoder blocks that are coupled, one for each video level.
     layers: tuple[int, ...] = (0, 7, 14, 21)
+    # The joint attention replaces the geometric one by a learned share that starts at zero, so that
+    # a fresh extension leaves a pretrained denoiser as it is. Without it the attention is joint
+    # from the first step: the paper's form.
     gated: bool = True
 
 
@@ -180,22 +165,15 @@ class SharedAttention(nn.Module):
 
 
 def video_keys(
+    # Projects the features; None for a model without shared attention.
     shared: SharedAttention | None,
-    denoiser: DenoiserConfig,
-    camera: CameraCondition,
+    denoiser: DenoiserConfig,  # whose blocks are coupled
+    camera: CameraCondition,  # of the views
     *,
-    features: VideoFeatures,
-    grid: tuple[int, int],
+    features: VideoFeatures,  # one (B, V, C, h', w') a coupled block
+    grid: tuple[int, int],  # (h, w) of the latents, in whose units the positions are
 ) -> dict[int, VideoKeys] | None:
-    """Keys and values of the coupled blocks, positioned by the given cameras.
-
-    Args:
-        shared: projects the features; None for a model without shared attention.
-        denoiser: whose blocks are coupled.
-        camera: of the views.
-        features: one (B, V, C, h', w') a coupled block.
-        grid: (h, w) of the latents, in whose units the positions are.
-    """
+    """Keys and values of the coupled blocks, positioned by the given cameras."""
     if shared is None:
         return None
     positions = [

@@ -38,12 +38,9 @@ GROUP = 4
 
 @dataclass(frozen=True)
 class ViewLayout:
-    """Views in clips.
+    """Views in clips."""
 
-    Attributes:
-        clips: the view shown by each frame of each clip; all clips have 4k + 1 frames.
-    """
-
+    # The view shown by each frame of each clip; all clips have 4k + 1 frames.
     clips: tuple[tuple[int, ...], ...]
 
     @property
@@ -122,38 +119,29 @@ _DTYPES = ("float32", "bfloat16", "float16")
 
 @dataclass(frozen=True)
 class VideoPriorConfig:
-    """How features are taken from the video model.
+    """How features are taken from the video model."""
 
-    Attributes:
-        layout: how views become video, see ``video_layouts.view_layout``. The paper does not say;
-            "per_view" has each view's own latent and mask.
-        taps: backbone blocks whose outputs, VACE hint included, are the features.
-        channels: of a feature, the backbone's width; checked against the weights.
-        timestep: of the single forward, 0 to 1000.
-        sigma: share of noise in x_t; None: timestep / 1000, as in Wan's schedulers whatever their
-            shift.
-        proxy_noise: standard deviation of the noise on valid target pixels, range [-1, 1].
-        resolution: (rows, columns) in px that views are resized to, each rounded to the nearest
-            multiple; None: their own size, rounded. 576 gives 504-px views the tokens of a 14-px
-            patch, 36 x 36.
-        multiple: of both sides, px; itself a multiple of a token's 16.
-        dtype: of the transformer; None as stored. What diffusers keeps in float32 stays so.
-        prompt: "empty", Wan's embedding of the empty prompt; or "zeros", for tests and tiny
-            configurations: Wan was not trained on it.
-        prompt_rows: rows that the prompt's embedding is padded to with zeros.
-    """
-
+    # How views become video, see ``video_layouts.view_layout``. The paper does not say; "per_view"
+    # has each view's own latent and mask.
     layout: str = "per_view"
+    # Backbone blocks whose outputs, VACE hint included, are the features.
     taps: tuple[int, ...] = (0, 5, 10, 15)
-    channels: int = 5120
-    timestep: float = 500.0
+    channels: int = 5120  # of a feature, the backbone's width; checked against the weights
+    timestep: float = 500.0  # of the single forward, 0 to 1000
+    # Share of noise in x_t; None: timestep / 1000, as in Wan's schedulers whatever their shift.
     sigma: float | None = None
+    # Standard deviation of the noise on valid target pixels, range [-1, 1].
     proxy_noise: float = 0.1
+    # (rows, columns) in px that views are resized to, each rounded to the nearest multiple; None:
+    # their own size, rounded. 576 gives 504-px views the tokens of a 14-px patch, 36 x 36.
     resolution: tuple[int, int] | None = None
-    multiple: int = 16
+    multiple: int = 16  # of both sides, px; itself a multiple of a token's 16
+    # Of the transformer; None as stored. What diffusers keeps in float32 stays so.
     dtype: str | None = None
+    # "empty", Wan's embedding of the empty prompt; or "zeros", for tests and tiny configurations:
+    # Wan was not trained on it.
     prompt: str = "empty"
-    prompt_rows: int = 512
+    prompt_rows: int = 512  # rows that the prompt's embedding is padded to with zeros
 
     def __post_init__(self) -> None:
         check_choice("video.layout", self.layout, LAYOUTS)
@@ -223,15 +211,11 @@ ROOM = 3.5e9
 
 @dataclass(frozen=True, eq=False)
 class VideoFeatures:
-    """F^W, to be handed to every denoising step.
+    """F^W, to be handed to every denoising step."""
 
-    Attributes:
-        tensors: one (B, V, C, h, w) for each tap.
-        latent_of_view: which of the video model's latents each view's features come from; views
-            with the same number have the same features.
-    """
-
-    tensors: tuple[Tensor, ...]
+    tensors: tuple[Tensor, ...]  # one (B, V, C, h, w) for each tap
+    # Which of the video model's latents each view's features come from; views with the same number
+    # have the same features.
     latent_of_view: tuple[int, ...]
 
     @property
@@ -247,22 +231,16 @@ class VideoFeatures:
 
 
 class VideoPrior:
-    """The frozen video model. Not an ``nn.Module``: it is no part of a model's state.
-
-    Args:
-        transformer: diffusers' WanVACETransformer3DModel.
-        vae: diffusers' AutoencoderKLWan.
-        prompt: (tokens, channels) embedding of the empty prompt; None with ``prompt="zeros"``.
-        config: see there.
-    """
+    """The frozen video model. Not an ``nn.Module``: it is no part of a model's state."""
 
     def __init__(
         self,
-        transformer: Any,
-        vae: Any,
+        transformer: Any,  # diffusers' WanVACETransformer3DModel
+        vae: Any,  # diffusers' AutoencoderKLWan
+        # (tokens, channels) embedding of the empty prompt; None with ``prompt="zeros"``.
         prompt: Tensor | None = None,
         *,
-        config: VideoPriorConfig | None = None,
+        config: VideoPriorConfig | None = None,  # see there
     ) -> None:
         self.config = config or VideoPriorConfig()
         zeros = self.config.prompt == "zeros"
@@ -294,22 +272,17 @@ class VideoPrior:
     @classmethod
     def from_pretrained(
         cls,
-        folder: Path | str,
+        folder: Path | str,  # see ``wan_folder``
         *,
-        config: VideoPriorConfig | None = None,
+        config: VideoPriorConfig | None = None,  # how features are taken
+        # Of the weights; "meta" compares everything and reads no weights.
         device: torch.device | str = "cpu",
+        # The weights stay in the CPU's memory and go to a CUDA device for the time of a pass's one
+        # forward: "always", "never", or, "auto", where less than ``ROOM`` would be free beside
+        # them.
         offload: str = "never",
     ) -> VideoPrior:
-        """From a folder that ``wan_checkpoint.truncate`` made, strictly.
-
-        Args:
-            folder: see ``wan_folder``.
-            config: how features are taken.
-            device: of the weights; "meta" compares everything and reads no weights.
-            offload: the weights stay in the CPU's memory and go to a CUDA device for the time of a
-                pass's one forward: "always", "never", or, "auto", where less than
-                ``ROOM`` would be free beside them.
-        """
+        """From a folder that ``wan_checkpoint.truncate`` made, strictly."""
         config = config or VideoPriorConfig()
         prompt = read_empty_prompt(Path(folder)) if config.prompt == "empty" else None
         dtype = None if config.dtype is None else half_type(config.dtype, torch.device(device))
@@ -337,21 +310,15 @@ class VideoPrior:
     @torch.no_grad()
     def features(
         self,
-        images: Tensor,
-        valid: Tensor,
-        context: int,
+        images: Tensor,  # (B, V, 3, H, W) in [0, 1]; what is not valid is not looked at
+        valid: Tensor,  # (B, V, 1, H, W), bool or 1 = valid
+        context: int,  # how many views, the first ones, are photographs: they get no noise
         *,
+        # One number, or B rows of V of them (see ``noise.view_seed``): a view's noise depends on
+        # its own alone.
         seed: int | Sequence[Sequence[int]] = 0,
     ) -> VideoFeatures:
-        """One forward of the video model.
-
-        Args:
-            images: (B, V, 3, H, W) in [0, 1]; what is not valid is not looked at.
-            valid: (B, V, 1, H, W), bool or 1 = valid.
-            context: how many views, the first ones, are photographs: they get no noise.
-            seed: one number, or B rows of V of them (see ``noise.view_seed``): a view's noise
-                depends on its own alone.
-        """
+        """One forward of the video model."""
         seeds = seed_rows(seed, *images.shape[:2])
         with self.networks.lent(self._guest):
             return self._features(images, valid, context, seeds=seeds)

@@ -65,22 +65,15 @@ def resampled_depth(depth: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def chosen_views(
-    context: Sequence[ContextView],
-    targets: Cameras,
+    context: Sequence[ContextView],  # to choose from
+    targets: Cameras,  # V cameras of one picture size
+    # (V, H, W) z-depth of the targets, scene units, filled where that is possible.
     depth: NDArray[np.float32],
     *,
-    count: int,
-    selection: str,
+    count: int,  # how many at most
+    selection: str,  # "covisible" or "nearest", see ``gvtools.view_selection``
 ) -> list[ContextView]:
-    """At most ``count`` context views, the best first.
-
-    Args:
-        context: to choose from.
-        targets: V cameras of one picture size.
-        depth: (V, H, W) z-depth of the targets, scene units, filled where that is possible.
-        count: how many at most.
-        selection: "covisible" or "nearest", see ``gvtools.view_selection``.
-    """
+    """At most ``count`` context views, the best first."""
     if not context:
         return []
     cameras = concatenate([view.camera for view in context])
@@ -99,19 +92,13 @@ COINCIDENT = 1e-12
 
 
 def view_batch(
-    context: Sequence[ContextView],
-    targets: Guidance,
-    size: tuple[int, int],
+    context: Sequence[ContextView],  # at least one view
+    targets: Guidance,  # the projections to complete
+    size: tuple[int, int],  # (H, W) of the model's pictures
     *,
-    fill: Filled | None = None,
+    fill: Filled | None = None,  # the targets with their holes filled; None leaves holes at 0
 ) -> tuple[ViewBatch, Cameras]:
     """One sample of the model.
-
-    Args:
-        context: at least one view.
-        targets: the projections to complete.
-        size: (H, W) of the model's pictures.
-        fill: the targets with their holes filled; None leaves holes at 0.
 
     Returns:
         The batch, in the first context view's frame and a unit in which the farthest view stands

@@ -119,14 +119,11 @@ class WanNetworks:
             for tensor, data in zip(tensors, home, strict=True):
                 tensor.data = data
 
-    def encode(self, clips: Tensor) -> Tensor:
+    def encode(self, clips: Tensor) -> Tensor:  # (N, 16, 1 + k, H / 8, W / 8) float32
         """The mode of the VAE's latents, normalised by its published mean and deviation.
 
         Args:
             clips: (N, 3, T, H, W) in [-1, 1], T = 4k + 1.
-
-        Returns:
-            (N, 16, 1 + k, H / 8, W / 8) float32.
         """
         latents = self.vae.encode(clips.to(self.vae.dtype)).latent_dist.mode().float()
         mean, deviation = (
@@ -138,7 +135,7 @@ class WanNetworks:
 
     def block_outputs(
         self, x: Tensor, condition: Tensor, *, timestep: float, blocks: Sequence[int]
-    ) -> list[Tensor]:
+    ) -> list[Tensor]:  # For each block (B, F, h / 2, w / 2, C)
         """What some blocks give in one forward, their VACE hints included.
 
         Args:
@@ -146,9 +143,6 @@ class WanNetworks:
             condition: (B, 96, F, h, w) of the VACE branch.
             timestep: 0 to 1000.
             blocks: their numbers.
-
-        Returns:
-            For each block (B, F, h / 2, w / 2, C).
         """
         after = [*self.transformer.blocks[1:], self.transformer.norm_out]
         taken: dict[int, Tensor] = {}

@@ -69,28 +69,24 @@ def write_empty_prompt(text_encoder: Path | str, out: Path | str) -> None:
 
 
 def truncate(
+    # A Wan VACE folder of diffusers (of two experts the low-noise one, ``transformer_2``, is
+    # taken), Wan's own folder (``low_noise_model``), a transformer's own folder, or its one
+    # safetensors file. Of several files only those that hold needed tensors are opened.
     source: Path | str,
-    out: Path | str,
+    out: Path | str,  # the folder to make; it must not be there
     *,
-    blocks: int = 16,
+    blocks: int = 16,  # backbone blocks to keep, and with them the VACE blocks that act on them
+    # Of the result, except for what diffusers keeps in float32.
     dtype: torch.dtype = torch.bfloat16,
+    # Folder of the VAE in diffusers' form; None looks beside the transformer.
     vae: Path | str | None = None,
+    # Called with bytes done and in all.
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Write a ``wan_folder`` from published weights; only what is needed is read.
 
     The folder appears under its name when it is whole. The empty prompt is made separately, by
     ``write_empty_prompt``. At most about 2 GB of tensors are in memory.
-
-    Args:
-        source: a Wan VACE folder of diffusers (of two experts the low-noise one, ``transformer_2``,
-            is taken), Wan's own folder (``low_noise_model``), a transformer's own folder, or its
-            one safetensors file. Of several files only those that hold needed tensors are opened.
-        out: the folder to make; it must not be there.
-        blocks: backbone blocks to keep, and with them the VACE blocks that act on them.
-        dtype: of the result, except for what diffusers keeps in float32.
-        vae: folder of the VAE in diffusers' form; None looks beside the transformer.
-        progress: called with bytes done and in all.
     """
     from safetensors import SafetensorError
 

@@ -52,39 +52,28 @@ VIDEO_FOLDER = "video"
 
 @dataclass(frozen=True)
 class Part:
-    """One file and the module that it fills.
+    """One file and the module that it fills."""
 
-    Attributes:
-        name: of the part.
-        module: prefix of its keys in the state dict of ``GeoVerse``.
-        files: where it may lie in a weights folder, the publisher's own place first.
-        source: who publishes it.
-        licence: its terms.
-        strip: prefix that is taken off every key that has it.
-        only: keys with none of these prefixes belong to other networks and are ignored; the
-            prefix is taken off as well.
-        names: keys other than these are no tensors of the module and are ignored.
-        tied: names that are one tensor in the publisher's network; a file may hold any of them.
-        optional: the model can do without it.
-        lenient: loaded as its publisher's code does: unknown names are ignored, and missing
-            tensors keep the values of the part that was loaded before; a message lists them.
-        stated_bytes: the file's size as published, where it holds other networks, too.
-        note: what else a user should know.
-    """
-
-    name: str
-    module: str
-    files: tuple[str, ...]
-    source: str
-    licence: str
-    strip: str = "module."
+    name: str  # of the part
+    module: str  # prefix of its keys in the state dict of ``GeoVerse``
+    files: tuple[str, ...]  # where it may lie in a weights folder, the publisher's own place first
+    source: str  # who publishes it
+    licence: str  # its terms
+    strip: str = "module."  # prefix that is taken off every key that has it
+    # Keys with none of these prefixes belong to other networks and are ignored; the prefix is taken
+    # off as well.
     only: tuple[str, ...] = ()
+    # Keys other than these are no tensors of the module and are ignored.
     names: tuple[str, ...] = ()
+    # Names that are one tensor in the publisher's network; a file may hold any of them.
     tied: tuple[tuple[str, ...], ...] = ()
-    optional: bool = False
+    optional: bool = False  # the model can do without it
+    # Loaded as its publisher's code does: unknown names are ignored, and missing tensors keep the
+    # values of the part that was loaded before; a message lists them.
     lenient: bool = False
+    # The file's size as published, where it holds other networks, too.
     stated_bytes: int | None = None
-    note: str = ""
+    note: str = ""  # what else a user should know
 
     def find(self, folder: Path) -> Path | None:
         """The part's file in a folder, if it is there."""
@@ -260,29 +249,17 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class PartReport:
-    """What was found of one part of a folder.
+    """What was found of one part of a folder."""
 
-    Attributes:
-        name: of the part.
-        path: its file or folder, or None.
-        ok: it can be loaded, or the model does without it.
-        summary: one line.
-        fit: names, shapes and types, where a file could be read.
-        bytes: on disk.
-        parameters: numbers in the tensors that fit.
-        types: what they are stored as.
-        ignored: names in the file that are not looked at.
-    """
-
-    name: str
-    path: Path | None
-    ok: bool
-    summary: str
-    fit: Fit | None = None
-    bytes: int = 0
-    parameters: int = 0
-    types: tuple[str, ...] = ()
-    ignored: tuple[str, ...] = ()
+    name: str  # of the part
+    path: Path | None  # its file or folder, or None
+    ok: bool  # it can be loaded, or the model does without it
+    summary: str  # one line
+    fit: Fit | None = None  # names, shapes and types, where a file could be read
+    bytes: int = 0  # on disk
+    parameters: int = 0  # numbers in the tensors that fit
+    types: tuple[str, ...] = ()  # what they are stored as
+    ignored: tuple[str, ...] = ()  # names in the file that are not looked at
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON file."""
@@ -418,14 +395,11 @@ def check_folder(folder: Path | str, config: GeoVerseConfig | None = None) -> li
     return reports
 
 
-def check_headers(folder: Path | str) -> GeoVerseConfig:
+def check_headers(folder: Path | str) -> GeoVerseConfig:  # Its configuration
     """Refuse a folder that cannot be loaded, by what can be seen without reading weights.
 
     Args:
         folder: of weights.
-
-    Returns:
-        Its configuration.
     """
     folder = Path(folder)
     config = config_of(folder)
@@ -457,25 +431,21 @@ def check_video_folder(folder: Path) -> None:
 
 
 def from_pretrained(
+    # With ``geoverse.safetensors``, or with published files (``gvtools weights list``).
     folder: Path | str,
     *,
-    config: GeoVerseConfig | None = None,
-    device: torch.device | str = "cpu",
+    config: GeoVerseConfig | None = None,  # instead of the folder's own, see ``config_of``
+    device: torch.device | str = "cpu",  # of the weights
+    # Of the autocast that the model is run in, see ``GeoVerse.hold_in``.
     dtype: torch.dtype = torch.float32,
+    # Load the video prior, where the configuration has one; see ``needs_video``.
     video: bool = True,
+    # Whether its weights leave the device between passes, see ``VideoPrior``.
     offload: str = "auto",
 ) -> GeoVerse:
     """The model of a weights folder, strictly loaded, in evaluation mode.
 
     What GeoVerse adds to published files starts untrained, without an effect (``fresh_extension``).
-
-    Args:
-        folder: with ``geoverse.safetensors``, or with published files (``gvtools weights list``).
-        config: instead of the folder's own, see ``config_of``.
-        device: of the weights.
-        dtype: of the autocast that the model is run in, see ``GeoVerse.hold_in``.
-        video: load the video prior, where the configuration has one; see ``needs_video``.
-        offload: whether its weights leave the device between passes, see ``VideoPrior``.
     """
     folder = Path(folder)
     check_is_folder(folder)
@@ -517,7 +487,7 @@ def _tensors(folder: Path, model: GeoVerse, *, numbers: bool = True) -> dict[str
 
 def save_pretrained(
     model: GeoVerse, folder: Path | str, *, dtype: str = "float32", about: str = ""
-) -> Path:
+) -> Path:  # The weights' file
     """Write ``config.json`` and ``geoverse.safetensors``; the video prior keeps its own folder.
 
     Each appears under its name when it is whole, and the weights of an earlier model are never
@@ -529,9 +499,6 @@ def save_pretrained(
         dtype: of the stored weights, one of ``DTYPES``. Statistics, tables and Fourier frequencies,
             whose rounding would change what the others mean, keep their float32.
         about: further words for the weights' metadata.
-
-    Returns:
-        The weights' file.
     """
     folder = Path(folder)
     path, config_path = folder / WHOLE_FILE, folder / CONFIG_FILE

@@ -29,15 +29,10 @@ from gvtools.networks.compute import Recomputing, attend
 
 @dataclass(frozen=True)
 class RotaryTable:
-    """Cosines and sines of 2-D rotary positions, computed once for all blocks of a pass.
+    """Cosines and sines of 2-D rotary positions, computed once for all blocks of a pass."""
 
-    Attributes:
-        cos: (T, 2, head_dim / 4) of each token: axis y, then axis x.
-        sin: likewise.
-    """
-
-    cos: Tensor
-    sin: Tensor
+    cos: Tensor  # (T, 2, head_dim / 4) of each token: axis y, then axis x
+    sin: Tensor  # likewise
 
     @classmethod
     def of(cls, positions: Tensor, head_dim: int, *, base: float = 100.0) -> RotaryTable:
@@ -109,26 +104,18 @@ class Mlp(nn.Module):
 
 
 class Block(nn.Module):
-    """Pre-norm transformer block with layer scale.
-
-    Args:
-        width: channels.
-        heads: divides ``width``.
-        mlp_ratio: hidden width of the MLP over ``width``.
-        qk_norm: see ``Attention``.
-        eps: of the two LayerNorms: 1e-6 in the backbone, 1e-5 in the camera encoder.
-        layer_scale: initial factor of both branches.
-    """
+    """Pre-norm transformer block with layer scale."""
 
     def __init__(
         self,
-        width: int,
-        heads: int,
+        width: int,  # channels
+        heads: int,  # divides ``width``
         *,
-        mlp_ratio: float = 4.0,
-        qk_norm: bool = False,
+        mlp_ratio: float = 4.0,  # hidden width of the MLP over ``width``
+        qk_norm: bool = False,  # see ``Attention``
+        # Of the two LayerNorms: 1e-6 in the backbone, 1e-5 in the camera encoder.
         eps: float = 1e-6,
-        layer_scale: float = 1.0,
+        layer_scale: float = 1.0,  # initial factor of both branches
     ) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(width, eps=eps)
@@ -247,37 +234,24 @@ LENGTH_GAIN = 6.0
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """Dimensions of the backbone; the defaults are Depth Anything 3 Base.
+    """Dimensions of the backbone; the defaults are Depth Anything 3 Base."""
 
-    Attributes:
-        width: channels of a token.
-        depth: number of blocks.
-        heads: attention heads.
-        mlp_ratio: hidden width of the MLPs over ``width``.
-        patch: patch edge, px.
-        base_grid: edge of the learned position table, patches.
-        alternate_from: from this block on, odd blocks are global; the camera token enters here.
-        qk_norm_from: from this block on, queries and keys are normed.
-        rotary_from: from this block on, attention has rotary positions.
-        taps: the blocks whose features are levels 0 to 3; all but none of them odd.
-        boundary: the level at which features are generated (the paper's b1).
-        norm_eps: of the LayerNorms within the blocks.
-        rays: the rays of known cameras are added to the patch tokens (not in Depth Anything 3,
-            which has a camera token alone).
-    """
-
-    width: int = 768
-    depth: int = 12
-    heads: int = 12
-    mlp_ratio: float = 4.0
-    patch: int = 14
-    base_grid: int = 37
+    width: int = 768  # channels of a token
+    depth: int = 12  # number of blocks
+    heads: int = 12  # attention heads
+    mlp_ratio: float = 4.0  # hidden width of the MLPs over ``width``
+    patch: int = 14  # patch edge, px
+    base_grid: int = 37  # edge of the learned position table, patches
+    # From this block on, odd blocks are global; the camera token enters here.
     alternate_from: int = 4
-    qk_norm_from: int = 4
-    rotary_from: int = 4
+    qk_norm_from: int = 4  # from this block on, queries and keys are normed
+    rotary_from: int = 4  # from this block on, attention has rotary positions
+    # The blocks whose features are levels 0 to 3; all but none of them odd.
     taps: tuple[int, ...] = (5, 7, 9, 11)
-    boundary: int = 1
-    norm_eps: float = 1e-6
+    boundary: int = 1  # the level at which features are generated (the paper's b1)
+    norm_eps: float = 1e-6  # of the LayerNorms within the blocks
+    # The rays of known cameras are added to the patch tokens (not in Depth Anything 3, which has a
+    # camera token alone).
     rays: bool = False
 
     @property
@@ -338,23 +312,16 @@ class Backbone(Recomputing):
 
     def encode(
         self,
-        images: Tensor,
+        images: Tensor,  # (B, V, 3, H, W), ImageNet-normalised
         *,
+        # How many levels; None for all. Blocks after the last tap are not run.
         levels: int | None = None,
+        # (B, V, width) from the camera encoder; the learned ones without.
         camera_token: Tensor | None = None,
+        # (B, V, N, 9) of ``patch_rays``, where the configuration has them.
         rays: Tensor | None = None,
-    ) -> list[Tensor]:
-        """Features of the first levels, raw, token 0 included.
-
-        Args:
-            images: (B, V, 3, H, W), ImageNet-normalised.
-            levels: how many levels; None for all. Blocks after the last tap are not run.
-            camera_token: (B, V, width) from the camera encoder; the learned ones without.
-            rays: (B, V, N, 9) of ``patch_rays``, where the configuration has them.
-
-        Returns:
-            A (B, V, 1 + N, 2 width) tensor a level.
-        """
+    ) -> list[Tensor]:  # A (B, V, 1 + N, 2 width) tensor a level
+        """Features of the first levels, raw, token 0 included."""
         batch, views = images.shape[:2]
         grid = self.grid(images.shape[-2], images.shape[-1])
         x = self.patch_embed(images.flatten(0, 1))
@@ -367,7 +334,7 @@ class Backbone(Recomputing):
 
     def propagate(
         self, level: Tensor, grid: tuple[int, int], *, boundary: int | None = None
-    ) -> list[Tensor]:
+    ) -> list[Tensor]:  # A (B, V, 1 + N, 2 width) tensor for each level after the boundary
         """The levels after ``boundary``, from the raw features of that level.
 
         Args:
@@ -375,9 +342,6 @@ class Backbone(Recomputing):
                 state) is used: a local block follows and replaces the first.
             grid: patches (rows, columns).
             boundary: the level that ``level`` is; the configured one by default.
-
-        Returns:
-            A (B, V, 1 + N, 2 width) tensor for each level after the boundary.
         """
         boundary = self.config.boundary if boundary is None else boundary
         state = level[..., self.config.width :]

@@ -18,37 +18,25 @@ from gvtools.networks.compute import Recomputing
 
 @dataclass(frozen=True)
 class GeometryHeadConfig:
-    """Dimensions of the geometry head; the defaults are Depth Anything 3 Base.
+    """Dimensions of the geometry head; the defaults are Depth Anything 3 Base."""
 
-    Attributes:
-        channels: of each level.
-        features: channels of the RefineNet chains.
-        projected: channels of the four projected levels.
-        patch: patch edge of the encoder, px.
-    """
-
-    channels: int = 1536
-    features: int = 128
+    channels: int = 1536  # of each level
+    features: int = 128  # channels of the RefineNet chains
+    # Channels of the four projected levels.
     projected: tuple[int, int, int, int] = (96, 192, 384, 768)
-    patch: int = 14
+    patch: int = 14  # patch edge of the encoder, px
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """What the geometry head predicts.
+    """What the geometry head predicts."""
 
-    Attributes:
-        depth: (B, V, H, W) z-depth along the rays, in units of the model.
-        depth_confidence: (B, V, H, W) > 1.
-        ray: (B, V, h, w, 6): direction (not of unit length, so that point = origin + depth *
-            direction), then origin, in the frame of the first view.
-        ray_confidence: (B, V, h, w) > 1.
-    """
-
-    depth: Tensor
-    depth_confidence: Tensor
+    depth: Tensor  # (B, V, H, W) z-depth along the rays, in units of the model
+    depth_confidence: Tensor  # (B, V, H, W) > 1
+    # (B, V, h, w, 6): direction (not of unit length, so that point = origin + depth * direction),
+    # then origin, in the frame of the first view.
     ray: Tensor
-    ray_confidence: Tensor
+    ray_confidence: Tensor  # (B, V, h, w) > 1
 
 
 class ResidualConv(nn.Module):

@@ -37,21 +37,13 @@ from gvtools.untrusted import read_json
 
 @dataclass(frozen=True)
 class DepthAnythingConfig:
-    """Dimensions of the whole network; the defaults are Depth Anything 3 Base.
+    """Dimensions of the whole network; the defaults are Depth Anything 3 Base."""
 
-    Attributes:
-        encoder: of the backbone.
-        head: of the geometry head.
-        camera_heads: attention heads of the camera encoder.
-        camera_depth: blocks of the camera encoder.
-        camera_layer_scale: initial layer scale of the camera encoder.
-    """
-
-    encoder: EncoderConfig = field(default_factory=EncoderConfig)
-    head: GeometryHeadConfig = field(default_factory=GeometryHeadConfig)
-    camera_heads: int = 16
-    camera_depth: int = 4
-    camera_layer_scale: float = 0.01
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)  # of the backbone
+    head: GeometryHeadConfig = field(default_factory=GeometryHeadConfig)  # of the geometry head
+    camera_heads: int = 16  # attention heads of the camera encoder
+    camera_depth: int = 4  # blocks of the camera encoder
+    camera_layer_scale: float = 0.01  # initial layer scale of the camera encoder
 
 
 class _Named(nn.Module):
@@ -89,20 +81,14 @@ class DepthAnything3(nn.Module):
 
     def encode(
         self,
-        images: Tensor,
+        images: Tensor,  # (B, V, 3, H, W) in [0, 1]
         *,
-        levels: int | None = None,
+        levels: int | None = None,  # how many; None for all four
+        # (B, V, 4, 4) cameras, when they are known; with ``K``.
         cam_from_world: Tensor | None = None,
-        K: Tensor | None = None,
+        K: Tensor | None = None,  # (B, V, 3, 3), px of ``images``
     ) -> list[Tensor]:
-        """Raw features of the first ``levels`` levels, token 0 included.
-
-        Args:
-            images: (B, V, 3, H, W) in [0, 1].
-            levels: how many; None for all four.
-            cam_from_world: (B, V, 4, 4) cameras, when they are known; with ``K``.
-            K: (B, V, 3, 3), px of ``images``.
-        """
+        """Raw features of the first ``levels`` levels, token 0 included."""
         token = rays = None
         if cam_from_world is not None and K is not None:
             size = (images.shape[-2], images.shape[-1])
@@ -149,15 +135,10 @@ def relative_cameras(cam_from_world: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Released:
-    """A released model.
+    """A released model."""
 
-    Attributes:
-        config: its dimensions.
-        licence: of its weights.
-    """
-
-    config: DepthAnythingConfig
-    licence: str
+    config: DepthAnythingConfig  # its dimensions
+    licence: str  # of its weights
 
 
 # By their publisher's name, below depth-anything/ of Hugging Face.
@@ -224,18 +205,14 @@ def find_weights(folder: Path | str) -> Path:
 
 
 def load_depth_anything(
+    # With ``model.safetensors`` of DA3-SMALL, -BASE or -LARGE, or a GeoVerse folder.
     folder: Path | str,
     *,
-    device: torch.device | str = "cpu",
+    device: torch.device | str = "cpu",  # of the weights
+    # Of the autocast that it is run in, see ``DepthAnything3.hold_in``.
     dtype: torch.dtype = torch.float32,
 ) -> DepthAnything3:
-    """The network, strictly loaded, frozen, in evaluation mode.
-
-    Args:
-        folder: with ``model.safetensors`` of DA3-SMALL, -BASE or -LARGE, or a GeoVerse folder.
-        device: of the weights.
-        dtype: of the autocast that it is run in, see ``DepthAnything3.hold_in``.
-    """
+    """The network, strictly loaded, frozen, in evaluation mode."""
     path = find_weights(folder)
     if path.name == GEOVERSE_FILE:
         config = _geoverse_config(path.with_name(GEOVERSE_CONFIG))

@@ -101,7 +101,7 @@ def fit(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]
 
 def ransac(
     source: Tensor, target: Tensor, weight: Tensor, *, samples: Tensor, threshold: float
-) -> Tensor:
+) -> Tensor:  # (3, 3), up to scale, determinant above 0
     """The homography of the sample whose inliers weigh most, fitted again to these.
 
     Depth Anything 3 fits again to at most 8000 inliers drawn at random; here it is all of them.
@@ -112,9 +112,6 @@ def ransac(
         weight: (N,) >= 0.
         samples: (iterations, S) places among the candidates, by falling weight.
         threshold: an inlier's error is below it, in units of ``target``.
-
-    Returns:
-        (3, 3), up to scale, determinant above 0.
     """
     pool = min(candidates(len(source)), len(source))
     if samples.ndim != 2 or int(samples.min()) < 0 or int(samples.max()) >= pool:
@@ -169,15 +166,10 @@ RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class RayCameras:
-    """Cameras read from ray maps, float64 on the CPU.
+    """Cameras read from ray maps, float64 on the CPU."""
 
-    Attributes:
-        world_from_cam: (..., V, 4, 4) rigid, in the rays' frame and units.
-        K: (..., V, 3, 3), pixels.
-    """
-
-    world_from_cam: Tensor
-    K: Tensor
+    world_from_cam: Tensor  # (..., V, 4, 4) rigid, in the rays' frame and units
+    K: Tensor  # (..., V, 3, 3), pixels
 
 
 def camera_centres(ray: Tensor, confidence: Tensor | None = None) -> Tensor:
@@ -204,11 +196,13 @@ def camera_centres(ray: Tensor, confidence: Tensor | None = None) -> Tensor:
 
 @torch.no_grad()
 def poses_least_squares(
-    ray: Tensor,
-    confidence: Tensor | None = None,
+    ray: Tensor,  # (..., V, h, w, 6); the first view is the reference
+    confidence: Tensor | None = None,  # (..., V, h, w) > 0, the weights w; None for equal ones
     *,
-    size: tuple[int, int],
-    subsample: int = 4,
+    size: tuple[int, int],  # (H, W) of the images that K is for, pixels
+    subsample: int = 4,  # step between cells
+    # Where in a cell its ray passes: 0 is published, 0.5 gives K in this project's convention (the
+    # first pixel's centre at 0.5). Poses are the same.
     cell_offset: float = 0.0,
 ) -> RayCameras:
     """Poses by a linear fit of each view's directions, as Geometric Latent Diffusion takes them.
@@ -216,14 +210,6 @@ def poses_least_squares(
     H of every view minimises Σ (w |H (x, y, 1)ᵀ - direction|)² over every ``subsample``-th cell;
     K is H⁻¹ of the first view, R the rotation nearest to H_v K, the centre the weighted mean of all
     origins. Rays with noise leave small numbers in K's lower triangle; they stay.
-
-    Args:
-        ray: (..., V, h, w, 6); the first view is the reference.
-        confidence: (..., V, h, w) > 0, the weights w; None for equal ones.
-        size: (H, W) of the images that K is for, pixels.
-        subsample: step between cells.
-        cell_offset: where in a cell its ray passes: 0 is published, 0.5 gives K in this project's
-            convention (the first pixel's centre at 0.5). Poses are the same.
     """
     _check(ray, confidence, views=True)
     if subsample < 1:
@@ -252,29 +238,21 @@ def poses_least_squares(
 
 @torch.no_grad()
 def poses_ransac(
-    ray: Tensor,
-    confidence: Tensor | None = None,
+    ray: Tensor,  # (..., V, h, w, 6)
+    confidence: Tensor | None = None,  # (..., V, h, w) >= 0; None for equal weights
     *,
-    size: tuple[int, int],
-    threshold: float = 0.2,
-    seed: int = 0,
+    size: tuple[int, int],  # (H, W) of the images that K is for, pixels
+    threshold: float = 0.2,  # largest error of an inlier, in (dx/dz, dy/dz)
+    seed: int = 0,  # of the samples
+    # (iterations, 8), places among the most confident rays, instead of the seed's.
     samples: Tensor | None = None,
-    factorisation: str = "ql",
+    factorisation: str = "ql",  # "ql" as published, "qr" as it should be: see the module
 ) -> RayCameras:
     """Poses by a robust homography from each view's directions, as Depth Anything 3 takes them.
 
     The homography leads from an image of [-1, 1]² to the directions' (dx/dz, dy/dz). It is fitted
     to 8 rays of the 30 % most confident, 100 times; the fit whose inliers have the most
     confidence is fitted again to all of these, and factored into a rotation and intrinsics.
-
-    Args:
-        ray: (..., V, h, w, 6).
-        confidence: (..., V, h, w) >= 0; None for equal weights.
-        size: (H, W) of the images that K is for, pixels.
-        threshold: largest error of an inlier, in (dx/dz, dy/dz).
-        seed: of the samples.
-        samples: (iterations, 8), places among the most confident rays, instead of the seed's.
-        factorisation: "ql" as published, "qr" as it should be: see the module.
     """
     _check(ray, confidence, views=True)
     if factorisation not in ("ql", "qr"):
