@@ -12,7 +12,6 @@ weird trick for parallelizing convolutional neural networks" (AlexNet).
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import CheckpointError, OptionError, ShapeError
+from gvtools.optional import package_folder
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -184,10 +184,8 @@ def load_model(net: str, file: Path) -> Model:
             f"{file}: does not hold the weights of LPIPS's network {net} ({first}); download "
             f"{backbone.url} again"
         ) from error
-    package = importlib.util.find_spec("lpips")
-    if package is None or package.origin is None:
-        raise CheckpointError("LPIPS: the package lpips is absent; pip install 'gvtools[lpips]'")
-    calibrated = Path(package.origin).with_name("weights") / "v0.1" / f"{net}.pth"
+    package = package_folder("lpips", extra="lpips", purpose="LPIPS", error=CheckpointError)
+    calibrated = package / "weights" / "v0.1" / f"{net}.pth"
     heads = torch.load(calibrated, map_location="cpu", weights_only=True)
     names = [f"lin{number}.model.1.weight" for number in range(len(backbone.compared))]
     return Model(layers, backbone.compared, [heads[name] for name in names])

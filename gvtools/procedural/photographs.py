@@ -8,13 +8,12 @@ in neither, since a sample of the project is made of it.
 from __future__ import annotations
 
 from functools import cache
-from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
+from gvtools.optional import installed, package_folder
 
 SPLITS = ("train", "held-out")
 
@@ -50,7 +49,7 @@ def check_split(split: str) -> int:
 def photograph_names(split: str) -> tuple[str, ...]:
     """The photographs of a split that are installed."""
     check_split(split)
-    learn = find_spec("sklearn") is not None
+    learn = installed("sklearn")
     return tuple(name for name in PHOTOGRAPHS[split] if learn or not name.startswith("sklearn:"))
 
 
@@ -60,10 +59,8 @@ def photograph(name: str) -> NDArray[np.uint8]:
     from PIL import Image
 
     if name.startswith("sklearn:"):
-        spec = find_spec("sklearn")
-        if spec is None or spec.origin is None:
-            raise OptionError(f"photograph {name!r} needs scikit-learn; install it")
-        file = Path(spec.origin).parent / "datasets" / "images" / f"{name[8:]}.jpg"
+        package = package_folder("sklearn", extra="train", purpose=f"photograph {name!r}")
+        file = package / "datasets" / "images" / f"{name[8:]}.jpg"
         image = Image.open(file).convert("RGB")
     else:
         import skimage.data

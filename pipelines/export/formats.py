@@ -14,11 +14,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from gvtools.errors import OptionError
+from gvtools.optional import require
 
 # What every point format takes, and what a mesh takes beside it.
 POINTS = ("max_points", "observed")
@@ -48,12 +48,8 @@ class ExportFormat:
 
     def load(self) -> Any:
         """The module that writes it."""
-        absent = [name for name in self.needs if find_spec(name) is None]
-        if absent:
-            raise OptionError(
-                f"--format {self.name} needs {' and '.join(absent)}, not installed here; run "
-                "'pip install \"gvtools[export]\"'"
-            )
+        for package in self.needs:
+            require(package, extra="export", purpose=f"--format {self.name}")
         return import_module(self.module)
 
     def check_path(self, path: Path, source: Path) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written
+from gvtools.optional import require
 
 SUFFIXES = (".mp4", ".gif", ".webp")
 # x264's constant rate factor: 18 is visually almost lossless, 23 is its default.
@@ -24,13 +25,8 @@ def check_suffix(path: Path) -> None:
     if suffix not in SUFFIXES:
         raise OptionError(f"--out {path}: expected a name that ends with {', '.join(SUFFIXES)}")
     if suffix == ".mp4":
-        try:
-            import av  # noqa: F401
-        except ImportError:
-            raise OptionError(
-                f'--out {path}: MP4 needs PyAV, which is not installed; pip install "gvtools[film]"'
-                ", or write a .gif or .webp"
-            ) from None
+        purpose, instead = f"--out {path}: MP4", "or write a .gif or .webp"
+        require("av", extra="film", purpose=purpose, instead=instead)
 
 
 def write_film(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -> None:

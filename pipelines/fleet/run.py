@@ -18,6 +18,7 @@ from typing import Any
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.tables import Column, Table, csv_text, markdown
 from gvtools.files import make_folder, write_json, write_text
+from gvtools.optional import require
 from pipelines.console import Console
 from pipelines.fleet.spec import Task, is_url
 from pipelines.fleet.task import finished_record, read_record, run_task, write_record
@@ -148,13 +149,8 @@ class Ray:
     def __init__(self, tasks: Sequence[Task], *, address: str, console: Console) -> None:
         # "auto" may find the address of a cluster that has ended: try 3 times, not 20, 40 s each.
         os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "3")
-        try:
-            import ray
-        except ImportError:
-            raise OptionError(
-                "--engine ray: Ray is not installed; pip install 'gvtools[cluster]', or give "
-                "--engine processes or slurm"
-            ) from None
+        instead = "or give --engine processes or slurm"
+        ray = require("ray", extra="cluster", purpose="--engine ray", instead=instead)
         _check_reachable(address)
         try:
             context = ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)

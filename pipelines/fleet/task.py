@@ -21,6 +21,7 @@ from typing import Any
 
 from gvtools.errors import GvError, OptionError, ProjectError
 from gvtools.files import digest, remove, write_json
+from gvtools.optional import require
 from pipelines.fleet.spec import Task, is_url
 from pipelines.scoring.sweep import DONE, FAILED, Record, difference
 
@@ -236,9 +237,8 @@ def write_record(place: str, record: Record) -> None:
 
 
 def _open(place: str) -> tuple[Any, str]:
+    fsspec = require("fsspec", extra="cluster", purpose=place)
     try:
-        import fsspec
-
         files, remote = fsspec.url_to_fs(place)
     except (ImportError, ValueError) as error:
         raise OptionError(

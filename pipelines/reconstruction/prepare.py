@@ -200,8 +200,8 @@ def _on_device(config: RunSettings) -> RunSettings:
         )
     if config.refine.wanted and not gsplat_installed():
         raise OptionError(
-            "device cuda: gsplat, which fits Gaussians there, is not installed; expected it; pip "
-            "install gvtools[cuda], or use --refine 0 or --device cpu"
+            "device cuda: fitting Gaussians needs gsplat, which is not installed; pip install "
+            "'gvtools[cuda]', or use --refine 0 or --device cpu"
         )
     return with_values(config, {"splat.backend": "torch", "splat.device": "cuda"})
 

@@ -13,6 +13,7 @@ from unittest.mock import patch
 from urllib.parse import urlsplit
 
 from gvtools.errors import OptionError
+from gvtools.optional import require
 
 if TYPE_CHECKING:
     import viser
@@ -30,14 +31,9 @@ def make_server(host: str, port: int, title: str) -> viser.ViserServer:
         port: the first one tried; where it is taken, the next free one is used.
         title: of the page.
     """
-    try:
-        import viser
-        import websockets.asyncio.server as websockets
-    except ImportError:
-        raise OptionError(
-            "the web viewer needs viser, which is not installed; pip install 'gvtools[web]', or "
-            "use --open3d"
-        ) from None
+    require("viser", extra="web", purpose="the web viewer", instead="or use --open3d")
+    import viser
+    import websockets.asyncio.server as websockets
 
     class Server(viser.ViserServer):
         """Never publishes itself, whatever a page asks for."""

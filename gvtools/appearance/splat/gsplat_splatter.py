@@ -7,7 +7,6 @@ any order, so the last digits differ from run to run.
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -24,11 +23,12 @@ from gvtools.appearance.splat.project_kernels import (
     VALUES,
 )
 from gvtools.appearance.splat.splat import EXACT, Lens, Splat
+from gvtools.optional import installed
 
 
 def gsplat_installed() -> bool:
     """Whether gsplat can be imported; whether it works on this machine's device shows in use."""
-    return find_spec("gsplat") is not None
+    return installed("gsplat")
 
 
 def splatter_on(device: str) -> type[Splat]:

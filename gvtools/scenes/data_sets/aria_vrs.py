@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import ProjectError
+from gvtools.optional import require
 from gvtools.scenes.photographs import Depth
 from gvtools.scenes.rgbd_recording import MILLIMETRES
 from gvtools.scenes.scene import Frame
@@ -169,12 +171,6 @@ def _provider(path: Path) -> Any:
 
 
 def _tools() -> Any:
-    try:
-        from projectaria_tools import core
-        from projectaria_tools.core import data_provider, sensor_data, stream_id
-    except ImportError:
-        raise OptionError(
-            "reading Aria's recordings needs projectaria_tools; pip install projectaria-tools"
-        ) from None
-    assert data_provider and sensor_data and stream_id  # what is used of it, loaded
-    return core
+    for part in ("data_provider", "sensor_data", "stream_id"):
+        require(f"projectaria_tools.core.{part}", extra="aria", purpose="reading Aria's recordings")
+    return import_module("projectaria_tools.core")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
+from gvtools.optional import require
 from gvtools.untrusted import UNPACKED_BYTES, UNPACKED_RATIO, regular
 
 if TYPE_CHECKING:
@@ -20,12 +21,7 @@ if TYPE_CHECKING:
 @contextmanager
 def hdf5_file(path: Path) -> Iterator[h5py.File]:
     """The HDF5 file at ``path``, open for reading."""
-    try:
-        import h5py
-    except ImportError:
-        raise ProjectError(
-            f"{path}: HDF5 is read with h5py, which is absent; pip install 'gvtools[data]'"
-        ) from None
+    h5py = require("h5py", extra="data", purpose=f"{path}: HDF5", error=ProjectError)
     try:
         with h5py.File(regular(path), "r") as file:
             yield file
@@ -68,12 +64,7 @@ def exr_channel(path: Path, channels: tuple[str, ...]) -> NDArray[np.float32]:
         path: the file.
         channels: names in order of preference; the first that is there is read.
     """
-    try:
-        import OpenEXR
-    except ImportError:
-        raise ProjectError(
-            f"{path}: EXR is read with OpenEXR, which is absent; pip install 'gvtools[data]'"
-        ) from None
+    OpenEXR = require("OpenEXR", extra="data", purpose=f"{path}: EXR", error=ProjectError)
     if not path.is_file():
         raise ProjectError(f"{path}: no such file")
     try:

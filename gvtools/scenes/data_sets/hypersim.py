@@ -31,7 +31,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import ProjectError
+from gvtools.optional import require
 from gvtools.scenes.data_sets.array_files import read_dataset
 from gvtools.scenes.data_sets.layouts import Layout
 from gvtools.scenes.data_sets.posed_pictures import (
@@ -50,7 +51,7 @@ from gvtools.scenes.transforms_frame import LensParameters
 from gvtools.untrusted import regular
 
 if TYPE_CHECKING:
-    from types import ModuleType
+    pass
 
 PARAMETERS = "metadata_camera_parameters.csv"
 SIZE = (1024, 768)  # width, height of the pictures where the file of parameters is absent
@@ -290,18 +291,12 @@ def _metres_per_unit(path: Path, parameters: dict[str, str]) -> float:
 def _hdf5(path: Path) -> Float64:
     """The array ``dataset`` of an HDF5 file, with its stored shape and type."""
     try:
-        with _h5py().File(regular(path), "r") as file:
+        with require("h5py", extra="data", purpose="reading Hypersim").File(
+            regular(path), "r"
+        ) as file:
             return read_dataset(path, file["dataset"])
     except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
         raise ProjectError(f"{path}: unreadable ({error}); copy it again") from None
-
-
-def _h5py() -> ModuleType:
-    try:
-        import h5py
-    except ImportError:
-        raise OptionError("reading Hypersim needs h5py; pip install h5py") from None
-    return h5py
 
 
 LAYOUT = Layout("ai_VVV_NNN/_detail/cam_XX with ai_VVV_NNN/images", _scenes, _read)

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import ProjectError
+from gvtools.optional import require
 from gvtools.scenes.scene import Frame
 from gvtools.untrusted import regular
 
 if TYPE_CHECKING:
-    from types import ModuleType
+    pass
 
 
 @dataclass(frozen=True)
@@ -122,11 +123,7 @@ def _opened(path: Path, *, edits: bool = True) -> Any:
     return container
 
 
-def _av() -> ModuleType:
-    try:
-        import av
-    except ImportError:
-        raise OptionError(
-            "reading a video needs PyAV; pip install av, or give frames as pictures"
-        ) from None
-    return av
+def _av() -> Any:
+    return require(
+        "av", extra="data", purpose="reading a video", instead="or give frames as pictures"
+    )

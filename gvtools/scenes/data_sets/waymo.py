@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import ProjectError
+from gvtools.optional import require
 from gvtools.scenes.data_sets.layouts import Layout
 from gvtools.scenes.data_sets.posed_pictures import (
     Float64,
@@ -32,7 +33,7 @@ from gvtools.scenes.transforms_frame import LensParameters
 from gvtools.untrusted import open_picture, regular
 
 if TYPE_CHECKING:
-    from types import ModuleType
+    pass
 
 CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
 TIME, CAMERA = "key.frame_timestamp_micros", "key.camera_name"
@@ -166,12 +167,8 @@ def _transform(values: Any) -> Float64 | None:
     return np.array(values, np.float64).reshape(4, 4)
 
 
-def _parquet() -> ModuleType:
-    try:
-        import pyarrow.parquet
-    except ImportError:
-        raise OptionError("reading Waymo's files needs pyarrow; pip install pyarrow") from None
-    return pyarrow.parquet
+def _parquet() -> Any:
+    return require("pyarrow.parquet", extra="data", purpose="reading Waymo's files")
 
 
 LAYOUT = Layout(

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError
 
 from gvtools.errors import ProjectError
+from gvtools.optional import require
 from gvtools.scenes.data_sets.array_files import exr_channel
 from gvtools.scenes.data_sets.posed_pictures import (
     Float64,
@@ -241,13 +242,10 @@ def _lzfse_depth(home: Path, maps: list[str], _: Path, *, shape: tuple[int, int]
 
 
 def _unpacked(home: Path, name: str, dtype: str, *, shape: tuple[int, int]) -> NDArray[Any]:
-    try:
-        import lzfse
-    except ImportError:
-        raise ProjectError(
-            f"{home}: depth is compressed by LZFSE, which is read with lzfse, which is absent; "
-            "pip install 'gvtools[phones]', or export EXR and JPG"
-        ) from None
+    lzfse = require(
+        "lzfse", extra="phones", purpose=f"{home}: depth compressed by LZFSE",
+        instead="or export EXR and JPG", error=ProjectError,
+    )  # fmt: skip
     try:
         data = _decompressed(_stored(home, name), np.dtype(dtype).itemsize * shape[0] * shape[1])
         return np.frombuffer(data, dtype).reshape(shape)

@@ -195,7 +195,7 @@ def test_an_absent_package_is_named_with_what_to_install(saved, tmp_path, monkey
     for package in form.needs:
         monkeypatch.setitem(sys.modules, package, None)
     out = tmp_path / f"out{next(iter(form.suffixes))}"
-    with pytest.raises(OptionError, match=rf'{form.needs[0]}.*pip install "gvtools\[export\]"'):
+    with pytest.raises(OptionError, match=rf"{form.needs[0]}.*pip install 'gvtools\[export\]'"):
         export_run(saved, "--format", kind, "--out", out)
     assert not out.exists()
 

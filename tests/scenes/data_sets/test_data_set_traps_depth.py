@@ -346,7 +346,7 @@ def test_aria_recordings_need_the_official_package(
 ) -> None:
     expected = mini_aria.write(tmp_path)
     monkeypatch.setitem(sys.modules, "projectaria_tools", None)
-    with pytest.raises(OptionError, match="pip install projectaria-tools"):
+    with pytest.raises(OptionError, match=r"pip install 'gvtools\[aria\]'"):
         read("aria_digital_twin", tmp_path, expected.scene)
     (tmp_path / expected.scene / "video.vrs").write_bytes(b"none")
     monkeypatch.undo()
