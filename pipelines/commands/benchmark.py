@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.untrusted import read_json
-from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
+from pipelines.commands.arguments import add_lpips_arguments, open_lpips
 
 if TYPE_CHECKING:
     from gvtools.evaluation.published import Benchmark

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError, ProjectError
-from pipelines.commands.scene_arguments import add_rgbd_arguments, rgbd_reading_of
+from pipelines.commands.arguments import add_rgbd_arguments, rgbd_reading_of
 
 if TYPE_CHECKING:
     from gvtools.capture.project import CaptureReport

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError, UnposedError
-from pipelines.commands.scene_arguments import open_scene, reading_of, rgbd_reading_of
+from pipelines.commands.arguments import open_scene, reading_of, rgbd_reading_of
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import GvError, ProjectError
-from pipelines.commands.scene_arguments import add_scene_arguments, open_scene
+from pipelines.commands.arguments import add_scene_arguments, open_scene
 
 if TYPE_CHECKING:
     from gvtools.scenes.inspection import SceneReport

@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.commands.actions import Action, AddOption, add_actions
+from pipelines.commands.arguments import Action, AddOption, add_actions
 from pipelines.data_sets.shards import shards, shards_options, verify, verify_options
 
 if TYPE_CHECKING:

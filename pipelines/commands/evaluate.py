@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
-from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
-from pipelines.commands.measurement_arguments import add_measurement_arguments
-from pipelines.commands.scene_arguments import add_scene_arguments
+from pipelines.commands.arguments import (
+    add_lpips_arguments,
+    add_measurement_arguments,
+    add_scene_arguments,
+    open_lpips,
+)
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -136,7 +139,7 @@ def _folder(args: argparse.Namespace) -> Path:
 
 
 def _run_protocol(args: argparse.Namespace, out: Path, console: Console) -> Path:
-    from pipelines.commands.scene_arguments import open_scene, reading_of
+    from pipelines.commands.arguments import open_scene, reading_of
     from pipelines.evaluation.protocol_run import run_protocol
 
     return run_protocol(

@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
-from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
-from pipelines.commands.measurement_arguments import add_measurement_arguments
-from pipelines.commands.scene_arguments import add_scene_arguments
+from pipelines.commands.arguments import (
+    add_lpips_arguments,
+    add_measurement_arguments,
+    add_scene_arguments,
+    open_lpips,
+)
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -121,7 +124,7 @@ def _check_apart(pictures: Sequence[Path], out: Path) -> None:
 
 def _reference(args: argparse.Namespace, console: Console) -> Reference:
     from gvtools.runs.layout import RECORD
-    from pipelines.commands.scene_arguments import open_scene, reading_of
+    from pipelines.commands.arguments import open_scene, reading_of
     from pipelines.judging.reference import observe_context, open_reference
 
     if (args.against / RECORD).is_file():

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.commands.help_settings import HelpSettings
+from pipelines.commands.arguments import HelpSettings
 
 if TYPE_CHECKING:
     from gvtools.settings import Settings
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) -> None:
     """What ``reconstruct`` and ``demo`` share."""
-    from pipelines.commands.scene_arguments import add_scene_arguments
+    from pipelines.commands.arguments import add_scene_arguments
 
     parser.add_argument("--out", type=Path, required=out_required, help="the run's folder")
     parser.add_argument("--context", metavar="SPEC", help="views that are given (default all)")

@@ -7,8 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
-from pipelines.commands.lpips_arguments import add_lpips_arguments, open_lpips
-from pipelines.commands.scene_arguments import add_scene_arguments, open_scene
+from pipelines.commands.arguments import (
+    add_lpips_arguments,
+    add_scene_arguments,
+    open_lpips,
+    open_scene,
+)
 
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras

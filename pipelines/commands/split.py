@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.commands.scene_arguments import add_scene_arguments, open_scene, reading_of
+from pipelines.commands.arguments import add_scene_arguments, open_scene, reading_of
 
 if TYPE_CHECKING:
     from pipelines.console import Console

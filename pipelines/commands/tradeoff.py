@@ -28,7 +28,7 @@ UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    from pipelines.commands.scene_arguments import add_scene_arguments
+    from pipelines.commands.arguments import add_scene_arguments
 
     parser.add_argument(
         "project", type=Path, help="COLMAP, posed RGB-D, transforms.json or spec:NAME:SCENE"
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.files import write_json
     from gvtools.runs.folder_lock import folder_lock
     from gvtools.settings import changes
-    from pipelines.commands.scene_arguments import reading_of
+    from pipelines.commands.arguments import reading_of
     from pipelines.reconstruction.plan import run_identity
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.scoring.tradeoff import (
@@ -126,7 +126,7 @@ def _within(config: RunSettings, budget: float | None) -> RunSettings:
 
 def _planned(args: argparse.Namespace, config: RunSettings, console: Console) -> tuple[Scene, Plan]:
     """The scene, and the plan of the run that the sweep starts from."""
-    from pipelines.commands.scene_arguments import open_scene
+    from pipelines.commands.arguments import open_scene
     from pipelines.reconstruction.prepare import make_plan
 
     if config.rounds is not None:

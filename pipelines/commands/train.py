@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
-from pipelines.commands.help_settings import HelpSettings
+from pipelines.commands.arguments import HelpSettings
 from pipelines.commands.tune import NAME, add_tune_arguments, refuse_tune_arguments, run_tune
 
 if TYPE_CHECKING:

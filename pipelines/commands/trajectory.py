@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError
-from pipelines.commands.scene_arguments import add_root_argument, refuse_root
+from pipelines.commands.arguments import add_root_argument, refuse_root
 
 if TYPE_CHECKING:
     from gvtools.evaluation.trajectories import PoseErrors

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError
-from pipelines.commands.scene_arguments import add_root_argument
+from pipelines.commands.arguments import add_root_argument
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import CheckpointError, GvError, OptionError, ProjectError
-from pipelines.commands.actions import Action, AddOption, add_actions
+from pipelines.commands.arguments import Action, AddOption, add_actions
 
 if TYPE_CHECKING:
     from gvtools.completers.geoverse.config import GeoVerseConfig

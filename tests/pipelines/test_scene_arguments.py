@@ -9,7 +9,7 @@ from scenes_workspace import sevenscenes, workspace
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.reading import rgbd_options
 from gvtools.scenes.scene import Scene
-from pipelines.commands.scene_arguments import add_scene_arguments, open_scene, reading_of
+from pipelines.commands.arguments import add_scene_arguments, open_scene, reading_of
 
 
 def parsed(*words: object) -> argparse.Namespace:

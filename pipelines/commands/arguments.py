@@ -1,18 +1,21 @@
-"""The options by which a command is told what a project does not tell by itself."""
+"""Arguments that commands share, and what they say: projects, figures, LPIPS, settings, actions."""
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gvtools.errors import OptionError
 from gvtools.scenes.data_sets.address import FORM, is_address
 
 if TYPE_CHECKING:
+    from gvtools.evaluation.lpips_distance import Lpips
     from gvtools.scenes.scene import Scene
+    from gvtools.settings import Settings
+    from pipelines.console import Console
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -132,3 +135,120 @@ def _intrinsics(text: str) -> list[list[float]]:
     if not (min(fx, fy) > 0 and all(math.isfinite(value) for value in (fx, fy, cx, cy))):
         raise argparse.ArgumentTypeError(f"{text!r}: expected finite numbers, FX and FY above 0")
     return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+
+
+MATCHERS = ("sift", "lightglue")
+
+
+def add_measurement_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--json``, ``--parts``, ``--no-control`` and ``--matcher``."""
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
+    parser.add_argument(
+        "--parts",
+        default="images,consistency,poses",
+        metavar="NAMES",
+        help="what to measure (default %(default)s)",
+    )
+    parser.add_argument(
+        "--no-control",
+        action="store_true",
+        help="leave out the same measures on the true pictures, which tell how to read the figures",
+    )
+    parser.add_argument(
+        "--matcher", choices=MATCHERS, default="sift", help="of the pose probe (default sift)"
+    )
+
+
+def add_lpips_arguments(parser: argparse.ArgumentParser) -> None:
+    """Network and weights."""
+    parser.add_argument(
+        "--lpips-net", choices=("vgg", "alex"), default="vgg", help="below LPIPS (default vgg)"
+    )
+    parser.add_argument(
+        "--lpips-weights",
+        type=Path,
+        metavar="DIR",
+        help="the folder with the network's published weights (default: torch's cache)",
+    )
+
+
+def open_lpips(args: argparse.Namespace) -> tuple[Lpips | None, str | None]:
+    """The network, or None with the reason."""
+    from gvtools.errors import CheckpointError
+    from gvtools.evaluation.lpips_distance import Lpips
+
+    try:
+        return Lpips(args.lpips_net, folder=args.lpips_weights), None
+    except CheckpointError as error:
+        if args.lpips_weights is not None:
+            raise
+        return None, str(error)
+
+
+class HelpSettings(argparse.Action):
+    """Like ``--help``, of settings.
+
+    Args:
+        settings: gives the settings of a command and those of its parts, when they are asked for;
+            takes what was given on the command line before.
+        options: of the option, see ``argparse.Action``.
+    """
+
+    def __init__(
+        self, *, settings: Callable[[argparse.Namespace], Sequence[Settings]], **options: Any
+    ) -> None:
+        super().__init__(**options, nargs=0)
+        self._settings = settings
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, *args: object
+    ) -> None:
+        """Print them to standard output and end the program with status 0."""
+        from gvtools.errors import GvError
+        from gvtools.settings import listing
+
+        try:
+            print(listing(*self._settings(namespace)))
+        except GvError as error:
+            parser.error(str(error))
+        parser.exit()
+
+
+AddOption = Callable[..., Any]
+
+
+class Action(NamedTuple):
+    """One of them.
+
+    Attributes:
+        run: does it.
+        add_options: given ``parser.add_argument``.
+        summary: one line.
+        examples: what follows the action's name.
+    """
+
+    run: Callable[[argparse.Namespace, Console], None]
+    add_options: Callable[[AddOption], None]
+    summary: str
+    examples: tuple[str, ...]
+
+
+def add_actions(parser: argparse.ArgumentParser, command: str, actions: dict[str, Action]) -> None:
+    """A parser for each action; ``args.act`` runs the chosen one."""
+    parsers = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    for name, action in actions.items():
+        lines = "\n".join(f"  gvtools {command} {name} {x}".rstrip() for x in action.examples)
+        added = parsers.add_parser(
+            name,
+            help=action.summary,
+            description=f"examples:\n{lines}\n\n{action.summary}.",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        added.set_defaults(act=action.run)
+        # As of every command; given before the action they hold as well.
+        for option, text in (("quiet", "print nothing but warnings"), ("debug", "tracebacks")):
+            added.add_argument(
+                f"--{option}", action="store_true", default=argparse.SUPPRESS, help=text
+            )
+        action.add_options(added.add_argument)
