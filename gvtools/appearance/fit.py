@@ -110,6 +110,7 @@ class Fit:
         begin: float = 0.0,
         surface: NDArray[np.float32] | None = None,
         splatter: type[Splat] = Splat,
+        backdrop: bool = True,
     ) -> None:
         """Prepare a fit.
 
@@ -123,8 +124,11 @@ class Fit:
             surface: (N, 3) points on surfaces: nothing may float before them, see free_space. None
                 allows Gaussians everywhere.
             splatter: draws the Gaussians.
+            backdrop: put another colour behind the Gaussians in each step, without recorded depth:
+                only opaque surfaces match photographs then, while over black a photograph's dark
+                parts could be fitted by stopping less light.
         """
-        self.start, self.seed, self.splatter = start, seed, splatter
+        self.start, self.seed, self.splatter, self.backdrop = start, seed, splatter, backdrop
         self.views, self.options = list(views), options or FitOptions()
         self.frame = start.frame
         self.rng = np.random.default_rng(seed)
@@ -176,20 +180,22 @@ class Fit:
         """Whether ``stop`` was called."""
         return self._stop.is_set()
 
-    def again(self, number: int, options: FitOptions) -> Fit:
-        """A new fit from the same start at the poses of this one, which has ended.
+    def again(self, number: int, options: FitOptions, *, backdrop: bool | None = None) -> Fit:
+        """A new fit from the same start at the poses of this one, which has ended or not begun.
 
         Args:
             number: of the fit; random choices differ with it.
             options: of the new fit.
+            backdrop: None for this one's.
         """
         poses = self.cameras.poses()
         views = [replace(v, cam_from_local=p) for v, p in zip(self.views, poses, strict=True)]
         kept = options.replaced(poses=False)
         seed = self.seed + number
         fit = Fit(
-            self.start, views, options=kept, seed=seed, surface=self.surface, splatter=self.splatter
-        )
+            self.start, views, options=kept, seed=seed, surface=self.surface,
+            splatter=self.splatter, backdrop=self.backdrop if backdrop is None else backdrop,
+        )  # fmt: skip
         fit._stop = self._stop
         return fit
 
@@ -198,6 +204,7 @@ class Fit:
         *,
         clock: Callable[[], float] = time.perf_counter,
         report: Callable[[float], object] = lambda share: None,
+        until: float = 1.0,
     ) -> None:
         """Fit for the time or the number of steps that the options give, or until it converged.
 
@@ -207,6 +214,7 @@ class Fit:
         Args:
             clock: tells seconds.
             report: is called now and then, and at the end, with the share that is done, 0 to 1.
+            until: the progress at which a trial ends, with its validation photographs left out.
         """
         limit, began = self.options.limit, clock()
         most = np.inf if self.begin else self.converged_after
@@ -219,7 +227,7 @@ class Fit:
                 over = float(np.interp(over, OF_STEPS, OF_TIME))
             if limit is not None:
                 over = max(over, (clock() - began) / max(limit, 1e-9)) + skipped
-            if over >= 1:
+            if over >= until:
                 break
             if limit is not None and self._validation and checks and over >= checks[0]:
                 checks = [share for share in checks if share > over]
@@ -229,6 +237,8 @@ class Fit:
             self.step(self.begin + (1 - self.begin) * over)
             if self.steps % 50 == 0:
                 report(over)
+        if until < 1:
+            return
         if self._validation:
             self._add_validation()
         self._check_poses()
@@ -259,10 +269,14 @@ class Fit:
         """Whether validation photographs gained since the last call."""
         if self.steps < GAINS_UNTIL * self.converged_after:
             return True
-        before, rows = self._last_psnr, self._validation
-        self._last_psnr = self.psnr_of({r: self._picture(r, self.cameras.given[r]) for r in rows})
+        before, self._last_psnr = self._last_psnr, self.left_out_psnr()
         # What cannot be measured is no reason to end.
         return not self._last_psnr < before + LEAST_STAGE_GAIN
+
+    def left_out_psnr(self) -> float:
+        """Mean PSNR of all validation photographs, rendered now [dB]; NaN without any."""
+        rows = self._validation
+        return self.psnr_of({row: self._picture(row, self.cameras.given[row]) for row in rows})
 
     def psnr_of(self, pictures: Mapping[int, Picture]) -> float:
         """Mean PSNR of rendered pictures against their photographs, by their numbers [dB]."""
@@ -401,11 +415,10 @@ class Fit:
         """(5, H, W) gradient of the loss, times the number of pixels to avoid tiny numbers."""
         options, pixels = self.options, view.weight.size
         gain, alpha = self.cameras.gain(number), picture.image[4]
-        # Another colour behind the Gaussians in each step: only opaque surfaces match photographs
-        # then, while over black a photograph's dark parts could be fitted by stopping less light.
-        # With recorded depth, this costs 0.3 dB in cameras far from all photographs (demo room).
+        # With recorded depth, a backdrop costs 0.3 dB in cameras far from all photographs (demo
+        # room).
         behind = np.zeros((3, 1, 1), np.float32)
-        if view.depth is None:
+        if view.depth is None and self.backdrop:
             behind = self.rng.random((3, 1, 1), np.float32)
         lit = picture.image[:3] * gain[:, None, None]
         shown = lit + (1 - alpha) * behind

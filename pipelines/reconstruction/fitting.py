@@ -27,7 +27,7 @@ from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit import CONTINUED, Fit
 from gvtools.appearance.fit_options import FitOptions, converged_steps
 from gvtools.appearance.fit_views import FitView
-from gvtools.appearance.fits import LEAST_SHARE, MOST_FITS, run_fits
+from gvtools.appearance.fits import LEAST_SHARE, MOST_FITS, run_fits, with_chosen_backdrop
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture, mean_picture
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
@@ -442,6 +442,9 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         fit = _continued_fit(plan, earlier, console, sweep=sweep)
     if fit is None:
         return None
+    fit, why = with_chosen_backdrop(fit)
+    if why:
+        console.line(f"fitting: {why}")
     limit = fit.options.limit
     if limit is not None:
         left = max(limit - (time.perf_counter() - began), limit / 2)

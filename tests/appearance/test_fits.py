@@ -10,7 +10,7 @@ from gvtools.appearance import fit_options
 from gvtools.appearance import fits as module
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.fit_options import FitOptions
-from gvtools.appearance.fits import run_fits
+from gvtools.appearance.fits import run_fits, with_chosen_backdrop
 from gvtools.appearance.picture import mean_picture
 
 WHOLE = 10
@@ -106,3 +106,39 @@ def test_further_fits_are_made_at_the_poses_of_the_first():
     np.testing.assert_array_equal([view.cam_from_local for view in again.views], moved)
     assert not again.cameras.with_poses
     assert again.seed == 1
+
+
+@pytest.mark.parametrize(("gain", "backdrop"), [(0.2, True), (0.4, False)])
+def test_left_out_photographs_choose_the_backdrop(gain, backdrop, monkeypatch):
+    monkeypatch.setattr(module, "TRIAL_STEPS", 6)
+    trials = []
+
+    def psnr(self):
+        trials.append(self)
+        return 20.0 if self.backdrop else 20.0 + gain
+
+    monkeypatch.setattr(Fit, "left_out_psnr", psnr)
+    first = fit_of(count=10, steps=8)
+    chosen, why = with_chosen_backdrop(first)
+    assert chosen.backdrop is backdrop and (chosen is first) is backdrop
+    assert "random 20.00 dB" in why and f"black {20 + gain:.2f} dB" in why
+    # Trials leave photographs out to their end, and fit to no others than the fit itself.
+    assert [0 < trial.steps < 6 and not trial.predicted for trial in trials] == [True, True]
+    assert chosen.steps == 0
+    alone = run_fits(chosen)[0]
+    again = run_fits(with_chosen_backdrop(fit_of(count=10, steps=8))[0])[0]
+    assert alone.gaussians.values.tobytes() == again.gaussians.values.tobytes()
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        {"count": 5, "steps": 900},
+        {"count": 17, "steps": 900},
+        {"count": 10, "steps": 8},
+        {"count": 10, "seconds": 9.0},
+    ],
+)
+def test_many_photographs_none_left_out_and_short_fits_have_no_trials(made):
+    fit = fit_of(**made)
+    assert with_chosen_backdrop(fit) == (fit, "")
